@@ -1,0 +1,46 @@
+"""The errors a user can meet, each with the exit code that the command line gives for it.
+
+A message says what is wrong, where (file, field, option) and what to do about it.
+"""
+
+
+class PlenoError(Exception):
+    """Root of all expected failures. `exit_code` is what the process returns."""
+
+    exit_code = 70
+
+    def __init__(self, what, where=None, fix=None):
+        super().__init__(what)
+        self.what, self.where, self.fix = str(what), None if where is None else str(where), fix
+
+    def __str__(self):
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text}; {self.fix}" if self.fix else text
+
+
+class UsageError(PlenoError):
+    """The command line asks for something that makes no sense."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """A configuration file breaks its rules; the message lists every violation."""
+
+
+class InputError(PlenoError):
+    """An input file is missing, unreadable, damaged, implausible or of the wrong kind."""
+
+    exit_code = 3
+
+
+class OutputError(PlenoError):
+    """The result could not be written; what stood at the target before is untouched."""
+
+    exit_code = 4
+
+
+class NumericsError(PlenoError):
+    """The numbers do not allow an answer, or not to the accuracy asked for."""
+
+    exit_code = 5

@@ -1,0 +1,1 @@
+"""The command line: one file a command, which parses, calls its stage and prints one line."""

@@ -1,0 +1,100 @@
+"""Entry point: the list of commands in the order of the pipeline, and the only place where errors become exit codes."""
+
+import importlib
+import os
+import sys
+
+import click
+
+from plenocli import __version__
+from plenocli.errors import PlenoError
+
+COMMANDS = (
+    "simulate-pif",
+    "capture-sim",
+    "calibrate",
+    "demux",
+    "learn-dict",
+    "reconstruct",
+    "score",
+    "report",
+    "inspect",
+    "schema",
+)
+"""The order is that of the pipeline, and of the help."""
+
+
+class Pipeline(click.Group):
+    """A group whose commands are imported when they are asked for."""
+
+    def list_commands(self, ctx):
+        return list(COMMANDS)
+
+    def get_command(self, ctx, name):
+        if name not in COMMANDS:
+            return None
+        return importlib.import_module(f"plenocli.cli.{name.replace('-', '_')}").command
+
+
+@click.group(
+    cls=Pipeline,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Exit codes: 0 done; 2 usage or configuration; 3 an input file is unreadable, damaged or of the wrong kind; "
+    "4 the output could not be written; 5 numerically impossible or accuracy unreachable; 70 a bug of plenocli.",
+)
+@click.version_option(__version__, prog_name="plenocli")
+def cli():
+    """Model a plenoptic camera end to end: from its description and a scene to captures, spectra and images.
+
+    \b
+    camera.toml --simulate-pif--> pif.h5 --capture-sim--> capture.h5|exr|dng
+      RAW or simulated captures --calibrate--> calibration.h5 --demux--> spectra.exr --score--> score.json
+      photographs --learn-dict--> dictionary.h5 --reconstruct--> image.exr --score--> report.html
+
+    Every command has --help with examples. Lengths carry their unit: 550nm, "250 um", 50mm.
+    """
+
+
+def main(argv=None):
+    """Run the command line and exit; every expected failure is one message on stderr and its exit code."""
+    sys.exit(run(argv))
+
+
+def run(argv=None):
+    """Run the command line with `argv` (default: the process's own) and return the exit code."""
+    debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
+    try:
+        code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except click.exceptions.Abort:
+        return _fail("interrupted", 130)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except PlenoError as error:
+        if debug:
+            raise
+        return _fail(str(error), error.exit_code)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except MemoryError as error:
+        if debug:
+            raise
+        return _fail(f"not enough memory ({error}); use fewer points, lenslets or wavelengths, or a lower --mem-limit", 5)
+    except Exception as error:  # the last line of defence: a bug must not look like a usage error
+        if debug:
+            raise
+        return _fail(
+            f"internal error, a bug of plenocli: {type(error).__name__}: {error}\n"
+            "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",
+            70,
+        )
+
+
+def _fail(message, code):
+    click.echo(f"plenocli: error: {message}", err=True)
+    return code

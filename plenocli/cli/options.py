@@ -1,0 +1,109 @@
+"""Every shared option once, with its unit and default in its help, and the parameter types that read units."""
+
+import json
+import math
+from pathlib import Path
+
+import click
+
+from plenocli.config.units import UnitError, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number
+
+
+class _Quantity(click.ParamType):
+    """A number with its unit, read by one of the parsers of plenocli.config.units."""
+
+    def __init__(self, name, parse, minimum=None, exclusive=False):
+        self.name, self._parse, self._minimum, self._exclusive = name, parse, minimum, exclusive
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):
+            return value
+        try:
+            number = self._parse(value)
+        except UnitError as error:
+            self.fail(str(error), param, ctx)
+        low = self._minimum
+        if low is not None and (number < low or (self._exclusive and number == low)):
+            self.fail(f"{value!r} must be {'above' if self._exclusive else 'at least'} {low:g}", param, ctx)
+        return number
+
+
+LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True)
+DECIBEL = _Quantity("decibel", parse_decibel)
+BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)
+DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True)
+POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True)
+NON_NEGATIVE = _Quantity("number", parse_number, 0.0)
+FRACTION = click.FloatRange(0.0, 1.0, min_open=True)
+
+
+class Grid(click.ParamType):
+    """Two whole numbers such as 3x3, or one of the given words."""
+
+    name = "ROWSxCOLUMNS"
+
+    def __init__(self, *words):
+        self._words = words
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str) or value in self._words:
+            return value
+        parts = value.lower().split("x")
+        if len(parts) == 2 and all(p.isdigit() and 0 < int(p) < 100000 for p in parts):
+            return int(parts[0]), int(parts[1])
+        self.fail(f"{value!r} is not a grid; write for example {'|'.join((*self._words, '3x3'))}", param, ctx)
+
+
+class Pair(click.ParamType):
+    """KEY=VALUE with a length as the key, such as 450nm=capture.h5 or 450nm=0.8."""
+
+    def __init__(self, value_name, convert_value):
+        self.name, self._convert = f"WAVELENGTH={value_name}", convert_value
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):
+            return value
+        key, equals, rest = value.partition("=")
+        if not equals or not rest:
+            self.fail(f"{value!r} is not {self.name}; write for example 450nm={'band450.dng' if self._convert is Path else '0.8'}", param, ctx)
+        try:
+            return parse_length(key), self._convert(rest)
+        except (UnitError, ValueError) as error:
+            self.fail(str(error), param, ctx)
+
+
+def input_path(name, **settings):
+    """A positional input file; its existence is checked by the reader, so that the exit code is 3 and the message says what is wrong."""
+    return click.argument(name, type=click.Path(path_type=Path), **settings)
+
+
+FILE = click.Path(path_type=Path)
+
+output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="File to write; a folder when there are several inputs.")
+overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
+seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
+workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes to use.")
+mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
+snr = click.option("--snr", "snr_db", type=DECIBEL, default=None, help="White noise of this signal-to-noise ratio, such as 60dB: sigma^2 = mean(y^2) 10^(-SNR/10).")
+
+
+def summary(report, as_json, line):
+    """Print what a command did: `report` (a dict) as JSON on request, else the one `line`."""
+    if as_json:
+        click.echo(json.dumps(_plain(report), allow_nan=False, sort_keys=True))
+    else:
+        click.echo(line)
+
+
+def _plain(value):
+    """JSON has no NaN, no arrays and no paths: numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

@@ -1,0 +1,323 @@
+"""The camera: one description of source, optics and detector, read from TOML, checked whole, kept in SI units.
+
+Planes along the axis: object --object.distance--> main lens --lenslet_array.distance--> lenslet array
+--sensor.distance--> sensor. All violations of a file are reported together, each with its path.
+"""
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError, WithJsonSchema, model_validator
+
+from plenocli.config.units import UnitError, format_length, parse_length
+from plenocli.errors import ConfigError, InputError
+
+MAX_BYTES = 1 << 20
+"""No camera description is longer; what is, is some other file."""
+
+
+def _quantity(parse, example, low, high, show):
+    """An annotated float that is written as text with a unit and lies within [low, high] in SI."""
+
+    def read(value: Any, info) -> float:
+        if info.context and info.context.get("si"):
+            number = value
+        elif isinstance(value, str):
+            number = parse(value)
+        else:
+            raise ValueError(f"{value!r} needs its unit as text, such as {example!r}")
+        if number is not None and not low <= number <= high:
+            raise ValueError(f"{value!r} is outside {show(low)} ... {show(high)}")
+        return number
+
+    pattern = {"type": "string", "description": f"number and unit, such as {example!r}, from {show(low)} to {show(high)}"}
+    return Annotated[float, BeforeValidator(read), WithJsonSchema(pattern)]
+
+
+def _suffix(unit):
+    def parse(text):
+        match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*" + re.escape(unit) + r"\s*", text)
+        try:
+            return float(match.group(1))
+        except (AttributeError, ValueError):
+            raise UnitError(f"{text!r} is no number of {unit}") from None
+
+    return parse
+
+
+def _plain(unit):
+    return lambda number: f"{number:g} {unit}"
+
+
+Length = _quantity(parse_length, "50 mm", 1e-9, 1e6, format_length)
+Gap = _quantity(parse_length, "0.1 mm", 0.0, 1.0, format_length)
+Wavelength = _quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)
+SignedLength = _quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)
+Electrons = _quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))
+Gain = _quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))
+Unit = Annotated[float, Field(gt=0.0, le=1.0)]
+Pair = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Aberration(Section):
+    """One Zernike term of the wavefront error W in the main-lens pupil, Noll index, in metres of optical path."""
+
+    noll: Annotated[int, Field(ge=1, le=231)]
+    coefficient: SignedLength
+
+
+class MainLens(Section):
+    focal_length: Length
+    aperture_diameter: Length | None = None
+    f_number: Annotated[float, Field(gt=0.1, le=1000)] | None = None
+    aperture_shape: Literal["circle", "square", "annulus"] = "circle"
+    obscuration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    glass: str = "none"
+    aberrations: tuple[Aberration, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_aperture(self):
+        if (self.aperture_diameter is None) == (self.f_number is None):
+            raise ValueError("give exactly one of aperture_diameter and f_number")
+        if (self.aperture_shape == "annulus") != (self.obscuration > 0):
+            raise ValueError("obscuration (above 0) goes with aperture_shape = \"annulus\", and only with it")
+        return self
+
+
+class Object(Section):
+    distance: Length
+    samples_per_lenslet: Pair = (40, 40)
+
+
+class LensletArray(Section):
+    distance: Length
+    pitch: Length | None = None
+    superpixel_pitch: Length | None = None
+    focal_length: Length
+    glass: str = "none"
+    lattice: Literal["square", "hexagonal"] = "square"
+    aperture_shape: Literal["square", "circle"] = "square"
+    fill_factor: Unit = 1.0
+    count: Pair = (11, 11)
+
+    @model_validator(mode="after")
+    def _one_pitch(self):
+        if (self.pitch is None) == (self.superpixel_pitch is None):
+            raise ValueError("give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)")
+        return self
+
+
+class Sensor(Section):
+    distance: Length
+    pixel_pitch: Length
+    pixels_per_lenslet: Pair
+    pixel_fill_factor: Unit = 1.0
+    cfa: Literal["mono", "RGGB", "BGGR", "GRBG", "GBRG"] = "mono"
+    camera: str | None = None
+    quantum_efficiency: Unit = 1.0
+    full_well: Electrons = 15000.0
+    read_noise: Electrons = 4.0
+    gain: Gain = 0.25
+    bits: Annotated[int, Field(ge=2, le=16)] = 12
+    black_level: Annotated[int, Field(ge=0, le=65534)] = 0
+
+    @model_validator(mode="after")
+    def _levels(self):
+        if self.black_level >= 2**self.bits - 1:
+            raise ValueError(f"black_level {self.black_level} leaves no range in {self.bits} bits")
+        if self.cfa != "mono" and self.camera is None:
+            raise ValueError(f"cfa = \"{self.cfa}\" needs camera, the name of measured sensitivities, such as \"Nikon 5100 (NPL)\"")
+        if self.full_well <= 0:
+            raise ValueError("full_well must be above 0 e")
+        return self
+
+
+class Light(Section):
+    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)]
+    design_wavelength: Wavelength | None = None
+    illuminant: str = "D65"
+
+    @model_validator(mode="after")
+    def _ascending(self):
+        if any(b <= a for a, b in zip(self.wavelengths, self.wavelengths[1:])):
+            raise ValueError("wavelengths must ascend without repetition")
+        return self
+
+
+class Filter(Section):
+    """A Gaussian band of intensity transmittance: peak exp(-4 ln2 ((l - center)/fwhm)^2) on a floor of `blocking`."""
+
+    center: Wavelength
+    fwhm: Length
+    peak: Unit = 0.8
+    blocking: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+
+
+class FilterArray(Section):
+    layout: Pair
+    gap: Gap = 0.0
+    size: Length | None = None
+    filters: tuple[Filter, ...]
+
+    @model_validator(mode="after")
+    def _one_filter_a_cell(self):
+        rows, columns = self.layout
+        if len(self.filters) != rows * columns:
+            raise ValueError(f"layout {rows} x {columns} needs {rows * columns} filters, row by row; there are {len(self.filters)}")
+        return self
+
+
+class Camera(Section):
+    """A plenoptic camera in SI units; every default and alternative is resolved when it is made."""
+
+    main_lens: MainLens
+    object: Object
+    lenslet_array: LensletArray
+    sensor: Sensor
+    light: Light
+    filter_array: FilterArray | None = None
+    _text: str = PrivateAttr("")
+
+    @model_validator(mode="after")
+    def _resolve(self):
+        lens, array, sensor, light, cells = self.main_lens, self.lenslet_array, self.sensor, self.light, self.filter_array
+        if lens.aperture_diameter is None:
+            self.__dict__["main_lens"] = lens = lens.model_copy(update={"aperture_diameter": array.distance / lens.f_number, "f_number": None})
+        if array.pitch is None:
+            pitch = array.superpixel_pitch / (1 + sensor.distance / array.distance)
+            self.__dict__["lenslet_array"] = array.model_copy(update={"pitch": pitch, "superpixel_pitch": None})
+        if light.design_wavelength is None:
+            middle = light.wavelengths[len(light.wavelengths) // 2]
+            self.__dict__["light"] = light.model_copy(update={"design_wavelength": middle})
+        if cells is not None:
+            side = lens.aperture_diameter * (1 if lens.aperture_shape == "square" else math.sqrt(0.5))
+            if cells.size is None:
+                self.__dict__["filter_array"] = cells = cells.model_copy(update={"size": side})
+            elif cells.size > lens.aperture_diameter * (1 + 1e-9):
+                raise ValueError(f"filter_array.size {format_length(cells.size)} is wider than the pupil, {format_length(lens.aperture_diameter)}")
+            if cells.gap * max(cells.layout) >= cells.size:
+                raise ValueError("filter_array.gap leaves no room for the filters")
+        return self
+
+    @property
+    def superpixel_pitch(self):
+        """Spacing of superpixel centres on the sensor, m: pitch (1 + z3/z2), by similar triangles from the pupil's centre."""
+        return self.lenslet_array.pitch * (1 + self.sensor.distance / self.lenslet_array.distance)
+
+    @property
+    def pixel_mismatch(self):
+        """(rows, columns): superpixel pitch in pixels minus pixels_per_lenslet; zero when superpixels tile whole pixels."""
+        pitch = self.superpixel_pitch / self.sensor.pixel_pitch
+        return tuple(pitch - n for n in self.sensor.pixels_per_lenslet)
+
+    @property
+    def text(self):
+        """The resolved description as TOML that parse_camera reads back to an equal camera."""
+        return to_toml(self)
+
+    def replace(self, **changes):
+        """A camera with dotted keys changed to SI values, checked again: replace(**{"object.distance": 0.6})."""
+        data = self.model_dump()
+        for path, value in changes.items():
+            section, key = path.split(".")
+            data[section][key] = value
+        return Camera.model_validate(data, context={"si": True})
+
+
+def load_camera(path):
+    """Read and check a camera description; InputError where the file cannot be read, ConfigError for what it says."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"is larger than {MAX_BYTES} bytes and so no camera description", path, "give a TOML file")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path, "give the TOML file of a camera, see `plenocli schema camera`") from None
+    except UnicodeDecodeError:
+        raise InputError("is not UTF-8 text", path, "give the TOML file of a camera") from None
+    return parse_camera(text, path)
+
+
+def parse_camera(text, where="camera"):
+    """A Camera from TOML text; ConfigError lists every violation with its path."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}", where, "mend the line") from None
+    try:
+        return Camera.model_validate(data)
+    except ValidationError as error:
+        lines = [_sentence(e) for e in error.errors()]
+        count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
+        raise ConfigError(f"{count}\n  " + "\n  ".join(lines), where) from None
+
+
+def camera_schema():
+    """The JSON Schema of a camera description, as a dict."""
+    return Camera.model_json_schema()
+
+
+def _sentence(error):
+    """One violation in words: path, what is wrong, and the nearest known key where a key is unknown."""
+    path = [str(p) for p in error["loc"]]
+    if error["type"] == "extra_forbidden":
+        known = _keys(path[:-1])
+        near = difflib.get_close_matches(path[-1], known, 1, 0.5)
+        hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+        return f"{'.'.join(path)}: unknown key; {hint}"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "missing":
+        message = "is missing"
+    return f"{'.'.join(path) or 'camera'}: {message}"
+
+
+def _keys(path):
+    """Names that a section knows; `path` as in a pydantic error location."""
+    model = Camera
+    for name in path:
+        if name.isdigit() or name not in model.model_fields:
+            continue
+        kinds = [a for a in _leaves(model.model_fields[name].annotation) if isinstance(a, type) and issubclass(a, BaseModel)]
+        model = kinds[0] if kinds else model
+    return list(model.model_fields)
+
+
+def _leaves(annotation):
+    arguments = getattr(annotation, "__args__", ())
+    return [leaf for a in arguments for leaf in _leaves(a)] if arguments else [annotation]
+
+
+_UNITS = {"full_well": "e", "read_noise": "e", "gain": "DN/e"}
+_NUMBERS = {"f_number", "obscuration", "fill_factor", "pixel_fill_factor", "quantum_efficiency", "peak", "blocking"}
+
+
+def to_toml(camera):
+    """TOML text of a resolved camera, one key a line, lengths with units; deterministic."""
+    lines = []
+    for section, values in camera.model_dump(exclude_none=True).items():
+        lines.append(f"[{section}]")
+        lines += [f"{key} = {_toml(key, value)}" for key, value in values.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _toml(key, value):
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {_toml(k, v)}" for k, v in value.items()) + " }"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(_toml(key, v) for v in value) + "]"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, int):
+        return str(value)
+    if key in _UNITS:
+        return f'"{value!r} {_UNITS[key]}"'
+    return repr(value) if key in _NUMBERS else f'"{format_length(value)}"'

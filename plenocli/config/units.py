@@ -1,0 +1,73 @@
+"""Numbers with units as text, parsed once at the border: "250 um", "60dB", "4GiB", "10 ms"."""
+
+import math
+import re
+
+LENGTHS = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+DURATIONS = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0}
+BYTES = {"B": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]\S*)?\s*")
+
+
+class UnitError(ValueError):
+    """Text that is not a number with a known unit."""
+
+
+def _parse(text, units, what, example):
+    match = _NUMBER.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise UnitError(f"{text!r} is no {what}; write a number and a unit, such as {example!r}")
+    number, unit = match.groups()
+    if unit is None:
+        raise UnitError(f"{text!r} has no unit; a {what} needs one of {', '.join(units)}, such as {example!r}")
+    if unit not in units:
+        raise UnitError(f"{text!r} is no {what}; the unit must be one of {', '.join(units)}, such as {example!r}")
+    # dividing by the exact power of ten keeps "550 nm" the double nearest to 550e-9
+    scale = units[unit]
+    value = float(f"{number}e{round(math.log10(scale))}") if scale < 1 and "e" not in number.lower() else float(number) * scale
+    if not math.isfinite(value):
+        raise UnitError(f"{text!r} is too large for a {what}")
+    return value
+
+
+def parse_length(text):
+    """Metres from text such as "250 um" or "550nm"; a bare number is refused (UnitError)."""
+    return _parse(text, LENGTHS, "length", "250 um")
+
+
+def parse_duration(text):
+    """Seconds from text such as "10 ms"; a bare number is refused (UnitError)."""
+    return _parse(text, DURATIONS, "duration", "10 ms")
+
+
+def parse_bytes(text):
+    """Bytes from text such as "4GiB"; a bare number is refused (UnitError)."""
+    return int(_parse(text, BYTES, "memory size", "4GiB"))
+
+
+def parse_decibel(text):
+    """Decibels from text such as "60dB"; "none" and bare numbers are refused (UnitError)."""
+    return _parse(text, {"dB": 1.0, "db": 1.0}, "ratio", "60dB")
+
+
+def parse_number(text):
+    """A finite number without a unit (UnitError otherwise)."""
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        raise UnitError(f"{text!r} is no number") from None
+    if not math.isfinite(value):
+        raise UnitError(f"{text!r} is not a finite number")
+    return value
+
+
+def format_length(metres):
+    """The shortest text that parse_length reads back to the same double, in a handy unit: 5.5e-7 -> "550 nm"."""
+    magnitude = abs(metres)
+    unit = next((u for u in ("nm", "um", "mm") if magnitude / LENGTHS[u] < 999.9995), "m")
+    for digits in (6, 9, 12, 15, 17):
+        text = f"{metres / LENGTHS[unit]:.{digits}g} {unit}"
+        if parse_length(text) == metres:
+            return text
+    return f"{metres!r} m"

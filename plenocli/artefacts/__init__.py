@@ -1,0 +1,17 @@
+"""Files in and out: the artefacts of all stages, EXR, camera RAW and DNG, photographs. Nothing heavy is imported until used."""
+
+from importlib import import_module
+
+_HOMES = {
+    "Artefact": "container", "write_artefact": "container", "read_artefact": "container", "cfa_text": "container",
+    "default_mem_limit": "container", "SCHEMAS": "kinds",
+    "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "require_file": "provenance",
+    "check_output": "atomic", "publish": "atomic",
+}
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,0 +1,261 @@
+"""The one writer and the one verified reader of artefacts.
+
+A file is a 512-byte user block (magic, SHA-256 and length of the rest), then an ordinary HDF5 file that any viewer opens.
+The HDF5 part is built in memory and written by `publish`, because HDF5 itself may crash the process when a disk is full.
+Reading goes the other way: all bytes once, digest, structure, declared sizes, and only then values, parsed from those bytes.
+"""
+
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from plenocli import __version__
+from plenocli.artefacts import schema as tables
+from plenocli.artefacts.kinds import SCHEMAS
+from plenocli.artefacts.provenance import Provenance, require_file
+from plenocli.artefacts.atomic import publish
+from plenocli.artefacts.structure import attribute_names, read_attribute, survey
+from plenocli.errors import InputError, OutputError, PlenoError
+
+MAGIC = b"plenocli artefact 1\n"
+HEADER_BYTES = 512
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
+_CHUNK_BYTES = 1 << 20
+_LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
+
+
+@dataclass
+class Artefact:
+    """data: dataset path ("pif/A") -> array; attrs: group or dataset path -> name -> number, list, text, bool or JSON-able value.
+
+    A colour filter array may be given as text ("mono", "RGGB"); it comes back as an array: see `cfa_text`.
+    """
+
+    kind: str
+    data: dict
+    attrs: dict = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=lambda: Provenance(""))
+
+
+def cfa_text(value):
+    """"mono" or four letters from the dataset capture/cfa (0-d or 2x2 array of bytes or str, or already text)."""
+    values = np.asarray(value)
+    return "".join(v.decode("ascii") if isinstance(v, bytes) else str(v) for v in values.ravel().tolist())
+
+
+def default_mem_limit():
+    """Half of the machine's memory, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+def write_artefact(path, artefact, *, overwrite=False):
+    """Check `artefact` against the table of its kind and put it at `path`, whole or not at all; same input, same bytes.
+
+    Raises ValueError listing every broken rule of the table (a bug of the caller), UsageError, OutputError.
+    """
+    image = build_image(artefact)
+    header = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
+    publish(path, [header.ljust(HEADER_BYTES, b"\0"), image], overwrite=overwrite)
+
+
+def read_artefact(path, kind=None, *, mem_limit=None):
+    """Read and verify the artefact at `path`.
+
+    kind: the kind due, or a tuple of kinds, or None for any. mem_limit: bytes, default half of the machine's memory.
+    Raises InputError for a file that is missing, not an artefact, damaged, too large, of another kind, or breaks its table.
+    """
+    path = Path(path)
+    limit = default_mem_limit() if mem_limit is None else int(mem_limit)
+    image = _verified_bytes(path, limit)
+    try:
+        with h5py.File(h5py.h5f.open_file_image(image), "r") as file:
+            return _parse(path, file, kind, limit)
+    except PlenoError:
+        raise
+    except Exception as error:  # h5py raises half a dozen types for a malformed file
+        raise InputError(f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again") from error
+
+
+# --- writing -----------------------------------------------------------------------------------------------------------
+
+def build_image(artefact):
+    """The HDF5 file as bytes. Raises ValueError listing every broken rule of the table."""
+    if artefact.kind not in SCHEMAS:
+        raise ValueError(f"no artefact kind '{artefact.kind}' (kinds: {', '.join(SCHEMAS)})")
+    schema = SCHEMAS[artefact.kind]
+    data = {path: _plain_array(path, value) for path, value in artefact.data.items() if value is not None}
+    attrs = {where: {n: v for n, v in named.items() if v is not None} for where, named in artefact.attrs.items()}
+    declared = {path: (values.shape, values.dtype) for path, values in data.items()}
+    problems = tables.declared_problems(schema, declared) + tables.attribute_problems(schema, attrs)
+    problems += tables.value_problems(schema, data)
+    groups = {path.rsplit("/", depth)[0] for path in data for depth in range(1, path.count("/") + 1)}
+    problems += [f"attributes for '{where}', which has no dataset" for where in attrs if attrs[where] and where not in groups | set(data)]
+    if problems:
+        raise ValueError(f"{artefact.kind} artefact breaks its table: " + "; ".join(problems))
+    stored = _stored_attributes(schema, artefact, declared, attrs)
+    longest = max(len(v) for named in stored.values() for v in named.values() if isinstance(v, bytes))
+    layout = "earliest" if longest < _LONG_TEXT else "v108"
+    try:
+        return _image(schema, data, stored, layout)
+    except MemoryError as error:
+        size = sum(values.nbytes for values in data.values())
+        raise OutputError(f"{size / 1e9:.1f} GB of results do not fit into memory twice", None, "ask for fewer points or bands") from error
+
+
+def _plain_array(path, value):
+    """Native byte order, C order; text as fixed-length ASCII."""
+    if isinstance(value, str) and path.endswith("/cfa"):
+        value = value if len(value) != 4 or value == "mono" else np.array(list(value)).reshape(2, 2)
+    values = np.asarray(value)
+    if values.dtype.kind == "U":
+        values = np.char.encode(values, "ascii")
+    return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("=")).reshape(values.shape)
+
+
+def _stored_attributes(schema, artefact, declared, attrs):
+    """path -> name -> what h5py stores: fixed-length bytes, numpy numbers, lists of bytes."""
+    origin = artefact.provenance
+    stored = {path: dict(named) for path, named in tables.plot_attributes(schema, declared).items()}
+    stored[""] |= {
+        "plenocli_kind": schema.kind, "schema_version": schema.version, "plenocli_version": __version__,
+        "command": origin.command, "config": origin.config, "inputs": _json(origin.inputs),
+        "seed": "none" if origin.seed is None else str(int(origin.seed)), "accuracy": _json(origin.accuracy)}
+    for where, named in attrs.items():
+        for name, value in named.items():
+            stored[where][name] = _json(value) if schema.attr_for(where, name).type == "json" else value
+    return {path: {name: _storable(value) for name, value in named.items()} for path, named in stored.items()}
+
+
+def _json(value):
+    return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False)
+
+
+def _storable(value):
+    if isinstance(value, str):
+        return value.encode("utf-8")
+    if isinstance(value, list) and value and isinstance(value[0], str):
+        return np.array([v.encode("utf-8") for v in value])
+    values = np.asarray(value)
+    return values.astype({"i": "i8", "u": "u8", "f": "f8", "b": "?"}[values.dtype.kind])
+
+
+def _image(schema, data, stored, layout):
+    with h5py.File("artefact", "w", driver="core", backing_store=False, libver=(layout, "v110"), track_times=False) as file:
+        for path in sorted(data):
+            file.create_dataset(path, data=data[path], **_storage(schema.field_for(path), data[path]))
+        for where in sorted(stored):
+            target = file[where or "/"]
+            for name, value in stored[where].items():
+                _put_attribute(target, name, value)
+        file.flush()
+        return file.id.get_file_image()
+
+
+def _put_attribute(target, name, value):
+    if isinstance(value, bytes):
+        # h5py would store a null-terminated ASCII type; utf-8 of exactly this length keeps every character of a config
+        kind = h5py.string_dtype("utf-8", max(len(value), 1))
+        target.attrs.create(name, np.array(value, dtype=kind), dtype=kind)
+    else:
+        target.attrs.create(name, value)
+
+
+def _storage(entry, values):
+    """Storage options: 1 MiB chunks with a checksum each; gzip unless the table says that it does not pay."""
+    if values.ndim == 0 or values.size == 0:
+        return {"track_times": False}
+    chunks, budget = [], max(_CHUNK_BYTES // values.itemsize, 1)
+    for size in reversed(values.shape):
+        chunks.insert(0, max(min(size, budget), 1))
+        budget //= chunks[0]
+    options = {"chunks": tuple(chunks), "fletcher32": True, "track_times": False}
+    if entry.compress:
+        options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    return options
+
+
+# --- reading -----------------------------------------------------------------------------------------------------------
+
+def _verified_bytes(path, limit):
+    """The HDF5 part of the file at `path`, read once, its digest and length verified."""
+    size = require_file(path)
+    if size > limit:
+        raise InputError(f"is {size / 1e9:.3g} GB, above the memory limit of {limit / 1e9:.3g} GB", path, "raise --mem-limit")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+    if not content.startswith(MAGIC):
+        if content.startswith(HDF5_SIGNATURE) or HDF5_SIGNATURE in content[:4096]:
+            raise InputError("is an HDF5 file, but not one that plenocli wrote (no digest block)", path,
+                             "give the result of a plenocli stage")
+        raise InputError("is not a plenocli artefact", path, "give the result of a plenocli stage")
+    header = _HEADER.fullmatch(content[:HEADER_BYTES])
+    if header is None or len(content) < HEADER_BYTES:
+        raise InputError("has a damaged digest block", path, "make it again")
+    image = memoryview(content)[HEADER_BYTES:]
+    if len(image) != int(header[2]):
+        raise InputError(f"is truncated or has grown: {len(image)} bytes where {int(header[2])} were written", path, "make it again")
+    if hashlib.sha256(image).hexdigest() != header[1].decode():
+        raise InputError("is damaged: its SHA-256 is not the one it was written with", path, "make it again")
+    return bytes(image)
+
+
+def _parse(path, file, kind, limit):
+    declared = survey(path, file, limit)
+    root = {name: read_attribute(path, file, name) for name in tables.ROOT_ATTRIBUTES if name in attribute_names(file)}
+    missing = [name for name in tables.ROOT_ATTRIBUTES if name not in root]
+    if missing:
+        raise InputError(f"root attributes are missing: {', '.join(missing)}", path, "make it again")
+    schema = _schema_of(path, root, kind)
+    problems = tables.declared_problems(schema, declared)
+    attrs = _read_attributes(path, file, schema, declared, problems)
+    if not problems:
+        data = {name: file[name][()] for name in declared}
+        data = {name: values if isinstance(values, np.ndarray) else np.asarray(values) for name, values in data.items()}
+        problems = tables.value_problems(schema, data)
+    if problems:
+        raise InputError("breaks the table of its kind: " + "; ".join(problems), path, f"make it again ({root['command']})")
+    provenance = Provenance(root["command"], json.loads(root["inputs"]), None if root["seed"] == "none" else int(root["seed"]),
+                            root["config"], json.loads(root["accuracy"]))
+    return Artefact(schema.kind, data, attrs, provenance)
+
+
+def _schema_of(path, root, kind):
+    found, version = root["plenocli_kind"], root["schema_version"]
+    wanted = (kind,) if isinstance(kind, str) else kind
+    if found not in SCHEMAS:
+        raise InputError(f"is of the unknown kind '{found}'", path, f"known kinds: {', '.join(SCHEMAS)}")
+    if wanted is not None and found not in wanted:
+        raise InputError(f"is a '{found}' artefact where '{' or '.join(wanted)}' is due", path, "swap or rename the inputs")
+    if version != SCHEMAS[found].version:
+        older = isinstance(version, (int, float)) and version < SCHEMAS[found].version
+        fix = f"make it again ({root['command']})" if older else "update plenocli"
+        raise InputError(f"has version {version} of kind '{found}', this program reads {SCHEMAS[found].version}", path, fix)
+    return SCHEMAS[found]
+
+
+def _read_attributes(path, file, schema, declared, problems):
+    """Attributes of the table found in the file; unknown ones are added to `problems`, plotting attributes are left out."""
+    generated = tables.plot_attributes(schema, declared)
+    attrs = {}
+    for where in generated:
+        target = file[where or "/"]
+        for name in attribute_names(target):
+            if name in generated[where] or (where == "" and name in tables.ROOT_ATTRIBUTES):
+                continue
+            attr = schema.attr_for(where, name)
+            if attr is None:
+                problems.append(f"attribute '{name}' of '/{where}' is unknown")
+                continue
+            value = read_attribute(path, target, name)
+            attrs.setdefault(where, {})[name] = json.loads(value) if attr.type == "json" else value
+    problems.extend(tables.attribute_problems(schema, attrs))
+    return attrs

@@ -1,0 +1,63 @@
+"""Where a result came from: the command, its inputs by name and digest, the seed. No clock, host, folder or user."""
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from plenocli.errors import InputError
+
+
+@dataclass
+class Provenance:
+    """`inputs`: role -> {"name": file name without folder, "sha256": hex}; `config`: resolved TOML text; `accuracy`: JSON-able dict."""
+
+    command: str
+    inputs: dict = field(default_factory=dict)
+    seed: int | None = None
+    config: str = ""
+    accuracy: dict = field(default_factory=dict)
+
+
+def describe_inputs(roles):
+    """Name and SHA-256 of each input file, for Provenance.inputs.
+
+    roles: role -> path, or role -> sequence of paths (they become "role 1", "role 2", ...); a None path is left out.
+    Raises InputError for a file that cannot be read.
+    """
+    described = {}
+    for role, paths in roles.items():
+        if paths is None:
+            continue
+        several = not isinstance(paths, (str, os.PathLike))
+        for number, path in enumerate(paths if several else [paths], start=1):
+            described[f"{role} {number}" if several else role] = {"name": Path(path).name, "sha256": file_digest(path)}
+    return described
+
+
+def file_digest(path):
+    """SHA-256 of a file's bytes, hex. Raises InputError."""
+    require_file(path)
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+
+
+def require_file(path):
+    """Raise InputError, saying which, unless `path` is an existing, non-empty, ordinary file. Returns its size in bytes."""
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise InputError("is a folder, not a file", path, "name a file in it")
+        if not path.exists():
+            raise InputError("does not exist", path, "check the name, or run the stage that makes it")
+        if not path.is_file():
+            raise InputError("is not an ordinary file", path, "copy it to a file first")
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputError(f"cannot be reached ({error.strerror})", path, "check the name and the permissions") from error
+    if size == 0:
+        raise InputError("is empty (0 bytes)", path, "make or copy it again")
+    return size

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError, WithJsonSchema, model_validator
 
-from plenocli.config.units import UnitError, format_length, parse_length
+from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
 from plenocli.errors import ConfigError, InputError
 
 MAX_BYTES = 1 << 20
@@ -59,6 +59,7 @@ Wavelength = _quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)
 SignedLength = _quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)
 Electrons = _quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))
 Gain = _quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))
+Duration = _quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)
 Unit = Annotated[float, Field(gt=0.0, le=1.0)]
 Pair = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
 
@@ -141,9 +142,12 @@ class Sensor(Section):
 
 
 class Light(Section):
+    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full well in `white_exposure`."""
+
     wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)]
     design_wavelength: Wavelength | None = None
     illuminant: str = "D65"
+    white_exposure: Duration = 0.01
 
     @model_validator(mode="after")
     def _ascending(self):
@@ -320,4 +324,6 @@ def _toml(key, value):
         return str(value)
     if key in _UNITS:
         return f'"{value!r} {_UNITS[key]}"'
+    if key == "white_exposure":
+        return f'"{format_duration(value)}"'
     return repr(value) if key in _NUMBERS else f'"{format_length(value)}"'

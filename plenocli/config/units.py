@@ -64,10 +64,18 @@ def parse_number(text):
 
 def format_length(metres):
     """The shortest text that parse_length reads back to the same double, in a handy unit: 5.5e-7 -> "550 nm"."""
-    magnitude = abs(metres)
-    unit = next((u for u in ("nm", "um", "mm") if magnitude / LENGTHS[u] < 999.9995), "m")
+    return _format(metres, LENGTHS, ("nm", "um", "mm"), "m", parse_length)
+
+
+def format_duration(seconds):
+    """The shortest text that parse_duration reads back to the same double: 0.01 -> "10 ms"."""
+    return _format(seconds, DURATIONS, ("us", "ms"), "s", parse_duration)
+
+
+def _format(value, units, small, base, parse):
+    unit = next((u for u in small if abs(value) / units[u] < 999.9995), base)
     for digits in (6, 9, 12, 15, 17):
-        text = f"{metres / LENGTHS[unit]:.{digits}g} {unit}"
-        if parse_length(text) == metres:
+        text = f"{value / units[unit]:.{digits}g} {unit}"
+        if parse(text) == value:
             return text
-    return f"{metres!r} m"
+    return f"{value!r} {base}"

@@ -1,0 +1,58 @@
+# plenocli: `make demo` and `make test` need nothing but Python 3.11 or newer, make and a package index.
+# Everything else: `make help`.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+VENV ?= .venv
+RUNS ?= runs
+BIN := $(abspath $(VENV))/bin
+READY := $(VENV)/.ready
+PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
+
+.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr raw tiny clean
+
+help: ## show these targets
+	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+env: $(READY) ## make the environment in .venv with the versions of constraints.txt
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "plenocli needs Python 3.11 or newer; say which: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
+	@echo "making the environment in $(VENV) (once, a few minutes)"
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plot,fast,dev]'
+	@touch $@
+
+demo: $(READY) ## both experiments at a small size, with pictures: runs/demo/report.html
+	$(PIPELINE) pipelines/demo.mk RUN=$(RUNS)/demo
+
+tiny: $(READY) ## every stage once on the smallest camera, in seconds
+	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/tiny CONFIG=sample_configs/tiny.toml ITERATIONS=3 BATCH=256
+
+test: $(READY) ## all tests but the slow ones
+	$(VENV)/bin/python -m pytest
+
+test-slow: $(READY) ## the slow tests too
+	$(VENV)/bin/python -m pytest -m ""
+
+spatial: $(READY) ## section 3-2 of the paper at full size: every reconstruction method in one table
+	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/spatial CONFIG=sample_configs/seed_spatial.toml
+
+spatial-250um: $(READY) ## the same with 250 um lenslets, f/4.4 and 4.8 um pixels
+	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/spatial-250um CONFIG=sample_configs/seed_spatial_250um.toml
+
+spectral: $(READY) ## section 3-1 of the paper: calibrate from narrow-band captures, demultiplex a ColorChecker
+	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/spectral CONFIG=sample_configs/seed_spectral.toml
+
+dslr: $(READY) ## the spectral experiment with a Bayer sensor
+	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/dslr CONFIG=sample_configs/dslr.toml
+
+raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. DARK=.. CAPTURES="a.nef b.nef"
+	$(PIPELINE) pipelines/raw.mk RUN=$(RUNS)/raw
+
+clean: ## remove results, keep the environment
+	rm -rf $(RUNS)

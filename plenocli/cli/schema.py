@@ -1,0 +1,19 @@
+"""`plenocli schema`: the JSON Schema of a configuration file."""
+
+import json
+
+import click
+
+
+@click.command("schema", short_help="Print the JSON Schema of a camera description.")
+@click.argument("kind", type=click.Choice(["camera"]))
+def command(kind):
+    """Print the JSON Schema of a configuration file, for editors and for checking without plenocli.
+
+    \b
+    Example:
+      plenocli schema camera > camera.schema.json
+    """
+    from plenocli.config.camera import camera_schema
+
+    click.echo(json.dumps(camera_schema(), indent=2))

@@ -1,0 +1,235 @@
+"""capture-sim: source -> optics -> detector, one exposure of a plenoptic camera."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import ConfigError, InputError, UsageError
+from plenocli.stages.progress import bar, note
+from plenocli.stages.scenes import Chart, Uniform, read_scene
+from plenocli.stages.seeds import stream
+
+WHITE_LEVEL = 0.8
+"""Share of full well that a perfect white reaches in [light] white_exposure, at the brightest pixel."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line says beyond the files; lengths in m, exposure in s (None: the camera's white exposure)."""
+
+    target: str | None = None
+    sampling: str = "fit"
+    refine: int = 1
+    bandwidth: float = 0.0
+    spectral_step: float | None = None
+    superpixels: object = "auto"
+    coherent_ring: object = "auto"
+    accuracy: float = 1e-3
+    snr_db: float | None = None
+    noise: str = "sensor"
+    exposure: float | None = None
+    seed: int = 0
+    mem_limit: int = 8 << 30
+
+
+def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scene_out=None, overwrite=False, command=""):
+    """Simulate one capture and write it as .h5, .exr or .dng; returns a summary dict.
+
+    Errors: ConfigError where the camera does not tile the sensor, UsageError for contradicting options, InputError for files.
+    """
+    from plenocli.artefacts import check_output, describe_inputs
+    from plenocli.config import load_camera
+
+    output = Path(output)
+    if output.suffix not in (".h5", ".exr", ".dng"):
+        raise UsageError(f"a capture is written as .h5, .exr or .dng, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
+    if output.suffix == ".dng" and (settings.snr_db is not None or settings.noise == "none"):
+        raise UsageError("a DNG holds whole numbers of a sensor; --snr and --noise none give real numbers", output, "write .h5 or .exr")
+    check_output(output, overwrite=overwrite, inputs=[camera_path, pif, scene])
+    if scene_out:
+        check_output(scene_out, overwrite=overwrite, inputs=[camera_path, pif, scene])
+    camera = load_camera(camera_path)
+    _check_tiling(camera, camera_path)
+    source, what = _source(camera, settings, scene)
+    matrix = _read_pif(pif, camera, settings, source.wavelengths) if pif else None
+    light, whites, truth = _carry(camera, source, what, settings, matrix)
+    capture, summary = _detect(camera, light, whites, settings)
+    _describe(capture, camera, settings, truth, scene)
+    provenance = dict(command=command, inputs=describe_inputs({"camera": camera_path, "pif": pif, "scene": scene if scene and Path(scene).is_file() else None}),
+                      seed=settings.seed, config=camera.text, accuracy={"asked": settings.accuracy})
+    _write(output, capture, provenance, overwrite)
+    if scene_out:
+        _write_scene(scene_out, truth, camera, provenance, overwrite)
+    return summary | {"output": str(output), "rows": capture["mosaic"].shape[0], "columns": capture["mosaic"].shape[1], "wavelengths": len(source.wavelengths)}
+
+
+def _check_tiling(camera, where):
+    if camera.lenslet_array.lattice != "square":
+        raise ConfigError("capture-sim tiles a sensor with superpixels, which a hexagonal lattice does not allow", where, 'set lenslet_array.lattice = "square"')
+    drift = max(abs(m) * n / 2 for m, n in zip(camera.pixel_mismatch, camera.lenslet_array.count))
+    if drift > 0.05:
+        rows, columns = camera.sensor.pixels_per_lenslet
+        raise ConfigError(
+            f"the superpixel pitch is {camera.superpixel_pitch / camera.sensor.pixel_pitch:.4f} pixels, not {rows} x {columns}: at the array's edge superpixels would be {drift:.2f} pixels off",
+            where, f'set lenslet_array.superpixel_pitch = "{rows * camera.sensor.pixel_pitch * 1e6:.6g} um" instead of pitch')
+
+
+def _source(camera, settings, scene):
+    """(Quadrature of the light, scene) from --target and --scene."""
+    from plenocli.config import parse_length
+    from plenocli.config.units import UnitError
+    from plenocli.scene.tables import illuminant
+    from plenocli.sensor.light import broadband, broadened, has_colour, narrow_band
+
+    target = settings.target
+    if (target is None) == (scene is None):
+        raise UsageError("give exactly one of --scene and --target", fix="for example --target white or --scene skimage:astronaut")
+    white = broadband(camera, lambda wavelengths: illuminant(camera.light.illuminant, wavelengths), settings.spectral_step)
+    if not has_colour(camera) and settings.bandwidth:
+        white = broadened(camera.light.wavelengths, settings.bandwidth)
+    if scene is not None:
+        return white, read_scene(scene, sampling=settings.sampling, spectral=has_colour(camera))
+    if target.startswith("mono:"):
+        try:
+            centre = parse_length(target.removeprefix("mono:"))
+        except UnitError as error:
+            raise UsageError(str(error), "--target", "write for example mono:450nm") from None
+        return narrow_band(centre, settings.bandwidth), Uniform(1.0)
+    scenes = {"white": Uniform(1.0), "dark": Uniform(0.0), "colorchecker": Chart()}
+    if target not in scenes:
+        raise UsageError(f"unknown target {target!r}", "--target", "choose white, dark, mono:450nm or colorchecker")
+    return white, scenes[target]
+
+
+class _Stored:
+    """The response of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
+
+    def __init__(self, artefact, band):
+        self.matrix, self.lenslet_offset = artefact.data["pif/A"][band], artefact.data["pif/lenslet_offset"]
+
+    def columns(self, points):
+        return self.matrix[:, :, points]
+
+
+def _read_pif(path, camera, settings, wavelengths):
+    """Responses by wavelength from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
+    from plenocli.artefacts import read_artefact
+    from plenocli.config import parse_camera
+
+    artefact = read_artefact(path, "pif", mem_limit=settings.mem_limit)
+    if settings.refine != 1:
+        raise UsageError("--refine computes its own finer response and cannot take --pif", fix="leave one of them out")
+    made_for = parse_camera(artefact.provenance.config, path)
+    for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array"):
+        drop = {"count"} if section == "lenslet_array" else {"full_well", "read_noise", "gain", "bits", "black_level", "quantum_efficiency", "cfa", "camera"} if section == "sensor" else set()
+        ours, theirs = getattr(camera, section), getattr(made_for, section)
+        if (ours and ours.model_dump(exclude=drop)) != (theirs and theirs.model_dump(exclude=drop)):
+            raise InputError(f"was made for another camera: [{section}] differs", path, "run simulate-pif on this camera")
+    known = artefact.data["pif/wavelength"]
+    stored = {}
+    for wavelength in wavelengths:
+        band = int(np.argmin(np.abs(known - wavelength)))
+        if abs(known[band] - wavelength) > 1e-12:
+            raise InputError(f"has no wavelength {wavelength * 1e9:.4g} nm, which this capture needs", path,
+                             "run simulate-pif with the same --spectral-step, or leave --pif out")
+        stored[wavelength] = _Stored(artefact, band)
+    return stored
+
+
+def _carry(camera, source, scene, settings, matrix):
+    """Light on every superpixel by colour letter, the white superpixel by letter, and the object as sampled."""
+    from plenocli.sensor.cfa import sensitivity
+    from plenocli.sensor.irradiance import superpixel_light, to_points
+
+    letters, efficiency = sensitivity(camera, source.wavelengths)
+    samples, count = camera.object.samples_per_lenslet, camera.lenslet_array.count
+    fine = tuple(n * settings.refine for n in samples)
+    grid = tuple(n * k for n, k in zip(count, fine))
+    finer = camera.replace(**{"object.samples_per_lenslet": fine}) if settings.refine > 1 else camera
+    light, whites, points, drawn = 0.0, 0.0, None, None
+    for index, wavelength in enumerate(bar(source.wavelengths, len(source.wavelengths), "wavelengths")):
+        response = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
+        if points is None or scene.spectral:
+            drawn = np.zeros((1, 1)) if scene.uniform else scene.at(wavelength, *grid)
+            points = np.broadcast_to(np.float32(0), (*count, fine[0] * fine[1])) if scene.uniform else to_points(drawn, fine)
+        offsets = response.lenslet_offset
+        pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
+        chunk = max(1, int(settings.mem_limit // 8 // (8 * len(offsets) * pixels)))
+        if scene.uniform:
+            white = sum(response.columns(slice(s, s + chunk)).sum(axis=(0, 2), dtype=np.float64) for s in range(0, fine[0] * fine[1], chunk))
+            carried = np.broadcast_to(scene.level * white, (*count, pixels))
+        else:
+            carried, white = superpixel_light(response.columns, offsets, points, chunk)
+        weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2
+        light = light + weight[:, :, None, None] * carried[None]
+        whites = whites + weight * white[None]
+    return (letters, light), whites, _truth(camera, scene, grid, settings.refine)
+
+
+def _build(camera, wavelength, settings):
+    from plenocli.optics.pif import PifBuilder
+
+    return PifBuilder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy)
+
+
+def _truth(camera, scene, grid, refine):
+    """The object (band, row, column) on the grid that reconstruction uses: area averages of the finer one."""
+    from plenocli.scene.sample import block_mean
+
+    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
+    return np.stack([block_mean(scene.at(w, *grid), (refine, refine)) for w in bands]).astype(np.float32)
+
+
+def _detect(camera, light, whites, settings):
+    """From relative light to what the sensor reports: (capture dict, summary dict)."""
+    from plenocli.sensor.cfa import cfa_map
+    from plenocli.sensor.irradiance import to_mosaic
+    from plenocli.sensor.noise import SensorModel, add_white_noise
+
+    letters, light = light
+    sensor, shape = camera.sensor, camera.sensor.pixels_per_lenslet
+    planes = {letter: to_mosaic(plane, shape) for letter, plane in zip(letters, light)}
+    mosaic = next(iter(planes.values()))
+    if sensor.cfa != "mono":
+        where = cfa_map(mosaic.shape, sensor.cfa)
+        mosaic = sum(np.where(where == letter, plane, 0.0) for letter, plane in planes.items())
+    peak = float(whites.max())
+    if not peak > 0:
+        raise ConfigError("no light of this source reaches the sensor", "camera", "check filters, wavelengths and illuminant")
+    capture = {"cfa": sensor.cfa}
+    rng = stream(settings.seed, "capture-sim")
+    if settings.snr_db is not None or settings.noise == "none":
+        # relative units: with one wavelength and no colour the mosaic is A x itself
+        mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
+        sigma = 0.0
+        if settings.snr_db is not None:
+            mosaic, sigma = add_white_noise(mosaic, settings.snr_db, rng)
+        capture |= dict(mosaic=mosaic.astype(np.float64), units="relative", black=0.0, snr_db=settings.snr_db, noise_sigma=float(sigma), electrons_per_unit=None)
+        return capture, {"units": "relative", "noise_sigma": float(sigma), "peak": float(mosaic.max())}
+    exposure = settings.exposure or camera.light.white_exposure
+    scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
+    model = SensorModel.from_camera(camera)
+    values = model.expose(mosaic * scale, rng)
+    white = 2**sensor.bits - 1
+    capture |= dict(mosaic=values, units="DN", black=float(sensor.black_level), white=float(white), gain_e_per_dn=1 / sensor.gain, exposure_s=exposure,
+                    electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0))
+    saturated = float(np.mean(mosaic * scale >= sensor.full_well))
+    if saturated > 0.001:
+        note(f"{saturated:.1%} of the pixels are over full well; a shorter --exposure would keep them")
+    return capture, {"units": "DN", "peak": int(values.max()), "saturated": saturated, "exposure_s": exposure}
+
+
+def _describe(capture, camera, settings, truth, scene):
+    """What later stages need to know beside the mosaic."""
+    rows, columns = camera.sensor.pixels_per_lenslet
+    count = camera.lenslet_array.count
+    first = np.array([(rows - 1) / 2, (columns - 1) / 2])
+    index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
+    capture.update(scene=truth, wavelength=np.array(camera.light.wavelengths[: len(truth)]), lenslet_centre=first + index * np.array([rows, columns]),
+                   lenslet_count=list(count), superpixel_shape=[rows, columns], scene_shape=list(truth.shape[1:]),
+                   target=settings.target or str(Path(str(scene)).name), illuminant=camera.light.illuminant)
+    if settings.target and settings.target.startswith("mono:"):
+        from plenocli.config import parse_length
+
+        capture["band_m"] = parse_length(settings.target.removeprefix("mono:"))

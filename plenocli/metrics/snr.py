@@ -1,0 +1,62 @@
+"""Three signal-to-noise ratios, kept apart by name because they differ by many decibels. All in dB."""
+
+import numpy as np
+
+DEFINITIONS = {
+    "snr_capture_db": "20 log10(mean / standard deviation) of the estimate over a uniform white target, band by band: over "
+    "repeated frames where there are several (temporal), else over the lenslets of one frame (spatial, so that "
+    "what flat-fielding leaves counts as noise)",
+    "snr_predicted_db": "20 log10(estimate / predicted standard deviation), band by band: what the noise model promises "
+    "before any repetition, taken at the root mean square of the prediction",
+    "snr_sensor_db": "10 log10(mean(y^2) / sigma^2) of the capture: the noise level of a simulation (60 dB in Berkner et al. "
+    "2013); the mean square of y, not its variance, is the signal",
+}
+
+
+def _decibel(ratio):
+    with np.errstate(divide="ignore"):
+        return 20 * np.log10(ratio)
+
+
+def snr_capture(frames):
+    """Capture SNR (band,) of estimates of one uniform white target, frames (frame, band, lenslet...).
+
+    Two or more frames: standard deviation over time at each lenslet, with which frame-to-frame change of the mean level
+    counts as noise; for two frames it equals std(f1 - f2)/sqrt 2 at equal means. One frame: over its lenslets.
+    Lenslets with NaN are left out. NaN where fewer than two samples are left; infinite without noise.
+    """
+    frames = np.asarray(frames, dtype=np.float64)
+    frames = frames.reshape(*frames.shape[:2], -1)
+    frames = frames[:, :, np.isfinite(frames).all(axis=(0, 1))]
+    count, bands, lenslets = frames.shape
+    if lenslets == 0 or (count == 1 and lenslets == 1):
+        return np.full(bands, np.nan)
+    mean = frames.mean(axis=(0, 2))
+    variance = frames.var(axis=0, ddof=1).mean(axis=1) if count > 1 else frames[0].var(axis=1, ddof=1)
+    return _ratio(mean, np.sqrt(variance))
+
+
+def snr_predicted(value, sigma):
+    """Predicted SNR (band,) of estimates `value` (band, lenslet...) with predicted standard deviations `sigma`."""
+    value, sigma = (np.asarray(v, dtype=np.float64).reshape(np.shape(v)[0], -1) for v in (value, sigma))
+    valid = np.isfinite(value).all(0) & np.isfinite(sigma).all(0)
+    if not valid.any():
+        return np.full(len(value), np.nan)
+    return _ratio(value[:, valid].mean(1), np.sqrt((sigma[:, valid] ** 2).mean(1)))
+
+
+def snr_sensor(signal, sigma, of="power"):
+    """Sensor-model SNR of a noise-free capture `signal` (any shape) with white noise of standard deviation `sigma`.
+
+    of="power": 10 log10(mean(y^2)/sigma^2), the definition used here; of="variance" takes the variance of y instead,
+    for comparison with work that does.
+    """
+    signal = np.asarray(signal, dtype=np.float64)
+    level = {"power": np.mean(signal**2), "variance": np.var(signal)}[of]
+    return float(_ratio(np.sqrt(level), float(sigma)))
+
+
+def _ratio(mean, deviation):
+    mean, deviation = np.maximum(mean, 0.0), np.asarray(deviation)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(deviation > 0, _decibel(mean / deviation), np.where(mean > 0, np.inf, np.nan))

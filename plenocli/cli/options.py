@@ -88,6 +88,38 @@ mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default
 snr = click.option("--snr", "snr_db", type=DECIBEL, default=None, help="White noise of this signal-to-noise ratio, such as 60dB: sigma^2 = mean(y^2) 10^(-SNR/10).")
 
 
+def command_line(ctx):
+    """The command as typed, without folders and without options left at their default: it goes into the artefact."""
+    words = [f"plenocli {ctx.info_name}"]
+    for parameter in ctx.command.params:
+        value = ctx.params.get(parameter.name)
+        source = ctx.get_parameter_source(parameter.name)
+        if source is None or source.name == "DEFAULT" or parameter.name in _UNRECORDED:
+            continue
+        values = value if isinstance(value, (list, tuple)) and parameter.multiple or parameter.nargs == -1 else [value]
+        for one in values:
+            text = _word(one)
+            if isinstance(parameter, click.Argument):
+                words.append(text)
+            else:
+                words.append(parameter.opts[-1] if one is True else f"{parameter.opts[-1]} {text}")
+    return " ".join(words)
+
+
+_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report"}
+"""How a file was made, not what it holds: the same inputs give the same bytes whatever these say."""
+
+
+def _word(value):
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, tuple):
+        return ("x" if all(isinstance(v, int) for v in value) else "=").join(_word(v) for v in value)
+    if isinstance(value, str) and "/" in value:
+        return Path(value).name
+    return format(value, ".12g") if isinstance(value, float) else str(value)
+
+
 def summary(report, as_json, line):
     """Print what a command did: `report` (a dict) as JSON on request, else the one `line`."""
     if as_json:

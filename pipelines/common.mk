@@ -1,0 +1,11 @@
+# Shared by all pipelines: one rule a stage, real prerequisites, nothing half-built.
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.SECONDARY:
+
+P := plenocli
+RUN ?= runs/experiment
+
+$(RUN) $(RUN)/%/:
+	@mkdir -p $@

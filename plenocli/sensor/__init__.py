@@ -1,0 +1,1 @@
+"""Detector: noise, colour filter array, lenslet grid, superpixels. Arrays in, arrays out; no files."""

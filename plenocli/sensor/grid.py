@@ -1,0 +1,230 @@
+"""The lenslet grid of a white image: square or hexagonal, any rotation, pitch of 5 to 300 px.
+
+Method: autocorrelation for the first guess, maxima of the smoothed picture, windowed centroids on the
+illumination-flattened image (vignetting left in biases the pitch), numbering by a walk over the lattice,
+then the simplest smooth map (affine, homography, low-order polynomial) that the residuals support.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.errors import InputError, NumericsError
+from plenocli.sensor import distortion, lattice, spots
+
+FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A lenslet grid. Positions are (row, column) px with pixel centres at integers.
+
+    kind: "square" or "hexagonal" (rows of a hexagonal grid are offset by half a pitch).
+    pitch: lengths of the two lattice vectors, (down, right), px. angle: of the right vector, degrees, positive
+    towards larger rows. centres (R, C, 2): the fitted map at every site of the array; valid (R, C): the cell lies
+    in the frame and is lit; residual (R, C): measured centroid minus fit, px, NaN where not measured.
+    rms: of all residuals of valid sites; rms_inliers: of those within 4 robust deviations. model: form of the map.
+    basis (2, 2): mean lattice vectors [down, right] px. strength: correlation of the image with itself one pitch away.
+    """
+
+    kind: str
+    pitch: np.ndarray
+    angle: float
+    centres: np.ndarray
+    valid: np.ndarray
+    residual: np.ndarray
+    rms: float
+    rms_inliers: float
+    model: str
+    basis: np.ndarray
+    strength: float
+
+
+def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", window=1024):
+    """Find the lenslet grid of `white` (rows, columns); `dark` of the same shape or scalar is subtracted first.
+
+    cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is scaled to the same mean.
+    lattice_kind: "auto", "square" or "hexagonal". Raises NumericsError, saying what was seen, where there is no
+    lattice, InputError for an image too small or not finite.
+    """
+    image = prepare(white, cfa, dark)
+    crop = _brightest_crop(image, window)
+    basis, strength, reason = lattice.find_basis(crop)
+    if basis is None:
+        raise NumericsError(f"no lenslet lattice in the image: {reason}", fix=FIX)
+    kind = lattice.kind_of(basis) if lattice_kind == "auto" else lattice_kind
+    basis = lattice.oriented(basis, kind)
+    pitch = float(np.hypot(*basis.T).min())
+    index, position, weight_ok, flux = _measured_sites(image, basis, kind, pitch)
+    inside = _whole(position, image.shape, 0.5 * pitch) & weight_ok
+    if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
+        raise NumericsError(
+            f"no lenslet lattice in the image: a pitch of {pitch:.1f} px repeats, but only {int(inside.sum())} sites "
+            "in the frame follow it",
+            fix=FIX,
+        )
+    model, _ = distortion.choose_model(index[inside], position[inside])
+    miss = np.hypot(*(position - model.at(index)).T)
+    if np.sqrt(np.mean(miss[inside] ** 2)) > 0.07 * pitch:
+        raise NumericsError(
+            f"no lenslet lattice in the image: spots {pitch:.1f} px apart scatter by {np.median(miss[inside]):.1f} px about "
+            "the best grid",
+            fix=FIX,
+        )
+    mean = distortion.fit_model("affine", index[inside], position[inside])
+    vectors = mean.coefficients[1:] / mean.scale
+    return _assemble(kind, model, vectors, strength, index, position, miss, weight_ok, image.shape, pitch)
+
+
+def prepare(white, cfa="mono", dark=None):
+    """Float image with dark removed, CFA positions equalised, dead and hot pixels replaced, background at zero."""
+    white = np.asarray(white)
+    if white.ndim != 2 or min(white.shape) < 24:
+        raise InputError(f"a white image must be a single plane of at least 24 x 24 px, this is {white.shape}")
+    image = white.astype(np.float32)
+    if dark is not None:
+        image -= np.asarray(dark, np.float32)
+    if not np.isfinite(image).all():
+        raise InputError("the white image holds values that are not finite")
+    if np.ptp(image) <= 0:
+        raise NumericsError(f"no lenslet lattice in the image: every pixel has the value {float(white.flat[0]):g}", fix=FIX)
+    step = 1
+    if cfa != "mono":
+        step = 2
+        means = np.array([[image[i::2, j::2].mean() for j in (0, 1)] for i in (0, 1)])
+        if (means <= 0).any():
+            raise NumericsError("a colour of the mosaic saw no light in the white image", fix="use a broad-band white source")
+        for i in (0, 1):
+            for j in (0, 1):
+                image[i::2, j::2] *= np.float32(means.mean() / means[i, j])
+    image = replace_dead(image, step)
+    if cfa != "mono":
+        image = _remove_nyquist(image)
+    sample = image[:: max(1, image.shape[0] // 1000), :: max(1, image.shape[1] // 1000)]
+    return image - np.float32(np.percentile(sample, 0.5))
+
+
+def replace_dead(image, step=1):
+    """Replace pixels far outside the range of their four neighbours `step` px away by those neighbours' mean."""
+    padded = np.pad(image, step, mode="reflect")
+    rows, columns = image.shape
+    neighbours = [
+        padded[:rows, step : step + columns],
+        padded[2 * step :, step : step + columns],
+        padded[step : step + rows, :columns],
+        padded[step : step + rows, 2 * step :],
+    ]
+    high = np.maximum(np.maximum(neighbours[0], neighbours[1]), np.maximum(neighbours[2], neighbours[3]))
+    low = np.minimum(np.minimum(neighbours[0], neighbours[1]), np.minimum(neighbours[2], neighbours[3]))
+    sample = (image - high)[::7, ::7]
+    noise = 1.48 * np.median(np.abs(sample - np.median(sample)))
+    bad = (image > 3 * np.abs(high) + 6 * noise) | (image < low / 3 - 3 * noise)
+    if not bad.any():
+        return image
+    out = image.copy()
+    out[bad] = (sum(n[bad].astype(np.float64) for n in neighbours) / 4).astype(np.float32)
+    return out
+
+
+def _remove_nyquist(image):
+    """Symmetric (1 2 1)/4 smoothing along both axes: what is left of the 2x2 mosaic pattern vanishes exactly."""
+    for axis in (0, 1):
+        padded = np.pad(image, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="reflect")
+        lower, middle, upper = (np.take(padded, np.arange(k, k + image.shape[axis]), axis=axis) for k in range(3))
+        image = (lower + 2 * middle + upper) / 4
+    return image
+
+
+def _brightest_crop(image, window):
+    """Up to `window` px a side around the centroid of the light."""
+    clipped = np.clip(image[::4, ::4], 0, None).astype(float)
+    total = clipped.sum()
+    low = []
+    for axis in (0, 1):
+        size = min(window, image.shape[axis])
+        profile = clipped.sum(axis=1 - axis)
+        centre = 4 * (profile * np.arange(len(profile))).sum() / total if total > 0 else image.shape[axis] / 2
+        low.append(int(np.clip(centre - size / 2, 0, image.shape[axis] - size)))
+    return image[low[0] : low[0] + window, low[1] : low[1] + window]
+
+
+def _measured_sites(image, basis, kind, pitch):
+    """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool, flux (N,)."""
+    maxima = spots.find_maxima(image, pitch)
+    if len(maxima) < 9:
+        raise NumericsError(f"no lenslet lattice in the image: {len(maxima)} bright spots at a pitch of {pitch:.1f} px", fix=FIX)
+    position, flux = spots.windowed_centroids(image, maxima, pitch, iterations=2)
+    middle = np.array(image.shape) / 2
+    bright = np.flatnonzero(flux > 0.5 * np.median(flux))
+    starts = bright[np.argsort(((position[bright] - middle) ** 2).sum(axis=1))]
+    best, chosen = np.zeros(len(position), bool), None
+    for start in starts[:: max(1, len(starts) // 6)][:6]:  # a start on dust or a reflection strands the walk
+        index, found = lattice.index_sites(position, basis, kind, start)
+        if found.sum() > best.sum():
+            best, chosen = found, index
+        if best.sum() > 0.6 * len(position):
+            break
+    index, first, flux = chosen[best], position[best], flux[best]
+    surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
+    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope / np.maximum(surface, 1e-9)[:, None])
+    level = flux / np.maximum(surface, 1e-9)
+    spread = 1.48 * np.median(np.abs(level - np.median(level)))
+    if spread > 0.25:
+        raise NumericsError(
+            f"no lenslet lattice in the image: patches repeat every {pitch:.1f} px, but their brightness scatters by "
+            f"{100 * spread:.0f} % from one to the next (a chart or a scene, not even light)",
+            fix=FIX,
+        )
+    clean = (level > 0.3) & (np.hypot(*(position - first).T) < 0.25 * pitch)
+    return index, position, clean, flux
+
+
+def _illumination(position, flux, shape, whole):
+    """Smooth surface (order up to 4) through the fluxes of `whole` lenslets: values (N,) and gradients (N, 2) per px."""
+    size = np.array(shape, float) / 2
+    u = (position - size) / size
+    use = whole if whole.sum() >= 9 else np.ones(len(u), bool)
+    order = max(k for k in range(5) if k == 0 or use.sum() >= 2.5 * (k + 1) * (k + 2) / 2)
+    powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+    design = np.stack([u[:, 0] ** i * u[:, 1] ** j for i, j in powers], axis=1)
+    weight = use.astype(float)
+    for _ in range(4):
+        fit = np.linalg.lstsq(design * weight[:, None], flux * weight, rcond=None)[0]
+        miss = np.abs(flux - design @ fit)
+        weight = use / np.maximum(1, miss / max(3 * np.median(miss[use]), 1e-12))
+    down = np.stack([i * u[:, 0] ** max(i - 1, 0) * u[:, 1] ** j for i, j in powers], axis=1) @ fit / size[0]
+    right = np.stack([j * u[:, 0] ** i * u[:, 1] ** max(j - 1, 0) for i, j in powers], axis=1) @ fit / size[1]
+    surface = np.maximum(design @ fit, 0.05 * np.median(flux))
+    return surface, np.stack([down, right], axis=1)
+
+
+def _whole(position, shape, margin):
+    return ((position >= margin - 0.5) & (position <= np.array(shape) - 0.5 - margin)).all(axis=-1)
+
+
+def _assemble(kind, model, vectors, strength, index, position, miss, clean, shape, pitch):
+    """Lay the sites out as an array (R, C) without empty border rows and columns."""
+    site = lattice.to_array(index, kind)
+    low, high = site[clean].min(axis=0), site[clean].max(axis=0)
+    keep = ((site >= low) & (site <= high)).all(axis=1)
+    site, position, miss, clean = site[keep] - low, position[keep], miss[keep], clean[keep]
+    grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1)
+    centres = model.at(lattice.from_array(grid, kind))
+    residual, lit = np.full(grid.shape[:2], np.nan), np.zeros(grid.shape[:2], bool)
+    residual[tuple(site.T)], lit[tuple(site.T)] = miss, clean
+    valid = lit & _whole(centres, shape, 0.5 * pitch)
+    inner = residual[valid]
+    spread = 1.48 * np.median(inner)
+    return Lattice(
+        kind=kind,
+        pitch=np.hypot(*vectors.T),
+        angle=float(np.degrees(np.arctan2(*vectors[1]))),
+        centres=centres,
+        valid=valid,
+        residual=residual,
+        rms=float(np.sqrt(np.mean(inner**2))),
+        rms_inliers=float(np.sqrt(np.mean(inner[inner <= 4 * spread] ** 2))) if spread > 0 else 0.0,
+        model=model.kind,
+        basis=vectors,
+        strength=strength,
+    )

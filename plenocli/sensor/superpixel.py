@@ -1,0 +1,34 @@
+"""Superpixels: one window of whole pixels a lenslet, cut out of the mosaic as it is (no resampling, no demosaicing)."""
+
+import numpy as np
+
+
+def windows(centres, shape):
+    """First pixel (R, C, 2) int of windows of `shape` (rows, columns) px centred nearest to `centres` (R, C, 2).
+
+    Pixel centres are at integers: an even window is centred half a pixel after its middle pixel's corner, so a
+    centre at 25.5 with 52 rows starts at row 0. Sites without a centre (NaN) start at a large negative number.
+    """
+    centres = np.asarray(centres, float)
+    first = np.rint(centres - (np.asarray(shape) - 1) / 2 + 1e-9)
+    return np.where(np.isfinite(first), first, -(2**30)).astype(int)
+
+
+def inside(origin, window, shape):
+    """Which windows (R, C) lie wholly in a mosaic of `shape`."""
+    return ((origin >= 0) & (origin + np.asarray(window) <= np.asarray(shape))).all(axis=-1)
+
+
+def extract(mosaic, origin, window):
+    """Pixels (R, C, h*w) of every window, row by row; NaN where a window is not wholly in the mosaic.
+
+    mosaic (rows, columns); origin (R, C, 2) int; window (h, w). Float arrays keep their type, others become float64.
+    """
+    mosaic = np.asarray(mosaic)
+    kind = mosaic.dtype if mosaic.dtype.kind == "f" else float
+    good = inside(origin, window, mosaic.shape)
+    out = np.full((*origin.shape[:-1], window[0] * window[1]), np.nan, kind)
+    if good.any():
+        view = np.lib.stride_tricks.sliding_window_view(mosaic, window)
+        out[good] = view[tuple(origin[good].T)].reshape(-1, window[0] * window[1])
+    return out

@@ -1,5 +1,6 @@
 """Results appear whole or not at all: temporary file beside the target, fsync, rename, fsync of the folder."""
 
+import contextlib
 import fcntl
 import os
 from pathlib import Path
@@ -78,12 +79,20 @@ def _open_partial(partial):
             except BlockingIOError as error:
                 raise OutputError("another run is writing this file", partial, "wait for it, or stop it") from error
             if _is_same_file(descriptor, partial):  # else the other run renamed it between our open and our lock
-                os.ftruncate(descriptor, 0)
+                _empty(descriptor, partial)
                 return descriptor
         except BaseException:
             os.close(descriptor)
             raise
         os.close(descriptor)
+
+
+def _empty(descriptor, partial):
+    try:
+        os.ftruncate(descriptor, 0)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def _is_same_file(descriptor, path):
@@ -101,8 +110,10 @@ def _write_all(descriptor, view):
 
 
 def _sync_folder(folder):
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    """Make the rename survive a power cut. Some network file systems refuse this; the file is then whole all the same."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,46 @@
+"""The error boundary: exit codes, one message, no traceback."""
+
+import pytest
+
+from plenocli.cli import main as boundary
+from plenocli.errors import ConfigError, InputError, NumericsError, OutputError, PlenoError, UsageError
+
+
+@pytest.mark.parametrize(
+    "error, code", [(UsageError("x"), 2), (ConfigError("x"), 2), (InputError("x"), 3), (OutputError("x"), 4), (NumericsError("x"), 5), (PlenoError("x"), 70), (MemoryError("x"), 5), (ZeroDivisionError("x"), 70), (KeyboardInterrupt(), 130)]
+)
+def test_every_failure_has_its_exit_code_and_one_message(monkeypatch, capfd, error, code):
+    def fail(**_):
+        raise error
+
+    monkeypatch.setattr(boundary.cli, "main", fail)
+    assert boundary.run([]) == code
+    out, err = capfd.readouterr()
+    assert out == "" and err.startswith("plenocli: error: ") and "Traceback" not in err
+
+
+def test_the_traceback_comes_on_request(monkeypatch):
+    def fail(**_):
+        raise ZeroDivisionError("x")
+
+    monkeypatch.setattr(boundary.cli, "main", fail)
+    monkeypatch.setenv("PLENOCLI_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        boundary.run([])
+
+
+def test_messages_say_where_and_what_to_do():
+    assert str(InputError("is empty", "a.h5", "make it again")) == "a.h5: is empty; make it again"
+
+
+@pytest.mark.parametrize("arguments, message", [(["simulate-fip"], "simulate-pif"), (["capture-sim"], "Missing argument"), (["capture-sim", "--nois", "none"], "--noise"), (["--wat"], "No such option")])
+def test_usage_errors_exit_2_and_suggest(capfd, arguments, message):
+    assert boundary.run(arguments) == 2
+    assert message in capfd.readouterr().err
+
+
+def test_help_lists_the_commands_in_the_order_of_the_pipeline(capfd):
+    assert boundary.run(["--help"]) == 0
+    out = capfd.readouterr().out
+    places = [out.index(f"\n  {name} ") for name in boundary.COMMANDS]
+    assert places == sorted(places) and "Exit codes" in out

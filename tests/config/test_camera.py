@@ -1,0 +1,86 @@
+"""Camera descriptions: read exactly, resolved once, refused with every violation named."""
+
+from pathlib import Path
+
+import pytest
+
+from plenocli.config import camera_schema, load_camera, parse_camera
+from plenocli.errors import ConfigError, InputError
+
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_configs"
+TINY = (SAMPLES / "tiny.toml").read_text()
+
+
+@pytest.mark.parametrize("path", sorted(SAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_sample_reads_and_survives_its_own_text(path):
+    camera = load_camera(path)
+    assert parse_camera(camera.text) == camera
+    assert parse_camera(camera.text).text == camera.text
+    assert max(abs(m) for m in camera.pixel_mismatch) < 1e-9, "superpixels of the samples tile whole pixels"
+
+
+def test_alternatives_are_resolved():
+    camera = parse_camera(TINY)
+    assert camera.main_lens.aperture_diameter == pytest.approx(0.055 / 8, rel=1e-15)
+    assert camera.lenslet_array.pitch == pytest.approx(26e-6 / (1 + 208e-6 / 0.055), rel=1e-15)
+    assert camera.superpixel_pitch == pytest.approx(26e-6, rel=1e-15)
+    assert camera.light.design_wavelength == 550e-9
+
+
+def test_replace_checks_again():
+    camera = parse_camera(TINY)
+    finer = camera.replace(**{"object.samples_per_lenslet": (24, 24)})
+    assert finer.object.samples_per_lenslet == (24, 24) and finer.lenslet_array == camera.lenslet_array
+    with pytest.raises(ValueError):
+        camera.replace(**{"object.distance": -1.0})
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ('focal_length = "50 mm"', 'focal_lenght = "50 mm"', r"main_lens.focal_lenght: unknown key; did you mean focal_length\?"),
+        ('focal_length = "50 mm"', "focal_length = 50", "main_lens.focal_length: 50 needs its unit"),
+        ('"2 um"', '"2 kg"', "sensor.pixel_pitch: '2 kg' is no length"),
+        ('"2 um"', '"-2 um"', "sensor.pixel_pitch: '-2 um' is outside"),
+        ('"2 um"', '"nan um"', "sensor.pixel_pitch"),
+        ("f_number = 8", "f_number = nan", "main_lens.f_number"),
+        ("[8, 8]", "[8, 0]", "object.samples_per_lenslet.1"),
+        ("[8, 8]", "[8, 99999999]", "object.samples_per_lenslet.1"),
+        ('["550 nm"]', "[]", "light.wavelengths"),
+        ('["550 nm"]', '["550 nm", "540 nm"]', "light: wavelengths must ascend"),
+        ('["550 nm"]', '["550 mm"]', "light.wavelengths.0: '550 mm' is outside 100 nm ... 100 um"),
+        ("f_number = 8", 'f_number = 8\naperture_diameter = "5 mm"', "main_lens: give exactly one of aperture_diameter and f_number"),
+        ("count = [5, 5]", 'count = [5, 5]\npitch = "26 um"', "lenslet_array: give exactly one of pitch"),
+        ("[sensor]", '[sensor]\ncfa = "RGGB"', "sensor: cfa = \"RGGB\" needs camera"),
+        ("[light]", "[lights]", "lights: unknown key; did you mean light"),
+    ],
+)
+def test_violations_are_named(old, new, message):
+    assert old in TINY
+    with pytest.raises(ConfigError, match=message):
+        parse_camera(TINY.replace(old, new))
+
+
+def test_all_violations_come_together():
+    with pytest.raises(ConfigError) as caught:
+        parse_camera(TINY.replace('"50 mm"', "50").replace('"2 um"', '"2 kg"').replace("count = [5, 5]", "cuont = [5, 5]"), "mine.toml")
+    assert str(caught.value).startswith("mine.toml: 3 violations")
+    assert "did you mean count?" in str(caught.value) and caught.value.exit_code == 2
+
+
+def test_files_that_are_no_description(tmp_path):
+    for name, content in {"binary.toml": b"\xff\xfe\x00", "huge.toml": b"#" * (1 << 20) + b"#"}.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            load_camera(tmp_path / name)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_camera(tmp_path / "absent.toml")
+    with pytest.raises(InputError):
+        load_camera(tmp_path)
+    (tmp_path / "half.toml").write_text('[main_lens]\nfocal_length = "50 m')
+    with pytest.raises(ConfigError, match="is not TOML: .*(line 2|end of document)"):
+        load_camera(tmp_path / "half.toml")
+
+
+def test_schema_names_every_section():
+    assert {"main_lens", "object", "lenslet_array", "sensor", "light", "filter_array"} <= set(camera_schema()["properties"])

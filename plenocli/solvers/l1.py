@@ -23,12 +23,13 @@ class SparseCode:
     passes: np.ndarray
 
 
-def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, passes=300):
+def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, passes=300, workers=None):
     """Solve the l1 problem for every column of `signals` by the active-set Newton method.
 
     dictionary: D = A Phi, (M, L).  signals: Y, (M, B).  lam > 0.  weights: w_j > 0, (L,), default 1.
     free: columns without penalty (they are projected out exactly, then solved for).  tol: relative duality gap to reach;
     what was reached is in the result.  Zero columns get a zero coefficient.
+    workers: threads over signals (compiled code only; default all cores); the result does not depend on it.
     """
     problem = _prepare(dictionary, signals, lam, weights, free)
     from plenocli.solvers import l1_kernel
@@ -37,6 +38,8 @@ def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, pa
     c, objective, gap = np.empty((count, atoms)), np.empty(count), np.empty(count)
     done = np.empty(count, np.int64)
     gram = problem.d.T @ problem.d
+    if workers is not None and l1_kernel.COMPILED:
+        l1_kernel.numba.set_num_threads(max(1, min(int(workers), l1_kernel.numba.config.NUMBA_NUM_THREADS)))
     l1_kernel.solve_signals(gram, problem.b, problem.energy, problem.threshold, float(tol), int(passes), c, objective, gap, done)
     return SparseCode(problem.restore(c), objective, gap, done)
 

@@ -4,12 +4,17 @@ Imported late (by plenocli.solvers.l1), because importing numba takes a second. 
 Cholesky factor has two spellings, loops for the compiler and one matrix-vector product a column for numpy.
 """
 
+import os
+
 import numpy as np
 
 try:
     import numba
 except ImportError:
     numba = None
+else:  # the one threading layer that ships with numba itself and does not share an OpenMP runtime with the BLAS
+    if "NUMBA_THREADING_LAYER" not in os.environ:
+        numba.config.THREADING_LAYER = "workqueue"
 
 PIVOT_FLOOR = 1e-13
 """A pivot below this times its diagonal means that the atom depends on those before it: it does not move."""

@@ -1,0 +1,68 @@
+"""What natural images look like to one lenslet: training patches, their mean and covariance, their autocovariance."""
+
+import numpy as np
+
+
+def draw_patches(images, shape, count, rng, *, flips=True):
+    """`count` random patches as columns, (point, count) float64, points numbered row by row.
+
+    images: 2-D arrays of linear luminance in [0, 1], each at least `shape` (rows, columns) large; an image is drawn with
+    probability proportional to the number of its patch positions, a position uniformly.  flips: mirror at random, which
+    leaves the statistics of natural scenes alone and doubles what few photographs have to say.
+    """
+    rows, columns = shape
+    room = [(i.shape[0] - rows + 1, i.shape[1] - columns + 1) for i in images]
+    if not room or min(min(r) for r in room) < 1:
+        raise ValueError(f"every training image must have at least {rows} x {columns} pixels")
+    share = np.array([r * c for r, c in room], float)
+    which = rng.choice(len(images), size=count, p=share / share.sum())
+    place = rng.random((count, 2))
+    mirror = rng.integers(0, 2, (count, 2)) if flips else np.zeros((count, 2), int)
+    patches = np.empty((rows * columns, count))
+    for k, (image, (u, v), (down, right)) in enumerate(zip(which, place, mirror)):
+        r, c = int(u * room[image][0]), int(v * room[image][1])
+        patch = images[image][r : r + rows, c : c + columns]
+        patches[:, k] = patch[:: -1 if down else 1, :: -1 if right else 1].ravel()
+    return patches
+
+
+def mean_covariance(patches):
+    """Mean (point,) and covariance (point, point) of patches (point, count)."""
+    mean = patches.mean(axis=1)
+    centred = patches - mean[:, None]
+    return mean, centred @ centred.T / max(patches.shape[1] - 1, 1)
+
+
+def autocovariance(images, reach):
+    """(mean, C) of the images taken as one stationary field: C[dr + reach, dc + reach], lags up to `reach` each way.
+
+    Each image's overlap-normalised autocovariance about the common mean, weighted by its pixels, made symmetric under
+    reversal of either axis. Lags beyond half an image's side rest on few pairs, and are tapered to zero from there.
+    """
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
+    total, pairs = np.zeros((2 * reach + 1,) * 2), np.zeros((2 * reach + 1,) * 2)
+    mean = np.sum([i.sum() for i in images]) / np.sum([i.size for i in images])
+    lags = np.arange(-reach, reach + 1)
+    for image in images:
+        shape = [next_fast_len(n + reach, real=True) for n in image.shape]
+        power = [np.abs(rfft2(x, shape)) ** 2 for x in (image - mean, np.ones(image.shape))]
+        lag_sum, lag_count = (irfft2(p, shape) for p in power)
+        reached = (np.abs(lags)[:, None] < image.shape[0]) & (np.abs(lags)[None, :] < image.shape[1])
+        total += np.where(reached, lag_sum[np.ix_(lags, lags)], 0)
+        pairs += np.where(reached, np.round(lag_count[np.ix_(lags, lags)]), 0)
+    field = total / np.maximum(pairs, 1)
+    field = (field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]) / 4
+    half = np.median([min(i.shape) for i in images]) / 2
+    taper = np.cos(np.pi / 2 * np.clip((np.abs(lags) - half) / max(reach - half, 1), 0, 1)) ** 2 if reach > half else 1.0 + 0 * lags
+    return float(mean), field * taper[:, None] * taper[None, :]
+
+
+def block_covariance(autocovariance_map, shape, shift=(0, 0)):
+    """Covariance (point, point) of a block of `shape` with the block `shift` (rows, columns of points) away, stationary field."""
+    reach = autocovariance_map.shape[0] // 2
+    r, c = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+    return autocovariance_map[
+        np.clip(r[None, :] - r[:, None] + shift[0] + reach, 0, 2 * reach),
+        np.clip(c[None, :] - c[:, None] + shift[1] + reach, 0, 2 * reach),
+    ]

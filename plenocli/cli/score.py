@@ -1,0 +1,43 @@
+"""`plenocli score`: results against the truth."""
+
+import click
+
+from plenocli.cli import options
+
+METRICS = ("psnr", "ssim", "block-mean", "rmse", "patches", "spectral-angle", "delta-e", "snr", "coherence")
+
+
+@click.command("score", short_help="Compare results with the truth: JSON, a table, a report.")
+@options.input_path("results", nargs=-1, required=True, metavar="RESULT...")
+@click.option("--truth", metavar="TRUTH", help="Capture that holds its scene, photograph, spectral EXR, image or spectra .h5, skimage:astronaut, or colorchecker.")
+@options.output
+@click.option("--report", type=options.FILE, help="Also write a page with pictures, such as report.html.")
+@click.option("--metric", "metrics", multiple=True, type=click.Choice(METRICS), help="Only these numbers. Repeatable; default all that apply.")
+@click.option("--white", "whites", multiple=True, type=options.FILE, help="Spectra of a white target, for the SNR and for radiance. Repeatable: frames over time.")
+@click.option("--patches", metavar="MAP", help="Label map on the lenslet grid (0 nothing, 1 to 24 the patches), or colorchecker.")
+@click.option("--pif", type=options.FILE, help="System matrix; a dictionary is scored with it.")
+@click.option("--capture", type=options.FILE, help="Simulated capture, for its sensor-model SNR.")
+@click.option("--block", type=options.Grid(), help="Object samples under one lenslet, such as 40x40; default what the files say.")
+@click.option("--sampling", type=click.Choice(["fit", "crop"]), default="fit", show_default=True, help="How a photograph became the object, as in capture-sim.")
+@click.option("--illuminant", "light", default="D65", show_default=True, help='Light for colour differences: A, D50, D65, E or a temperature such as "3200 K".')
+@options.mem_limit
+@options.overwrite
+@options.as_json
+@click.pass_context
+def command(ctx, results, output, as_json, **settings):
+    """Compare RESULTs (image, spectra or dictionary; .h5 or .exr) with the truth, side by side in one table.
+
+    Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline. Spectra: error per band and over the six patches of the
+    paper, spectral angle, colour difference, SNR under three names. Dictionaries: coherence. OUT is JSON with the
+    definition of every number; null stands for "infinite" (no error at all) or "does not apply".
+
+    \b
+    Examples:
+      plenocli score tikhonov.h5 lmmse.h5 --truth capture.h5 -o score.json --report report.html
+      plenocli score chart.exr --truth colorchecker --white white1.h5 --white white2.h5 -o score.json
+      plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
+    """
+    from plenocli.stages.score import run_score, table
+
+    document = run_score(results, output, command=options.command_line(ctx), **settings)
+    options.summary(document, as_json, table(document))

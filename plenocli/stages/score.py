@@ -1,0 +1,307 @@
+"""score: results against the truth, side by side, as JSON, a table and (on request) the report page."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import InputError, PlenoError, UsageError
+from plenocli.stages.progress import note
+from plenocli.stages.score_inputs import CHART, block_of, read_labels, read_result, read_truth, read_white
+
+GROUPS = {
+    "psnr": ("psnr_db", "psnr_inner_db", "psnr_clipped_db"),
+    "ssim": ("ssim",),
+    "block-mean": ("block_mean_psnr_db", "gain_over_block_mean_db"),
+    "rmse": ("rmse", "rmse_per_band"),
+    "patches": ("patches", "patch_rmse_per_band", "six_patch_rmse", "six_patch_rmse_per_band", "six_patches_seen"),
+    "spectral-angle": ("spectral_angle_deg",),
+    "delta-e": ("delta_e_2000",),
+    "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
+    "coherence": (
+        "coherence_raw", "coherence_candes_romberg", "coherence_effective", "coherence_effective_mean", "welch_bound",
+        "exact_recovery_sparsity", "dead_atoms", "invisible_atoms", "atoms", "points", "pixels",
+    ),
+}
+"""What --metric may ask for, and the numbers that each brings."""
+
+WHITE_LABEL = 19
+
+
+def run_score(
+    results, output, *, truth=None, report=None, metrics=(), whites=(), patches=None, pif=None, capture=None, block=None,
+    sampling="fit", light="D65", overwrite=False, mem_limit=None, command="",
+):
+    """Score every result, write `output` (JSON) and perhaps `report` (HTML); returns the JSON document as a dict.
+
+    results: paths. truth: path or scene name, needed but for dictionaries. whites: spectra of a white target, frames.
+    patches: label map or "colorchecker". pif: system matrix (dictionaries need it). capture: for its sensor-model SNR.
+    block: object samples per lenslet (h, w), else from the files. light: for colour differences. One bad result does not
+    stop the others: its message stands in its place and is raised at the end.
+    """
+    from plenocli.artefacts import check_output, describe_inputs, publish, read_artefact
+
+    inputs = [*results, truth, *whites, patches, pif, capture]
+    files = [path for path in inputs if path is not None and Path(path).is_file()]
+    for target in filter(None, (output, report)):
+        check_output(target, overwrite=overwrite, inputs=files)
+    if report is not None and Path(report) == Path(output):
+        raise UsageError("--output and --report name the same file", output, "give the report another name, such as report.html")
+    system = read_artefact(pif, "pif", mem_limit=mem_limit) if pif else None
+    context = _Context(truth, whites, patches, system, capture, block, sampling, light, mem_limit)
+    scored, pictures, errors = [], [], []
+    for path in results:
+        try:
+            entry, picture = _score_one(path, context)
+            _keep(entry["metrics"], metrics)
+        except PlenoError as error:
+            note(f"error: {error}")
+            errors.append(error)
+            entry, picture = {"name": Path(path).name, "error": str(error).replace(str(path), Path(path).name), "metrics": {}}, None
+        scored.append(entry)
+        pictures.append(picture)
+    if len(errors) == len(results):
+        raise errors[0]
+    _name_apart(scored, results)
+    document = {
+        "metrics": next(entry["metrics"] for entry in scored if "error" not in entry),
+        "results": scored,
+        "definitions": _definitions(scored),
+        "command": command,
+        "inputs": describe_inputs({
+            "result": list(results), "truth": truth if truth and Path(truth).is_file() else None, "white": list(whites),
+            "patches": patches if patches and Path(patches).is_file() else None, "pif": pif, "capture": capture,
+        }),
+    }
+    document = finite(document)
+    publish(output, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode(), overwrite=overwrite)
+    if report is not None:
+        from plenocli.report.score_page import score_page
+
+        publish(report, score_page(document, pictures).encode(), overwrite=overwrite)
+    if errors:
+        raise errors[0]
+    return document
+
+
+class _Context:
+    """Everything a result is scored with; files are read once."""
+
+    def __init__(self, truth, whites, patches, system, capture, block, sampling, light, mem_limit):
+        from plenocli.scene.tables import illuminant
+
+        illuminant(light, [560e-9])  # an unknown name is refused before any work
+        if patches is None and str(truth) == CHART:
+            patches = CHART
+        self.truth, self.patches, self.system, self.block = truth, patches, system, block
+        self.sampling, self.light, self.mem_limit = sampling, light, mem_limit
+        self.whites = read_white(whites, mem_limit) if whites else None
+        self.sensor_snr = _sensor_snr(capture, mem_limit) if capture else None
+
+
+def _score_one(path, context):
+    """(JSON-able entry, what the report draws) of one result."""
+    result = read_result(path, mem_limit=context.mem_limit)
+    entry = {"name": Path(path).name, "kind": result.kind}
+    if result.method:
+        entry["method"] = result.method
+    if result.kind == "dictionary":
+        entry["metrics"] = _score_dictionary(path, result, context.system)
+        return entry, {"result": result}
+    if context.truth is None:
+        raise UsageError("the truth is missing", path, "name it with --truth: a capture, photograph, spectral EXR, image, spectra or colorchecker")
+    truth = read_truth(context.truth, result, context.sampling)
+    if not np.isfinite(truth).any():
+        raise InputError("holds no finite value", context.truth)
+    picture = {"result": result, "truth": truth}
+    if result.wavelengths is None:
+        block = context.block or block_of(result, context.truth, context.system)
+        entry["metrics"] = _score_image(path, result, truth, block)
+        picture["block"] = block
+    else:
+        entry["wavelengths_nm"] = [round(float(w) * 1e9, 6) for w in result.wavelengths]
+        entry["metrics"], entry["patches"] = _score_spectra(path, result, truth, context)
+        picture["patches"] = entry["patches"]
+    if context.sensor_snr is not None:
+        entry["metrics"]["snr_sensor_db"] = context.sensor_snr
+    return entry, picture
+
+
+def _score_image(path, result, truth, block):
+    from plenocli.metrics.quality import score_picture
+
+    if not (np.isfinite(result.values).all() and np.isfinite(truth).all()):
+        raise InputError("holds values that are not finite", path, "reconstruct again; pictures have no gaps")
+    if block is not None and any(n % b for n, b in zip(result.grid, block, strict=True)):
+        raise UsageError(f"{result.grid[0]} x {result.grid[1]} points are no whole number of {block[0]} x {block[1]} blocks", path,
+                         "correct --block")
+    return score_picture(result.values, truth, block)
+
+
+def _score_spectra(path, result, truth, context):
+    """(metrics, patches) of a spectral cube."""
+    from plenocli.metrics.quality import score_picture
+    from plenocli.metrics.spectral import patch_statistics, score_cube, score_patches
+    from plenocli.scene.tables import SIX_PATCHES, colorchecker, patch_index
+
+    values = _reflectance(path, result, context)
+    labels = None if context.patches is None else read_labels(context.patches, result.grid)
+    scores = score_cube(values, truth, result.wavelengths, context.light)
+    if not scores["lenslets"]:
+        raise InputError("has no lenslet with values in all bands", path, "check the calibration it was made with")
+    if result.kind == "image":
+        scores |= score_picture(values, truth)
+    listed = []
+    if labels is not None:
+        six = tuple(patch_index(name) + 1 for name in SIX_PATCHES)
+        scores |= score_patches(values, truth, labels, six)
+        true = patch_statistics(truth, labels)
+        names = colorchecker()[0]
+        for label, found in patch_statistics(values, labels).items():
+            listed.append({
+                "label": label, "name": names[label - 1], "lenslets": found["count"], "mean": found["mean"].tolist(),
+                "std": found["std"].tolist(), "truth": true[label]["mean"].tolist() if label in true else None,
+                "one_of_six": label in six,
+            })
+    scores |= _snr(result, labels, context)
+    return scores, listed
+
+
+def _reflectance(path, result, context):
+    """The result's values as reflectance: as they are, or radiance divided by that of the white target."""
+    from plenocli.scene.tables import WHITE_REFERENCE
+
+    if result.quantity != "radiance":
+        return result.values
+    if context.whites is None:
+        if str(context.truth) == CHART:
+            raise UsageError("holds radiance, the truth is reflectance", path, "demux with --reference, or name the spectra of a white target with --white")
+        return result.values
+    white = context.whites[0].mean(axis=0)
+    if white.shape != result.values.shape:
+        raise UsageError(f"is {result.values.shape}, the white target {white.shape}", path, "demultiplex both with one calibration")
+    return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * WHITE_REFERENCE
+
+
+def _snr(result, labels, context):
+    """Capture and predicted SNR on the white target, or on the chart's white patch where there is none."""
+    from plenocli.metrics.snr import snr_capture, snr_predicted
+
+    if context.whites is not None:
+        frames, sigma = context.whites
+        target = f"white target, {len(frames)} frames over time" if len(frames) > 1 else "white target, one frame over its lenslets"
+    elif labels is not None and (labels == WHITE_LABEL).any():
+        here = labels == WHITE_LABEL
+        frames, sigma = result.values[None][:, :, here], None if result.sigma is None else np.asarray(result.sigma)[:, here]
+        target = "white patch of the chart, over its lenslets"
+    else:
+        return {}
+    scores = {"snr_target": target, "snr_capture_db": snr_capture(frames)}
+    if sigma is not None:
+        scores["snr_predicted_db"] = snr_predicted(frames[0], sigma)
+    for name in ("snr_capture", "snr_predicted"):
+        if f"{name}_db" in scores:
+            bands = scores[f"{name}_db"]
+            scores[f"{name}_mean_db"] = float(bands.mean()) if np.isfinite(bands).all() else None
+            scores[f"{name}_db"] = bands.tolist()
+    return scores
+
+
+def _sensor_snr(path, mem_limit):
+    """Sensor-model SNR of a capture from its mosaic and the noise it says it got."""
+    from plenocli.artefacts import read_artefact
+
+    capture = read_artefact(path, "capture", mem_limit=mem_limit)
+    attrs = capture.attrs.get("capture", {})
+    sigma = float(attrs.get("noise_sigma") or 0)
+    if not sigma > 0:
+        raise InputError("names no noise level", path, "simulate it with capture-sim --snr, or leave --capture out")
+    signal = np.asarray(capture.data["capture/mosaic"], dtype=np.float64) - float(np.mean(attrs.get("black") or 0))
+    power = np.mean(signal**2) - sigma**2  # the stored mosaic carries the noise already
+    return float(10 * np.log10(power / sigma**2)) if power > 0 else None
+
+
+def _score_dictionary(path, result, system):
+    """Coherence of the atoms with the matrix of their own superpixel, scaled as the dictionary was learnt with."""
+    from plenocli.metrics.coherence import coherence
+
+    if system is None:
+        raise UsageError("the coherence of a dictionary depends on the system matrix", path, "name it with --pif pif.h5")
+    offsets = np.asarray(system.data["pif/lenslet_offset"])
+    own = np.flatnonzero((offsets == 0).all(axis=1))
+    matrix = system.data["pif/A"][0, own[0] if own.size else 0]
+    if matrix.shape[1] != len(result.values):
+        raise InputError(f"has atoms of {len(result.values)} points, the matrix has {matrix.shape[1]}", path, "name the matrix it was learnt for")
+    scale = float(result.attrs.get("scale") or 1.0)
+    return coherence(matrix / matrix.dtype.type(scale), result.values.astype(matrix.dtype, copy=False))
+
+
+def _keep(scores, wanted):
+    """Leave only the metrics asked for; UsageError where one could not be computed."""
+    if not wanted:
+        return
+    for group in wanted:
+        if not any(name in scores for name in GROUPS[group]):
+            raise UsageError(f"--metric {group} does not apply to this result with what was given", fix=_NEEDS.get(group, "leave it out"))
+    names = {name for group in wanted for name in GROUPS[group]} | ({"snr_target"} if "snr" in wanted else set())
+    for name in [name for name in scores if name not in names]:
+        del scores[name]
+
+
+_NEEDS = {
+    "snr": "name the spectra of a white target with --white, or a --capture simulated with --snr",
+    "patches": "give a label map with --patches",
+    "block-mean": "give the object samples per lenslet with --block 40x40",
+    "coherence": "give a dictionary and --pif",
+    "spectral-angle": "give a spectral result",
+    "delta-e": "give a spectral result",
+}
+
+
+def _name_apart(scored, paths):
+    """Short labels for the table: file stems, with the folder's name where two stems are equal, else with a number."""
+    stems = [Path(path).stem for path in paths]
+    labels = stems if len(set(stems)) == len(stems) else [f"{Path(p).parent.name}/{stem}" for p, stem in zip(paths, stems, strict=True)]
+    for number, (entry, label) in enumerate(zip(scored, labels, strict=True), start=1):
+        entry["label"] = label if labels.count(label) == 1 else f"{label} {number}"
+
+
+def _definitions(scored):
+    from plenocli.metrics import coherence, quality, snr, spectral
+
+    found = {}
+    for entry in scored:
+        home = {"dictionary": [coherence], "image": [quality], "spectra": [spectral]}.get(entry.get("kind"), [])
+        if "wavelengths_nm" in entry:
+            home = [spectral, quality]
+        for name in entry["metrics"]:
+            for module in (*home, snr):
+                if name in module.DEFINITIONS:
+                    found[name] = module.DEFINITIONS[name]
+                    break
+    return found
+
+
+def finite(value):
+    """A JSON-able copy: arrays become lists, numbers that are not finite become None (an infinite PSNR: no error at all)."""
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if hasattr(value, "tolist"):
+        return finite(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def table(document):
+    """The results side by side as text: one row a metric, one column a result."""
+    from plenocli.report.tables import metric_rows
+
+    header, rows = metric_rows(document)
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = ["  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))) for row in [header, *rows]]
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,0 +1,159 @@
+"""Pictures of the spectral chain: lenslet grid, response, demultiplexed bands, spectra of patches, error bars. PNG bytes."""
+
+import numpy as np
+
+from plenocli.report.drawing import (
+    COLOURS, LEVEL_MAP, LIGHT_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail,
+)
+
+
+def calibration_picture(flat, centres, valid, residual=None):
+    """The white image (row, column; peak 1 in each superpixel) with the lenslet centres found, and a close-up.
+
+    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None. flat None: the centres alone.
+    """
+    centres, valid = np.asarray(centres), np.asarray(valid, dtype=bool)
+    found = centres[valid & np.isfinite(centres).all(axis=-1)]
+    with drawing(10.2, 4.6) as made:
+        whole, close = made.figure.subplots(1, 2)
+        if flat is not None:
+            shown, step = thumbnail(np.nan_to_num(np.asarray(flat, dtype=np.float64)))
+            extent = (-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5)
+            for axes, picture, where in ((whole, shown, extent), (close, np.nan_to_num(flat), None)):
+                axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest", **({"extent": where} if where else {}))
+            limits = extent
+        else:
+            limits = (found[:, 1].min() - 5, found[:, 1].max() + 5, found[:, 0].max() + 5, found[:, 0].min() - 5)
+        colours = np.full(len(found), 0.0) if residual is None else np.asarray(residual)[valid & np.isfinite(centres).all(axis=-1)]
+        size = max(0.8, min(14.0, 5000 / max(len(found), 1)))
+        dots = whole.scatter(found[:, 1], found[:, 0], c=np.nan_to_num(colours), s=size, cmap=LEVEL_MAP, linewidths=0)
+        whole.set(xlim=limits[:2], ylim=limits[2:], aspect="equal", xlabel="column [px]", ylabel="row [px]",
+                  title=f"{len(found)} lenslets found" + (" on the white image" if flat is not None else ""))
+        if residual is not None:
+            colour_bar(whole, dots, "distance from the lattice [px]")
+        middle = found[np.argmin(((found - found.mean(axis=0)) ** 2).sum(axis=1))]
+        nearest = np.sort(np.hypot(*(found - middle).T))
+        half = 2.2 * (nearest[1] if len(nearest) > 1 else 20)
+        close.plot(found[:, 1], found[:, 0], "+", color=COLOURS[1], markersize=9, markeredgewidth=1.4)
+        close.set(xlim=(middle[1] - half, middle[1] + half), ylim=(middle[0] + half, middle[0] - half), aspect="equal", xlabel="column [px]",
+                  title="centres in the middle of the sensor")
+    return made.png
+
+
+def response_picture(response, window, wavelengths):
+    """F of one lenslet (pixel, band): which pixels of the superpixel answer to which band, each band on its own scale."""
+    count = len(wavelengths)
+    with drawing(min(2.5 * count, 10.2), 2.7) as made:
+        panels = made.figure.subplots(1, count, squeeze=False)[0]
+        for band, axes in enumerate(panels):
+            values = np.nan_to_num(np.asarray(response)[:, band]).reshape(window)
+            image = axes.imshow(values, cmap=LIGHT_MAP, vmin=0, interpolation="nearest")
+            bare(axes, nanometres(wavelengths[band]))
+            colour_bar(axes, image, "")
+    return made.png
+
+
+def band_pictures(cube, wavelengths, quantity="value", light="D65"):
+    """Demultiplexed bands (band, row, column) on one scale, and the colour they make together (white = 1)."""
+    from plenocli.scene.colour import preview_rgb
+
+    cube = np.asarray(cube, dtype=np.float64)
+    top = float(np.nanpercentile(cube, 99.5)) or 1.0
+    scale = 1.0 if quantity == "reflectance" else top
+    shown = min(len(wavelengths), 8)
+    chosen = np.unique(np.round(np.linspace(0, len(wavelengths) - 1, shown)).astype(int))
+    columns = min(5, len(chosen) + 1)
+    lines = -(-(len(chosen) + 1) // columns)
+    panel = 10.2 / columns
+    with drawing(10.2, lines * (panel * cube.shape[1] / cube.shape[2] * 0.96 + 0.35)) as made:
+        panels = made.figure.subplots(lines, columns, squeeze=False)
+        for axes in panels.flat:
+            axes.set_axis_off()
+        panels[0, 0].set_axis_on()
+        show_picture(panels[0, 0], np.moveaxis(preview_rgb(wavelengths, np.nan_to_num(cube) / scale, light), 0, -1), f"colour from {len(wavelengths)} bands", interpolation="nearest")
+        used = [panels.flat[0]]
+        for axes, band in zip(panels.flat[1:], chosen, strict=False):
+            axes.set_axis_on()
+            image = axes.imshow(cube[band], cmap="gray", vmin=0, vmax=top, interpolation="nearest")
+            bare(axes, nanometres(wavelengths[band]))
+            used.append(axes)
+        bar = made.figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, shrink=0.85)
+        bar.set_label(quantity)
+        bar.outline.set_linewidth(0.4)
+    return made.png
+
+
+def patch_spectra(entries, wavelengths_nm, only_six=False):
+    """Spectra of the chart's patches: truth as a line, each result as points with +- one standard deviation.
+
+    entries: sequence of (label, patches) as score lists them: dicts with label, name, mean, std, truth. A colour strip
+    beneath each title shows the patch.
+    """
+    from plenocli.scene.colour import preview_rgb
+    from plenocli.scene.tables import colorchecker
+
+    wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
+    wanted = {p["label"]: p for _, patches in entries for p in patches if p["one_of_six"] or not only_six}
+    order = sorted(wanted)
+    columns = 6 if len(order) > 6 else 3
+    lines = -(-len(order) // columns)
+    _, table_wavelengths, table = colorchecker()
+    colours = preview_rgb(table_wavelengths, table.T[:, :, None])[..., 0].T
+    with drawing(10.2, (1.5 if columns == 6 else 2.1) * lines + 0.35) as made:
+        panels = made.figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+        for axes in panels.flat[len(order):]:
+            axes.set_axis_off()
+        spread = 0.012 * np.ptp(wavelengths_nm) if len(entries) > 1 else 0.0
+        for place, (axes, label) in enumerate(zip(panels.flat, order, strict=False)):
+            axes.axhspan(1.06, 1.14, color=swatch(colours[label - 1]), linewidth=0)
+            axes.plot(table_wavelengths * 1e9, table[label - 1], color="#bbbbbb", linewidth=1, label="chart, full spectrum" if not place else None)
+            if wanted[label]["truth"] is not None:
+                axes.plot(wavelengths_nm, wanted[label]["truth"], "_", color=TRUTH, markersize=9, markeredgewidth=1.4, label="truth" if not place else None)
+            for number, (name, patches) in enumerate(entries):
+                for patch in patches:
+                    if patch["label"] == label:
+                        shift = (number - (len(entries) - 1) / 2) * spread
+                        axes.errorbar(wavelengths_nm + shift, patch["mean"], patch["std"], fmt="o", markersize=3.2, capsize=1.8, linewidth=0.9,
+                                      color=COLOURS[number % len(COLOURS)], label=name if not place else None)
+            axes.set_title(wanted[label]["name"], fontsize=8)
+            axes.set(ylim=(-0.05, 1.14), xlim=(400, 700) if 400 <= wavelengths_nm.min() and wavelengths_nm.max() <= 700 else None)
+            axes.grid(True)
+        made.figure.supxlabel("wavelength [nm]", fontsize=8.5)
+        made.figure.supylabel("reflectance", fontsize=8.5)
+        made.figure.legend(loc="outside upper center", ncols=len(entries) + 2)
+    return made.png
+
+
+def accuracy_bars(entries):
+    """Error and SNR per band for each result, as the paper's Fig. 7: entries of a score document with bands.
+
+    Left: RMSE averaged over the six patches (over all lenslets where no patches are known). Right: capture SNR, with the
+    predicted SNR as a tick.
+    """
+    entries = [e for e in entries if e.get("wavelengths_nm") and "rmse_per_band" in e["metrics"]]
+    error_name = "six_patch_rmse_per_band" if all("six_patch_rmse_per_band" in e["metrics"] for e in entries) else "rmse_per_band"
+    with_snr = any(e["metrics"].get("snr_capture_db") for e in entries)
+    with drawing(9.6 if with_snr else 5.4, 3.1) as made:
+        panels = np.ravel(made.figure.subplots(1, 2 if with_snr else 1))
+        _bars(panels[0], entries, error_name)
+        panels[0].set(ylabel="RMSE in reflectance", title="error, mean of the six patches" if error_name.startswith("six") else "error over all lenslets")
+        if with_snr:
+            _bars(panels[1], entries, "snr_capture_db", "snr_predicted_db")
+            panels[1].set(ylabel="SNR [dB]", title="capture SNR on white (tick: predicted)")
+        made.figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(entries), 4))
+    return made.png
+
+
+def _bars(axes, entries, name, tick=None):
+    bands = entries[0]["wavelengths_nm"]
+    width = 0.8 / len(entries)
+    for number, entry in enumerate(entries):
+        place = np.arange(len(bands)) + (number - (len(entries) - 1) / 2) * width
+        values = [np.nan if v is None else v for v in entry["metrics"].get(name) or [None] * len(bands)]
+        axes.bar(place, values, 0.9 * width, color=COLOURS[number % len(COLOURS)], label=entry.get("label", entry["name"]))
+        predicted = entry["metrics"].get(tick) if tick else None
+        if predicted:
+            axes.plot(place, [np.nan if v is None else v for v in predicted], "_", color=TRUTH, markersize=60 * width, markeredgewidth=1.3)
+    axes.set_xticks(range(len(bands)), [f"{w:g} nm" for w in bands])
+    axes.tick_params(axis="x", length=0)
+    axes.grid(True, axis="y")

@@ -97,33 +97,40 @@ def prepare(white, cfa="mono", dark=None):
         for i in (0, 1):
             for j in (0, 1):
                 image[i::2, j::2] *= np.float32(means.mean() / means[i, j])
-    image = replace_dead(image, step)
+    image = _replace_dead(image, step)
     if cfa != "mono":
         image = _remove_nyquist(image)
     sample = image[:: max(1, image.shape[0] // 1000), :: max(1, image.shape[1] // 1000)]
     return image - np.float32(np.percentile(sample, 0.5))
 
 
-def replace_dead(image, step=1):
-    """Replace pixels far outside the range of their four neighbours `step` px away by those neighbours' mean."""
+def dead_pixels(image, step=1):
+    """Mask of pixels far outside the range of their four neighbours `step` px away: dead, or hot."""
+    neighbours = _neighbours(image, step)
+    high, low = np.maximum.reduce(neighbours), np.minimum.reduce(neighbours)
+    sample = (image - high)[::7, ::7]
+    noise = 1.48 * np.median(np.abs(sample - np.median(sample)))
+    return (image > 3 * np.abs(high) + 6 * noise) | (image < low / 3 - 3 * noise)
+
+
+def _replace_dead(image, step):
+    bad = dead_pixels(image, step)
+    if not bad.any():
+        return image
+    out = image.copy()
+    out[bad] = (sum(n[bad].astype(np.float64) for n in _neighbours(image, step)) / 4).astype(np.float32)
+    return out
+
+
+def _neighbours(image, step):
     padded = np.pad(image, step, mode="reflect")
     rows, columns = image.shape
-    neighbours = [
+    return [
         padded[:rows, step : step + columns],
         padded[2 * step :, step : step + columns],
         padded[step : step + rows, :columns],
         padded[step : step + rows, 2 * step :],
     ]
-    high = np.maximum(np.maximum(neighbours[0], neighbours[1]), np.maximum(neighbours[2], neighbours[3]))
-    low = np.minimum(np.minimum(neighbours[0], neighbours[1]), np.minimum(neighbours[2], neighbours[3]))
-    sample = (image - high)[::7, ::7]
-    noise = 1.48 * np.median(np.abs(sample - np.median(sample)))
-    bad = (image > 3 * np.abs(high) + 6 * noise) | (image < low / 3 - 3 * noise)
-    if not bad.any():
-        return image
-    out = image.copy()
-    out[bad] = (sum(n[bad].astype(np.float64) for n in neighbours) / 4).astype(np.float32)
-    return out
 
 
 def _remove_nyquist(image):

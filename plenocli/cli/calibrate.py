@@ -1,0 +1,45 @@
+"""`plenocli calibrate`: the lenslet grid and the response of a camera from its captures."""
+
+from pathlib import Path
+
+import click
+
+from plenocli.cli import options
+
+
+@click.command("calibrate", short_help="Find the lenslet grid and measure the response F from white, dark and narrow-band captures.")
+@click.option("--white", "whites", multiple=True, required=True, type=options.FILE, help="White image: even light through the main lens. Repeatable: frames are averaged.")
+@click.option("--dark", "darks", multiple=True, type=options.FILE, help="Dark frame. Repeatable; without one the file's black level is used.")
+@click.option("--band", "bands", multiple=True, type=options.Pair("FILE", Path), help="White target under narrow-band light, such as 450nm=band450.dng. Repeatable, also within a band.")
+@click.option("--band-radiance", "radiances", multiple=True, type=options.Pair("NUMBER", float), help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.")
+@click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
+@click.option("--shared", is_flag=True, help="One F for all lenslets (whole-pixel pitch only) instead of one each.")
+@click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
+@options.output
+@options.overwrite
+@options.as_json
+@click.pass_context
+def command(ctx, output, as_json, radiances, **settings):
+    """Calibrate a plenoptic camera: lenslet grid, white and dark levels, and the response F of every superpixel.
+
+    Files are camera RAW, DNG, PNG or TIFF mosaics (never demosaiced) or captures of capture-sim. The grid may be square
+    or hexagonal, turned, of any pitch from 5 to 300 pixels. F needs --band captures; without them the calibration
+    holds grid, white and dark.
+
+    \b
+    Examples:
+      plenocli calibrate --white white.png --dark dark.png -o grid.h5
+      plenocli calibrate --white w1.NEF --white w2.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF -o cal.h5
+      plenocli calibrate --white white.dng --band 450nm=450.dng --band-radiance 450nm=0.8 --camera camera.toml -o cal.h5
+    """
+    from plenocli.stages.calibrate import run_calibrate
+
+    if any(not value > 0 for _, value in radiances):
+        raise click.BadParameter("a radiance must be above 0", ctx, param_hint="--band-radiance")
+    report = run_calibrate(output, radiances=radiances, command=options.command_line(ctx), **settings)
+    down, right = report["pitch_px"]
+    line = (f"{output}: {report['lattice']} grid, pitch {down:.4f} x {right:.4f} px, angle {report['angle_deg']:.3f} deg, "
+            f"{report['lenslets']} lenslets, residual {report['rms_px']:.3f} px rms ({report['model']})")
+    if "condition" in report:
+        line += f"; F: {len(report['bands_nm'])} bands, condition {report['condition']:.3g}, {report['columns']}"
+    options.summary(report, as_json, line)

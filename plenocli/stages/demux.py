@@ -1,0 +1,313 @@
+"""demux: band radiances or reflectances behind every lenslet of captures, with predicted standard deviations."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import InputError, NumericsError, OutputError, PlenoError, UsageError
+from plenocli.stages.mosaics import read_exposure
+from plenocli.stages.progress import bar, note
+
+WORTHWHILE = 1.05  # `auto` takes a method that assumes more only where it predicts a mean square error this much smaller
+
+
+@dataclass(frozen=True)
+class Settings:
+    """method: pinv, single-pixel, wls, lmmse, nnls or auto; reference_reflectance: of the white reference."""
+
+    method: str = "auto"
+    reference: Path | None = None
+    reference_reflectance: float = 0.99
+
+
+@dataclass(frozen=True)
+class Response:
+    """A calibration as demux uses it (arrays as in the calibration artefact)."""
+
+    response: np.ndarray
+    variance: np.ndarray | None
+    wavelengths: np.ndarray
+    origin: np.ndarray
+    window: tuple
+    valid: np.ndarray
+    white: np.ndarray
+    dark: object
+    cfa: str
+    units: str
+    white_level: float
+    exposure: float | None
+    gain: float | None
+    read_variance: float
+
+
+def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".exr", workers=1, overwrite=False, command=""):
+    """Demultiplex every capture; returns a summary dict.
+
+    One capture gives the file `output` (.exr or .h5), several a folder with one file each, named after the capture;
+    finished ones are skipped unless overwrite. A capture that fails does not stop the others: its message is printed
+    and an error is raised at the end, with the exit code of the worst.
+    """
+    from plenocli.artefacts import check_output
+
+    captures, output = [Path(c) for c in captures], Path(output)
+    several = len(captures) > 1 or output.is_dir()
+    jobs = _jobs(captures, output, suffix, several)
+    inputs = [*captures, calibration, settings.reference]
+    if several and output.exists() and not output.is_dir():
+        raise OutputError("is a file; several captures go to a folder", output, "name a folder")
+    if not several:
+        check_output(output, overwrite=overwrite, inputs=inputs)
+    elif not output.is_dir():
+        try:
+            output.mkdir()
+        except OSError as error:
+            raise OutputError(f"the folder cannot be made ({error.strerror})", output, "make its parent folder first") from None
+    todo = [(c, t) for c, t in jobs if overwrite or not several or not t.exists()]
+    arguments = (calibration, settings, overwrite, command)
+    first = _Worker(*arguments) if todo else None  # a broken calibration ends the run here, before any capture
+    reports, errors = [], []
+    for capture, outcome in _outcomes(todo, first, arguments, workers):
+        if isinstance(outcome, PlenoError):
+            if not several:
+                raise outcome
+            note(f"error: {outcome}")
+            errors.append((capture, outcome))
+        else:
+            reports.append(outcome)
+    summary = {"output": str(output), "done": len(reports), "skipped": len(jobs) - len(todo), "failed": [str(c) for c, _ in errors], "captures": reports}
+    if errors:
+        worst = max(errors, key=lambda pair: pair[1].exit_code)[1]
+        raise type(worst)(f"{len(errors)} of {len(jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", output, f"{len(jobs) - len(errors)} are done; see the messages above")
+    return summary
+
+
+def _jobs(captures, output, suffix, several):
+    if not several:
+        if output.suffix not in (".exr", ".h5"):
+            raise UsageError(f"spectra are written as .exr or .h5, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
+        return [(captures[0], output)]
+    targets = [output / (capture.stem + suffix) for capture in captures]
+    for target in targets:
+        same = [c for c, t in zip(captures, targets) if t == target]
+        if len(same) > 1:
+            raise UsageError(f"captures {', '.join(str(c) for c in same)} would all become {target.name}", fix="rename one, or use two folders")
+    return list(zip(captures, targets))
+
+
+def _outcomes(todo, first, arguments, workers):
+    """(capture, report or PlenoError) of every job, in order; in this process or in several."""
+    if workers == 1 or len(todo) < 2:
+        for capture, target in bar(todo, len(todo), "captures"):
+            yield capture, first.attempt(capture, target)
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(min(workers, len(todo)), get_context("spawn"), _start, arguments) as pool:
+        running = [(capture, pool.submit(_attempt, capture, target)) for capture, target in todo]
+        for capture, job in bar(running, len(running), "captures"):
+            yield capture, job.result()
+
+
+def _start(*arguments):
+    global _worker
+    _worker = _Worker(*arguments)
+
+
+def _attempt(capture, target):
+    return _worker.attempt(capture, target)
+
+
+class _Worker:
+    """What one process needs for any number of captures: calibration read, white reference demultiplexed, once."""
+
+    def __init__(self, calibration, settings, overwrite, command):
+        self.path, self.settings, self.overwrite, self.command = calibration, settings, overwrite, command
+        self.calibration = read_response(calibration)
+        self.reference = None
+        self.prior = _prior(self.calibration)
+        if settings.reference is not None:
+            self.reference = self._radiance(settings.reference, self._plain_method())[:2]
+
+    def attempt(self, capture, target):
+        try:
+            return self._demux(capture, target)
+        except PlenoError as error:
+            return error
+
+    def _plain_method(self):
+        """The white reference is demultiplexed without a prior: a prior's pull would not divide out."""
+        method = self.settings.method
+        return {"auto": "pinv", "lmmse": "wls"}.get(method, method)
+
+    def _radiance(self, path, method):
+        exposure = read_exposure(path)
+        values, noise = _values(exposure, self.calibration, path)
+        return estimate(self.calibration, values, noise, method, self.prior)
+
+    def _demux(self, capture, target):
+        from plenocli.artefacts import describe_inputs
+
+        c = self.calibration
+        value, sigma, method, why = self._radiance(capture, self.settings.method)
+        quantity = "radiance"
+        if self.reference is not None:
+            value, sigma = _reflectance(value, sigma, *self.reference, self.settings.reference_reflectance)
+            quantity = "reflectance"
+        if not np.isfinite(value).any():
+            raise NumericsError("no lenslet could be demultiplexed", capture, "check exposure and calibration")
+        inputs = describe_inputs({"capture": capture, "calibration": self.path, "reference": self.settings.reference})
+        attrs = dict(quantity=quantity, method=method)
+        if self.settings.reference is not None:
+            attrs["reference"] = Path(self.settings.reference).name
+        parameters = {"asked": self.settings.method, "reason": why, "reference_reflectance": self.settings.reference_reflectance if self.reference is not None else None}
+        _write(target, c.wavelengths, np.moveaxis(value, -1, 0), np.moveaxis(sigma, -1, 0), attrs, parameters, inputs, self.overwrite, self.command)
+        seen = np.isfinite(value).all(axis=-1)
+        return dict(capture=Path(capture).name, output=str(target), method=method, reason=why, quantity=quantity, lenslets=int(seen.sum()),
+                    array=list(value.shape[:2]), bands_nm=[float(w * 1e9) for w in c.wavelengths],
+                    mean=[float(v) for v in value[seen].mean(axis=0)], sigma=[float(v) for v in np.nanmean(sigma[seen], axis=0)] if np.isfinite(sigma[seen]).any() else None)
+
+
+def read_response(path):
+    """The Response of a calibration artefact; InputError where it holds none."""
+    from plenocli.artefacts import read_artefact
+    from plenocli.sensor.frames import Dark
+
+    artefact = read_artefact(path, "calibration")
+    data, attrs = artefact.data, artefact.attrs
+    if "response/F" not in data:
+        raise InputError("holds no response F, only the lenslet grid", path, "calibrate with --band captures")
+    levels, response = attrs.get("white", {}), attrs.get("response", {})
+    black = np.asarray(levels.get("black", 0.0), float)
+    black = black.reshape(2, 2) if black.size == 4 else np.full((2, 2), float(black.ravel()[0]))
+    dark_attrs = attrs.get("dark", {})
+    dark = Dark(data["dark/mean"], black, dark_attrs.get("exposure"), dark_attrs.get("sigma"))
+    gain = response.get("gain_e_per_dn")
+    return Response(data["response/F"], data.get("response/covariance"), data["response/wavelength"], data["response/origin"],
+                    tuple(int(n) for n in data["response/window"]), data["grid/valid"].astype(bool), data["response/white"], dark, str(response.get("cfa", "mono")),
+                    str(response.get("units", "DN")), float(levels.get("white", np.inf)), response.get("exposure_s"), None if gain is None else 1 / gain,
+                    float(response.get("read_noise", 0.0)) ** 2)
+
+
+def _values(exposure, c, path):
+    """Superpixel values (R, C, pixel) at the calibration's exposure and (gain, read variance) that hold there (None: unknown)."""
+    from plenocli.sensor.frames import saturated
+    from plenocli.sensor.superpixel import extract
+
+    if exposure.values.shape != c.dark.mean.shape:
+        raise InputError(f"is {exposure.values.shape[0]} x {exposure.values.shape[1]} px, the calibration {c.dark.mean.shape[0]} x {c.dark.mean.shape[1]}", path, "use captures of the calibrated camera")
+    if exposure.cfa != c.cfa:
+        raise InputError(f"has the colour filter array {exposure.cfa}, the calibration {c.cfa}", path, "use captures of the calibrated camera")
+    if exposure.units != c.units:
+        raise InputError(f"is in {exposure.units}, the calibration in {c.units}", path, "make all captures in the same way")
+    if (exposure.seconds is None) != (c.exposure is None):
+        raise InputError("and the calibration do not both know their exposure time", path, "use files of one kind for all captures")
+    scale = 1.0 if c.exposure is None else c.exposure / exposure.seconds
+    signal = (np.asarray(exposure.values, np.float32) - c.dark.at(exposure.seconds)) * np.float32(scale)
+    top = exposure.white if np.isfinite(exposure.white) else c.white_level
+    signal[saturated(exposure.values, exposure.black, top)] = np.nan
+    values = extract(signal, c.origin, c.window)
+    values[~c.valid] = np.nan
+    if exposure.sigma is not None:
+        return values, (0.0, (exposure.sigma * scale) ** 2)
+    gain = c.gain if c.gain is not None else exposure.gain
+    return values, None if gain is None else (gain * scale, c.read_variance * scale**2)
+
+
+def estimate(c, values, noise, method, prior=None):
+    """Radiances and sigmas (R, C, band) of superpixel values (R, C, pixel), with the method used and why.
+
+    Least squares first gives the expected radiance from which the noise of each pixel follows; `auto` compares the mean
+    square errors that the methods predict.
+    """
+    from plenocli.solvers.spectral import choose_pixels, demultiplex
+
+    pixels = choose_pixels(c.response)
+    if noise is None:
+        used = "pinv" if method == "auto" else method
+        value, sigma = demultiplex(c.response, values, used, pixels=pixels)
+        return value, sigma, used, "the sensor's noise is not known" if method == "auto" else "asked for"
+    start, _ = demultiplex(c.response, values, "pinv")
+    variance = _variance(c, start, noise)
+    if method != "auto":
+        value, sigma = demultiplex(c.response, values, method, variance=variance, pixels=pixels, prior=prior)
+        return value, sigma, method, "asked for"
+    tried = {m: demultiplex(c.response, values, m, variance=variance, prior=prior) for m in ("pinv", "wls", *(["lmmse"] if prior else []))}
+    error = {m: float(np.nanmean(sigma**2)) for m, (_, sigma) in tried.items()}
+    error["single-pixel"] = _single_pixel_error(c, pixels, start, noise)
+    least = min(error.values())
+    used = next(m for m in error if error[m] <= WORTHWHILE * least)
+    if used == "single-pixel":
+        tried[used] = demultiplex(c.response, values, used, variance=variance, pixels=pixels)
+    why = "predicted rms error " + ", ".join(f"{m} {np.sqrt(e):.3g}" for m, e in error.items())
+    return *tried[used], used, why
+
+
+def _variance(c, radiance, noise):
+    """Pixel variance (R, C, pixel) float32 in blocks of lenslet rows: shot and read noise, and what F-hat does not know."""
+    from plenocli.solvers.spectral import noise_variance
+
+    radiance = np.nan_to_num(radiance)
+    out = np.empty((*radiance.shape[:2], c.response.shape[-2]), np.float32)
+    for row in range(len(out)):
+        response = c.response if c.response.ndim == 2 else c.response[row]
+        out[row] = noise_variance(response, radiance[row], noise[0], noise[1], c.variance)
+    return np.maximum(out, 1e-12)
+
+
+def _single_pixel_error(c, pixels, radiance, noise):
+    """Mean square error that single-pixel extraction would make: crosstalk bias and the noise of one pixel."""
+    from plenocli.solvers.spectral import single_pixel_bias
+
+    shape = radiance.shape
+    rows = c.response if c.response.ndim > 2 else np.broadcast_to(c.response, (*shape[:2], *c.response.shape))
+    pixels = np.broadcast_to(pixels, shape)
+    bias = single_pixel_bias(rows, pixels, np.nan_to_num(radiance))
+    own = np.take_along_axis(rows, pixels[..., None, :], axis=-2)[..., 0, :]
+    variance = (noise[0] * np.clip(own * radiance, 0, None) + noise[1]) / own**2
+    return float(np.nanmean(np.where(np.isfinite(radiance), bias**2 + variance, np.nan)))
+
+
+def _prior(c):
+    """Mean and covariance of radiance for lmmse: the chart's 24 reflectances under the light of the calibration's white.
+
+    None where the white image cannot tell the light in every band.
+    """
+    from plenocli.scene.statistics import radiance_statistics, reflectance_statistics
+    from plenocli.scene.tables import colorchecker
+    from plenocli.solvers.spectral import demultiplex
+
+    light, _ = demultiplex(c.response, c.white, "pinv")
+    light = np.nanmedian(light.reshape(-1, len(c.wavelengths)), axis=0)
+    if not (np.isfinite(light).all() and (light > 0).all()):
+        return None
+    mean, covariance = reflectance_statistics(colorchecker(c.wavelengths)[2])
+    covariance = covariance + 1e-4 * np.eye(len(mean))  # narrow neighbouring bands are nearly the same number on a chart
+    return radiance_statistics(mean, covariance, light)
+
+
+def _reflectance(value, sigma, white, white_sigma, level):
+    """Ratio to the white reference times its reflectance, with both relative errors."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = np.where(white > 0, white, np.nan)
+        ratio = level * value / known
+        spread = level / known * np.sqrt(sigma**2 + (value / known * white_sigma) ** 2)
+    return ratio, spread
+
+
+def _write(target, wavelengths, value, sigma, attrs, parameters, inputs, overwrite, command):
+    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_spectral_exr
+
+    value, sigma = value.astype(np.float32), sigma.astype(np.float32)
+    if Path(target).suffix == ".h5":
+        data = {"spectra/value": value, "spectra/sigma": sigma, "spectra/wavelength": wavelengths}
+        write_artefact(target, Artefact("spectra", data, {"spectra": attrs | {"parameters": parameters}}, Provenance(command, inputs)), overwrite=overwrite)
+        return
+    import json
+
+    from plenocli.scene.colour import preview_rgb
+
+    whole = np.nan_to_num(value)
+    texts = {"method": attrs["method"], "parameters": json.dumps(parameters, sort_keys=True), "inputs": json.dumps(inputs, sort_keys=True), "command": command}
+    write_spectral_exr(target, wavelengths, value, attrs["quantity"], rgb=preview_rgb(wavelengths, whole), sigma=sigma, attrs=texts, overwrite=overwrite)

@@ -5,23 +5,21 @@ import numpy as np
 from plenocli.operators import BlockToeplitz
 
 
-def superpixel_light(columns, offsets, scene, chunk):
+def superpixel_light(blocks, offsets, scene):
     """Carry a scene to the sensor: (light (lenslet_row, lenslet_column, pixel), white (pixel,)), float64.
 
-    columns: function of a slice of object points -> blocks A_o (lenslet offset, pixel, point in the slice), so that a
-    fine response streams through memory.  offsets (lenslet offset, 2).  scene (lenslet_row, lenslet_column, point)
-    reflectance; beyond the array the object is dark.  white is the superpixel of a uniform white object that goes on
-    beyond the array: a lenslet's own light and all of its neighbours'.
-    Object points add incoherently, each for 1/point of the white object's area (docs/model.md, "The system matrix").
+    blocks: pairs (object points, A_o (lenslet offset, pixel, point)) that cover every point once, so that a fine response
+    streams through memory.  offsets (lenslet offset, 2).  scene (lenslet_row, lenslet_column, point): reflectance; beyond
+    the array the object is dark.  None: no scene, and no light.  white is the superpixel of a uniform white object that
+    goes on beyond the array: a lenslet's own light and all of its neighbours'.
+    Object points add incoherently (docs/model.md, "The system matrix").
     """
-    count, points = scene.shape[:2], scene.shape[2]
     light, white = 0.0, 0.0
-    for start in range(0, points, chunk):
-        part = slice(start, min(start + chunk, points))
-        blocks = columns(part)
-        light = light + BlockToeplitz(blocks, offsets, count).forward(scene[:, :, part])
-        white = white + blocks.sum(axis=(0, 2), dtype=np.float64)
-    return light.astype(np.float64), white
+    for points, block in blocks:
+        if scene is not None:
+            light = light + BlockToeplitz(block, offsets, scene.shape[:2]).forward(scene[:, :, points]).astype(np.float64)
+        white = white + block.sum(axis=(0, 2), dtype=np.float64)
+    return light, white
 
 
 def to_points(picture, samples):

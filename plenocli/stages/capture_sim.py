@@ -1,5 +1,6 @@
 """capture-sim: source -> optics -> detector, one exposure of a plenoptic camera."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,10 +107,10 @@ class _Stored:
     """The response of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
 
     def __init__(self, artefact, band):
-        self.matrix, self.lenslet_offset = artefact.data["pif/A"][band], artefact.data["pif/lenslet_offset"]
+        self.matrix, self.offsets = artefact.data["pif/A"][band], artefact.data["pif/lenslet_offset"]
 
-    def columns(self, points):
-        return self.matrix[:, :, points]
+    def blocks(self, size=None):
+        yield np.arange(self.matrix.shape[2]), self.matrix
 
 
 def _read_pif(path, camera, settings, wavelengths):
@@ -138,29 +139,25 @@ def _read_pif(path, camera, settings, wavelengths):
 
 
 def _carry(camera, source, scene, settings, matrix):
-    """Light on every superpixel by colour letter, the white superpixel by letter, and the object as sampled."""
+    """((letters, light on every superpixel by letter), the white superpixel by letter, the object as sampled)."""
     from plenocli.sensor.cfa import sensitivity
     from plenocli.sensor.irradiance import superpixel_light, to_points
 
     letters, efficiency = sensitivity(camera, source.wavelengths)
-    samples, count = camera.object.samples_per_lenslet, camera.lenslet_array.count
+    count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
     fine = tuple(n * settings.refine for n in samples)
     grid = tuple(n * k for n, k in zip(count, fine))
     finer = camera.replace(**{"object.samples_per_lenslet": fine}) if settings.refine > 1 else camera
-    light, whites, points, drawn = 0.0, 0.0, None, None
+    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
+    light, whites, points = 0.0, 0.0, None
     for index, wavelength in enumerate(bar(source.wavelengths, len(source.wavelengths), "wavelengths")):
         response = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
-        if points is None or scene.spectral:
-            drawn = np.zeros((1, 1)) if scene.uniform else scene.at(wavelength, *grid)
-            points = np.broadcast_to(np.float32(0), (*count, fine[0] * fine[1])) if scene.uniform else to_points(drawn, fine)
-        offsets = response.lenslet_offset
-        pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
-        chunk = max(1, int(settings.mem_limit // 8 // (8 * len(offsets) * pixels)))
+        if not scene.uniform and (points is None or scene.spectral):
+            points = to_points(scene.at(wavelength, *grid), fine)
+        size = max(8, settings.mem_limit // 16 // (8 * len(response.offsets) * pixels))
+        carried, white = superpixel_light(response.blocks(size), response.offsets, points)
         if scene.uniform:
-            white = sum(response.columns(slice(s, s + chunk)).sum(axis=(0, 2), dtype=np.float64) for s in range(0, fine[0] * fine[1], chunk))
             carried = np.broadcast_to(scene.level * white, (*count, pixels))
-        else:
-            carried, white = superpixel_light(response.columns, offsets, points, chunk)
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2
         light = light + weight[:, :, None, None] * carried[None]
         whites = whites + weight * white[None]
@@ -205,14 +202,13 @@ def _detect(camera, light, whites, settings):
         sigma = 0.0
         if settings.snr_db is not None:
             mosaic, sigma = add_white_noise(mosaic, settings.snr_db, rng)
-        capture |= dict(mosaic=mosaic.astype(np.float64), units="relative", black=0.0, snr_db=settings.snr_db, noise_sigma=float(sigma), electrons_per_unit=None)
+        capture |= dict(mosaic=mosaic.astype(np.float64), units="relative", black=0.0, white=float("inf"), snr_db=settings.snr_db, noise_sigma=float(sigma))
         return capture, {"units": "relative", "noise_sigma": float(sigma), "peak": float(mosaic.max())}
     exposure = settings.exposure or camera.light.white_exposure
     scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
     model = SensorModel.from_camera(camera)
     values = model.expose(mosaic * scale, rng)
-    white = 2**sensor.bits - 1
-    capture |= dict(mosaic=values, units="DN", black=float(sensor.black_level), white=float(white), gain_e_per_dn=1 / sensor.gain, exposure_s=exposure,
+    capture |= dict(mosaic=values, units="DN", black=float(sensor.black_level), white=float(model.white_level), gain_e_per_dn=1 / sensor.gain, exposure_s=exposure,
                     electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0))
     saturated = float(np.mean(mosaic * scale >= sensor.full_well))
     if saturated > 0.001:
@@ -233,3 +229,37 @@ def _describe(capture, camera, settings, truth, scene):
         from plenocli.config import parse_length
 
         capture["band_m"] = parse_length(settings.target.removeprefix("mono:"))
+
+
+DATASETS = ("mosaic", "cfa", "scene", "wavelength", "lenslet_centre")
+"""Keys of a capture that are datasets; the others are attributes."""
+
+
+def _write(output, capture, provenance, overwrite):
+    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_dng, write_exr
+
+    attrs = {k: v for k, v in capture.items() if k not in DATASETS and v is not None}
+    if output.suffix == ".h5":
+        data = {f"capture/{k}": v for k, v in capture.items() if k in DATASETS}
+        write_artefact(output, Artefact("capture", data, {"capture": attrs}, Provenance(**provenance)), overwrite=overwrite)
+        return
+    text = json.dumps({"capture": attrs | {"cfa": capture["cfa"]}, "provenance": provenance}, sort_keys=True)
+    if output.suffix == ".exr":
+        write_exr(output, {"Y": capture["mosaic"].astype(np.float32)}, {"plenocli": text}, overwrite=overwrite)
+    else:
+        write_dng(output, capture["mosaic"], cfa=capture["cfa"], black=capture["black"], white=capture["white"],
+                  exposure_s=capture["exposure_s"], xmp_json=text, overwrite=overwrite)
+
+
+def _write_scene(path, truth, camera, provenance, overwrite):
+    """The object as sampled, an `image` artefact or EXR: one picture, or one a band of [light] wavelengths."""
+    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_exr, write_spectral_exr
+
+    path, wavelengths = Path(path), np.array(camera.light.wavelengths[: len(truth)])
+    if path.suffix == ".exr" and len(truth) == 1:
+        write_exr(path, {"Y": truth[0]}, {}, overwrite=overwrite)
+    elif path.suffix == ".exr":
+        write_spectral_exr(path, wavelengths, truth, "reflectance", overwrite=overwrite)
+    else:
+        data = {"image/value": truth[0]} if len(truth) == 1 else {"image/value": truth, "image/wavelength": wavelengths}
+        write_artefact(path, Artefact("image", data, {"image": {"method": "object as sampled"}}, Provenance(**provenance)), overwrite=overwrite)

@@ -4,9 +4,14 @@ from importlib import import_module
 
 _HOMES = {
     "Artefact": "container", "write_artefact": "container", "read_artefact": "container", "cfa_text": "container",
-    "default_mem_limit": "container", "SCHEMAS": "kinds",
+    "default_mem_limit": "limits", "SCHEMAS": "kinds",
     "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "require_file": "provenance",
     "check_output": "atomic", "publish": "atomic",
+    "read_exr": "exr", "write_exr": "exr",
+    "Spectral": "spectral_exr", "read_spectral_exr": "spectral_exr", "write_spectral_exr": "spectral_exr",
+    "Picture": "pictures", "read_picture": "pictures", "srgb_to_linear": "pictures",
+    "Mosaic": "mosaic", "read_mosaic": "mosaic",
+    "write_capture_exr": "mosaic", "write_dng": "dng", "read_raw": "raw",
 }
 __all__ = sorted(_HOMES)
 

@@ -44,17 +44,27 @@ def publish(path, data, *, overwrite=False):
     Raises UsageError if the file exists and `overwrite` is not set, OutputError if it cannot be written; the target is
     then untouched and nothing is left beside it.
     """
+    pieces = [data] if isinstance(data, (bytes, bytearray, memoryview)) else data
+    with replacement(path, overwrite=overwrite) as (_, descriptor):
+        for piece in pieces:
+            _write_all(descriptor, memoryview(piece).cast("B"))
+
+
+@contextlib.contextmanager
+def replacement(path, *, overwrite=False):
+    """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when the block ends well.
+
+    For libraries that write by name; they must write into the file that is there. Errors as `publish`.
+    """
     path = Path(path)
     check_output(path, overwrite=overwrite)
     partial = partial_path(path)
-    pieces = [data] if isinstance(data, (bytes, bytearray, memoryview)) else data
     try:
         descriptor = _open_partial(partial)
     except OSError as error:
         raise OutputError(f"cannot be written ({error.strerror})", path, "check the folder and its permissions") from error
     try:
-        for piece in pieces:
-            _write_all(descriptor, memoryview(piece).cast("B"))
+        yield partial, descriptor
         os.fsync(descriptor)
         if not overwrite and path.exists():
             raise UsageError("appeared while the result was computed", path, "pass --overwrite or choose another name")

@@ -8,7 +8,6 @@ Reading goes the other way: all bytes once, digest, structure, declared sizes, a
 import hashlib
 import io
 import json
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from plenocli import __version__
 from plenocli.artefacts import schema as tables
 from plenocli.artefacts.kinds import SCHEMAS
+from plenocli.artefacts.limits import default_mem_limit
 from plenocli.artefacts.provenance import Provenance, require_file
 from plenocli.artefacts.atomic import publish
 from plenocli.artefacts.structure import attribute_names, read_attribute, survey
@@ -49,11 +49,6 @@ def cfa_text(value):
     """"mono" or four letters from the dataset capture/cfa (0-d or 2x2 array of bytes or str, or already text)."""
     values = np.asarray(value)
     return "".join(v.decode("ascii") if isinstance(v, bytes) else str(v) for v in values.ravel().tolist())
-
-
-def default_mem_limit():
-    """Half of the machine's memory, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
 def write_artefact(path, artefact, *, overwrite=False):

@@ -35,7 +35,8 @@ CAPTURE = Schema("capture", 1, "One exposure of a plenoptic camera, simulated or
     Field("capture/scene", "band scene_row scene_column", "f", "1", "the object as sampled", optional=True),
     Field("capture/wavelength", "band", "f", "m", "wavelengths of capture/scene", optional=True, minimum=0, ascending=True),
 ), attrs={"capture": (
-    Attr("units", "text", "", "DN or electron"),
+    Attr("units", "text", "", "DN, electron, or relative: 1 is the light of a white object point through the clear pupil"),
+    Attr("electrons_per_unit", "number", "e", "electrons for one unit of A x"),
     Attr("black", "number", "units", "level of no light: one number, or 2x2 by position"),
     Attr("white", "number", "units", "saturation level", finite=False),
     Attr("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),

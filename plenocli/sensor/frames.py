@@ -91,6 +91,8 @@ def photon_transfer(first, second, limit=np.inf, bins=24):
         return None
     mean, half = mean[good], half[good]
     edges = np.unique(np.quantile(mean, np.linspace(0, 1, bins + 1)))
+    if len(edges) < 5:
+        return None
     which = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(which, minlength=len(edges) - 1)
     full = count > 50

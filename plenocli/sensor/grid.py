@@ -173,7 +173,9 @@ def _measured_sites(image, basis, kind, pitch):
             break
     index, first, flux = chosen[best], position[best], flux[best]
     surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
-    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope / np.maximum(surface, 1e-9)[:, None])
+    slope = slope / np.maximum(surface, 1e-9)[:, None]
+    slope *= _share_within(image, first, pitch, slope, _whole(first, image.shape, 0.5 * pitch))
+    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope)
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
     if spread > 0.25:
@@ -203,6 +205,35 @@ def _illumination(position, flux, shape, whole):
     right = np.stack([j * u[:, 0] ** i * u[:, 1] ** max(j - 1, 0) for i, j in powers], axis=1) @ fit / size[1]
     surface = np.maximum(design @ fit, 0.05 * np.median(flux))
     return surface, np.stack([down, right], axis=1)
+
+
+def _share_within(image, position, pitch, slope, whole, most=1500):
+    """How much (0..1) of the illumination's gradient across lenslets also holds within a superpixel.
+
+    Light that falls off continuously over the sensor has it all, a vignetting that dims whole superpixels none. The
+    gradient shifts centroids in a large window more than in a small one; the share is the one at which both agree.
+    Where the data cannot tell, it tends to 1.
+    """
+    chosen = np.flatnonzero(whole)
+    chosen = chosen[:: max(1, len(chosen) // most)]
+    if len(chosen) < 9:
+        return 1.0
+    centre, tilt = position[chosen], slope[chosen]
+    plain, tilted = (
+        spots.windowed_centroids(image, centre, pitch, slope=t)[0] - spots.windowed_centroids(image, centre, pitch, slope=t, window=spots.SMALL_WINDOW)[0]
+        for t in (0 * tilt, tilt)
+    )
+    plain = plain - np.median(plain, axis=0)
+    gain = (plain - tilted) - np.median(plain - tilted, axis=0)
+    size = np.hypot(*plain.T)
+    keep = size < 5 * max(np.median(size), 1e-9)
+    energy = (gain[keep] ** 2).sum()
+    if energy == 0:
+        return 1.0
+    share = (gain[keep] * plain[keep]).sum() / energy
+    spread = np.sqrt(((plain[keep] - share * gain[keep]) ** 2).mean() / energy)
+    trust = 1 / max(spread, 1e-6) ** 2
+    return float(np.clip((share * trust + 4.0) / (trust + 4.0), 0, 1))  # 4: a prior of 1 +- 0.5
 
 
 def _whole(position, shape, margin):

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-WINDOW_SIGMA, WINDOW_RADIUS = 0.25, 0.7  # of the pitch; wider windows take in the neighbours
+WINDOW = (0.25, 0.7)  # sigma and radius, of the pitch; wider windows take in the neighbours
+SMALL_WINDOW = (0.17, 0.48)
 CORE_SIGMA = 0.13  # of the pitch: the middle of a spot, which the frame does not cut in a whole cell
 
 
@@ -23,26 +24,26 @@ def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
     return np.argwhere(peak) * float(shrink) + (shrink - 1) / 2
 
 
-def windowed_centroids(image, centres, pitch, slope=None, iterations=3, batch_pixels=3_000_000):
+def windowed_centroids(image, centres, pitch, slope=None, iterations=3, window=WINDOW, batch_pixels=3_000_000):
     """Windowed centroids: where the tapered-Gaussian-weighted first moment vanishes (Newton steps).
 
     image (rows, columns); centres (N, 2) px, first guesses; pitch px; slope: relative illumination gradient
-    (N, 2) per px, divided out of each patch. Where the frame cuts a window, only pixels whose mirror image
+    (N, 2) per px, divided out of each patch; window: sigma and radius in pitches. Where the frame cuts a window, only pixels whose mirror image
     about the centre is also in the frame count, so that a cut does not pull.
     Returns positions (N, 2) px and flux (N,): mean of the middle of the spot.
     """
     image = np.ascontiguousarray(image, np.float32)
     centres = np.array(centres, float)
-    half = int(np.ceil(WINDOW_RADIUS * pitch)) + 1
+    half = int(np.ceil(window[1] * pitch)) + 1
     flux = np.zeros(len(centres))
     batch = max(1, batch_pixels // (2 * half + 1) ** 2)
     for start in range(0, len(centres), batch):
         part = slice(start, start + batch)
-        centres[part], flux[part] = _newton(image, centres[part], pitch, half, None if slope is None else slope[part], iterations)
+        centres[part], flux[part] = _newton(image, centres[part], pitch, half, None if slope is None else slope[part], iterations, window)
     return centres, flux
 
 
-def _newton(image, centre, pitch, half, slope, iterations):
+def _newton(image, centre, pitch, half, slope, iterations, window):
     first = np.rint(centre).astype(int)
     reach = np.arange(-half, half + 1)
     line = [np.clip(first[:, axis, None] + reach, 0, image.shape[axis] - 1) for axis in (0, 1)]
@@ -51,7 +52,7 @@ def _newton(image, centre, pitch, half, slope, iterations):
         tilt = 1 + slope[:, 0, None, None] * reach[None, :, None] + slope[:, 1, None, None] * reach[None, None, :]
         patch = patch / np.maximum(tilt, 0.2).astype(np.float32)
     offset = centre - first
-    variance, radius = (WINDOW_SIGMA * pitch) ** 2, WINDOW_RADIUS * pitch
+    variance, radius = (window[0] * pitch) ** 2, window[1] * pitch
     for _ in range(iterations):
         arms = [reach - offset[:, axis, None] for axis in (0, 1)]
         weights, slopes = [], []

@@ -7,5 +7,7 @@ SHELL := bash
 P := plenocli
 RUN ?= runs/experiment
 
-$(RUN) $(RUN)/%/:
+$(RUN):
+	@mkdir -p $@
+$(RUN)/%/:
 	@mkdir -p $@

@@ -56,7 +56,7 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
         black, found["white"] = np.broadcast_to(np.asarray(notes["black"], dtype=float), (2, 2)).copy(), notes["white"]
     else:
         _check_plausible(path, values, black, found["white"])
-    exposure = found["exposure_s"] or found["exif"].get("exposure_s") or notes.get("exposure_s")
+    exposure = notes.get("exposure_s") or found["exposure_s"] or found["exif"].get("exposure_s")
     gain = notes.get("gain_e_per_dn")
     meta = {key: found[key] for key in ("full_shape", "camera_white", "iso", "f_number", "focal_length_m") if found.get(key)}
     meta |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}

@@ -8,7 +8,7 @@ from plenocli.cli import options
 @click.command("capture-sim", short_help="Simulate a capture of a scene or a calibration target.")
 @options.input_path("camera")
 @click.option("--scene", metavar="SCENE", help="Photograph, spectral EXR, image .h5, skimage:astronaut (a photograph that ships with scikit-image) or colorchecker.")
-@click.option("--target", metavar="TARGET", help="Instead of a scene: white, dark, mono:450nm (white under narrow-band light) or colorchecker.")
+@click.option("--target", metavar="TARGET", help="Instead of a scene: white (a reference of reflectance 0.99), dark, mono:450nm (the reference under narrow-band light) or colorchecker.")
 @options.output
 @click.option("--pif", type=options.FILE, help="Use this system matrix instead of computing one.")
 @click.option("--snr", "snr_db", type=options.DECIBEL, help="White noise of this signal-to-noise ratio, such as 60dB, instead of the sensor's own: sigma^2 = mean(y^2) 10^(-SNR/10).")

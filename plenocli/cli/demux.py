@@ -3,6 +3,7 @@
 import click
 
 from plenocli.cli import options
+from plenocli.config import REFERENCE_REFLECTANCE
 
 
 @click.command("demux", short_help="Recover band radiances or reflectances per lenslet from captures.")
@@ -11,7 +12,7 @@ from plenocli.cli import options
 @click.option("--method", type=click.Choice(["auto", "pinv", "single-pixel", "wls", "lmmse", "nnls"]), default="auto", show_default=True,
               help="auto takes the one with the least predicted error and says so.")
 @click.option("--reference", type=options.FILE, help="Capture of a white reference: the result is reflectance instead of radiance.")
-@click.option("--reference-reflectance", type=options.FRACTION, default=0.99, show_default=True, help="Reflectance of that white reference.")
+@click.option("--reference-reflectance", type=options.FRACTION, default=REFERENCE_REFLECTANCE, show_default=True, help="Reflectance of that white reference.")
 @click.option("--format", "suffix", type=click.Choice(["exr", "h5"]), default="exr", show_default=True, help="File type when OUT is a folder.")
 @options.output
 @options.workers

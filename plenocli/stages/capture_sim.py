@@ -78,7 +78,7 @@ def _check_tiling(camera, where):
 
 def _source(camera, settings, scene):
     """(Quadrature of the light, scene) from --target and --scene."""
-    from plenocli.config import parse_length
+    from plenocli.config import REFERENCE_REFLECTANCE, parse_length
     from plenocli.config.units import UnitError
     from plenocli.scene.tables import illuminant
     from plenocli.sensor.light import broadband, broadened, has_colour, narrow_band
@@ -96,8 +96,8 @@ def _source(camera, settings, scene):
             centre = parse_length(target.removeprefix("mono:"))
         except UnitError as error:
             raise UsageError(str(error), "--target", "write for example mono:450nm") from None
-        return narrow_band(centre, settings.bandwidth), Uniform(1.0)
-    scenes = {"white": Uniform(1.0), "dark": Uniform(0.0), "colorchecker": Chart()}
+        return narrow_band(centre, settings.bandwidth), Uniform(REFERENCE_REFLECTANCE)
+    scenes = {"white": Uniform(REFERENCE_REFLECTANCE), "dark": Uniform(0.0), "colorchecker": Chart()}
     if target not in scenes:
         raise UsageError(f"unknown target {target!r}", "--target", "choose white, dark, mono:450nm or colorchecker")
     return white, scenes[target]
@@ -236,19 +236,19 @@ DATASETS = ("mosaic", "cfa", "scene", "wavelength", "lenslet_centre")
 
 
 def _write(output, capture, provenance, overwrite):
-    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_dng, write_exr
+    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_capture_exr, write_dng
 
     attrs = {k: v for k, v in capture.items() if k not in DATASETS and v is not None}
     if output.suffix == ".h5":
         data = {f"capture/{k}": v for k, v in capture.items() if k in DATASETS}
         write_artefact(output, Artefact("capture", data, {"capture": attrs}, Provenance(**provenance)), overwrite=overwrite)
         return
-    text = json.dumps({"capture": attrs | {"cfa": capture["cfa"]}, "provenance": provenance}, sort_keys=True)
     if output.suffix == ".exr":
-        write_exr(output, {"Y": capture["mosaic"].astype(np.float32)}, {"plenocli": text}, overwrite=overwrite)
+        words = {name: value for name, value in attrs.items() if value != float("inf")}
+        write_capture_exr(output, capture["mosaic"], words | {"cfa": capture["cfa"]}, attrs={"plenocli:provenance": json.dumps(provenance, sort_keys=True)}, overwrite=overwrite)
     else:
-        write_dng(output, capture["mosaic"], cfa=capture["cfa"], black=capture["black"], white=capture["white"],
-                  exposure_s=capture["exposure_s"], xmp_json=text, overwrite=overwrite)
+        write_dng(output, capture["mosaic"], cfa=capture["cfa"], black=capture["black"], white=capture["white"], exposure_s=capture["exposure_s"],
+                  xmp_json=attrs | {"provenance": provenance}, overwrite=overwrite)
 
 
 def _write_scene(path, truth, camera, provenance, overwrite):

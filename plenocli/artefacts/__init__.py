@@ -8,7 +8,7 @@ _HOMES = {
     "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "require_file": "provenance",
     "check_output": "atomic", "publish": "atomic",
     "read_exr": "exr", "write_exr": "exr",
-    "Spectral": "spectral_exr", "read_spectral_exr": "spectral_exr", "write_spectral_exr": "spectral_exr",
+    "Spectral": "spectral_exr", "read_spectral_exr": "spectral_exr", "write_spectral_exr": "spectral_exr", "is_spectral": "spectral_exr",
     "Picture": "pictures", "read_picture": "pictures", "srgb_to_linear": "pictures",
     "Mosaic": "mosaic", "read_mosaic": "mosaic",
     "write_capture_exr": "mosaic", "write_dng": "dng", "read_raw": "raw",

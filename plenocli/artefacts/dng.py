@@ -30,8 +30,8 @@ def write_dng(path, mosaic, *, cfa, black, white, exposure_s=None, iso=None, xmp
     """Write a sensor mosaic as DNG; `rawpy` reads the same numbers back.
 
     mosaic: (row, column) unsigned integers below 65536. cfa: "mono" or four letters, row by row. black: DN, one number or
-    2x2 by position. white: saturation level, DN. exposure_s: s. xmp_json: JSON-able dict or JSON text kept in the XMP packet;
-    the SHA-256 of the mosaic is added to it as "mosaic_sha256".
+    2x2 by position. white: saturation level, DN. exposure_s: s. xmp_json: JSON-able dict or JSON text kept in the XMP packet
+    (attributes of a capture artefact by their names, "provenance"); black, white and the mosaic's SHA-256 are added to it.
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
     values = np.asarray(mosaic)

@@ -21,7 +21,8 @@ class Mosaic:
     """values: (row, column) as stored. cfa: "mono" or four letters, row by row. black: (2, 2) by position, and white: in the
     units of the values ("DN", "electron" or "relative"); white is inf where nothing saturates. gain: DN/e or None.
     exposure_s: s or None. band_m: centre of the narrow band that lit the scene, m, or None.
-    source: "raw", "dng", "image", "capture" or "exr"."""
+    source: "raw", "dng", "image", "capture" or "exr". meta: whatever else the file says; a simulated capture's attributes
+    by their names, whatever the file."""
 
     values: np.ndarray
     cfa: str = "mono"
@@ -50,7 +51,7 @@ def read_mosaic(path, *, cfa=None, luminance=False, mem_limit=None):
         found.cfa = cfa or "mono"
     elif kind == "jpeg":
         raise InputError("is a JPEG: its values were demosaiced, bent and compressed", path, "give the RAW, a PNG or a TIFF of the sensor")
-    elif _is_hdf5(path):
+    elif is_hdf5(path):
         found = _from_capture(path, mem_limit)
     else:
         found = Mosaic(**read_raw(path, mem_limit=mem_limit), source="dng" if kind == "tiff" and path.suffix.lower() == ".dng" else "raw")
@@ -70,7 +71,7 @@ def write_capture_exr(path, mosaic, description, *, attrs=None, overwrite=False)
     write_exr(path, {"Y": np.asarray(mosaic)}, {CAPTURE: text, **(attrs or {})}, overwrite=overwrite)
 
 
-def _is_hdf5(path):
+def is_hdf5(path):
     from plenocli.artefacts.container import HDF5_SIGNATURE, MAGIC
 
     with open(path, "rb") as stream:
@@ -91,8 +92,8 @@ def _from_exr(path, mem_limit):
     if set(channels) != {"Y"} and len(channels) != 1:
         raise InputError(f"has {len(channels)} channels ({', '.join(list(channels)[:6])}), a mosaic has one", path, "give a capture")
     try:
-        description = json.loads(attrs.get(CAPTURE, "{}"))
-    except ValueError as error:
+        description = dict(json.loads(attrs.get(CAPTURE, "{}")))
+    except (TypeError, ValueError) as error:
         raise InputError(f"has a broken attribute {CAPTURE}", path, "make it again") from error
     return _described(path, next(iter(channels.values())), description, "exr")
 

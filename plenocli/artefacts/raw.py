@@ -60,8 +60,7 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
     gain = notes.get("gain_e_per_dn")
     meta = {key: found[key] for key in ("full_shape", "camera_white", "iso", "f_number", "focal_length_m") if found.get(key)}
     meta |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}
-    meta |= {"notes": notes} if notes else {}
-    meta["verified"] = bool(notes)
+    meta |= {key: value for key, value in notes.items() if key != "mosaic_sha256"} | {"verified": bool(notes)}
     return {"values": values, "cfa": cfa, "black": black, "white": float(found["white"]), "exposure_s": exposure or None,
             "gain": 1 / gain if gain else None, "band_m": notes.get("band_m"), "meta": meta}
 

@@ -45,7 +45,7 @@ def read_result(path, kinds=("image", "spectra", "dictionary"), mem_limit=None):
         raise InputError(
             f"is {path.suffix or 'a file without a suffix'}, not a result", path, "give an image, spectra or dictionary as .h5, or an .exr"
         )
-    return _from_exr(path)
+    return _from_exr(path, mem_limit)
 
 
 def _from_artefact(path, kinds, mem_limit):
@@ -63,18 +63,19 @@ def _from_artefact(path, kinds, mem_limit):
     return Result(path.stem, kind, values, data["wavelength"] if values.ndim == 3 else None, data["sigma"], str(attrs.get("quantity", "")), attrs)
 
 
-def _from_exr(path):
-    from plenocli.artefacts import read_exr, read_picture, read_spectral_exr
+def _from_exr(path, mem_limit):
+    from plenocli.artefacts import read_exr, read_spectral_exr
+    from plenocli.artefacts.spectral_exr import is_spectral
 
-    picture = read_picture(path)
-    if picture.is_spectral:
-        spectral = read_spectral_exr(path)
+    if is_spectral(path):
+        spectral = read_spectral_exr(path, mem_limit=mem_limit)
         values = np.asarray(spectral.values, dtype=np.float64)
         return Result(path.stem, "spectra", values, np.asarray(spectral.wavelengths), spectral.sigma, spectral.quantity, dict(spectral.attrs))
-    values = np.asarray(picture.values, dtype=np.float64)
-    if values.ndim == 3 and values.shape[2] != 1:
-        raise InputError(f"has {values.shape[2]} channels and no wavelengths", path, "give a picture with channel Y, or a spectral EXR")
-    return Result(path.stem, "image", values.reshape(values.shape[:2]), attrs=dict(read_exr(path)[1]))
+    channels, attrs = read_exr(path, mem_limit=mem_limit)
+    if "Y" not in channels and len(channels) != 1:
+        raise InputError(f"has the channels {', '.join(channels)} and no wavelengths", path, "give a picture with channel Y, or a spectral EXR")
+    values = channels.get("Y", next(iter(channels.values())))
+    return Result(path.stem, "image", np.asarray(values, dtype=np.float64), attrs=dict(attrs))
 
 
 def read_truth(truth, result, sampling="fit"):

@@ -145,7 +145,7 @@ def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ra
         if values is not None:
             left.legend(loc="lower left")
         energy = np.asarray(column_energy)[0].reshape(object_shape) * 100
-        show_map(right, energy, f"light on the superpixels kept, {nanometres(wavelengths[0])}", "share of a point's light [%]", cmap=LEVEL_MAP)
+        show_map(right, energy, f"light on the superpixels kept, {nanometres(wavelengths[0])}", "share of a point's light [%]", cmap=LEVEL_MAP, vmin=0, vmax=100)
         right.set(xlabel="object point, column", ylabel="object point, row")
     return made.png
 
@@ -179,8 +179,8 @@ def reconstructions(entries, truth, columns=4):
             image = below.imshow(error, cmap=SIGN_MAP, vmin=-top, vmax=top)
             bare(below)
         if image is not None:
-            bar = made.figure.colorbar(image, ax=panels[1, 0], orientation="horizontal", fraction=0.06, location="top")
-            bar.set_label("error, result - truth [of white]")
+            bar = made.figure.colorbar(image, cax=panels[1, 0].inset_axes([0.04, 0.8, 0.92, 0.05]), orientation="horizontal")
+            bar.set_label("error: result - truth\n(white = 1)")
             bar.outline.set_linewidth(0.4)
     return made.png
 
@@ -222,7 +222,7 @@ def picture(values, title=""):
 def method_bars(documents):
     """PSNR of every method, one colour an experiment: documents is a sequence of (name, entries of a score document)."""
     methods = list(dict.fromkeys(entry["label"] for _, entries in documents for entry in entries))
-    with drawing(8.2, 0.62 + (0.24 * len(documents) + 0.16) * len(methods)) as made:
+    with drawing(8.2, 0.95 + (0.24 * len(documents) + 0.16) * len(methods)) as made:
         axes = made.figure.subplots()
         thick = 0.8 / len(documents)
         low = high = None
@@ -245,7 +245,7 @@ def method_bars(documents):
         axes.set(xlabel="PSNR [dB], peak 1.0, whole picture", xlim=(min(0, low or 0), (high or 1) * 1.08))
         axes.grid(True, axis="x")
         axes.tick_params(axis="y", length=0)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.42 / (0.62 + 0.3 * len(methods)) - 0.08), ncols=3)
+made.figure.legend(loc="outside lower center", ncols=3)
     return made.png
 
 

@@ -1,0 +1,82 @@
+"""A page in one file: headings, text, tables and pictures (inside, as base64), all text escaped."""
+
+import base64
+import html
+from pathlib import Path
+
+
+class Page:
+    """Collects blocks in order; `render` gives the HTML. Texts are plain text, never markup."""
+
+    def __init__(self, title, lead=""):
+        self._title, self._lead, self._blocks, self._sections = title, lead, [], []
+
+    def section(self, title, text=""):
+        """A numbered-by-order main section with an entry in the list at the top."""
+        self._sections.append(title)
+        self._blocks.append(f'<h2 id="s{len(self._sections)}">{html.escape(title)}</h2>')
+        self.text(text)
+
+    def heading(self, title, text=""):
+        """A heading below a section."""
+        self._blocks.append(f"<h3>{html.escape(title)}</h3>")
+        self.text(text)
+
+    def text(self, text):
+        """One paragraph; nothing for an empty text."""
+        if text:
+            self._blocks.append(f"<p>{html.escape(text)}</p>")
+
+    def warning(self, text):
+        """A paragraph that stands out."""
+        self._blocks.append(f'<p class="warning">{html.escape(text)}</p>')
+
+    def cards(self, cards):
+        """Headline numbers: a sequence of (value, what it is)."""
+        if cards:
+            boxes = "".join(f'<div class="card"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>' for value, what in cards)
+            self._blocks.append(f'<div class="cards">{boxes}</div>')
+
+    def figure(self, png, caption=""):
+        """A picture with its caption, which is also its description for those who cannot see it."""
+        if png:
+            data = base64.b64encode(png).decode("ascii")
+            width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
+            self._blocks.append(
+                f'<figure><img src="data:image/png;base64,{data}" width="{width * 100 // 130}" height="{height * 100 // 130}" alt="{html.escape(caption or "picture")}">'
+                f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            )
+
+    def table(self, header, rows, caption="", best=None, text=False):
+        """A table of text cells. best: row number -> set of columns set in bold. text: cells are words, aligned left."""
+        best = best or {}
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+        body = "".join(
+            "<tr>" + "".join(f"<td{' class=best' if column in best.get(number, ()) else ''}>{html.escape(cell)}</td>" for column, cell in enumerate(row)) + "</tr>"
+            for number, row in enumerate(rows)
+        )
+        legend = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+        kind = ' class="text"' if text else ""
+        self._blocks.append(f'<div class="scroll"><table{kind}>{legend}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+
+    def definitions(self, entries, summary="What the numbers mean"):
+        """Terms and what they mean, folded away: dict term -> text."""
+        if entries:
+            inner = "".join(f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>" for term, text in entries.items())
+            self._blocks.append(f"<details><summary>{html.escape(summary)}</summary><dl>{inner}</dl></details>")
+
+    def code(self, text, summary):
+        """Text in a fixed-width block, folded away."""
+        self._blocks.append(f"<details><summary>{html.escape(summary)}</summary><pre>{html.escape(text)}</pre></details>")
+
+    def render(self):
+        """The page as text. The same blocks give the same bytes."""
+        style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+        links = "".join(f'<a href="#s{i}">{html.escape(title)}</a>' for i, title in enumerate(self._sections, start=1))
+        nav = f"<nav>{links}</nav>" if len(self._sections) > 1 else ""
+        lead = f'<p class="lead">{html.escape(self._lead)}</p>' if self._lead else ""
+        return (
+            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{html.escape(self._title)}</title>\n<style>\n{style}</style></head>\n<body><main>\n"
+            f"<h1>{html.escape(self._title)}</h1>\n{lead}{nav}\n" + "\n".join(self._blocks) + "\n</main></body></html>\n"
+        )

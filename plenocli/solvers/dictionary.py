@@ -1,0 +1,201 @@
+"""Dictionary learning for incoherent sampling (Berkner et al. 2013, Fig. 4, Algorithm 1), made sound.
+
+Each iteration draws a batch X of clean training patches, measures them with noise, Y = A X + n, codes Y sparsely with
+D = A Phi, and then refits Phi to the clean patches: min (1/B)|X - Phi C|^2 + delta |A Phi|^2, columns normalised.
+A is scaled to unit spectral norm and x lies in [0, 1]: lambda and delta mean nothing before that. Where the paper is
+silent or its pseudo-code does not work:
+- atom 0 is constant and free of the penalty (nearly all light is in the mean, which the total flux fixes well); all other
+  atoms have zero mean, so that it is not learnt over and over;
+- the dictionary step is solved in closed form (a Sylvester equation), and its normal equations are checked;
+- atoms that no patch of the batch used are replaced by training patches;
+- iteration i draws from its own random stream, so a resumed run equals an uninterrupted one bit for bit;
+- progress is measured on a fixed validation batch, since each iteration has another objective.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from plenocli.solvers.l1 import sparse_code
+from plenocli.solvers.natural import draw_patches
+
+HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "coherence_mean", "coherence_max", "worst_gap", "step_residual")
+"""After each iteration: validation objective (mean over patches), validation PSNR (dB, peak 1), share of atoms replaced, mean
+number of penalised atoms in use, |Phi - previous Phi|_F over kept atoms, mean and largest |cosine| of two columns of
+A Phi (kept atoms), largest relative duality gap, relative residual of the dictionary step's normal equations."""
+
+_DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """lam, delta: weights in the scaled problem (see `Learner`).  batch: patches an iteration (the paper: at least 4 per
+    atom).  snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.  initial: patches, random or pca."""
+
+    atoms: int
+    batch: int
+    lam: float
+    delta: float
+    snr_db: float
+    seed: int = 0
+    initial: str = "patches"
+    validation: int = 256
+    tol: float = 1e-4
+
+
+@dataclass
+class State:
+    """What a resumed run needs: iterations done, atoms (point, atom) float64 of unit norm, history name -> list of floats."""
+
+    iteration: int
+    atoms: np.ndarray
+    history: dict = field(default_factory=lambda: {name: [] for name in HISTORY})
+
+    def save(self):
+        """{name: array}, from which `State.load` restores the same state bit for bit."""
+        return {"iteration": np.array(self.iteration), "atoms": self.atoms.astype(np.float64)} | {
+            f"history_{name}": np.array(values, np.float64) for name, values in self.history.items()}
+
+    @classmethod
+    def load(cls, fields):
+        history = {name: np.asarray(fields[f"history_{name}"]).tolist() for name in HISTORY}
+        return cls(int(fields["iteration"]), np.array(fields["atoms"], np.float64), history)
+
+
+class Learner:
+    """Algorithm 1 for one system matrix and one set of training images.
+
+    svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which everything is divided.
+    training, held_out: lists of 2-D linear images in [0, 1]; validation patches come from `held_out` (other scenes).
+    object_shape: points (rows, columns) of a patch.  A appears only as S V^T / scale acting on patches: U^T y carries all
+    that least squares can see, and noise in it is as white as in y, so it is drawn there.
+    """
+
+    def __init__(self, svd, object_shape, training, held_out, settings, *, workers=None):
+        self.svd, self.object_shape, self.training = svd, tuple(object_shape), training
+        self.settings, self.workers, self.scale = settings, workers, float(svd.s[0])
+        kept = svd.rank()
+        self.seen = (svd.s[:kept, None] / self.scale) * svd.vt[:kept]
+        self.pixels = svd.u.shape[0]
+        if settings.atoms < 2 or settings.batch < 1:
+            raise ValueError("a dictionary needs at least two atoms and a batch of one")
+        rng = np.random.default_rng([settings.seed, _DRAW_VALIDATION])
+        self.validation = draw_patches(held_out, self.object_shape, settings.validation, rng)
+        self.measured, self.sigma = self.measure(self.validation, rng)
+        self._step_basis = None
+
+    def measure(self, patches, rng):
+        """(noisy U^T A X / scale, sigma) of patches (point, count)."""
+        clean = self.seen @ patches
+        sigma = np.sqrt(np.sum(clean**2) / (self.pixels * patches.shape[1]) * 10 ** (-self.settings.snr_db / 10))
+        return clean + sigma * rng.standard_normal(clean.shape), float(sigma)
+
+    def start(self):
+        """The state before the first iteration."""
+        rng = np.random.default_rng([self.settings.seed, _DRAW_START])
+        points, count = self.seen.shape[1], self.settings.atoms - 1
+        if self.settings.initial == "random":
+            atoms = rng.uniform(-0.5, 0.5, (points, count))
+        else:
+            atoms = draw_patches(self.training, self.object_shape, max(count, 2 * points if self.settings.initial == "pca" else 0), rng)
+            if self.settings.initial == "pca":
+                centred = atoms - atoms.mean(axis=0)
+                basis = np.linalg.svd(centred, full_matrices=False)[0][:, : points - 1]
+                atoms = np.concatenate([basis, centred], axis=1)[:, :count]
+            elif self.settings.initial != "patches":
+                raise ValueError(f"unknown start {self.settings.initial!r}")
+        return State(0, _with_constant(_unit(atoms, rng)))
+
+    def code(self, atoms, measured, tol=None):
+        """Sparse code (SparseCode) of measured patches with the atoms; atom 0 is free."""
+        return sparse_code(self.seen @ atoms, measured, self.settings.lam, free=[0], tol=tol or self.settings.tol, workers=self.workers)
+
+    def step(self, state):
+        """One iteration; `state` is left as it was."""
+        settings = self.settings
+        rng = np.random.default_rng([settings.seed, _DRAW_ITERATION, state.iteration])
+        patches = draw_patches(self.training, self.object_shape, settings.batch, rng)
+        measured, _ = self.measure(patches, rng)
+        code = self.code(state.atoms, measured)
+        refitted, residual = self._refit(patches, code.c[1:])
+        norm = np.linalg.norm(refitted, axis=0)
+        dead = (np.count_nonzero(code.c[1:], axis=1) == 0) | (norm < 1e-9)
+        fresh = draw_patches(self.training, self.object_shape, int(dead.sum()), rng) if dead.any() else np.zeros((len(refitted), 0))
+        refitted[:, dead] = fresh
+        atoms = _with_constant(_unit(refitted, rng))
+        after = State(state.iteration + 1, atoms, {k: list(v) for k, v in state.history.items()})
+        self._record(after, state, np.concatenate([[False], dead]), float(code.gap.max()), residual)
+        return after
+
+    def validate(self, atoms):
+        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
+        code = self.code(atoms, self.measured)
+        error = np.mean((atoms @ code.c - self.validation) ** 2)
+        return float(code.objective.mean()), float(-10 * np.log10(error)), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+
+    def _record(self, after, before, dead, gap, residual):
+        objective, quality, nonzeros, worst = self.validate(after.atoms)
+        largest, mean = effective_coherence(self.seen @ after.atoms[:, 1:])
+        change = float(np.linalg.norm((after.atoms - before.atoms)[:, ~dead]))
+        values = (objective, quality, float(dead[1:].mean()), nonzeros, change, mean, largest, max(gap, worst), residual)
+        for name, value in zip(HISTORY, values):
+            after.history[name].append(value)
+
+    def _refit(self, patches, c):
+        """Zero-mean atoms (point, atom - 1) of the closed-form dictionary step, and its relative residual."""
+        from scipy.sparse import csr_array
+
+        if self._step_basis is None:
+            centred = self.seen - self.seen.mean(axis=1, keepdims=True)
+            energy, basis = np.linalg.eigh(centred.T @ centred)
+            # the constant is an eigenvector with eigenvalue 0, but so may others be: take it out by hand
+            self._step_basis = np.maximum(energy, 0), basis
+        sparse = csr_array(c)
+        gram = (sparse @ sparse.T).toarray() / patches.shape[1]
+        right = (sparse @ (patches - patches.mean(axis=0)).T).T / patches.shape[1]
+        return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
+
+
+def dictionary_step(energy, basis, gram, right, delta):
+    """(Phi, residual): the minimum of (1/B)|X - Phi C|^2 + delta |A Phi|^2, in closed form.
+
+    Its normal equations are the Sylvester equation delta Q Phi + Phi (G + e I) = R with Q = A^T A = basis diag(energy) basis^T,
+    G = C C^T / B `gram`, R = X C^T / B `right`, and a ridge e = 1e-6 tr(G) / atoms that keeps it solvable where atoms are not
+    used. residual: |left - right|_F / |R|_F; above 1e-8 is NumericsError.
+    """
+    from plenocli.errors import NumericsError
+
+    ridge = max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
+    use, directions = np.linalg.eigh(gram)
+    use = np.maximum(use, 0) + ridge
+    inner = (basis.T @ (right @ directions)) / (delta * energy[:, None] + use[None, :])
+    atoms = basis @ inner @ directions.T
+    left = delta * (basis @ (energy[:, None] * (basis.T @ atoms))) + atoms @ gram + ridge * atoms
+    residual = float(np.linalg.norm(left - right) / max(np.linalg.norm(right), np.finfo(float).tiny))
+    if not residual <= 1e-8:
+        raise NumericsError(f"the dictionary step solves its equations only to {residual:.1e}", fix="use a larger --batch or another --delta")
+    return atoms, residual
+
+
+def effective_coherence(d):
+    """(largest, mean) |cosine| between two columns of D; columns of zero norm are left out."""
+    norm = np.linalg.norm(d, axis=0)
+    unit = d[:, norm > 0] / norm[norm > 0]
+    cosine = np.abs(unit.T @ unit)
+    np.fill_diagonal(cosine, 0)
+    count = len(cosine)
+    return (float(min(cosine.max(), 1.0)), float(cosine.sum() / (count * (count - 1)))) if count > 1 else (0.0, 0.0)
+
+
+def _unit(atoms, rng):
+    """Zero-mean atoms of unit norm; flat ones become random ones."""
+    atoms = atoms - atoms.mean(axis=0)
+    flat = np.linalg.norm(atoms, axis=0) < 1e-6 * np.sqrt(len(atoms))
+    if flat.any():
+        atoms[:, flat] = rng.standard_normal((len(atoms), int(flat.sum())))
+        atoms[:, flat] -= atoms[:, flat].mean(axis=0)
+    return atoms / np.linalg.norm(atoms, axis=0)
+
+
+def _with_constant(atoms):
+    return np.concatenate([np.full((len(atoms), 1), 1 / np.sqrt(len(atoms))), atoms], axis=1)

@@ -245,7 +245,7 @@ def method_bars(documents):
         axes.set(xlabel="PSNR [dB], peak 1.0, whole picture", xlim=(min(0, low or 0), (high or 1) * 1.08))
         axes.grid(True, axis="x")
         axes.tick_params(axis="y", length=0)
-made.figure.legend(loc="outside lower center", ncols=3)
+        made.figure.legend(loc="outside lower center", ncols=3)
     return made.png
 
 

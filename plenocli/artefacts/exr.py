@@ -41,11 +41,11 @@ def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip")
 
         output = oiio.ImageOutput.create("exr")
         if output is None or not output.open(str(partial), spec):
-            raise OutputError(f"OpenEXR cannot write it ({_error(output)})", path, "check the folder and the space left")
+            raise OutputError(f"OpenEXR cannot write it ({oiio_error(output)})", path, "check the folder and the space left")
         written = output.write_image(pixels)
         closed = output.close()
         if not (written and closed):
-            raise OutputError(f"OpenEXR could not write all of it ({_error(output)})", path, "free some space; nothing was changed")
+            raise OutputError(f"OpenEXR could not write all of it ({oiio_error(output)})", path, "free some space; nothing was changed")
         _verify_header(path, partial, names, attrs, compression)
 
 
@@ -59,7 +59,7 @@ def read_exr(path, *, mem_limit=None):
         _check_header(path, source, spec, mem_limit)
         pixels = source.read_image("float")
         if pixels is None:
-            raise InputError(f"is damaged: {_error(source)}", path, "make or copy it again")
+            raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
         attrs = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
         pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
         channels = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)}
@@ -132,7 +132,7 @@ def _verify_header(path, partial, names, attrs, compression):
 
     source = oiio.ImageInput.open(str(partial))
     if source is None:
-        raise OutputError(f"cannot be read back ({_error(None)})", path, "free some space; nothing was changed")
+        raise OutputError(f"cannot be read back ({oiio_error(None)})", path, "free some space; nothing was changed")
     spec = source.spec()
     back = {a.name: a.value for a in spec.extra_attribs}
     source.close()
@@ -162,14 +162,14 @@ def _opened(path):
     except UnicodeDecodeError:
         source = None
     if source is None or source.format_name() != "openexr":
-        raise InputError(f"is no readable EXR: {_error(source)}", path, "make or copy it again")
+        raise InputError(f"is no readable EXR: {oiio_error(source)}", path, "make or copy it again")
     try:
         yield source
     except UnicodeDecodeError as error:
         raise InputError("is damaged: an attribute or channel name is not text", path, "make or copy it again") from error
     finally:
         source.close()
-        _error(source)  # an error never fetched is printed when the process ends
+        oiio_error(source)  # an error never fetched is printed when the process ends
 
 
 def _check_header(path, source, spec, mem_limit):
@@ -187,12 +187,16 @@ def _check_header(path, source, spec, mem_limit):
         raise InputError("holds integer channels, which have no unit", path, "keep only half and float channels")
     if source.seek_subimage(1, 0):
         raise InputError("holds several parts", path, "split it into one file a part")
-    _error(source)
+    oiio_error(source)
     source.seek_subimage(0, 0)
 
 
-def _error(handle):
+def oiio_error(handle):
+    """The pending message of an OpenImageIO object (or of the library, for None), in one line; fetching clears it."""
     import OpenImageIO as oiio
 
-    own = handle.geterror() if handle is not None else ""
-    return (own or oiio.geterror()).strip().replace("\n", "; ")
+    try:
+        own = handle.geterror() if handle is not None else ""
+        return (own or oiio.geterror()).strip().replace("\n", "; ")
+    except UnicodeDecodeError:  # the message quotes a name that is not text
+        return "a name in its header is not text"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.artefacts.exr import oiio_error
 from plenocli.artefacts.limits import require_room
 from plenocli.artefacts.provenance import require_file
 from plenocli.errors import InputError
@@ -74,14 +75,14 @@ def read_stored(path, kind, mem_limit=None):
     settings.attribute("oiio:UnassociatedAlpha", 1)  # else colours come multiplied with alpha
     source = oiio.ImageInput.open(str(Path(path)), settings)
     if source is None or source.format_name() != kind:
-        raise InputError(f"is no readable {kind.upper()}: {_error(source)}", path, "make or copy it again")
+        raise InputError(f"is no readable {kind.upper()}: {oiio_error(source)}", path, "make or copy it again")
     try:
         spec = source.spec()
         if spec.depth > 1 or spec.nchannels > 8:
             raise InputError(f"has {spec.depth} layers and {spec.nchannels} channels", path, "give a flat picture")
         require_room(path, spec.width * spec.height * spec.nchannels * (spec.format.size() + 4), mem_limit)
         values = source.read_image(spec.format)
-        trouble = _error(source)
+        trouble = oiio_error(source)
         if values is None or trouble:
             raise InputError(f"is damaged: {trouble}", path, "make or copy it again")
         values = np.asarray(values).reshape(spec.height, spec.width, spec.nchannels)
@@ -92,7 +93,7 @@ def read_stored(path, kind, mem_limit=None):
         return values, list(spec.channelnames), bits if values.dtype.kind == "u" else container
     finally:
         source.close()
-        _error(source)
+        oiio_error(source)
 
 
 def _from_exr(path, mem_limit):
@@ -113,9 +114,3 @@ def _finite(path, values):
     if not np.isfinite(values).all():
         raise InputError(f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite", path, "mend or crop it")
     return values
-
-
-def _error(handle):
-    import OpenImageIO as oiio
-
-    return ((handle.geterror() if handle is not None else "") or oiio.geterror()).strip().replace("\n", "; ")

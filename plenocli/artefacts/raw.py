@@ -53,16 +53,14 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
     black = np.array(found["black"])[np.clip(np.array(found.get("indices", [[0, 0], [0, 0]])), 0, 3)] if cfa != "mono" else np.full((2, 2), found["black"][0])
     notes = _own_notes(path, pixels)
     if notes:
-        black, found["white"] = np.broadcast_to(np.asarray(notes["black"], dtype=float), (2, 2)).copy(), notes["white"]
+        black, found["white"] = np.broadcast_to(np.asarray(notes["black"]), (2, 2)).astype(float), notes["white"]
     else:
         _check_plausible(path, values, black, found["white"])
-    exposure = notes.get("exposure_s") or found["exposure_s"] or found["exif"].get("exposure_s")
-    gain = notes.get("gain_e_per_dn")
     meta = {key: found[key] for key in ("full_shape", "camera_white", "iso", "f_number", "focal_length_m") if found.get(key)}
     meta |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}
     meta |= {key: value for key, value in notes.items() if key != "mosaic_sha256"} | {"verified": bool(notes)}
-    return {"values": values, "cfa": cfa, "black": black, "white": float(found["white"]), "exposure_s": exposure or None,
-            "gain": 1 / gain if gain else None, "band_m": notes.get("band_m"), "meta": meta}
+    return {"values": values, "cfa": cfa, "black": black, "white": float(found["white"]), "exposure_s": notes.get("exposure_s") or _exposure(found),
+            "gain": 1 / notes["gain_e_per_dn"] if notes.get("gain_e_per_dn") else None, "band_m": notes.get("band_m"), "meta": meta}
 
 
 def _from_child(path, limit, timeout_s):
@@ -109,9 +107,18 @@ def _own_notes(path, pixels):
     notes = read_notes(path)
     if "mosaic_sha256" not in notes:
         return {}
-    if notes["mosaic_sha256"] != hashlib.sha256(pixels).hexdigest() or not {"black", "white"} <= set(notes):
+    if notes["mosaic_sha256"] != hashlib.sha256(pixels).hexdigest():
         raise InputError("is damaged or was edited: its mosaic is not the one it was written with", path, "make it again")
+    numbers = [notes.get("white"), *np.ravel(notes.get("black")), *(notes[k] for k in ("exposure_s", "gain_e_per_dn", "band_m") if notes.get(k) is not None)]
+    if np.size(notes.get("black")) not in (1, 4) or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in numbers):
+        raise InputError("is damaged or was edited: its XMP notes hold no levels", path, "make it again")
     return notes
+
+
+def _exposure(found):
+    """Exposure time, s, or None: the exact fraction of the EXIF tag where it agrees with LibRaw's single precision."""
+    exact, rounded = found["exif"].get("exposure_s"), found["exposure_s"]
+    return exact if exact and (not rounded or abs(exact / rounded - 1) < 1e-3) else rounded or None
 
 
 def _check_plausible(path, values, black, white):

@@ -130,11 +130,11 @@ def _artefact_lines(report):
 def _raw_lines(report):
     black = report["black"]
     unit = {"exposure_s": "s", "f_number": "", "focal_length_m": "m", "iso": ""}
-    lines = [f"  camera    {report['camera'] or 'unknown'}", f"  cfa       {report['cfa']}",
-             f"  black     {black[0][0]:g} {black[0][1]:g} / {black[1][0]:g} {black[1][1]:g} DN (rows of the 2x2 cell)", f"  white     {report['white']:g} DN"]
-    lines += [f"  {name:<9} {'unknown' if report[name] is None else f'{report[name]:.6g} {label}'.rstrip()}" for name, label in unit.items()]
-    lines.append(f"  zeros     {report['zeros']:.3%}, saturated {report['saturated']:.3%}")
-    lines += [f"  {name:<9} {_range(entry)}" for name, entry in report["positions"].items()]
+    lines = [f"  camera         {report['camera'] or 'unknown'}", f"  cfa            {report['cfa']}",
+             f"  black          {black[0][0]:g} {black[0][1]:g} / {black[1][0]:g} {black[1][1]:g} DN (rows of the 2x2 cell)", f"  white          {report['white']:g} DN"]
+    lines += [f"  {name:<14} {'unknown' if report[name] is None else f'{report[name]:.6g} {label}'.rstrip()}" for name, label in unit.items()]
+    lines.append(f"  zeros          {report['zeros']:.3%}, saturated {report['saturated']:.3%}")
+    lines += [f"  {name:<14} {_range(entry)}" for name, entry in report["positions"].items()]
     return lines
 
 

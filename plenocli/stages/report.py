@@ -1,0 +1,293 @@
+"""report: one page about everything that lies in a run folder."""
+
+import numpy as np
+
+from plenocli.errors import PlenoError
+from plenocli.report.page import Page
+from plenocli.report.score_page import add_dictionary, add_reconstructions, add_spectra, add_table
+from plenocli.stages.run_folder import RunFolder
+from plenocli.stages.score_inputs import block_of, read_result, read_truth
+
+_CAPTURES = 3  # drawn in a section; the rest are listed
+_SPECTRA = 4
+
+
+def run_report(folder, output, *, title=None, overwrite=False):
+    """Write one self-contained page about a run folder; returns a summary dict.
+
+    InputError where the folder holds nothing to show. Files that cannot be read are named on the page and in the summary.
+    """
+    from plenocli.artefacts import check_output, publish
+
+    check_output(output, overwrite=overwrite)
+    run = RunFolder(folder)
+    page = Page(title or f"plenocli report: {run.root.resolve().name}", "A plenoptic camera modelled end to end: what it captured, what was recovered, and how good that is.")
+    scores = run.of_kind("score")
+    spatial = [file for file in scores if _of_pictures(file)]
+    spectral = [file for file in scores if _of_bands(file)]
+    page.cards(_headlines(spatial, spectral))
+    for name, problem in run.unreadable:
+        page.warning(f"{name} could not be read: it {problem}.")
+    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral)]
+    _files(page, run)
+    publish(output, page.render().encode(), overwrite=overwrite)
+    return {"output": str(output), "files": len(run.files), "unreadable": [name for name, _ in run.unreadable], "scores": len(scores),
+            "sections": [name for name in sections if name]}
+
+
+def _of_pictures(file):
+    return any("psnr_db" in entry["metrics"] and not entry.get("wavelengths_nm") for entry in file.content["results"])
+
+
+def _of_bands(file):
+    return any(entry.get("wavelengths_nm") for entry in file.content["results"])
+
+
+def _headlines(spatial, spectral):
+    """The best number of each experiment."""
+    cards = []
+    for file in spatial:
+        best = max((e for e in file.content["results"] if e["metrics"].get("psnr_db") is not None), key=lambda e: e["metrics"]["psnr_db"], default=None)
+        if best:
+            cards.append((f"{best['metrics']['psnr_db']:.2f} dB", f"best PSNR, {best['label']} ({file.path.stem})"))
+    entries = [e for file in spectral for e in file.content["results"]]
+    errors = [(e["metrics"].get("six_patch_rmse", e["metrics"].get("rmse")), e) for e in entries]
+    errors = [(value, e) for value, e in errors if value is not None]
+    if errors:
+        value, entry = min(errors, key=lambda pair: pair[0])
+        cards.append((f"{value:.4f}", f"least RMSE in reflectance, {entry['label']}"))
+    ratios = [(e["metrics"]["snr_capture_mean_db"], e) for e in entries if e["metrics"].get("snr_capture_mean_db") is not None]
+    if ratios:
+        value, entry = max(ratios, key=lambda pair: pair[0])
+        cards.append((f"{value:.1f} dB", f"best capture SNR, mean of bands, {entry['label']}"))
+    return cards
+
+
+# --- spatial -----------------------------------------------------------------------------------------------------------
+
+def _spatial(page, run, scores):
+    """The section about pictures; returns its name, or None where there is nothing to show."""
+    from plenocli.report.pictures import method_bars
+
+    images = [file for file in run.of_kind("image") if not any(user.kind == "capture" for user in run.users(file))]
+    # What an image came from directly is a picture's matrix or capture; without images, whatever no calibration used.
+    direct = {digest for file in (*images, *run.of_kind("dictionary")) for digest in file.sources.values()}
+    calibrated = {digest for file in (*run.of_kind("calibration"), *run.of_kind("spectra")) for digest in file.sources.values()}
+    matrices = [f for f in run.of_kind("pif") if f.digest in direct] or [f for f in run.of_kind("pif") if not any(u.digest in calibrated for u in run.users(f))]
+    captures = [f for f in run.of_kind("capture") if f.digest in direct or f.digest not in calibrated]
+    if not (scores or images or matrices or run.of_kind("dictionary") or captures):
+        return None
+    page.section("Spatial", "Wave optics carries each object point through main lens and lenslet to the pixels behind it: one column of the system matrix A. "
+                            "Inverting A gives more object points than there are lenslets.")
+    if scores:
+        page.figure(method_bars([(file.path.stem, [e for e in file.content["results"] if e["metrics"].get("psnr_db") is not None]) for file in scores]),
+                    "Quality of every method; the dashed line is the PSNR of one value a lenslet.")
+    for file in scores:
+        page.heading(file.name.removesuffix(".json"), file.command)
+        add_table(page, file.content)
+        _drawn_results(page, run, file)
+    scored = {digest for file in scores for digest in file.sources.values()}
+    _alone(page, [file for file in images if file.digest not in scored])
+    if captures:
+        page.heading("Captures")
+    for file in captures[:_CAPTURES]:
+        _capture(page, run, file)
+    for file in matrices[:2]:
+        _matrix(page, file)
+    for file in run.of_kind("dictionary"):
+        _dictionary(page, run, file)
+    return "Spatial"
+
+
+def _drawn_results(page, run, file):
+    """Pictures of the results of a score document, as far as they still lie in the folder."""
+    truth = run.by_digest(file.sources.get("truth"))
+    digests = [file.sources.get(f"result {number}") for number in range(1, len(file.content["results"]) + 1)]
+    pairs = []
+    for entry, digest in zip(file.content["results"], digests, strict=True):
+        found = run.by_digest(digest)
+        if found is None or truth is None or found.kind != "image":
+            continue
+        try:
+            result = read_result(found.path)
+            if result.wavelengths is None:
+                pairs.append((entry, {"result": result, "truth": read_truth(truth.path, result), "block": block_of(result, truth.path)}))
+        except PlenoError as error:
+            page.warning(str(error))
+    for shape in dict.fromkeys(pair[1]["truth"].shape for pair in pairs):
+        add_reconstructions(page, [pair for pair in pairs if pair[1]["truth"].shape == shape])
+
+
+def _alone(page, files):
+    """Reconstructions that nobody scored, real captures' for instance."""
+    from plenocli.report.pictures import picture
+
+    for file in files[:6]:
+        result = read_result(file.path)
+        if result.wavelengths is None:
+            page.figure(picture(result.values, file.name), f"{file.name}{': ' + result.method if result.method else ''}; no truth to compare with.")
+
+
+def _capture(page, run, file):
+    """One capture with its lenslet grid."""
+    from plenocli.artefacts import read_mosaic
+    from plenocli.report.pictures import capture_picture
+
+    try:
+        mosaic = read_mosaic(file.path)
+    except PlenoError as error:
+        page.warning(str(error))
+        return
+    centres = pitch = None
+    if file.kind == "capture" and file.path.suffix == ".h5":
+        centres = file.artefact().data.get("capture/lenslet_centre")
+    calibration = next((u for u in run.users(file) if u.kind == "calibration"), None) or next(
+        (run.by_digest(d) for u in run.users(file) for d in u.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "calibration"), None)
+    if centres is None and calibration is not None:
+        centres = calibration.artefact().data["grid/centre"]
+    shape = mosaic.meta.get("superpixel_shape")
+    if centres is None and shape is not None:
+        pitch = tuple(float(n) for n in np.ravel(shape))
+    words = [file.name, mosaic.meta.get("target"), None if mosaic.cfa == "mono" else f"colour filter array {mosaic.cfa}",
+             None if not mosaic.exposure_s else f"exposure {mosaic.exposure_s * 1e3:g} ms", None if not mosaic.band_m else f"{mosaic.band_m * 1e9:g} nm light"]
+    page.figure(capture_picture(mosaic.values, mosaic.units, centres, pitch, float(np.mean(mosaic.black))), ", ".join(str(w) for w in words if w) + ".")
+
+
+def _matrix(page, file):
+    from plenocli.report.pictures import matrix_summary, pif_columns
+
+    artefact = file.artefact()
+    data, attrs = artefact.data, artefact.attrs.get("pif", {})
+    shape = tuple(int(n) for n in data["pif/object_shape"])
+    page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.command)
+    bands, lenslets, pixels, points = data["pif/A"].shape
+    facts = [("bands x superpixels x pixels x object points", f"{bands} x {lenslets} x {pixels} x {points}")]
+    facts += [(label, _text(attrs[name])) for name, label in (
+        ("rank", "numerical rank"), ("condition", "condition number"), ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
+        ("coherent_ring", "rings of neighbours added coherently"), ("kappa", "kappa [1/m]"), ("model", "propagation")) if name in attrs]
+    page.table(["", ""], [list(fact) for fact in facts], text=True)
+    page.figure(pif_columns(data["pif/A"][0], tuple(int(n) for n in data["pif/pixel_shape"]), shape, data["pif/lenslet_offset"]),
+                "What the sensor sees of single object points, one panel a point, square-root scale. Panels stand as the points' images do on the lenslet.")
+    page.figure(matrix_summary(data.get("pif/singular_values"), data["pif/column_energy"], data["pif/wavelength"], shape, attrs.get("rank")),
+                "Left: how many object patterns the sensor tells apart, and how well. Right: light that stays on the superpixels kept.")
+
+
+def _text(value):
+    if isinstance(value, (list, tuple, np.ndarray)):
+        values = np.ravel(value)
+        return _text(values[0]) if values.size == 1 else f"{_text(values.min())} to {_text(values.max())}"
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def _dictionary(page, run, file):
+    from plenocli.report.pictures import learning_history
+
+    artefact = file.artefact()
+    page.heading(f"Dictionary {file.name.removesuffix('.h5')}", file.command)
+    attrs = artefact.attrs.get("dictionary", {})
+    rows = [[name.replace("_", " "), _text(value)] for name, value in attrs.items() if isinstance(value, (int, float, np.number)) and not isinstance(value, bool)]
+    page.table(["", ""], rows, text=True)
+    matrix = next((run.by_digest(d) for d in file.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "pif"), None)
+    system = pixel_shape = None
+    if matrix is not None:
+        pif = matrix.artefact()
+        own = np.flatnonzero((np.asarray(pif.data["pif/lenslet_offset"]) == 0).all(axis=1))
+        system, pixel_shape = pif.data["pif/A"][0, own[0] if own.size else 0], tuple(int(n) for n in pif.data["pif/pixel_shape"])
+        if system.shape[1] != artefact.data["dictionary/atoms"].shape[0]:
+            system = None
+    add_dictionary(page, file.name, read_result(file.path), system, pixel_shape)
+    history = {key.rsplit("/", 1)[1]: values for key, values in artefact.data.items() if key.startswith("dictionary/history/")}
+    page.figure(learning_history(history), "How learning went.")
+
+
+# --- spectral ----------------------------------------------------------------------------------------------------------
+
+def _spectral(page, run, scores):
+    """The section about spectra; returns its name, or None where there is nothing to show."""
+    calibrations, spectra = run.of_kind("calibration"), run.of_kind("spectra")
+    if not (scores or calibrations or spectra):
+        return None
+    page.section("Spectral", "Filters in the pupil of the main lens send each band to its own pixels behind a lenslet. The response F, measured under "
+                             "narrow-band light, is inverted for every lenslet.")
+    for folder in dict.fromkeys(file.folder for file in scores):
+        _merged_scores(page, run, [file for file in scores if file.folder == folder])
+    scored = {digest for file in scores for digest in file.sources.values()}
+    _bands_alone(page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)])
+    for file in calibrations:
+        _calibration(page, file)
+    sources = {digest for file in (*calibrations, *spectra) for digest in file.sources.values()}
+    captures = sorted((f for f in run.of_kind("capture") if f.digest in sources), key=lambda f: ("chart" not in f.name, "white" not in f.name, f.name))
+    if captures:
+        page.heading("Captures")
+    for file in captures[:_CAPTURES]:
+        _capture(page, run, file)
+    return "Spectral"
+
+
+def _merged_scores(page, run, files):
+    """All score documents of one folder in one table and one set of bars."""
+    results = [entry for file in files for entry in file.content["results"] if entry.get("wavelengths_nm")]
+    document = {"results": results, "definitions": {name: text for file in files for name, text in file.content["definitions"].items()}}
+    add_table(page, document)
+    digests = [file.sources.get(f"result {number}") for file in files for number, entry in enumerate(file.content["results"], start=1) if entry.get("wavelengths_nm")]
+    pairs = []
+    for entry, digest in zip(results, digests, strict=True):
+        found = run.by_digest(digest)
+        if found is not None and len(pairs) < _SPECTRA:
+            pairs.append((entry, {"result": read_result(found.path)}))
+    add_spectra(page, document, pairs)
+
+
+def _is_white(run, file):
+    return any(role.startswith("white") and digest == file.digest for user in run.users(file) for role, digest in user.sources.items())
+
+
+def _bands_alone(page, files):
+    from plenocli.report.spectral_pictures import band_pictures
+
+    for file in files[:_SPECTRA]:
+        result = read_result(file.path)
+        page.figure(band_pictures(result.values, result.wavelengths, result.quantity or "value"), f"{file.name}: one value a lenslet and band; not scored.")
+
+
+def _calibration(page, file):
+    from plenocli.report.spectral_pictures import calibration_picture, response_picture
+
+    artefact = file.artefact()
+    data, attrs = artefact.data, artefact.attrs
+    page.heading(f"Calibration {file.name.removesuffix('.h5')}", file.command)
+    grid, response = attrs.get("grid", {}), attrs.get("response", {})
+    rows = [[label, _listed(of[name])] for of, name, label in (
+        (grid, "lattice", "lattice"), (grid, "pitch", "pitch, rows and columns [px]"), (grid, "angle", "rotation [deg]"), (grid, "rms", "rms distance from the lattice [px]"),
+        (grid, "lenslets", "lenslets"), (response, "condition", "median condition number of F")) if name in of]
+    page.table(["", ""], rows, text=True)
+    page.figure(calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual")), "The lenslet grid found on the white image.")
+    if "response/F" not in data:
+        return
+    values, window, wavelengths = data["response/F"], tuple(int(n) for n in data["response/window"]), data["response/wavelength"]
+    if values.ndim == 4:
+        seen = np.argwhere(np.isfinite(values).all(axis=(2, 3)) & data["grid/valid"].astype(bool))
+        if not len(seen):
+            return
+        row, col = seen[np.argmin(((seen - np.array(values.shape[:2]) / 2) ** 2).sum(axis=1))]
+        values = values[row, col]
+    page.figure(response_picture(values, window, wavelengths), f"Response F of the lenslet in the middle [{response.get('units', 'DN')} for unit relative radiance]: pixels that answer to each band.")
+
+
+def _listed(value):
+    return " x ".join(f"{v:.5g}" for v in np.ravel(value)) if not isinstance(value, (str, int, float)) else _text(value)
+
+
+# --- files -------------------------------------------------------------------------------------------------------------
+
+def _files(page, run):
+    """Every file with the command that made it, and the configurations."""
+    page.section("Files and provenance", "Artefacts carry the SHA-256 of their inputs; every one listed here was verified when this page was made.")
+    rows = [[file.name, file.kind, file.digest[:12], file.command] for file in run.files]
+    page.table(["file", "kind", "SHA-256", "made by"], rows, text=True)
+    configs = {}
+    for file in run.files:
+        if file.config:
+            configs.setdefault(file.config, []).append(file.name)
+    for config, names in configs.items():
+        page.code(config, f"Camera of {', '.join(names[:4])}{' and others' if len(names) > 4 else ''}")

@@ -13,12 +13,13 @@ SAME_EXPOSURE = 0.01
 @dataclass(frozen=True)
 class Dark:
     """What the sensor reports without light. mean (rows, columns) DN at `exposure` s (None: unknown); black (2, 2) DN;
-    sigma: temporal noise of one frame, DN (None: no dark frame was given)."""
+    sigma: temporal noise of one frame, DN (None: no dark frame was given). variance: of the mean itself, DN^2."""
 
     mean: np.ndarray
     black: np.ndarray
     exposure: float | None
     sigma: float | None
+    variance: float = 0.0
 
     def at(self, exposure):
         """Expected dark image at another exposure: the part above the black level grows with time."""
@@ -50,7 +51,8 @@ def make_dark(frames, exposures, black, shape):
     else:
         low, high = np.percentile((mean - tiled(black, shape))[::3, ::3], [15.87, 84.13])
         spread = float(high - low) / 2
-    return Dark(mean, np.asarray(black, float), longest, max(spread, 1 / np.sqrt(12)))
+    spread = max(spread, 1 / np.sqrt(12))
+    return Dark(mean, np.asarray(black, float), longest, spread, spread**2 / len(chosen))
 
 
 def saturated(values, black, white):
@@ -66,7 +68,7 @@ def merge(frames, exposures, dark, white, reference):
 
     sum of (frame - dark) over sum of exposures, saturated pixels left out: the least-noise average of shot-limited
     frames. exposures: s each, or all None (taken as equal). weight (rows, columns): good exposure time in units of
-    `reference`; the variance of the signal is (gain signal + read variance / mean share of time) / weight.
+    `reference`: the variance of the signal is (gain signal + read variance) / weight for frames near that exposure.
     """
     total, time = 0.0, 0.0
     for frame, exposure in zip(frames, exposures):

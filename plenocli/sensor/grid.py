@@ -12,6 +12,8 @@ import numpy as np
 from plenocli.errors import InputError, NumericsError
 from plenocli.sensor import distortion, lattice, spots
 
+CLIP = 0.8  # of a spot's bright level; measured best on real white images, where spots have structure inside
+FRAME_TOLERANCE = 0.4  # px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
 FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
 
 
@@ -175,7 +177,7 @@ def _measured_sites(image, basis, kind, pitch):
     surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
     slope = slope / np.maximum(surface, 1e-9)[:, None]
     slope *= _share_within(image, first, pitch, slope, _whole(first, image.shape, 0.5 * pitch))
-    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope)
+    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope, clip=CLIP)
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
     if spread > 0.25:
@@ -237,7 +239,8 @@ def _share_within(image, position, pitch, slope, whole, most=1500):
 
 
 def _whole(position, shape, margin):
-    return ((position >= margin - 0.5) & (position <= np.array(shape) - 0.5 - margin)).all(axis=-1)
+    low = margin - 0.5 - FRAME_TOLERANCE
+    return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
 
 
 def _assemble(kind, model, vectors, strength, index, position, miss, clean, shape, pitch):

@@ -24,11 +24,12 @@ def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
     return np.argwhere(peak) * float(shrink) + (shrink - 1) / 2
 
 
-def windowed_centroids(image, centres, pitch, slope=None, iterations=3, window=WINDOW, batch_pixels=3_000_000):
+def windowed_centroids(image, centres, pitch, slope=None, iterations=3, window=WINDOW, clip=None, batch_pixels=3_000_000):
     """Windowed centroids: where the tapered-Gaussian-weighted first moment vanishes (Newton steps).
 
     image (rows, columns); centres (N, 2) px, first guesses; pitch px; slope: relative illumination gradient
-    (N, 2) per px, divided out of each patch; window: sigma and radius in pitches. Where the frame cuts a window, only pixels whose mirror image
+    (N, 2) per px, divided out of each patch; window: sigma and radius in pitches; clip: cut patches at
+    this share of their own bright level, which makes edges count more than what a superpixel shows inside. Where the frame cuts a window, only pixels whose mirror image
     about the centre is also in the frame count, so that a cut does not pull.
     Returns positions (N, 2) px and flux (N,): mean of the middle of the spot.
     """
@@ -39,11 +40,11 @@ def windowed_centroids(image, centres, pitch, slope=None, iterations=3, window=W
     batch = max(1, batch_pixels // (2 * half + 1) ** 2)
     for start in range(0, len(centres), batch):
         part = slice(start, start + batch)
-        centres[part], flux[part] = _newton(image, centres[part], pitch, half, None if slope is None else slope[part], iterations, window)
+        centres[part], flux[part] = _newton(image, centres[part], pitch, half, None if slope is None else slope[part], iterations, window, clip)
     return centres, flux
 
 
-def _newton(image, centre, pitch, half, slope, iterations, window):
+def _newton(image, centre, pitch, half, slope, iterations, window, clip):
     first = np.rint(centre).astype(int)
     reach = np.arange(-half, half + 1)
     line = [np.clip(first[:, axis, None] + reach, 0, image.shape[axis] - 1) for axis in (0, 1)]
@@ -51,6 +52,10 @@ def _newton(image, centre, pitch, half, slope, iterations, window):
     if slope is not None:
         tilt = 1 + slope[:, 0, None, None] * reach[None, :, None] + slope[:, 1, None, None] * reach[None, None, :]
         patch = patch / np.maximum(tilt, 0.2).astype(np.float32)
+    if clip is not None:
+        positive = np.maximum(patch, 0)
+        level = np.einsum("nyx,nyx->n", positive, positive) / np.maximum(positive.sum(axis=(1, 2)), 1e-20)
+        patch = np.minimum(patch, (clip * level)[:, None, None].astype(np.float32))
     offset = centre - first
     variance, radius = (window[0] * pitch) ** 2, window[1] * pitch
     for _ in range(iterations):

@@ -7,10 +7,16 @@ def windows(centres, shape):
     """First pixel (R, C, 2) int of windows of `shape` (rows, columns) px centred nearest to `centres` (R, C, 2).
 
     Pixel centres are at integers: an even window is centred half a pixel after its middle pixel's corner, so a
-    centre at 25.5 with 52 rows starts at row 0. Sites without a centre (NaN) start at a large negative number.
+    centre at 25.5 with 52 rows starts at row 0. On a lattice of whole-pixel pitch all centres sit at the same place
+    within a pixel; there all windows take the same rounding, lest noise decide it for each. Sites without a centre (NaN) start at a large negative number.
     """
     centres = np.asarray(centres, float)
-    first = np.rint(centres - (np.asarray(shape) - 1) / 2 + 1e-9)
+    corner = centres - (np.asarray(shape) - 1) / 2
+    for axis in (0, 1):
+        turns = np.exp(2j * np.pi * corner[..., axis][np.isfinite(corner[..., axis])])
+        if turns.size and np.abs(turns.mean()) > 0.95:
+            corner[..., axis] -= np.angle(turns.mean()) / (2 * np.pi)
+    first = np.rint(corner)
     return np.where(np.isfinite(first), first, -(2**30)).astype(int)
 
 

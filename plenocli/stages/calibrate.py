@@ -18,12 +18,12 @@ class Noise:
     source: str
 
 
-def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, lattice="auto", overwrite=False, command=""):
+def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, lattice="auto", cfa=None, overwrite=False, command=""):
     """Calibrate and write `output`; returns a summary dict.
 
     whites, darks: paths. bands: (wavelength m, path) pairs, several a band allowed. radiances: (wavelength m, relative
     radiance of that source) pairs, 1 where not given. camera: TOML for gain and read noise. shared: one F for all
-    lenslets. Errors: InputError for files, NumericsError where there is no lattice or no light.
+    lenslets. cfa: colour filter array of PNG and TIFF mosaics (default: the camera's, else mono). Errors: InputError for files, NumericsError where there is no lattice or no light.
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.config import load_camera
@@ -33,9 +33,10 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
     check_output(output, overwrite=overwrite, inputs=[*whites, *darks, camera, *(path for _, path in bands)])
     description = load_camera(camera) if camera else None
-    white = read_exposures(whites)
-    dark_frames = read_exposures(darks, white[0])
-    band_frames = {wavelength: read_exposures([p for w, p in bands if w == wavelength], white[0]) for wavelength in dict.fromkeys(w for w, _ in bands)}
+    cfa = cfa or (description.sensor.cfa if description else None)
+    white = read_exposures(whites, cfa=cfa)
+    dark_frames = read_exposures(darks, white[0], cfa)
+    band_frames = {wavelength: read_exposures([p for w, p in bands if w == wavelength], white[0], cfa) for wavelength in dict.fromkeys(w for w, _ in bands)}
     every = [*white, *(e for group in band_frames.values() for e in group)]
     check_exposure_times(every)
     reference = white[0].seconds
@@ -53,7 +54,7 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     data["dark/mean"] = dark.mean.astype(np.float32)
     merged = {w: merge([e.values for e in group], [e.seconds for e in group], dark, group[0].white, reference) for w, group in band_frames.items()}
     if merged:
-        _response(data, attrs, merged, dict(radiances), bad, noise, shared, grid, white[0].cfa)
+        _response(data, attrs, merged, dict(radiances), bad, noise, dark.variance, shared, grid, white[0].cfa)
     _add_attrs(attrs, white[0], dark, noise, reference, grid)
     report = _report(grid, attrs, data, whites, noise)
     write_artefact(output, Artefact("calibration", data, attrs, Provenance(command, describe_inputs(roles), None, description.text if description else "")), overwrite=overwrite)
@@ -147,7 +148,7 @@ def _mean(cells):
         return (np.where(known, cells, 0).sum(axis=0, dtype=float) / known.sum(axis=0)).astype(np.float32)
 
 
-def _response(data, attrs, merged, radiances, bad, noise, shared, grid, cfa):
+def _response(data, attrs, merged, radiances, bad, noise, dark_variance, shared, grid, cfa):
     """F-hat: each band's signal over the radiance of its source, with its variance (pixel, band), mean over lenslets."""
     from plenocli.sensor.superpixel import extract
     from plenocli.solvers.spectral import choose_pixels, column_angles, condition_number
@@ -164,14 +165,15 @@ def _response(data, attrs, merged, radiances, bad, noise, shared, grid, cfa):
     for k, (wavelength, (signal, weight)) in enumerate(merged.items()):
         energy[k] = next((r for w, r in radiances.items() if abs(w - wavelength) < 1e-12), 1.0)
         cells = extract(np.where(bad, np.nan, signal), origin, window)
+        light = cells[valid][np.isfinite(cells[valid])]
+        if not light.size or light.mean() < 6 * light.std() / np.sqrt(light.size):
+            raise NumericsError(f"the captures at {wavelength * 1e9:g} nm hold no light above the dark level", fix="check that dark and band files are not swapped")
         times = extract(weight.astype(np.float32), origin, window)
         response[..., k] = cells / np.float32(energy[k])
         if noise.gain is not None:
-            single = (noise.gain * np.clip(cells[valid], 0, None) + noise.read_variance) / times[valid]
+            single = (noise.gain * np.clip(cells[valid], 0, None) + noise.read_variance) / times[valid] + dark_variance
             variance[:, k] = _mean(single) / energy[k] ** 2
     response[~valid] = np.nan
-    if not np.nanmax(response, initial=0) > 0:
-        raise NumericsError("the narrow-band captures hold no light", fix="check that dark and band files are not swapped")
     if shared:
         response = _mean(response[valid])
         variance = variance / valid.sum()

@@ -142,7 +142,7 @@ class _Worker:
         return {"auto": "pinv", "lmmse": "wls"}.get(method, method)
 
     def _radiance(self, path, method):
-        exposure = read_exposure(path)
+        exposure = read_exposure(path, cfa=self.calibration.cfa)
         values, noise = _values(exposure, self.calibration, path)
         return estimate(self.calibration, values, noise, method, self.prior)
 
@@ -309,5 +309,12 @@ def _write(target, wavelengths, value, sigma, attrs, parameters, inputs, overwri
     from plenocli.scene.colour import preview_rgb
 
     whole = np.nan_to_num(value)
+    if attrs["quantity"] == "reflectance":
+        rgb = preview_rgb(wavelengths, whole)
+    else:  # no light is taken off: shown under the one that was there
+        rgb = preview_rgb(wavelengths, whole / max(float(whole.max()), 1e-30), "E")
     texts = {"method": attrs["method"], "parameters": json.dumps(parameters, sort_keys=True), "inputs": json.dumps(inputs, sort_keys=True), "command": command}
-    write_spectral_exr(target, wavelengths, value, attrs["quantity"], rgb=preview_rgb(wavelengths, whole), sigma=sigma, attrs=texts, overwrite=overwrite)
+    if attrs["quantity"] == "radiance":
+        texts["emissiveUnits"] = "relative"
+    texts = {name: text for name, text in texts.items() if text}
+    write_spectral_exr(target, wavelengths, value, attrs["quantity"], rgb=rgb, sigma=sigma, attrs=texts, overwrite=overwrite)

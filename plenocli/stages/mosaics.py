@@ -25,11 +25,14 @@ class Exposure:
     sigma: float | None
 
 
-def read_exposure(path, like=None):
-    """Read a capture (.h5, .exr, RAW, DNG, PNG, TIFF). `like`: an Exposure whose size, CFA and units it must share."""
+def read_exposure(path, like=None, cfa=None):
+    """Read a capture (.h5, .exr, RAW, DNG, PNG, TIFF). `like`: an Exposure whose size, CFA and units it must share.
+
+    cfa: what a PNG or TIFF cannot say; other files must agree with it (None: they say it, images are mono).
+    """
     from plenocli.artefacts import read_mosaic
 
-    m = read_mosaic(path)
+    m = read_mosaic(path, cfa=cfa)
     meta = getattr(m, "meta", None) or {}
     sigma = meta.get("noise_sigma")
     white = np.inf if m.white is None or not np.isfinite(m.white) else float(m.white)
@@ -42,11 +45,11 @@ def read_exposure(path, like=None):
     return exposure
 
 
-def read_exposures(paths, like=None):
+def read_exposures(paths, like=None, cfa=None):
     """Several captures of one kind; the first (or `like`) sets size and CFA."""
     out = []
     for path in paths:
-        out.append(read_exposure(path, like or (out[0] if out else None)))
+        out.append(read_exposure(path, like or (out[0] if out else None), cfa))
     return out
 
 

@@ -1,0 +1,132 @@
+"""demux as a batch: folders, reruns, bad files, workers, formats."""
+
+import json
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import Artefact, read_artefact, read_spectral_exr, write_artefact
+from plenocli.cli.main import run
+from plenocli.errors import InputError, NumericsError, UsageError
+from plenocli.stages.calibrate import run_calibrate
+from plenocli.stages.demux import Settings, run_demux
+
+PITCH, COUNT, BANDS = 12, 7, (480e-9, 620e-9)
+
+
+def capture(path, radiance, seed=0, **attrs):
+    """A lenslet image with a left and a right half, one band each with 3 % leak; 2 DN white noise on 100 DN black."""
+    y, x = np.indices((PITCH, PITCH)) - (PITCH - 1) / 2
+    edge = np.clip((5.2 - np.abs(y)) / 1.5, 0, 1) * np.clip((5.2 - np.abs(x)) / 1.5, 0, 1)
+    response = 1000 * edge[..., None] * np.where((x > 0)[..., None] == (np.arange(2) == 1), 0.97, 0.03)
+    radiance = np.broadcast_to(radiance, (COUNT, COUNT, 2))
+    image = np.einsum("rcb,yxb->rycx", radiance, response).reshape(COUNT * PITCH, -1)
+    values = 100 + image + np.random.default_rng(seed).normal(0, 2.0, image.shape)
+    known = dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1) | attrs
+    data = {"capture/mosaic": np.rint(values).clip(0, 4095).astype(np.uint16), "capture/cfa": "mono"}
+    write_artefact(path, Artefact("capture", data, {"capture": {k: v for k, v in known.items() if v is not None}}), overwrite=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demux")
+    white = capture(folder / "white.h5", 1.0, 1)
+    bands = [(w, capture(folder / f"b{k}.h5", np.eye(2)[k], 2 + k)) for k, w in enumerate(BANDS)]
+    calibration = folder / "c.h5"
+    run_calibrate(calibration, whites=[white], bands=bands)
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.1, 0.9, (4, COUNT, COUNT, 2))
+    shots = [capture(folder / f"shot{i}.h5", truth[i], 10 + i) for i in range(4)]
+    return dict(white=white, calibration=calibration, shots=shots, truth=truth)
+
+
+def test_a_folder_of_captures_with_a_bad_one_and_a_rerun(files, tmp_path, capsys):
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(files["shots"][0].read_bytes()[:3000])
+    out = tmp_path / "spectra"
+    arguments = ["demux", str(files["shots"][0]), str(bad), *map(str, files["shots"][1:]), "--calibration", str(files["calibration"]), "--format", "h5", "-o", str(out)]
+    assert run(arguments) == 3
+    err = capsys.readouterr().err
+    assert "bad.h5" in err and "1 of 5 captures failed" in err and "Traceback" not in err
+    assert sorted(p.name for p in out.iterdir()) == [f"shot{i}.h5" for i in range(4)]
+    for i in range(4):
+        value = np.moveaxis(read_artefact(out / f"shot{i}.h5", "spectra").data["spectra/value"], 0, -1)
+        np.testing.assert_allclose(value, files["truth"][i], atol=0.01)
+    before = {p: p.stat().st_mtime_ns for p in out.iterdir()}
+    (out / "shot2.h5").unlink()
+    assert run([a for a in arguments if a != str(bad)] + ["--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["done"], report["skipped"]) == (1, 3)
+    assert all(p.stat().st_mtime_ns == before[p] for p in out.iterdir() if p.name != "shot2.h5")
+
+
+def test_workers_write_the_same_bytes(files, tmp_path):
+    for name, workers in (("one", 1), ("two", 2)):
+        run_demux(files["shots"], tmp_path / name, calibration=files["calibration"], suffix=".h5", workers=workers)
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
+def test_exr_holds_value_and_preview(files, tmp_path):
+    report = run_demux([files["shots"][1]], tmp_path / "s.exr", calibration=files["calibration"], settings=Settings("pinv", files["white"]))
+    found = read_spectral_exr(tmp_path / "s.exr")
+    assert report["captures"][0]["quantity"] == "reflectance"
+    np.testing.assert_allclose(found.wavelengths, BANDS, rtol=1e-9)
+    cube = found.values if hasattr(found, "values") else found.cube
+    np.testing.assert_allclose(np.moveaxis(np.asarray(cube), 0, -1), 0.99 * files["truth"][1], atol=0.012)
+
+
+def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files, tmp_path):
+    report = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])["captures"][0]
+    assert report["method"] == "pinv" and "not known" in report["reason"]
+    data = read_artefact(tmp_path / "s.h5", "spectra").data
+    error = np.moveaxis(data["spectra/value"], 0, -1) - files["truth"][0]
+    assert (error / np.moveaxis(data["spectra/sigma"], 0, -1)).std() == pytest.approx(1, abs=0.25)
+    with pytest.raises(NumericsError, match="noise, which is not known"):
+        run_demux([files["shots"][0]], tmp_path / "w.h5", calibration=files["calibration"], settings=Settings("wls"))
+
+
+def test_captures_of_another_kind_are_refused(files, tmp_path):
+    def attempt(path, match):
+        with pytest.raises(InputError, match=match):
+            run_demux([path], tmp_path / "o.h5", calibration=files["calibration"])
+
+    attempt(capture(tmp_path / "a.h5", 0.5, exposure_s=None), "exposure time")
+    attempt(capture(tmp_path / "b.h5", 0.5, units="electron"), "is in electron")
+    attempt(tmp_path / "missing.h5", "missing.h5")
+    attempt(files["calibration"], "c.h5")
+    big = tmp_path / "big.h5"
+    write_artefact(big, Artefact("capture", {"capture/mosaic": np.full((90, 90), 120, np.uint16), "capture/cfa": "mono"}, {"capture": dict(units="DN", exposure_s=0.1)}))
+    attempt(big, "90 x 90 px, the calibration 84 x 84")
+    assert not (tmp_path / "o.h5").exists()
+
+
+def test_names_that_would_collide_and_wrong_suffixes_are_usage_errors(files, tmp_path):
+    (tmp_path / "x").mkdir()
+    twin = tmp_path / "x" / "shot0.h5"
+    twin.write_bytes(files["shots"][0].read_bytes())
+    with pytest.raises(UsageError, match="would all become"):
+        run_demux([files["shots"][0], twin], tmp_path / "o", calibration=files["calibration"])
+    with pytest.raises(UsageError, match=".exr or .h5"):
+        run_demux([twin], tmp_path / "o.png", calibration=files["calibration"])
+
+
+def test_a_lenslet_cut_by_the_frame_is_masked(files, tmp_path):
+    """The lit array ends at the sensor's edge on all sides here; a grid shifted by half a cell has cut lenslets."""
+    def shifted(path, radiance, seed):
+        whole = read_artefact(capture(path, radiance, seed)).data["capture/mosaic"]
+        cut = np.roll(whole, -6, axis=0)[:-12]
+        attrs = dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1)
+        write_artefact(path, Artefact("capture", {"capture/mosaic": cut, "capture/cfa": "mono"}, {"capture": attrs}), overwrite=True)
+        return path
+
+    white = shifted(tmp_path / "w.h5", 1.0, 1)
+    bands = [(w, shifted(tmp_path / f"b{k}.h5", np.eye(2)[k], 5 + k)) for k, w in enumerate(BANDS)]
+    run_calibrate(tmp_path / "c.h5", whites=[white], bands=bands)
+    run_demux([white], tmp_path / "o.h5", calibration=tmp_path / "c.h5")
+    valid = read_artefact(tmp_path / "c.h5", "calibration").data["grid/valid"]
+    value = read_artefact(tmp_path / "o.h5", "spectra").data["spectra/value"]
+    assert valid.sum() == (COUNT - 2) * COUNT
+    np.testing.assert_array_equal(np.isfinite(value).all(axis=0), valid)
+    np.testing.assert_allclose(value[:, valid], 1.0, atol=0.02)

@@ -62,6 +62,7 @@ def read_exr(path, *, mem_limit=None):
             raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
         attrs = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
         pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
+        "".join([*spec.channelnames, *attrs, *attrs.values()]).encode()  # damaged text may come as lone surrogates
         channels = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)}
     if DIGEST in attrs:
         ours = {name: value for name, value in attrs.items() if name.startswith("plenocli:") or name in _listed(attrs)}
@@ -159,13 +160,13 @@ def _opened(path):
         raise InputError("is not an EXR file", path, "give an .exr")
     try:
         source = oiio.ImageInput.open(str(path))
-    except UnicodeDecodeError:
+    except UnicodeError:
         source = None
     if source is None or source.format_name() != "openexr":
         raise InputError(f"is no readable EXR: {oiio_error(source)}", path, "make or copy it again")
     try:
         yield source
-    except UnicodeDecodeError as error:
+    except UnicodeError as error:
         raise InputError("is damaged: an attribute or channel name is not text", path, "make or copy it again") from error
     finally:
         source.close()

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from plenocli.config.units import UnitError, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number
+from plenocli.config.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number
 
 
 class _Quantity(click.ParamType):
     """A number with its unit, read by one of the parsers of plenocli.config.units."""
 
-    def __init__(self, name, parse, minimum=None, exclusive=False):
-        self.name, self._parse, self._minimum, self._exclusive = name, parse, minimum, exclusive
+    def __init__(self, name, parse, minimum=None, exclusive=False, show=lambda value: format(value, ".12g")):
+        self.name, self._parse, self._minimum, self._exclusive, self.show = name, parse, minimum, exclusive, show
 
     def convert(self, value, param, ctx):
         if not isinstance(value, str):
@@ -28,10 +28,10 @@ class _Quantity(click.ParamType):
         return number
 
 
-LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True)
-DECIBEL = _Quantity("decibel", parse_decibel)
+LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True, show=lambda value: format_length(value).replace(" ", ""))
+DECIBEL = _Quantity("decibel", parse_decibel, show=lambda value: f"{value:.12g}dB")
 BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)
-DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True)
+DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True, show=lambda value: format_duration(value).replace(" ", ""))
 POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True)
 NON_NEGATIVE = _Quantity("number", parse_number, 0.0)
 FRACTION = click.FloatRange(0.0, 1.0, min_open=True)
@@ -96,13 +96,9 @@ def command_line(ctx):
         source = ctx.get_parameter_source(parameter.name)
         if source is None or source.name == "DEFAULT" or parameter.name in _UNRECORDED:
             continue
-        values = value if isinstance(value, (list, tuple)) and parameter.multiple or parameter.nargs == -1 else [value]
-        for one in values:
-            text = _word(one)
-            if isinstance(parameter, click.Argument):
-                words.append(text)
-            else:
-                words.append(parameter.opts[-1] if one is True else f"{parameter.opts[-1]} {text}")
+        for one in value if parameter.multiple or parameter.nargs == -1 else [value]:
+            flag = [] if isinstance(parameter, click.Argument) else [parameter.opts[-1]]
+            words += flag if one is True else [*flag, _word(one, parameter.type)]
     return " ".join(words)
 
 
@@ -110,13 +106,15 @@ _UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_
 """How a file was made, not what it holds: the same inputs give the same bytes whatever these say."""
 
 
-def _word(value):
-    if isinstance(value, Path):
-        return value.name
-    if isinstance(value, tuple):
-        return ("x" if all(isinstance(v, int) for v in value) else "=").join(_word(v) for v in value)
-    if isinstance(value, str) and "/" in value:
+def _word(value, kind):
+    if isinstance(value, Path) or (isinstance(value, str) and "/" in value):
         return Path(value).name
+    if isinstance(kind, Grid) and isinstance(value, tuple):
+        return "x".join(map(str, value))
+    if isinstance(kind, Pair):
+        return f"{LENGTH.show(value[0])}={_word(value[1], None)}"
+    if isinstance(kind, _Quantity):
+        return kind.show(value)
     return format(value, ".12g") if isinstance(value, float) else str(value)
 
 

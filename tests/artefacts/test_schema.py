@@ -38,3 +38,16 @@ def test_contract_names_are_there():
     }
     for kind, paths in due.items():
         assert all(SCHEMAS[kind].field_for(path) for path in paths), kind
+
+
+def test_importing_the_package_costs_nothing():
+    code = "import sys, plenocli.artefacts; print([m for m in ('numpy', 'h5py', 'OpenImageIO', 'rawpy', 'exifread') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there():
+    import plenocli.artefacts as artefacts
+
+    for name in artefacts.__all__:
+        value = getattr(artefacts, name)
+        assert value is SCHEMAS or callable(value), name

@@ -148,7 +148,6 @@ class Learner:
         if self._step_basis is None:
             centred = self.seen - self.seen.mean(axis=1, keepdims=True)
             energy, basis = np.linalg.eigh(centred.T @ centred)
-            # the constant is an eigenvector with eigenvalue 0, but so may others be: take it out by hand
             self._step_basis = np.maximum(energy, 0), basis
         sparse = csr_array(c)
         gram = (sparse @ sparse.T).toarray() / patches.shape[1]

@@ -1,7 +1,7 @@
 """Active-set Newton method for one l1 problem in Gram form; compiled by numba where it is installed, else plain numpy.
 
 Imported late (by plenocli.solvers.l1), because importing numba takes a second. The same statements run either way; only the
-Cholesky factor has two spellings, loops for the compiler and one matrix-vector product a column for numpy.
+Cholesky factor and what goes with it have two spellings, loops for the compiler and whole arrays for numpy.
 """
 
 import os
@@ -64,30 +64,53 @@ def _factor_by_columns(matrix):
     return matrix
 
 
-_factor = _jit(_factor_by_rows) if COMPILED else _factor_by_columns
-
-
-@_jit
-def _solve_factored(factor, h):
+def _solve_by_loops(factor, h):
     """d with L L^T d = h; unknowns whose pivot is infinite come out as 0."""
     n = h.shape[0]
-    d = h.copy()
+    d = np.empty(n)
     for i in range(n):
-        d[i] = (d[i] - np.dot(factor[i, :i], d[:i])) / factor[i, i]
+        row = factor[i]
+        total = h[i]
+        for k in range(i):
+            total -= row[k] * d[k]
+        d[i] = total / row[i]
     for i in range(n - 1, -1, -1):
-        d[i] = d[i] / factor[i, i]
-        d[:i] -= d[i] * factor[i, :i]
+        row = factor[i]
+        value = d[i] / row[i]
+        d[i] = value
+        for k in range(i):
+            d[k] -= value * row[k]
     return d
 
 
-@_jit
-def _gather(gram, index):
-    """gram[index][:, index]; the lower triangle is what the factor reads."""
+def _solve_by_lapack(factor, h):
+    """The same solution."""
+    from scipy.linalg import solve_triangular
+
+    half = solve_triangular(factor, h, lower=True, check_finite=False)
+    return solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
+
+
+def _gather_by_loops(gram, index):
+    """gram[index][:, index]."""
     n = index.shape[0]
     block = np.empty((n, n))
     for i in range(n):
-        block[i] = gram[index[i]][index]
+        row = gram[index[i]]
+        for j in range(n):
+            block[i, j] = row[index[j]]
     return block
+
+
+def _gather_by_index(gram, index):
+    """The same block."""
+    return gram[np.ix_(index, index)]
+
+
+if COMPILED:
+    _factor, _solve_factored, _gather = _jit(_factor_by_rows), _jit(_solve_by_loops), _jit(_gather_by_loops)
+else:
+    _factor, _solve_factored, _gather = _factor_by_columns, _solve_by_lapack, _gather_by_index
 
 
 @_jit
@@ -148,9 +171,7 @@ def _settle(gram, b, threshold, index, x, sign, inner_limit):
         if n == 0:
             break
         block = _gather(gram, index)
-        h = b[index] - threshold[index] * sign
-        for i in range(n):
-            h[i] -= np.dot(block[i], x)
+        h = b[index] - threshold[index] * sign - np.dot(block, x)
         d = _solve_factored(_factor(block), h)
         keep = np.ones(n, np.bool_)
         rejected = False

@@ -1,0 +1,153 @@
+"""learn-dict: a dictionary of object patches for one system matrix, from training pictures."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import InputError, UsageError
+from plenocli.stages.progress import bar, note
+from plenocli.stages.systems import read_system
+from plenocli.stages.training import files_of, read_training, split_by_scene
+
+LAMBDAS = np.logspace(-7, -4, 7)
+"""Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """atoms: None means one an object point.  lam: None chooses on the validation patches.  snr_db: noise of the measurement."""
+
+    atoms: int | None = None
+    batch: int | None = None
+    iterations: int = 10
+    lam: float | None = None
+    delta: float = 1e-3
+    snr_db: float = 60.0
+    initial: str = "patches"
+    seed: int = 0
+    workers: int | None = None
+    mem_limit: int | None = None
+
+
+def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=False, command=""):
+    """Learn, or go on learning from `resume`, and write a dictionary artefact; returns a summary dict.
+
+    `settings.iterations` counts all iterations, those of `resume` included, so that an interrupted run and its
+    continuation end with the same atoms as one that was left alone.
+    """
+    from plenocli.artefacts import check_output
+    from plenocli.solvers.dictionary import Learner
+    from plenocli.solvers.linear import decompose
+
+    files = files_of(images)
+    check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])])
+    system = read_system(pif, settings.mem_limit)
+    pictures = read_training(images, system.object_shape)
+    training, held = split_by_scene(pictures)
+    earlier = _read_resume(resume, system) if resume else None
+    chosen = _resolve(settings, system, earlier)
+    svd = decompose(system.own)
+
+    def learner(lam):
+        return Learner(svd, system.object_shape, [p for _, p in training], [p for _, p in held], replace(chosen, lam=lam), workers=settings.workers)
+
+    if chosen.lam is None:
+        chosen = replace(chosen, lam=_choose_lambda(learner))
+    machine = learner(chosen.lam)
+    state = earlier[0] if earlier else machine.start()
+    if state.iteration > settings.iterations:
+        raise UsageError(f"{Path(resume).name} has done {state.iteration} iterations, more than {settings.iterations}", "--iterations", "ask for more")
+    for _ in bar(range(settings.iterations - state.iteration), settings.iterations - state.iteration, "iterations"):
+        state = machine.step(state)
+    summary = _judge(machine, state, svd, training, chosen)
+    _write(output, state, machine, chosen, system, summary, dict(
+        command=command, pif=pif, files=files, resume=None, seed=chosen.seed, names=[n for n, _ in training], held=[n for n, _ in held]), overwrite)
+    return summary | {"output": str(output)}
+
+
+def _resolve(settings, system, earlier):
+    """solvers.dictionary.Settings from the command line and, for a resumed run, from the file."""
+    from plenocli.solvers import dictionary
+
+    points = int(np.prod(system.object_shape))
+    if earlier:
+        stored = dictionary.Settings(**earlier[1])
+        wanted = {"atoms": settings.atoms, "batch": settings.batch, "lam": settings.lam}
+        for name, value in wanted.items():
+            if value is not None and value != getattr(stored, name):
+                raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
+        for name, value in (("delta", settings.delta), ("snr_db", settings.snr_db), ("seed", settings.seed), ("initial", settings.initial)):
+            if value != getattr(stored, name) and value != getattr(Settings, name):
+                raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
+        return stored
+    atoms = settings.atoms or points
+    return dictionary.Settings(atoms, settings.batch or 4 * atoms, settings.lam, settings.delta, settings.snr_db, settings.seed, settings.initial)
+
+
+def _read_resume(path, system):
+    """(State, Settings as a dict) of a dictionary artefact; InputError where it belongs to another system matrix."""
+    from plenocli.artefacts import file_digest, read_artefact
+    from plenocli.solvers.dictionary import State
+
+    artefact = read_artefact(path, "dictionary")
+    if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
+        raise InputError(f"was learnt for another system matrix than {system.path.name}", path, "give the pif it was learnt with")
+    fields = {k.removeprefix("dictionary/state/"): v for k, v in artefact.data.items() if k.startswith("dictionary/state/")}
+    try:
+        return State.load(fields), dict(artefact.attrs["dictionary"]["parameters"]["settings"])
+    except KeyError as error:
+        raise InputError(f"lacks {error}, which a resumed run needs", path, "start a new dictionary") from None
+
+
+def _choose_lambda(learner):
+    """lambda with the best validation PSNR for the starting dictionary."""
+    quality = []
+    for lam in LAMBDAS:
+        machine = learner(float(lam))
+        quality.append(machine.validate(machine.start().atoms)[1])
+    best = float(LAMBDAS[int(np.argmax(quality))])
+    note(f"lambda = {best:.2e}: validation {max(quality):.2f} dB with the starting atoms, out of {len(LAMBDAS)} values")
+    return best
+
+
+def _judge(machine, state, svd, training, chosen):
+    """Summary: validation PSNR beside LMMSE with statistics of the same training pictures, and coherence."""
+    from plenocli.metrics.coherence import coherence
+    from plenocli.solvers.linear import Svd
+    from plenocli.solvers.lmmse import prepare
+    from plenocli.solvers.natural import draw_patches, mean_covariance
+
+    points = machine.seen.shape[1]
+    patches = draw_patches([p for _, p in training], machine.object_shape, 4 * points, np.random.default_rng([chosen.seed, 3]))
+    kept = len(machine.seen)
+    scaled = Svd(np.eye(kept), svd.s[:kept] / machine.scale, svd.vt[:kept])
+    linear = prepare(scaled, *mean_covariance(patches), machine.sigma).apply(machine.measured)
+    lmmse = float(-10 * np.log10(np.mean((linear - machine.validation) ** 2)))
+    objective, quality, nonzeros, gap = machine.validate(state.atoms)
+    measures = coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)
+    return {"iterations": state.iteration, "atoms": state.atoms.shape[1], "batch": chosen.batch, "lambda": chosen.lam, "delta": chosen.delta,
+            "validation_psnr_db": quality, "lmmse_psnr_db": lmmse, "beats_lmmse": bool(quality > lmmse), "nonzeros": nonzeros, "worst_gap": gap,
+            "objective": objective, "dead_share": state.history["dead_share"][-1] if state.iteration else None, "coherence": measures}
+
+
+def _write(output, state, machine, chosen, system, summary, origin, overwrite):
+    from dataclasses import asdict
+
+    from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact
+
+    measures = summary["coherence"]
+    data = {"dictionary/atoms": state.atoms}
+    data |= {f"dictionary/history/{name}": np.array(values) for name, values in state.history.items()}
+    data |= {f"dictionary/state/{name}": value for name, value in state.save().items()}
+    attrs = {"delta": chosen.delta, "lambda": chosen.lam, "object_shape": list(system.object_shape), "iterations": state.iteration, "scale": machine.scale,
+             "coherence_effective": measures["coherence_effective"], "coherence_average": measures["coherence_effective_mean"],
+             "coherence_raw": measures["coherence_raw"], "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
+             "coherence_welch": measures["welch_bound"], "coherence": measures,
+             "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "training": [Path(n).name for n in origin["names"]], "validation": [Path(n).name for n in origin["held"]]},
+             "notes": {k: summary[k] for k in ("validation_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap")}}
+    attrs = {k: v for k, v in attrs.items() if v is not None}
+    provenance = Provenance(origin["command"], describe_inputs({"pif": origin["pif"], "image": origin["files"]}), origin["seed"])
+    write_artefact(output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite)
+    if not summary["beats_lmmse"]:
+        note(f"the dictionary does NOT beat LMMSE on held-out pictures ({summary['validation_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} dB): reconstruct --method lmmse is the better choice")

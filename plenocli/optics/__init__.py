@@ -1,0 +1,1 @@
+"""Wave optics: from the camera's description to the system matrix A."""

@@ -1,0 +1,134 @@
+"""The main lens's coherent spread function at the lenslet array, as a short sum of separable terms.
+
+A point imaged at xp has the field exp(j k |x|^2/(2 z2)) h(x - xp) on the array, with
+
+    h(d) = 1/(lambda z2 sqrt(S)) * integral of P(xi) exp(-j k xi.d/z2) over the pupil,   S the aperture's area,
+
+so h depends on x - xp only and the integral of |h|^2 over the plane is the share of the light that the filters pass.
+A singular value decomposition on Gauss-Legendre nodes turns h(dy, dx) into sum_j a_j(dy) b_j(dx); the a_j, b_j are
+band-limited (the pupil is finite), so their Legendre series carry them to any other point.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.errors import NumericsError
+from plenocli.optics.pupil import aperture_area, pupil_rows
+from plenocli.optics.quadrature import gauss, nodes_for
+
+MAX_NODES = 4000
+"""Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays answer the question."""
+
+
+@dataclass(frozen=True)
+class SeparableField:
+    """h(dy, dx) = sum_j a_j(dy) b_j(dx) for |dy|, |dx| <= `half`.
+
+    `rows`, `columns`: Legendre coefficients (degrees, terms) of a_j and b_j, complex; `even`: only even degrees are stored.
+    `symmetry`: (flip rows, flip columns, transpose) under which h does not change; `tail`: root energy of what was cut.
+    """
+
+    half: float
+    rows: np.ndarray
+    columns: np.ndarray
+    even: bool
+    symmetry: tuple
+    tail: float
+
+    @property
+    def terms(self):
+        """Number of separable terms."""
+        return self.rows.shape[1]
+
+    def evaluate(self, d, axis):
+        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,), complex128."""
+        d = np.asarray(d, float)
+        coefficients = self.columns if axis else self.rows
+        basis = _legendre(d.ravel() / self.half, len(coefficients), 2 if self.even else 1)
+        parts = np.ascontiguousarray(coefficients).view(float)
+        return (basis @ parts).view(complex).reshape(*d.shape, -1)
+
+
+def _legendre(t, count, step):
+    """Legendre polynomials of degrees 0, step, 2 step, ... at t: (len(t), count)."""
+    out = np.empty((count, len(t)))
+    previous, current = np.zeros_like(t), np.ones_like(t)
+    for degree in range((count - 1) * step + 1):
+        if degree % step == 0:
+            out[degree // step] = current
+        previous, current = current, ((2 * degree + 1) * t * current - degree * previous) / (degree + 1)
+    return out.T
+
+
+def psf_nodes(geometry, half):
+    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number."""
+    count = nodes_for(2 * geometry.k * geometry.D1 / 2 * half / geometry.z2)
+    return count + count % 2
+
+
+def sampled_field(camera, geometry, dy, dx):
+    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: complex (len(dy), len(dx)). Source: see the module."""
+    k, z2 = geometry.k, geometry.z2
+    reach = math.hypot(np.abs(dy).max(), np.abs(dx).max())
+    total = np.zeros((len(dy), len(dx)), complex)
+    for rows in pupil_rows(camera, geometry, k * reach / z2):
+        inner = _row_transforms(rows, k / z2 * dx)
+        total += np.exp(-1j * k / z2 * np.outer(dy, rows.y)) @ inner
+    return total / (geometry.wavelength * z2 * math.sqrt(aperture_area(camera.main_lens)))
+
+
+def _row_transforms(rows, frequency):
+    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)), by slabs that stay in cache."""
+    half = len(frequency) // 2
+    mirrored = len(frequency) % 2 == 0 and np.allclose(frequency[:half], -frequency[::-1][:half], rtol=1e-14, atol=0)
+    f = frequency[half:] if mirrored else frequency
+    out = np.empty((len(rows.y), len(frequency)), complex)
+    weight = np.stack([rows.weight.real, rows.weight.imag], -1)
+    slab = max(1, 2_000_000 // max(1, f.size * rows.x.shape[1]))
+    for start in range(0, len(rows.y), slab):
+        part = slice(start, start + slab)
+        phase = f[None, :, None] * rows.x[part, None, :]
+        c, s = np.cos(phase) @ weight[part], np.sin(phase) @ weight[part]
+        c, s = c[..., 0] + 1j * c[..., 1], s[..., 0] + 1j * s[..., 1]
+        if mirrored:
+            out[part, half:] = c - 1j * s
+            out[part, :half] = (c + 1j * s)[:, ::-1]
+        else:
+            out[part] = c - 1j * s
+    return out
+
+
+def separable_field(camera, geometry, half, tolerance):
+    """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of at most `tolerance`.
+
+    NumericsError where the node rule asks for more than MAX_NODES.
+    """
+    count = psf_nodes(geometry, half)
+    if count > MAX_NODES:
+        raise NumericsError(
+            f"the field on the array needs {count} nodes per axis, more than {MAX_NODES}",
+            "main_lens and lenslet_array", "take fewer superpixels, a longer wavelength or a slower lens")
+    t, w = gauss(count)
+    h = sampled_field(camera, geometry, half * t, half * t)
+    scale = np.abs(h).max()
+    if scale == 0:
+        empty = np.zeros((1, 1), complex)
+        return SeparableField(half, empty, empty, False, (True, True, True), 0.0)
+    same = [np.abs(h - other).max() < 1e-10 * scale for other in (h[::-1], h[:, ::-1], h.T)]
+    even = bool(same[0] and same[1])
+    if even:
+        t, w, h = t[count // 2:], 2 * w[count // 2:], h[count // 2:, count // 2:]
+    if np.abs(h.imag).max() < 1e-13 * scale:
+        h = h.real
+    root = np.sqrt(w * half)
+    u, s, v = np.linalg.svd(root[:, None] * h * root)
+    tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
+    terms = max(1, int(np.count_nonzero(tails > tolerance)))
+    s_root = np.sqrt(s[:terms])
+    a, b = u[:, :terms] * s_root / root[:, None], v[:terms].T * s_root / root[:, None]
+    tail = float(tails[terms]) if terms < len(s) else 0.0
+    step = 2 if even else 1
+    project = _legendre(t, len(t), step).T * w * ((2 * step * np.arange(len(t)) + 1) / 2)[:, None]
+    return SeparableField(half, (project @ a).astype(complex), (project @ b).astype(complex), even, tuple(bool(x) for x in same), tail)

@@ -1,0 +1,57 @@
+"""`plenocli reconstruct`: pictures from captures."""
+
+import click
+
+from plenocli.cli import options
+
+METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionary")
+
+
+@click.command("reconstruct", short_help="Recover the picture behind each lenslet from captures.")
+@options.input_path("captures", nargs=-1, required=True)
+@click.option("--pif", type=options.FILE, help="System matrix A (from simulate-pif).")
+@click.option("--calibration", type=options.FILE, help="Lenslet grid and white reference of a real camera (from calibrate).")
+@click.option("--method", type=click.Choice(METHODS), default="auto", show_default=True, help="auto: dictionary if one is given, else lmmse.")
+@click.option("--dictionary", type=options.FILE, help="Dictionary for --method dictionary (from learn-dict).")
+@click.option("--overlap", type=click.Choice(["1", "3"]), default="1", show_default=True, help="Superpixels looked at for each block: its own, or 3x3.")
+@click.option("--training", multiple=True, metavar="IMAGE", help="Photograph or skimage:NAME for the statistics of lmmse. Repeatable; default those of scikit-image, without the astronaut.")
+@click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")
+@click.option("--noise-sigma", type=options.POSITIVE, help="Standard deviation of the noise, relative like A x; default what the capture says, else estimated.")
+@click.option("--alpha", type=options.NON_NEGATIVE, help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.")
+@click.option("--rank", type=click.IntRange(1), help="Directions kept by tsvd; default by the discrepancy principle.")
+@click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 for dictionary; default as learnt.")
+@click.option("--nnls-iterations", type=click.IntRange(1), help="Stop nnls after so many gradient steps; default converged.")
+@click.option("--clip", is_flag=True, help="Set negative values to zero; their share is reported either way.")
+@click.option("--format", "suffix", type=click.Choice(["h5", "exr"]), default="h5", show_default=True, help="File type when OUT is a folder.")
+@options.output
+@options.seed
+@options.workers
+@options.mem_limit
+@options.overwrite
+@options.as_json
+@click.pass_context
+def command(ctx, captures, output, pif, calibration, suffix, overlap, overwrite, as_json, **settings):
+    """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet, relative to white.
+
+    OUT is an image .h5 (with the predicted standard deviation for lmmse) or .exr; with several captures a folder with one
+    file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the others. With
+    --calibration and no --pif the picture has one value a lenslet.
+
+    \b
+    Examples:
+      plenocli reconstruct capture.h5 --pif pif.h5 -o picture.h5
+      plenocli reconstruct capture.h5 --pif pif-3x3.h5 --method lmmse --overlap 3 -o picture.h5
+      plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary d.h5 -o picture.exr
+      plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
+    """
+    from plenocli.stages.reconstruct import Settings, run_reconstruct
+
+    report = run_reconstruct(captures, output, Settings(overlap=int(overlap), **settings), pif=pif, calibration=calibration, suffix=f".{suffix}",
+                             overwrite=overwrite, command=options.command_line(ctx))
+    if len(captures) == 1 and report["done"] == 1:
+        one = report["captures"][0]
+        rule = f", {one['rule']}" if "rule" in one else ""
+        line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative"
+    else:
+        line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"
+    options.summary(report, as_json, line)

@@ -1,0 +1,179 @@
+"""reconstruct: the picture in front of the camera from a capture, per lenslet or with the neighbours."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import InputError, OutputError, PlenoError, UsageError
+from plenocli.stages.estimators import Estimators
+from plenocli.stages.progress import bar, note
+from plenocli.stages.superpixels import calibrated, read_superpixels
+from plenocli.stages.systems import read_system
+from plenocli.stages.training import files_of
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of the command. noise_sigma in units of A x; alpha in units of A's squared singular values; lam as in learn-dict."""
+
+    method: str = "auto"
+    overlap: int = 1
+    dictionary: Path | None = None
+    training: tuple = ()
+    truth: Path | None = None
+    noise_sigma: float | None = None
+    alpha: float | None = None
+    rank: int | None = None
+    lam: float | None = None
+    nnls_iterations: int | None = None
+    clip: bool = False
+    seed: int = 0
+    workers: int = 1
+    mem_limit: int | None = None
+
+
+def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, suffix=".h5", overwrite=False, command=""):
+    """Reconstruct every capture; returns a summary dict.
+
+    One capture gives the file `output` (.h5 or .exr), several a folder with one file each; finished ones are skipped unless
+    overwrite. One that fails does not stop the others; an error with the worst exit code follows at the end.
+    """
+    captures, output = [Path(c) for c in captures], Path(output)
+    _check_options(settings, pif, calibration)
+    several = len(captures) > 1 or output.is_dir()
+    inputs = [*captures, pif, calibration, settings.dictionary, settings.truth, *(files_of(settings.training) or ())]
+    jobs = _jobs(captures, output, suffix, several, overwrite, inputs)
+    todo = [(c, t) for c, t in jobs if overwrite or not several or not t.exists()]
+    estimators = Estimators(read_system(pif, settings.mem_limit), settings) if pif and todo else None
+    reports, errors = [], []
+    for capture, target in bar(todo, len(todo), "captures"):
+        try:
+            reports.append(_one(capture, target, settings, estimators, calibration, overwrite, dict(command=command, pif=pif, calibration=calibration)))
+        except PlenoError as error:
+            if not several:
+                raise
+            note(f"error: {error}")
+            errors.append((capture, error))
+    if errors:
+        worst = max((e for _, e in errors), key=lambda e: e.exit_code)
+        raise type(worst)(f"{len(errors)} of {len(jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", output,
+                          f"{len(jobs) - len(errors)} are done; see the messages above")
+    return {"output": str(output), "done": len(reports), "skipped": len(jobs) - len(todo), "captures": reports}
+
+
+def _check_options(settings, pif, calibration):
+    if pif is None and calibration is None:
+        raise UsageError("a picture needs --pif, or --calibration for the block mean of a real capture", fix="give one of them")
+    if pif is None and settings.method not in ("auto", "block-mean"):
+        raise UsageError(f"--method {settings.method} needs the system matrix", "--pif", "give it, or use --method block-mean")
+    if settings.method == "dictionary" and settings.dictionary is None:
+        raise UsageError("--method dictionary needs --dictionary", fix="learn one with learn-dict")
+    if settings.truth and settings.method not in ("tikhonov", "tsvd"):
+        raise UsageError("--truth serves only to choose the weight of tikhonov or tsvd with hindsight", "--truth", "leave it out; score compares results with the truth")
+    for name, methods in (("alpha", ("tikhonov",)), ("rank", ("tsvd",)), ("lam", ("dictionary",)), ("nnls_iterations", ("nnls",)), ("dictionary", ("auto", "dictionary"))):
+        if getattr(settings, name) is not None and settings.method not in methods:
+            option = {"lam": "lambda"}.get(name, name.replace("_", "-"))
+            raise UsageError(f"--{option} means nothing to --method {settings.method}", fix=f"leave it out, or use --method {methods[-1]}")
+
+
+def _jobs(captures, output, suffix, several, overwrite, inputs):
+    from plenocli.artefacts import check_output
+
+    if not several:
+        if output.suffix not in (".h5", ".exr"):
+            raise UsageError(f"a picture is written as .h5 or .exr, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
+        check_output(output, overwrite=overwrite, inputs=inputs)
+        return [(captures[0], output)]
+    if output.exists() and not output.is_dir():
+        raise OutputError("is a file; several captures go to a folder", output, "name a folder")
+    targets = [output / (c.stem + suffix) for c in captures]
+    if len(set(targets)) < len(targets):
+        raise UsageError("two captures have the same name and would become one file", output, "rename one, or use two folders")
+    try:
+        output.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made ({error.strerror})", output, "make its parent folder first") from None
+    return list(zip(captures, targets))
+
+
+def _one(capture, target, settings, estimators, calibration, overwrite, origin):
+    """Reconstruct and write one capture; returns its report."""
+    if estimators is None:
+        picture, sigma, report = _white_normalised(capture, calibration), None, {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
+    else:
+        data = read_superpixels(capture, estimators.system, calibration, settings.mem_limit)
+        blocks, spread, report = estimators.solve(data, _truth(settings.truth, estimators.system.object_shape, data.y.shape[:2]))
+        picture = to_picture(blocks, estimators.system.object_shape)
+        sigma = None if spread is None else to_picture(spread, estimators.system.object_shape)
+    negative = float(np.mean(picture < 0))
+    if settings.clip:
+        picture = np.maximum(picture, 0)
+    _write(target, picture, sigma, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
+    return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": negative, "clipped": settings.clip}
+
+
+def to_picture(blocks, shape):
+    """(lenslet_row, lenslet_column, point) -> (row, column), points numbered row by row in blocks of `shape`."""
+    rows, columns = blocks.shape[:2]
+    return blocks.reshape(rows, columns, *shape).transpose(0, 2, 1, 3).reshape(rows * shape[0], columns * shape[1])
+
+
+def to_blocks(picture, shape):
+    """(row, column) -> (lenslet_row, lenslet_column, point), the inverse of `to_picture`."""
+    rows, columns = picture.shape[0] // shape[0], picture.shape[1] // shape[1]
+    return picture.reshape(rows, shape[0], columns, shape[1]).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+
+
+def _truth(path, shape, count):
+    """The true blocks (lenslet_row, lenslet_column, point) from a capture that holds its scene, an image .h5 or an EXR; or None."""
+    if path is None:
+        return None
+    path = Path(path)
+    if path.suffix == ".h5":
+        from plenocli.artefacts import read_artefact
+
+        artefact = read_artefact(path, ("capture", "image"))
+        picture = artefact.data.get("capture/scene", artefact.data.get("image/value"))
+    else:
+        from plenocli.artefacts import read_picture
+
+        picture = np.moveaxis(read_picture(path).values, -1, 0)
+    if picture is None:
+        raise InputError("holds no scene", path, "give a simulated capture, or an image")
+    picture = np.asarray(picture, float)
+    picture = picture.mean(axis=0) if picture.ndim == 3 else picture
+    expected = (count[0] * shape[0], count[1] * shape[1])
+    if picture.shape != expected:
+        raise InputError(f"is {picture.shape[0]} x {picture.shape[1]} points, the picture {expected[0]} x {expected[1]}", path, "give the object as sampled (capture-sim --scene-out)")
+    return to_blocks(picture, shape)
+
+
+def _white_normalised(capture, calibration):
+    """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the white reference; 0 where it cannot be had."""
+    from plenocli.artefacts import read_mosaic
+
+    signal, white, valid = calibrated(capture, read_mosaic(capture), calibration)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = signal.sum(axis=2) / white.sum(axis=2)
+    lost = ~np.isfinite(value)
+    if lost.any():
+        note(f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the sensor or are dark; they are 0 in the picture")
+    return np.where(lost, 0, value)
+
+
+def _write(target, picture, sigma, report, clipped, settings, estimators, capture, origin, overwrite):
+    from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact, write_exr
+
+    parameters = {k: v for k, v in report.items() if k != "method"}
+    if target.suffix == ".exr":
+        channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
+        write_exr(target, channels, {"method": report["method"]}, overwrite=overwrite)
+        return
+    inputs = describe_inputs({"capture": capture, "pif": origin["pif"], "calibration": origin["calibration"], "dictionary": settings.dictionary,
+                              "truth": settings.truth, "training": files_of(settings.training)})
+    data = {"image/value": picture} | ({} if sigma is None else {"image/sigma": sigma})
+    attrs = {"method": report["method"], "parameters": parameters, "clipped": clipped}
+    if estimators is not None:
+        attrs["notes"] = {"block": list(estimators.system.object_shape)}
+    write_artefact(target, Artefact("image", data, {"image": attrs}, Provenance(origin["command"], inputs, settings.seed)), overwrite=overwrite)

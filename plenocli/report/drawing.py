@@ -36,8 +36,11 @@ class Drawing:
 
 
 @contextmanager
-def drawing(width, height):
-    """A Drawing of width x height inches in the house style; rendered when the block ends."""
+def drawing(width, height, layout="constrained"):
+    """A Drawing of width x height inches in the house style; rendered when the block ends.
+
+    layout: matplotlib's layout engine; None for figures of many panels, which it would take seconds to arrange.
+    """
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -45,7 +48,7 @@ def drawing(width, height):
     except ImportError as error:
         raise UsageError("pictures need matplotlib, which is not installed", fix="pip install 'plenocli[plot]'") from error
     with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE}):
-        made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout="constrained"))
+        made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout=layout))
         FigureCanvasAgg(made.figure)
         yield made
         buffer = io.BytesIO()

@@ -18,6 +18,8 @@ def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
     mosaic = np.asarray(mosaic, dtype=np.float64) - black
     top = float(np.percentile(mosaic, 99.9)) or 1.0
     centres = _tiling(mosaic.shape, pitch) if centres is None and pitch is not None else centres
+    if centres is not None and not np.isfinite(centres).all(axis=-1).any():
+        centres = None
     rows, cols = mosaic.shape
     with drawing(10.2, 4.75) as made:
         whole, close = made.figure.subplots(1, 2)
@@ -58,10 +60,13 @@ def _middle(shape, centres):
 
 
 def _spacing(centres, shape):
-    """Median (row, column) spacing of lenslets in px."""
-    row = np.abs(np.diff(centres[..., 0], axis=0)) if centres.shape[0] > 1 else np.array([shape[0]])
-    col = np.abs(np.diff(centres[..., 1], axis=1)) if centres.shape[1] > 1 else np.array([shape[1]])
-    return float(np.nanmedian(row)), float(np.nanmedian(col))
+    """Median (row, column) spacing of lenslets in px; the frame's size along an axis with one lenslet."""
+    found = []
+    for axis in (0, 1):
+        steps = np.abs(np.diff(centres[..., axis], axis=axis))
+        steps = steps[np.isfinite(steps)]
+        found.append(float(np.median(steps)) if steps.size else float(shape[axis]))
+    return found
 
 
 def _lattice(axes, centres, width):

@@ -99,8 +99,10 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
     lines = -(-len(order) // columns)
     _, table_wavelengths, table = colorchecker()
     colours = preview_rgb(table_wavelengths, table.T[:, :, None])[..., 0].T
-    with drawing(10.2, (1.5 if columns == 6 else 2.1) * lines + 0.35) as made:
-        panels = made.figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    height = (1.5 if columns == 6 else 2.1) * lines + 0.8
+    with drawing(10.2, height, layout=None) as made:
+        panels = made.figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw={
+            "left": 0.055, "right": 0.99, "bottom": 0.48 / height, "top": 1 - 0.55 / height, "wspace": 0.12 if columns == 6 else 0.07, "hspace": 0.28})
         for axes in panels.flat[len(order):]:
             axes.set_axis_off()
         spread = 0.012 * np.ptp(wavelengths_nm) if len(entries) > 1 else 0.0
@@ -116,11 +118,13 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
                         axes.errorbar(wavelengths_nm + shift, patch["mean"], patch["std"], fmt="o", markersize=3.2, capsize=1.8, linewidth=0.9,
                                       color=COLOURS[number % len(COLOURS)], label=name if not place else None)
             axes.set_title(wanted[label]["name"], fontsize=8)
-            axes.set(ylim=(-0.05, 1.14), xlim=(400, 700) if 400 <= wavelengths_nm.min() and wavelengths_nm.max() <= 700 else None)
+            axes.set_ylim(-0.05, 1.14)
+            if 400 <= wavelengths_nm.min() and wavelengths_nm.max() <= 700:
+                axes.set(xlim=(400, 700), xticks=(450, 550, 650))
             axes.grid(True)
-        made.figure.supxlabel("wavelength [nm]", fontsize=8.5)
-        made.figure.supylabel("reflectance", fontsize=8.5)
-        made.figure.legend(loc="outside upper center", ncols=len(entries) + 2)
+        made.figure.supxlabel("wavelength [nm]", fontsize=8.5, y=0.06 / height)
+        made.figure.supylabel("reflectance", fontsize=8.5, x=0.004)
+        made.figure.legend(loc="upper center", ncols=len(entries) + 2)
     return made.png
 
 

@@ -1,0 +1,138 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact, write_exr
+from plenocli.cli.main import run
+from plenocli.errors import InputError
+from plenocli.scene.chart import chart_scene
+from plenocli.stages.report import run_report
+from plenocli.stages.run_folder import RunFolder
+from plenocli.stages.score import run_score
+
+BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
+
+
+def put(path, kind, data, attrs=None, inputs=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_artefact(path, Artefact(kind, data, attrs or {}, Provenance(f"plenocli made {path.name}", describe_inputs(inputs or {}), 1, "# camera\n")), overwrite=True)
+    return path
+
+
+def spatial(root, rng):
+    offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(-1, 2)
+    system = rng.random((1, 9, 30, 16)).astype("f4") / 300
+    pif = put(root / "pif.h5", "pif", {
+        "pif/A": system, "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": offsets, "pif/pixel_shape": np.array([5, 6]),
+        "pif/object_shape": np.array([4, 4]), "pif/column_energy": system.sum(axis=(1, 2)), "pif/singular_values": np.linspace(1, 0.01, 16)[None],
+    }, {"pif": {"rank": [16], "condition": [100.0], "symmetry_defect": [0.2], "kappa": 1.5}})
+    scene = rng.random((1, 20, 20)).astype("f4")
+    capture = put(root / "same" / "capture.h5", "capture", {
+        "capture/mosaic": rng.random((25, 30)).astype("f4"), "capture/cfa": "mono", "capture/scene": scene, "capture/wavelength": np.array([550e-9])},
+        {"capture": {"units": "electron", "black": 0.0, "lenslet_count": [5, 5], "superpixel_shape": [5, 6], "noise_sigma": 0.1}}, {"pif": pif})
+    results = [put(root / "same" / f"{name}.h5", "image", {"image/value": np.clip(scene[0] + error * rng.standard_normal((20, 20)), 0, None).astype("f4")},
+                   {"image": {"method": name}}, {"capture": capture, "pif": pif}) for name, error in (("tikhonov", 0.1), ("lmmse", 0.05))]
+    put(root / "dictionary.h5", "dictionary", {"dictionary/atoms": rng.standard_normal((16, 20)), "dictionary/history/psnr_db": np.linspace(10, 12, 5)},
+        {"dictionary": {"object_shape": [4, 4], "delta": 0.1}}, {"pif": pif})
+    run_score(results, root / "score-same.json", truth=capture, command="plenocli score tikhonov.h5 lmmse.h5")
+
+
+def spectral(root, rng):
+    root.mkdir(parents=True, exist_ok=True)
+    truth = chart_scene(12, 18, BANDS)[0].astype(float)
+    white = put(root / "white.h5", "capture", {"capture/mosaic": rng.random((96, 144)).astype("f4"), "capture/cfa": "mono"}, {"capture": {"units": "DN"}})
+    rows, cols = np.mgrid[0:12, 0:18]
+    calibration = put(root / "calibration.h5", "calibration", {
+        "grid/centre": np.stack([rows * 8 + 3.5, cols * 8 + 3.5], -1), "grid/valid": np.ones((12, 18), bool), "grid/residual": rng.random((12, 18)),
+        "white/flat": rng.random((96, 144)), "response/F": rng.random((12, 18, 64, 4)), "response/window": np.array([8, 8]), "response/wavelength": BANDS,
+        "response/origin": np.stack([rows * 8, cols * 8], -1),
+    }, {"grid": {"lattice": "square", "pitch": [8.0, 8.0], "angle": 0.0, "rms": 0.01, "lenslets": 216}, "response": {"condition": 1.3, "units": "DN"}}, {"white": white})
+    for method, error in (("pinv", 0.005), ("single-pixel", 0.02)):
+        result = put(root / f"chart-{method}.h5", "spectra", {
+            "spectra/value": truth + error * rng.standard_normal(truth.shape), "spectra/wavelength": BANDS, "spectra/sigma": np.full(truth.shape, error)},
+            {"spectra": {"quantity": "reflectance", "method": method}}, {"capture": white, "calibration": calibration})
+        run_score([result], root / f"score-{method}.json", truth="colorchecker")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("run")
+    rng = np.random.default_rng(0)
+    spatial(root / "spatial", rng)
+    spectral(root / "spectral", rng)
+    return root
+
+
+def test_the_page_shows_both_chains(folder, tmp_path):
+    summary = run_report(folder, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert summary["sections"] == ["Spatial", "Spectral"] and summary["unreadable"] == [] and summary["scores"] == 3
+    # bars, results, close-up, capture, PIF, matrix, atoms, history; bars, patches, 2 x bands, grid, response, capture
+    assert page.count("<figure>") == 15
+    for word in ("score-same", "lmmse", "PSNR [dB]", "RMSE over the six patches, 450 nm", "symmetry defect", "chart-single-pixel", "plenocli made pif.h5", "# camera"):
+        assert word in page
+    assert str(folder) not in page
+
+
+def test_the_same_folder_gives_the_same_bytes(folder, tmp_path):
+    for name in ("a.html", "b.html"):
+        run_report(folder / "spectral", tmp_path / name, title="x")
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_a_torn_file_is_named_and_the_rest_is_shown(folder, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(folder / "spectral", copy)
+    (copy / "torn.h5").write_bytes((copy / "white.h5").read_bytes()[:-50])
+    (copy / "notes.json").write_text("[1, 2]")
+    (copy / "score-bad.json").write_text('{"results": [{"metrics": 3}]}')
+    (copy / "broken.json").write_text('{"results": ')
+    summary = run_report(copy, tmp_path / "r.html")
+    assert summary["unreadable"] == ["broken.json", "score-bad.json", "torn.h5"]
+    assert "torn.h5 could not be read" in (tmp_path / "r.html").read_text() and summary["sections"] == ["Spectral"]
+
+
+def test_results_without_scores_are_shown_alone(tmp_path):
+    put(tmp_path / "run" / "letters.h5", "image", {"image/value": np.random.default_rng(1).random((30, 40)).astype("f4")}, {"image": {"method": "block-mean"}})
+    write_exr(tmp_path / "run" / "more.exr", {"Y": np.ones((8, 8), "f4")})
+    summary = run_report(tmp_path / "run", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert summary["sections"] == ["Spatial"] and page.count("<figure>") == 2 and "no truth to compare with" in page
+
+
+def test_lineage_follows_digests(folder):
+    run_folder = RunFolder(folder)
+    capture = next(f for f in run_folder.files if f.name == "spatial/same/capture.h5")
+    assert {f.name for f in run_folder.users(capture)} == {"spatial/same/tikhonov.h5", "spatial/same/lmmse.h5", "spatial/score-same.json"}
+    assert run_folder.by_digest(capture.sources["pif"]).name == "spatial/pif.h5"
+
+
+def test_nothing_to_show(tmp_path):
+    with pytest.raises(InputError, match="no result"):
+        run_report(tmp_path, tmp_path / "r.html")
+    with pytest.raises(InputError, match="no folder"):
+        run_report(tmp_path / "absent", tmp_path / "r.html")
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_score_writes_its_own_page(folder, tmp_path, capsys):
+    results = [str(folder / "spatial" / "same" / f"{name}.h5") for name in ("tikhonov", "lmmse")]
+    truth = str(folder / "spatial" / "same" / "capture.h5")
+    assert run(["score", *results, "--truth", truth, "-o", str(tmp_path / "s.json"), "--report", str(tmp_path / "s.html")]) == 0
+    page = (tmp_path / "s.html").read_text()
+    assert page.count("<figure>") == 2 and "tikhonov" in page and 'class=best' in page
+    assert run(["score", str(folder / "spectral" / "chart-pinv.h5"), "--truth", "colorchecker", "-o", str(tmp_path / "c.json"), "--report", str(tmp_path / "c.html")]) == 0
+    assert (tmp_path / "c.html").read_text().count("<figure>") == 3
+    pif = ["--pif", str(folder / "spatial" / "pif.h5")]
+    assert run(["score", str(folder / "spatial" / "dictionary.h5"), *pif, "-o", str(tmp_path / "d.json"), "--report", str(tmp_path / "d.html")]) == 0
+    assert (tmp_path / "d.html").read_text().count("<figure>") == 1
+
+
+def test_command_line(folder, tmp_path, capsys):
+    arguments = ["report", str(folder / "spectral"), "-o", str(tmp_path / "r.html")]
+    assert run([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sections"] == ["Spectral"]
+    assert run(arguments) == 2
+    assert run(["report", str(tmp_path / "none"), "-o", str(tmp_path / "q.html")]) == 3

@@ -115,7 +115,7 @@ def _ring(asked, views, grid, accuracy, reasons, warnings):
     if asked == 0:
         reasons.append("isolated lenslets as asked: light of neighbours is left out")
         return 0
-    rings = (1, 2, 3) if asked == "auto" else (asked,)
+    rings = (1, 2) if asked == "auto" else (asked,)
     errors = {ring: max(window_error(v, grid, ring) for v in views) for ring in rings}
     ring = next((r for r in rings if errors[r] <= accuracy), rings[-1])
     reasons.append(f"{ring} ring(s) of neighbour lenslets join coherently{'' if asked == 'auto' else ' as asked'}: "

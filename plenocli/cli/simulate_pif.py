@@ -1,0 +1,48 @@
+"""`plenocli simulate-pif`: the system matrix of a camera."""
+
+import click
+
+from plenocli.cli import options
+
+
+class _Step(click.ParamType):
+    name = "auto|LENGTH"
+
+    def convert(self, value, param, ctx):
+        return value if value == "auto" else options.LENGTH.convert(value, param, ctx)
+
+
+@click.command("simulate-pif", short_help="Compute the system matrix A of a camera by wave optics.")
+@options.input_path("camera")
+@click.option("-o", "--output", type=options.FILE, metavar="OUT", help="File to write, .h5; not needed with --explain.")
+@click.option("--wavelength", "wavelengths", type=options.LENGTH, multiple=True, help="Wavelength such as 550nm; repeatable; default [light] wavelengths.")
+@click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
+@click.option("--superpixels", type=options.Grid("auto"), default="auto", show_default=True, help="Superpixels whose pixels are kept, odd: auto, 1x1, 3x3.")
+@click.option("--coherent-ring", type=click.Choice(["auto", "0", "1", "2"]), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")
+@click.option("--model", type=click.Choice(["auto", "fresnel", "ray", "exact"]), default="auto", show_default=True, help="Propagation model; auto is fresnel, the only one so far.")
+@click.option("--accuracy", type=options.POSITIVE, default=1e-4, show_default=True, help="Relative error of each column against the converged paraxial model.")
+@click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True, help="Type of the stored matrix.")
+@click.option("--explain", is_flag=True, help="Print the plan, its cost and its reasons; compute nothing.")
+@options.mem_limit
+@options.workers
+@options.overwrite
+@options.as_json
+@click.pass_context
+def command(ctx, camera, output, model, explain, workers, overwrite, as_json, **settings):
+    """Compute the system matrix A of CAMERA (a .toml file): for every object point over one lenslet's field the share of
+    its light that lands on each pixel, by wave optics in the paraxial model. Reports rank, condition, energy and symmetry.
+
+    \b
+    Examples:
+      plenocli simulate-pif camera.toml -o pif.h5
+      plenocli simulate-pif camera.toml --superpixels 1x1 --coherent-ring 0 -o isolated.h5
+      plenocli simulate-pif camera.toml --wavelength 450nm --wavelength 650nm --accuracy 1e-3 --explain
+    """
+    from plenocli.stages.simulate_pif import Settings, line, run_simulate_pif
+
+    if model in ("ray", "exact"):
+        raise click.UsageError(f"--model {model} does not exist yet; use --model fresnel, and see the neglected phase that it reports.")
+    ring = settings.pop("coherent_ring")
+    settings = Settings(coherent_ring=ring if ring == "auto" else int(ring), **settings)
+    report = run_simulate_pif(camera, output, settings, explain=explain, overwrite=overwrite, command=options.command_line(ctx))
+    options.summary(report, as_json, line(report))

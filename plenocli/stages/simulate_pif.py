@@ -1,0 +1,118 @@
+"""simulate-pif: the system matrix of a camera by wave optics, with what it can and cannot resolve."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.errors import NumericsError, UsageError
+from plenocli.stages.progress import bar, note
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line says beyond the camera: wavelengths in m (empty: the camera's), spectral_step m, "auto" or None."""
+
+    wavelengths: tuple = ()
+    spectral_step: object = None
+    superpixels: object = "auto"
+    coherent_ring: object = "auto"
+    accuracy: float = 1e-4
+    dtype: str = "float32"
+    mem_limit: int = 8 << 30
+
+
+def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=False, command=""):
+    """Compute A and write it as a pif artefact; returns a summary dict. With `explain` only the plan is made.
+
+    Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where memory or accuracy do not
+    suffice, OutputError where the file cannot be written.
+    """
+    from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
+    from plenocli.config import load_camera
+    from plenocli.optics.diagnose import describe
+    from plenocli.optics.pif import build_pif, plan_pif
+
+    if not explain:
+        if output is None:
+            raise UsageError("no output file given", "--output", "write -o pif.h5, or --explain to see the plan only")
+        check_output(output, overwrite=overwrite, inputs=[camera_path])
+    camera = load_camera(camera_path)
+    request = dict(wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
+                   accuracy=settings.accuracy, dtype=np.dtype(settings.dtype))
+    plan = plan_pif(camera, **request)
+    if explain:
+        return {"plan": plan.explain(), "seconds": plan.seconds, "bytes": plan.bytes, "superpixels": list(plan.superpixels),
+                "coherent_ring": plan.coherent_ring, "nodes": plan.nodes, "estimated_accuracy": plan.estimated}
+    # the matrix, its copy while columns are gathered, and the file's image in memory
+    needed = 3 * plan.bytes + (1 << 27)
+    if needed > settings.mem_limit:
+        raise NumericsError(f"the matrix needs about {needed / 2**30:.2g} GiB, more than the limit of {settings.mem_limit / 2**30:.2g} GiB",
+                            camera_path, "take fewer superpixels, points or wavelengths, or raise --mem-limit")
+    for warning in plan.warnings:
+        note(warning)
+    with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
+        pif = build_pif(camera, **request, progress=lambda done, total: progress.update(done - progress.n))
+    found = describe(pif)
+    for warning in found["warnings"]:
+        note(warning)
+    data, attrs = _contents(pif, found)
+    accuracy = {"asked": plan.accuracy, "estimated": plan.estimated, "model": "fresnel", "reasons": [*plan.reasons, *plan.warnings]}
+    provenance = Provenance(command, describe_inputs({"camera": camera_path}), None, camera.text, accuracy)
+    write_artefact(output, Artefact("pif", data, attrs, provenance), overwrite=overwrite)
+    return _summary(output, pif, found, plan)
+
+
+def _wavelengths(camera, settings):
+    if settings.wavelengths and settings.spectral_step is not None:
+        raise UsageError("--wavelength and --spectral-step contradict each other", fix="leave one of them out")
+    if settings.wavelengths:
+        return tuple(sorted(set(settings.wavelengths)))
+    if settings.spectral_step is None:
+        return None
+    from plenocli.scene.tables import illuminant
+    from plenocli.sensor.light import broadband
+
+    step = None if settings.spectral_step == "auto" else settings.spectral_step
+    return tuple(float(w) for w in broadband(camera, lambda w: illuminant(camera.light.illuminant, w), step).wavelengths)
+
+
+def _contents(pif, found):
+    data = {
+        "pif/A": pif.A,
+        "pif/wavelength": pif.wavelength,
+        "pif/lenslet_offset": np.asarray(pif.lenslet_offset, np.int32),
+        "pif/pixel_shape": np.array(pif.pixel_shape, np.int32),
+        "pif/object_shape": np.array(pif.object_shape, np.int32),
+        "pif/column_energy": pif.column_energy,
+    }
+    notes = pif.notes
+    attrs = {"coherent_ring": notes["coherent_ring"], "kappa": notes["kappa"], "eps": notes["eps"], "superpixel_pitch": notes["superpixel_pitch"],
+             "model": notes["model"], "notes": notes}
+    if "singular_values" in found:
+        data["pif/singular_values"] = found["singular_values"]
+    attrs |= {key: found[key] for key in ("rank", "condition", "symmetry_defect") if key in found}
+    return data, {"pif": attrs}
+
+
+def _summary(output, pif, found, plan):
+    keep = {key: found[key] for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max") if key in found}
+    bands, superpixels, pixels, points = pif.A.shape
+    return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
+            "wavelengths": pif.wavelength.tolist(), "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
+            "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],
+            "quartic_phase_rad": pif.notes["quartic_phase_rad"], "warnings": [*plan.warnings, *found["warnings"]], **keep}
+
+
+def line(report):
+    """One sentence about what run_simulate_pif did, for people."""
+    if "plan" in report:
+        return report["plan"]
+    low, high = min(report["energy_min"]), max(report["energy_max"])
+    text = (f"{Path(report['output'])}: A of {report['bands']} band(s), {report['superpixels'][0]}x{report['superpixels'][1]} superpixels, "
+            f"{report['pixels']} pixels, {report['points']} points; column energy {low:.3f} to {high:.3f}")
+    if "rank" in report:
+        text += f"; rank {min(report['rank'])} ({min(report['rank_60db'])} above 60 dB noise), condition {max(report['condition']):.1e}"
+    if "symmetry_defect" in report:
+        text += f"; symmetry defect {min(report['symmetry_defect']):.1e}"
+    return f"{text}; neglected phase {report['quartic_phase_rad']:.2g} rad"

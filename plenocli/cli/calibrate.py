@@ -15,6 +15,7 @@ from plenocli.cli import options
 @click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
 @click.option("--shared", is_flag=True, help="One F for all lenslets (whole-pixel pitch only) instead of one each.")
 @click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
+@click.option("--centre", "near", type=(float, float), default=None, metavar="ROW COLUMN", help="A pixel near the centre of any superpixel; needed only where filters in the pupil draw lines as dark as the superpixels' borders.")
 @click.option("--cfa", type=click.Choice(["mono", "RGGB", "BGGR", "GRBG", "GBRG"]), help="Colour filter array of PNG and TIFF mosaics, which cannot say it; default the camera's, else mono.")
 @options.output
 @options.overwrite

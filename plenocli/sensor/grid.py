@@ -5,7 +5,7 @@ illumination-flattened image (vignetting left in biases the pitch), numbering by
 then the simplest smooth map (affine, homography, low-order polynomial) that the residuals support.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from plenocli.errors import InputError, NumericsError
 from plenocli.sensor import distortion, lattice, spots
 
 CLIP = 0.8  # of a spot's bright level; measured best on real white images, where spots have structure inside
+STRUCTURED = 0.3
 FRAME_TOLERANCE = 0.4  # px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
 FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
 
@@ -42,22 +43,28 @@ class Lattice:
     strength: float
 
 
-def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", window=1024):
+def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, window=1024):
     """Find the lenslet grid of `white` (rows, columns); `dark` of the same shape or scalar is subtracted first.
 
     cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is scaled to the same mean.
-    lattice_kind: "auto", "square" or "hexagonal". Raises NumericsError, saying what was seen, where there is no
+    lattice_kind: "auto", "square" or "hexagonal". near: (row, column) px close to the centre of any one superpixel;
+    needed only where filters in the pupil divide superpixels by dark lines as dark as their borders: then the phase
+    that fits most whole superpixels into the frame is taken, or else the darkest lines. Raises NumericsError, saying what was seen, where there is no
     lattice, InputError for an image too small or not finite.
     """
     image = prepare(white, cfa, dark)
     crop = _brightest_crop(image, window)
-    basis, strength, reason = lattice.find_basis(crop)
+    basis, strength, structure = lattice.find_basis(crop)
     if basis is None:
-        raise NumericsError(f"no lenslet lattice in the image: {reason}", fix=FIX)
+        raise NumericsError(f"no lenslet lattice in the image: {structure}", fix=FIX)
+    structured = structure > STRUCTURED
     kind = lattice.kind_of(basis) if lattice_kind == "auto" else lattice_kind
     basis = lattice.oriented(basis, kind)
+    sides = np.hypot(*basis.T)
+    if sides.max() > 1.3 * sides.min():
+        raise NumericsError(f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by {sides[1]:.1f} px, which no square or hexagonal array does", fix=FIX)
     pitch = float(np.hypot(*basis.T).min())
-    index, position, weight_ok, flux = _measured_sites(image, basis, kind, pitch)
+    index, position, weight_ok, flux = _measured_sites(image, basis, kind, pitch, structured)
     inside = _whole(position, image.shape, 0.5 * pitch) & weight_ok
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
@@ -73,9 +80,18 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", window=1024):
             "the best grid",
             fix=FIX,
         )
+    lit = None
+    if structured:
+        position[inside] = spots.register(image, model.at(index[inside]), pitch)
+        model, _ = distortion.choose_model(index[inside], position[inside])
+        miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
+    if structured and kind == "square":
+        moved = _to_dark_borders(image, model, index[inside], pitch, near)
+        position = position + moved.at(index) - model.at(index)
+        model, lit = moved, _lit_cells(image, moved)
     mean = distortion.fit_model("affine", index[inside], position[inside])
     vectors = mean.coefficients[1:] / mean.scale
-    return _assemble(kind, model, vectors, strength, index, position, miss, weight_ok, image.shape, pitch)
+    return _assemble(kind, model, vectors, strength, index, position, miss, weight_ok, image.shape, pitch, lit)
 
 
 def prepare(white, cfa="mono", dark=None):
@@ -157,12 +173,13 @@ def _brightest_crop(image, window):
     return image[low[0] : low[0] + window, low[1] : low[1] + window]
 
 
-def _measured_sites(image, basis, kind, pitch):
+def _measured_sites(image, basis, kind, pitch, structured):
     """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool, flux (N,)."""
-    maxima = spots.find_maxima(image, pitch)
+    window = spots.WIDE_WINDOW if structured else spots.WINDOW
+    maxima = spots.find_maxima(image, pitch, 0.28 if structured else 0.18)
     if len(maxima) < 9:
         raise NumericsError(f"no lenslet lattice in the image: {len(maxima)} bright spots at a pitch of {pitch:.1f} px", fix=FIX)
-    position, flux = spots.windowed_centroids(image, maxima, pitch, iterations=2)
+    position, flux = spots.windowed_centroids(image, maxima, pitch, iterations=2, window=window)
     middle = np.array(image.shape) / 2
     bright = np.flatnonzero(flux > 0.5 * np.median(flux))
     starts = bright[np.argsort(((position[bright] - middle) ** 2).sum(axis=1))]
@@ -176,11 +193,12 @@ def _measured_sites(image, basis, kind, pitch):
     index, first, flux = chosen[best], position[best], flux[best]
     surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
     slope = slope / np.maximum(surface, 1e-9)[:, None]
-    slope *= _share_within(image, first, pitch, slope, _whole(first, image.shape, 0.5 * pitch))
-    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope, clip=CLIP)
+    if not structured:
+        slope *= _share_within(image, first, pitch, slope, _whole(first, image.shape, 0.5 * pitch))
+    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope, window=window, clip=CLIP)
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
-    if spread > 0.25:
+    if spread > 0.1:  # real white images have 0.02 at most
         raise NumericsError(
             f"no lenslet lattice in the image: patches repeat every {pitch:.1f} px, but their brightness scatters by "
             f"{100 * spread:.0f} % from one to the next (a chart or a scene, not even light)",
@@ -207,6 +225,80 @@ def _illumination(position, flux, shape, whole):
     right = np.stack([j * u[:, 0] ** i * u[:, 1] ** max(j - 1, 0) for i, j in powers], axis=1) @ fit / size[1]
     surface = np.maximum(design @ fit, 0.05 * np.median(flux))
     return surface, np.stack([down, right], axis=1)
+
+
+def _to_dark_borders(image, model, index, pitch, near):
+    """The map moved so that cell borders lie on dark lines between superpixels.
+
+    The brightness of several parts draws a centroid towards the brightest; dark lines, seen in profiles along both
+    lattice directions of all cells folded into one, do not care. Lines between the parts may be as dark as those
+    between superpixels: of several candidates the one nearest to `near`, or the best filled frame, decides.
+    """
+    lines = [_dark_lines(image, model, index, pitch, axis) for axis in (0, 1)]
+    best, chosen = None, model
+    for down, depth_down in lines[0]:
+        for right, depth_right in lines[1]:
+            moved = replace(model, shift=model.shift - np.array([down, right]))
+            if near is not None:
+                site = np.rint(_index_at(moved, near))
+                merit = (-np.hypot(*(moved.at(site) - near)), 0.0)
+            else:
+                cells = _cells(moved, image.shape)
+                merit = (int(_whole(moved.at(cells), image.shape, 0.5 * pitch).sum()), depth_down + depth_right)
+            if best is None or merit > best:
+                best, chosen = merit, moved
+    return chosen
+
+
+def _dark_lines(image, model, index, pitch, axis):
+    """Dark lines across one lattice direction: [(distance of the line from the cell's border, cells; depth)]."""
+    chosen = index[:: max(1, len(index) // 800)]
+    bins = max(24, int(4 * pitch))
+    along = (np.arange(bins) + 0.5) / bins
+    across = (np.arange(16) + 0.5) / 16 - 0.5
+    grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)[..., :: 1 if axis == 0 else -1]
+    near = np.clip(np.rint(model.at(chosen[:, None, None] + grid)).astype(int), 0, np.array(image.shape) - 1)
+    profile = image[near[..., 0], near[..., 1]].mean(axis=(0, 2), dtype=float)
+    kernel = np.ones(max(1, bins // 24)) / max(1, bins // 24)
+    smooth = np.convolve(np.tile(profile, 3), kernel, "same")[bins : 2 * bins]
+    depth = smooth.max() - smooth
+    local = (depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max())
+    lines = []
+    for peak in np.flatnonzero(local):
+        away = (along - along[peak] + 0.5) % 1 - 0.5
+        close = np.abs(away) < 0.1
+        weight = np.clip(depth[close] - 0.5 * depth[peak], 0, None)
+        lines.append((along[peak] + (away[close] * weight).sum() / weight.sum() - 0.5, float(depth[peak])))
+    return lines
+
+
+def _index_at(model, position):
+    """Index (2,), not whole, that the map takes to `position`: Newton steps from the affine part."""
+    site = np.zeros(2)
+    for _ in range(20):
+        here = model.at(site)
+        slope = np.stack([model.at(site + step) - here for step in np.eye(2)], axis=1)
+        site = site + np.linalg.solve(slope, np.asarray(position, float) - here)
+    return site
+
+
+def _cells(model, shape):
+    """Indices (M, N, 2) of a block of sites that covers the frame."""
+    corners = np.array([_index_at(model, c) for c in [(0, 0), (0, shape[1]), (shape[0], 0), shape]])
+    low, high = np.floor(corners.min(axis=0)).astype(int) - 1, np.ceil(corners.max(axis=0)).astype(int) + 1
+    return np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1)
+
+
+def _lit_cells(image, model):
+    """Indices (N, 2) of the sites whose cell holds at least 0.3 of the typical light."""
+    cells = _cells(model, image.shape)
+    inner = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 9)] * 2, indexing="ij"), axis=-1)
+    near = np.rint(model.at(cells[:, :, None, None] + inner)).astype(int)
+    frame = np.array(image.shape) - 1
+    inside = ((near >= 0) & (near <= frame)).all(axis=(-1, 2, 3))
+    near = np.clip(near, 0, frame)
+    light = image[near[..., 0], near[..., 1]].mean(axis=(2, 3))
+    return cells[inside & (light > 0.3 * np.median(light[inside]))]
 
 
 def _share_within(image, position, pitch, slope, whole, most=1500):
@@ -243,18 +335,23 @@ def _whole(position, shape, margin):
     return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
 
 
-def _assemble(kind, model, vectors, strength, index, position, miss, clean, shape, pitch):
-    """Lay the sites out as an array (R, C) without empty border rows and columns."""
+def _assemble(kind, model, vectors, strength, index, position, miss, clean, shape, pitch, lit):
+    """Lay the sites out as an array (R, C) without empty border rows and columns; lit (N, 2): more sites that hold light."""
     site = lattice.to_array(index, kind)
-    low, high = site[clean].min(axis=0), site[clean].max(axis=0)
+    bright = site[clean] if lit is None else lattice.to_array(lit, kind)
+    low, high = bright.min(axis=0), bright.max(axis=0)
     keep = ((site >= low) & (site <= high)).all(axis=1)
-    site, position, miss, clean = site[keep] - low, position[keep], miss[keep], clean[keep]
     grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1)
     centres = model.at(lattice.from_array(grid, kind))
-    residual, lit = np.full(grid.shape[:2], np.nan), np.zeros(grid.shape[:2], bool)
-    residual[tuple(site.T)], lit[tuple(site.T)] = miss, clean
-    valid = lit & _whole(centres, shape, 0.5 * pitch)
-    inner = residual[valid]
+    residual, valid = np.full(grid.shape[:2], np.nan), np.zeros(grid.shape[:2], bool)
+    residual[tuple((site[keep] - low).T)] = miss[keep]
+    valid[tuple((bright - low).T)] = True
+    valid &= _whole(centres, shape, 0.5 * pitch)
+    rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+    if rows.size:  # a border of cells that the frame cuts everywhere is of no use
+        block = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        centres, residual, valid = centres[block], residual[block], valid[block]
+    inner = residual[valid & np.isfinite(residual)]
     spread = 1.48 * np.median(inner)
     return Lattice(
         kind=kind,

@@ -3,6 +3,7 @@
 import numpy as np
 
 WINDOW = (0.25, 0.7)  # sigma and radius, of the pitch; wider windows take in the neighbours
+WIDE_WINDOW = (0.33, 0.95)  # for superpixels with several bright parts: only the fundamental period is left
 SMALL_WINDOW = (0.17, 0.48)
 CORE_SIGMA = 0.13  # of the pitch: the middle of a spot, which the frame does not cut in a whole cell
 
@@ -77,3 +78,29 @@ def _newton(image, centre, pitch, half, slope, iterations, window, clip):
     core = [np.exp(-0.5 * ((reach - offset[:, axis, None]) / (CORE_SIGMA * pitch)) ** 2).astype(np.float32) for axis in (0, 1)]
     flux = np.einsum("ny,ny->n", (patch @ core[1][:, :, None])[..., 0], core[0]) / (core[0].sum(axis=1) * core[1].sum(axis=1))
     return first + offset, flux
+
+
+def register(image, centres, pitch, rounds=3):
+    """Positions (N, 2), px, of superpixels by least squares on their common look (an empirical template).
+
+    image; centres (N, 2) px from a fitted lattice, whole cells within the frame. Each cell is scale * template
+    shifted by a part of a pixel + offset; the template is the mean of all. Holds for superpixels of any inner
+    structure, where a centroid is drawn to the brightest part. The mean shift is zero: the phase stays the lattice's.
+    """
+    from scipy.ndimage import map_coordinates
+
+    reach = np.arange(-int(0.55 * pitch), int(0.55 * pitch) + 1.0)
+    patches = np.empty((len(centres), len(reach), len(reach)), np.float32)
+    centres = np.array(centres, float)
+    for _ in range(rounds):
+        for i, (row, column) in enumerate(centres):
+            grid = np.meshgrid(row + reach, column + reach, indexing="ij")
+            patches[i] = map_coordinates(image, grid, order=1, mode="nearest")
+        flat = patches.reshape(len(patches), -1)
+        template = (flat / np.maximum(flat.mean(axis=1, keepdims=True), 1e-20)).mean(axis=0).reshape(len(reach), -1)
+        down, right = np.gradient(template)
+        design = np.stack([template.ravel(), down.ravel(), right.ravel(), np.ones(template.size)], axis=1)
+        fit = np.linalg.lstsq(design, flat.T.astype(float), rcond=None)[0]
+        shift = -fit[1:3].T / np.where(fit[0] > 0, fit[0], np.inf)[:, None]
+        centres += np.clip(shift - np.median(shift, axis=0), -0.1 * pitch, 0.1 * pitch)
+    return centres

@@ -18,12 +18,13 @@ class Noise:
     source: str
 
 
-def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, lattice="auto", cfa=None, overwrite=False, command=""):
+def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, lattice="auto", cfa=None, near=None, overwrite=False, command=""):
     """Calibrate and write `output`; returns a summary dict.
 
     whites, darks: paths. bands: (wavelength m, path) pairs, several a band allowed. radiances: (wavelength m, relative
     radiance of that source) pairs, 1 where not given. camera: TOML for gain and read noise. shared: one F for all
-    lenslets. cfa: colour filter array of PNG and TIFF mosaics (default: the camera's, else mono). Errors: InputError for files, NumericsError where there is no lattice or no light.
+    lenslets. cfa: colour filter array of PNG and TIFF mosaics (default: the camera's, else mono). near: (row, column) px close
+    to any superpixel's centre (see find_grid). Errors: InputError for files, NumericsError where there is no lattice or no light.
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.config import load_camera
@@ -46,7 +47,7 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     signal, weight = merge([e.values for e in white], [e.seconds for e in white], dark, white[0].white, reference)
     if np.isnan(signal).mean() > 0.05:
         raise InputError(f"{np.isnan(signal).mean():.0%} of the white image is saturated", white[0].path, "expose it for less time")
-    grid = _grid(signal, white[0], lattice)
+    grid = _grid(signal, white[0], lattice, near)
     window = _window(grid)
     data, attrs = _describe_grid(grid, window, white[0].values.shape)
     bad = _bad(signal, dark, white[0])
@@ -88,11 +89,11 @@ def _noise(white, darks, dark, band_groups, camera):
     return Noise(gain, read if read is not None else 1 / 12, source if gain is not None else "unknown")
 
 
-def _grid(signal, white, lattice):
+def _grid(signal, white, lattice, near):
     from plenocli.sensor.grid import find_grid
 
     try:
-        return find_grid(np.where(np.isnan(signal), np.nanmax(signal), signal), white.cfa, None, lattice)
+        return find_grid(np.where(np.isnan(signal), np.nanmax(signal), signal), white.cfa, None, lattice, near)
     except (NumericsError, InputError) as error:
         raise type(error)(error.what, white.path, error.fix) from None
 

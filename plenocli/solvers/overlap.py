@@ -14,26 +14,16 @@ import numpy as np
 RING = 1
 
 
-def without_neighbours(solve, blocks, offsets, y, *, sweeps=3):
-    """Per-lenslet `solve` with the neighbours' light taken away: repeat x <- solve(y - sum_(o != 0) A_o x[l - o]).
-
-    solve: (pixel, signal) -> (point, signal).  y: (lenslet_row, lenslet_column, pixel).  Returns x (lenslet_row,
-    lenslet_column, point). The light between lenslets is a few per cent in focus, so `sweeps` repetitions settle it.
-    """
-    from plenocli.operators import BlockToeplitz
-
-    count = y.shape[:2]
-    stray = BlockToeplitz(blocks, offsets, count).neighbours_only()
-    x = _by_lenslet(solve, y)
-    for _ in range(sweeps if len(stray.blocks) else 0):
-        x = _by_lenslet(solve, y - stray.forward(x))
-    return x
+def by_lenslet(solve, y):
+    """`solve` (pixel, signal) -> (point, signal) on all superpixels y (lenslet_row, lenslet_column, pixel) at once."""
+    rows, columns = y.shape[:2]
+    return solve(y.reshape(rows * columns, -1).T).T.reshape(rows, columns, -1)
 
 
 def joint_tikhonov(blocks, offsets, y, alpha, *, start=None, tol=1e-8, iterations=2000):
     """argmin |y - Ax|^2 + alpha |x|^2 over the whole array, matrix-free by conjugate gradients on the normal equations.
 
-    y (lenslet_row, lenslet_column, pixel) -> (x, relative residual of the normal equations); x as `without_neighbours`.
+    y (lenslet_row, lenslet_column, pixel) -> (x, relative residual of the normal equations); x (lenslet_row, lenslet_column, point).
     """
     from plenocli.operators import BlockToeplitz
 
@@ -166,8 +156,3 @@ def _filter(footprint, autocovariance, margin):
     for k, plane in enumerate(footprint):
         filtered[k] = irfft2(rfft2(plane, shape) * spectrum, shape)[np.ix_(rows, columns)]
     return filtered
-
-
-def _by_lenslet(solve, y):
-    rows, columns = y.shape[:2]
-    return solve(y.reshape(rows * columns, -1).T).T.reshape(rows, columns, -1)

@@ -4,12 +4,19 @@ from functools import cached_property
 
 import numpy as np
 
-from plenocli.errors import InputError
+from plenocli.errors import InputError, NumericsError
 from plenocli.stages.progress import note
+from plenocli.solvers.overlap import by_lenslet
 from plenocli.stages.training import read_training
 
 PATCHES_A_POINT = 6
 """Training patches for the LMMSE covariance, for each object point."""
+
+
+NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
+SWEEPS = 4
+MISFIT = 1.5
+"""Estimated noise over the capture's own from which on the estimate is believed."""
 
 
 class Estimators:
@@ -30,25 +37,42 @@ class Estimators:
 
         truth (like x): chooses the weight of tikhonov or tsvd with hindsight.
         """
-        from plenocli.solvers.overlap import without_neighbours
-
         method, reason = self._method()
         report = {"method": method, "reason": reason, "overlap": self.settings.overlap}
-        sigma = self._noise(data, report) if method in ("tikhonov", "tsvd", "lmmse", "dictionary") else None
-        stacked = data.y.reshape(-1, data.y.shape[2]).T
+        if self.settings.overlap == 3 and not self.coupled and method != "lmmse":
+            note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
         if method == "lmmse" and self.settings.overlap == 3:
-            x, spread = self._joint(sigma, data.scene).apply(data.y)
+            x, spread = self._joint(self._noise(data, data.y, report), data.scene).apply(data.y)
             return x, spread, report
+        hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
+        if self._takes_neighbours():
+            return self._by_sweeps(method, data, hidden, report), None, report
+        sigma = self._noise(data, data.y, report) if method in NOISY else None
         if method == "lmmse":
             estimator = self._lmmse(sigma, data.scene)
-            x = self._around(estimator.apply, data.y)
+            x = by_lenslet(estimator.apply, data.y)
             return x, np.broadcast_to(estimator.sigma, x.shape), report
-        hidden = None if truth is None else truth.reshape(len(stacked.T), -1).T
-        solver = {"block-mean": self._block_mean, "tikhonov": self._tikhonov, "tsvd": self._tsvd, "nnls": self._nnls, "dictionary": self._dictionary}[method]
-        solve = solver(stacked, sigma, hidden, report)
-        if method == "tikhonov" and self.settings.overlap == 3 and self.coupled:
-            return self._joint_tikhonov(data.y, without_neighbours(solve, self.system.blocks, self.system.offsets, data.y), report), None, report
-        return self._around(solve, data.y), None, report
+        return by_lenslet(self._solver(method, data.y, sigma, hidden, report), data.y), None, report
+
+    def _by_sweeps(self, method, data, truth, report):
+        """Per lenslet, with the neighbours' light taken away by repetition: x <- solve(y - light of x on neighbours).
+
+        The first light is that of the block means. Each sweep chooses its weights for what is left, so that a poor first
+        picture is not over-fitted.
+        """
+        from plenocli.operators import BlockToeplitz
+
+        stray = BlockToeplitz(self.system.blocks, self.system.offsets, data.y.shape[:2]).neighbours_only()
+        left = data.y - self._stray(data.y)
+        for sweep in range(SWEEPS):
+            sigma = self._noise(data, left, report, quiet=sweep < SWEEPS - 1) if method in NOISY else None
+            x = by_lenslet(self._solver(method, left, sigma, truth, report), left)
+            left = data.y - stray.forward(x)
+        return self._joint_tikhonov(data.y, x, report) if method == "tikhonov" else x
+
+    def _solver(self, method, y, sigma, truth, report):
+        setup = {"block-mean": self._block_mean, "tikhonov": self._tikhonov, "tsvd": self._tsvd, "nnls": self._nnls, "dictionary": self._dictionary}[method]
+        return setup(y.reshape(-1, y.shape[2]).T, sigma, truth, report)
 
     def _method(self):
         asked = self.settings.method
@@ -58,30 +82,52 @@ class Estimators:
             return "dictionary", "a dictionary was given"
         return "lmmse", "the best of the linear methods, with its own error estimate"
 
-    def _around(self, solve, y):
-        """Per lenslet; with --overlap 3 the neighbours' light is taken away by repetition."""
-        from plenocli.solvers.overlap import without_neighbours
+    def _noise(self, data, y, report, quiet=False):
+        """Standard deviation of what in y is not A x: given, the capture's own, or estimated; the report says which.
 
-        if self.settings.overlap == 3 and not self.coupled:
-            note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
-        sweeps = 3 if self.settings.overlap == 3 else 0
-        return without_neighbours(solve, self.system.blocks, self.system.offsets, y, sweeps=sweeps)
-
-    def _noise(self, data, report):
-        """Standard deviation of the noise in y: as given, as the capture says, or estimated, and which."""
-        from plenocli.solvers.linear import estimate_noise
-
+        The estimate also wins over the capture's figure where it is MISFIT times larger: then y holds more than A x and the
+        sensor's noise (neighbours' light, another matrix), which would be amplified if it were trusted as signal.
+        """
         if self.settings.noise_sigma is not None:
             sigma, source = self.settings.noise_sigma, "given"
-        elif data.sigma:
-            sigma, source = data.sigma, "from the capture"
         else:
-            stacked = data.y.reshape(-1, data.y.shape[2]).T
-            sigma, source = estimate_noise(self.svd, stacked), "estimated from what the system matrix cannot produce"
-            sigma = max(sigma, 1e-12 * float(np.abs(stacked).max(initial=0)), np.finfo(float).tiny)
-            note(f"the capture does not say its noise: sigma = {sigma:.3g}, {source}")
+            sigma, source = self._estimated(data, y.reshape(-1, y.shape[2]).T, quiet)
         report |= {"noise_sigma": float(sigma), "noise_source": source}
         return float(sigma)
+
+    def _takes_neighbours(self):
+        return self.coupled and self.settings.overlap == 3
+
+    def _stray(self, y):
+        """The neighbours' light, from the block means: enough to estimate the noise."""
+        from plenocli.operators import BlockToeplitz
+
+        op = BlockToeplitz(self.system.blocks, self.system.offsets, y.shape[:2])
+        uniform = self.system.own.sum(axis=1)
+        level = y @ uniform / (uniform @ uniform)
+        return op.neighbours_only().forward(np.broadcast_to(level[:, :, None], op.domain.shape))
+
+    def _estimated(self, data, stacked, quiet):
+        from plenocli.solvers.linear import estimate_noise
+
+        floor = max(1e-9 * float(np.abs(stacked).max(initial=0)), np.finfo(float).tiny)
+        joint = self._takes_neighbours() and self._method()[0] == "lmmse"
+        try:
+            sigma = max(estimate_noise(self.svd, stacked), floor)
+        except NumericsError:
+            if not data.sigma:
+                raise
+            return data.sigma, "from the capture"
+        if data.sigma is not None and (joint or sigma <= MISFIT * max(data.sigma, floor)):
+            return max(data.sigma, floor), "from the capture"
+        if quiet:
+            pass
+        elif data.sigma is None:
+            note(f"the capture does not say its noise: sigma = {sigma:.3g}, estimated from what the system matrix cannot produce")
+        else:
+            note(f"the capture holds {sigma / max(data.sigma, floor):.3g} times more than its noise that the system matrix cannot produce: sigma = {sigma:.3g} is used. "
+                 "If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3")
+        return sigma, "estimated from what the system matrix cannot produce"
 
     def _block_mean(self, stacked, sigma, truth, report):
         uniform = self.system.own.sum(axis=1)
@@ -110,7 +156,7 @@ class Estimators:
         elif truth is not None:
             rank, rule = linear.oracle_rank(self.svd, z, truth), "oracle: least error against the truth, which no camera has"
         else:
-            rank, rule = linear.discrepancy_rank(self.svd, z, sigma), "discrepancy"
+            rank, rule = linear.best_rank(self.svd, z, sigma), "least estimated error"
         report |= {"rank": int(rank), "rule": rule}
         return lambda y: linear.truncated(self.svd, self.svd.compress(y), rank)
 
@@ -143,11 +189,13 @@ class Estimators:
             raise InputError(f"has atoms of {len(atoms)} points, the system matrix {self.system.own.shape[1]}", path, "learn it with this pif")
         if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(self.system.path):
             note(f"the dictionary was learnt for another system matrix than {self.system.path.name}")
-        lam = self.settings.lam if self.settings.lam is not None else float(attrs["lambda"])
         scale = float(self.svd.s[0])
+        learnt = float(attrs["parameters"]["sigma"])
+        louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
+        lam = self.settings.lam if self.settings.lam is not None else float(attrs["lambda"]) * louder
         kept = self.svd.rank()
         seen = (self.svd.s[:kept, None] / scale) * self.svd.vt[:kept] @ atoms
-        report |= {"lambda": lam, "rule": "as learnt" if self.settings.lam is None else "given"}
+        report |= {"lambda": lam, "rule": "given" if self.settings.lam is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder:.3g} for more noise"}
 
         def solve(y):
             code = sparse_code(seen, self.svd.compress(y)[:kept] / scale, lam, free=[0])

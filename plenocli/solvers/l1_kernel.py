@@ -16,8 +16,9 @@ else:  # the one threading layer that ships with numba itself and does not share
     if "NUMBA_THREADING_LAYER" not in os.environ:
         numba.config.THREADING_LAYER = "workqueue"
 
-PIVOT_FLOOR = 1e-13
-"""A pivot below this times its diagonal means that the atom depends on those before it: it does not move."""
+PIVOT_FLOOR = 1e-12
+"""Least pivot, times its diagonal. Atoms that depend on others then move far along the flat direction, and the line search
+stops them where one of them reaches zero and leaves."""
 
 if numba is None:
     COMPILED = False
@@ -36,7 +37,7 @@ else:
 
 
 def _factor_by_rows(matrix):
-    """Lower Cholesky factor in place (row-wise, dot products); a dependent row gets an infinite pivot."""
+    """Lower Cholesky factor in place (row-wise, dot products), pivots no less than PIVOT_FLOOR."""
     n = matrix.shape[0]
     for i in range(n):
         row = matrix[i]
@@ -50,7 +51,7 @@ def _factor_by_rows(matrix):
         total = diagonal
         for k in range(i):
             total -= row[k] * row[k]
-        row[i] = np.sqrt(total) if total > PIVOT_FLOOR * diagonal else np.inf
+        row[i] = np.sqrt(max(total, PIVOT_FLOOR * diagonal))
     return matrix
 
 
@@ -58,14 +59,14 @@ def _factor_by_columns(matrix):
     """The same factor, one matrix-vector product a column."""
     for j in range(matrix.shape[0]):
         column = matrix[j:, j] - matrix[j:, :j] @ matrix[j, :j]
-        pivot = np.sqrt(column[0]) if column[0] > PIVOT_FLOOR * matrix[j, j] else np.inf
+        pivot = np.sqrt(max(column[0], PIVOT_FLOOR * matrix[j, j]))
         matrix[j:, j] = column / pivot
         matrix[j, j] = pivot
     return matrix
 
 
 def _solve_by_loops(factor, h):
-    """d with L L^T d = h; unknowns whose pivot is infinite come out as 0."""
+    """d with L L^T d = h."""
     n = h.shape[0]
     d = np.empty(n)
     for i in range(n):

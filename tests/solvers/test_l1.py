@@ -1,0 +1,126 @@
+"""Sparse coding: every solution carries its certificate, and the compiled and the plain kernel agree."""
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+
+from plenocli.solvers import l1, l1_kernel
+
+
+def plenoptic_like(rows=30, atoms=40, signals=12, seed=0):
+    """A dictionary with singular values over four decades, as A Phi has, and signals of a few of its atoms plus noise."""
+    rng = np.random.default_rng(seed)
+    u, _ = np.linalg.qr(rng.standard_normal((rows, rows)))
+    d = (u * np.logspace(0, -4, rows)) @ rng.standard_normal((rows, atoms))
+    c = np.where(rng.random((atoms, signals)) < 0.1, rng.standard_normal((atoms, signals)), 0)
+    y = d @ c
+    return d, y + 1e-4 * np.sqrt(np.mean(y**2)) * rng.standard_normal(y.shape)
+
+
+def optimality(d, y, c, lam, weights=None):
+    """Largest violation of the subgradient conditions, in units of lambda."""
+    g = 2 * d.T @ (y - d @ c) / lam / (1 if weights is None else weights[:, None])
+    return max(np.max(np.abs(g), initial=0) - 1, np.max(np.abs(g - np.sign(c))[c != 0], initial=0))
+
+
+@pytest.mark.parametrize("lam", [1e-2, 1e-4, 1e-6])
+def test_solution_meets_the_subgradient_conditions(lam):
+    d, y = plenoptic_like()
+    code = l1.sparse_code(d, y, lam, tol=1e-9)
+    assert code.gap.max() <= 1e-8  # at the smallest lambda the Gram form has no more digits
+    assert optimality(d, y, code.c, lam) < 1e-4
+    np.testing.assert_allclose(code.objective, np.sum((y - d @ code.c) ** 2, axis=0) + lam * np.abs(code.c).sum(axis=0), rtol=1e-6)
+
+
+def test_one_atom_by_hand():
+    code = l1.sparse_code(np.array([[2.0]]), np.array([[3.0, -3.0, 0.1]]), 1.0)  # c = (d y - lam/2) / d^2, or 0
+    np.testing.assert_allclose(code.c, [[5.5 / 4, -5.5 / 4, 0.0]])
+
+
+def test_lambda_convention_has_no_half():
+    d, y = plenoptic_like()
+    edge = l1.largest_lambda(d, y)
+    np.testing.assert_allclose(edge, 2 * np.abs(d.T @ y).max(axis=0))
+    assert not np.any(l1.sparse_code(d, y[:, :1], 1.001 * edge[0]).c)
+    assert np.any(l1.sparse_code(d, y[:, :1], 0.999 * edge[0], tol=1e-12).c)
+
+
+def test_fista_with_the_same_certificate_agrees():
+    d, y = np.random.default_rng(3).standard_normal((30, 40)), np.random.default_rng(4).standard_normal((30, 5))
+    newton, first_order = l1.sparse_code(d, y, 3.0, tol=1e-10), l1.fista(d, y, 3.0, tol=1e-10, iterations=5000)
+    assert first_order.gap.max() <= 1e-10
+    np.testing.assert_allclose(newton.c, first_order.c, atol=1e-4)
+    np.testing.assert_allclose(newton.objective, first_order.objective, rtol=1e-9)
+
+
+def test_the_gap_bounds_the_distance_from_the_optimum():
+    d, y = np.random.default_rng(3).standard_normal((30, 40)), np.random.default_rng(4).standard_normal((30, 5))
+    best = l1.sparse_code(d, y, 3.0, tol=1e-12).objective
+    rough = l1.fista(d, y, 3.0, tol=0, iterations=20)
+    assert np.all(rough.gap > 1e-8)
+    assert np.all(rough.objective - best <= rough.gap * rough.objective * (1 + 1e-9))
+
+
+def test_free_atoms_are_not_penalised():
+    d, y = plenoptic_like()
+    code = l1.sparse_code(d, y, 1e-3, free=[0, 7], tol=1e-9)
+    residual = y - d @ code.c
+    assert np.abs(d[:, [0, 7]].T @ residual).max() < 1e-10
+    g = 2 * np.delete(d, [0, 7], 1).T @ residual / 1e-3
+    assert np.abs(g).max() <= 1 + 1e-4
+
+
+def test_weights_scale_lambda():
+    d, y = plenoptic_like()
+    w = np.linspace(0.5, 2, d.shape[1])
+    np.testing.assert_allclose(l1.sparse_code(d, y, 1e-3, weights=w, tol=1e-10).c, l1.sparse_code(d / w, y, 1e-3, tol=1e-10).c / w[:, None], atol=1e-6)
+
+
+def duplicate(d, y):
+    return np.concatenate([d, d[:, :10]], axis=1), y
+
+
+def zeros(d, y):
+    d, y = d.copy(), y.copy()
+    d[:, 3], y[:, 2] = 0, 0
+    return d, y
+
+
+def rank_one(d, y):
+    return np.outer(d[:, 0], np.linspace(0.5, 1, d.shape[1])), y
+
+
+@pytest.mark.parametrize("spoil", [duplicate, zeros, rank_one])
+def test_degenerate_dictionaries_keep_their_certificate(spoil):
+    d, y = spoil(*plenoptic_like())
+    code = l1.sparse_code(d, y, 1e-4, tol=1e-7)
+    assert np.all(np.isfinite(code.c)) and code.gap.max() <= 1e-5
+
+
+def test_workers_do_not_change_the_result():
+    d, y = plenoptic_like()
+    np.testing.assert_array_equal(l1.sparse_code(d, y, 1e-4, workers=1).c, l1.sparse_code(d, y, 1e-4, workers=2).c)
+
+
+def test_plain_numpy_gives_the_same(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    spec = importlib.util.spec_from_file_location("plain_kernel", l1_kernel.__file__)
+    plain = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(plain)
+    assert not plain.COMPILED
+    d, y = plenoptic_like()
+    compiled = l1.sparse_code(d, y, 1e-5, tol=1e-9)
+    monkeypatch.setitem(sys.modules, "plenocli.solvers.l1_kernel", plain)
+    monkeypatch.setattr("plenocli.solvers.l1_kernel", plain)
+    without = l1.sparse_code(d, y, 1e-5, tol=1e-9)
+    np.testing.assert_allclose(without.c, compiled.c, atol=1e-7 * np.abs(compiled.c).max())
+    np.testing.assert_array_equal(without.c != 0, compiled.c != 0)
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="lambda"):
+        l1.sparse_code(np.eye(2), np.eye(2), 0.0)
+    with pytest.raises(ValueError, match="weights"):
+        l1.sparse_code(np.eye(2), np.eye(2), 1.0, weights=[1, 0])

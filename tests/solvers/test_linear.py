@@ -1,0 +1,154 @@
+"""Tikhonov, truncation, noise estimate and LMMSE against their definitions, and 3x3 LMMSE against the full covariance."""
+
+import numpy as np
+import pytest
+
+from plenocli.errors import NumericsError
+from plenocli.operators import BlockToeplitz
+from plenocli.solvers import linear, lmmse, natural, overlap
+
+
+@pytest.fixture(scope="module")
+def system():
+    """A (60, 36) with singular values over five decades, 200 signals, noise 1e-3."""
+    rng = np.random.default_rng(0)
+    u, v = (np.linalg.qr(rng.standard_normal((n, 36)))[0] for n in (60, 36))
+    a = (u * np.logspace(0, -5, 36)) @ v.T
+    x = rng.standard_normal((36, 200))
+    return a, x, a @ x + 1e-3 * rng.standard_normal((60, 200))
+
+
+def test_tikhonov_is_its_normal_equations(system):
+    a, _, y = system
+    svd = linear.decompose(a)
+    x = linear.tikhonov(svd, svd.compress(y), 1e-4)
+    np.testing.assert_allclose(x, np.linalg.solve(a.T @ a + 1e-4 * np.eye(36), a.T @ y), rtol=1e-8, atol=1e-10)
+
+
+def test_truncation_is_the_pseudo_inverse(system):
+    a, _, y = system
+    svd = linear.decompose(a)
+    cut = (svd.s[9] + svd.s[10]) / 2 / svd.s[0]
+    np.testing.assert_allclose(linear.truncated(svd, svd.compress(y), 10), np.linalg.pinv(a, rcond=cut) @ y, rtol=1e-8, atol=1e-9)
+
+
+def test_discrepancy_leaves_the_noise(system):
+    a, _, y = system
+    svd = linear.decompose(a)
+    z = svd.compress(y)
+    alpha = linear.discrepancy_alpha(svd, z, 1e-3)
+    left = z - svd.s[:, None] * (svd.vt @ linear.tikhonov(svd, z, alpha))
+    assert np.sum(left**2) == pytest.approx(z.size * 1e-6, rel=1e-6)
+
+
+def test_oracles_are_the_best(system):
+    a, x, y = system
+    svd = linear.decompose(a)
+    z = svd.compress(y)
+    error = lambda estimate: np.sum((estimate - x) ** 2)  # noqa: E731
+    best = error(linear.tikhonov(svd, z, linear.oracle_alpha(svd, z, x)))
+    assert best <= min(error(linear.tikhonov(svd, z, alpha)) for alpha in np.logspace(-10, 0, 41)) * (1 + 1e-6)
+    ranks = [error(linear.truncated(svd, z, k)) for k in range(1, 37)]
+    assert linear.oracle_rank(svd, z, x) == int(np.argmin(ranks)) + 1
+    assert abs(linear.best_rank(svd, z, 1e-3) - linear.oracle_rank(svd, z, x)) <= 1
+
+
+def test_noise_is_estimated_from_what_a_cannot_make(system):
+    a, _, y = system
+    assert linear.estimate_noise(linear.decompose(a), y) == pytest.approx(1e-3, rel=0.05)
+    with pytest.raises(NumericsError, match="noise-sigma"):
+        linear.estimate_noise(linear.decompose(np.eye(5)), np.ones((5, 2)))
+
+
+def test_useless_matrices_are_refused():
+    for bad in (np.zeros((3, 2)), np.full((3, 2), np.nan)):
+        with pytest.raises(NumericsError):
+            linear.decompose(bad)
+
+
+def test_lmmse_is_the_textbook_formula(system):
+    a, _, y = system
+    root = np.random.default_rng(1).standard_normal((36, 36)) / 6
+    c, mean = root @ root.T, np.linspace(0, 1, 36)
+    estimator = lmmse.prepare(linear.decompose(a), mean, c, 1e-3)
+    gain = c @ a.T @ np.linalg.inv(a @ c @ a.T + 1e-6 * np.eye(60))
+    np.testing.assert_allclose(estimator.apply(y), mean[:, None] + gain @ (y - (a @ mean)[:, None]), atol=1e-4)
+    np.testing.assert_allclose(estimator.sigma**2, np.diag(c - gain @ a @ c), rtol=1e-4)
+
+
+def test_lmmse_predicts_its_own_error(system):
+    a, x, y = system
+    estimator = lmmse.prepare(linear.decompose(a), np.zeros(36), np.eye(36), 1e-3)
+    assert np.sqrt(np.mean((estimator.apply(y) - x) ** 2)) == pytest.approx(np.sqrt(np.mean(estimator.sigma**2)), rel=0.03)
+    with pytest.raises(NumericsError, match="noise"):
+        lmmse.prepare(linear.decompose(a), np.zeros(36), np.eye(36), 0.0)
+
+
+N = 4
+RING = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
+
+
+def neighbours(coupled):
+    blocks = np.random.default_rng(2).random((9, 9, N * N)) * np.where(np.any(RING != 0, axis=1), 0.03 if coupled else 0, 1)[:, None, None]
+    return (blocks, RING) if coupled else (blocks[4:5], RING[4:5])
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_joint_lmmse_is_the_full_covariance(coupled):
+    blocks, offsets = neighbours(coupled)
+    rng, count, sigma = np.random.default_rng(3), 3, 1e-2
+    reach = overlap.needed_reach((N, N), offsets)
+    lag = np.arange(-reach, reach + 1)
+    covariance_map = 0.05 * np.exp(-np.hypot(lag[:, None], lag[None, :]) / 6)
+    joint = overlap.prepare_joint(linear.decompose(blocks[len(blocks) // 2]), blocks, offsets, (N, N), 0.4, covariance_map, sigma, most=99)
+    side = count + 2  # light from one lenslet outside counts, with the scene's statistics
+    op = BlockToeplitz(blocks, offsets, (side, side))
+    index = np.arange((side * N) ** 2).reshape(side, N, side, N).transpose(0, 2, 1, 3).ravel()
+    r, c = np.divmod(index, side * N)
+    full_map = 0.05 * np.exp(-np.hypot(*(np.arange(-side * N, side * N + 1)[s] for s in ((slice(None), None), (None, slice(None))))) / 6)
+    cover = full_map[r[:, None] - r[None, :] + side * N, c[:, None] - c[None, :] + side * N]
+    identity = np.eye(op.domain.size).reshape(-1, *op.domain.shape)
+    matrix = np.stack([op.forward(e)[1:-1, 1:-1].ravel() for e in identity], axis=1)
+    y = rng.random((count, count, 9)) + matrix.sum(axis=1).reshape(count, count, 9) * 0.4
+    data = matrix @ cover @ matrix.T + sigma**2 * np.eye(len(matrix))
+    cross = cover @ matrix.T
+    estimate = 0.4 + (cross @ np.linalg.solve(data, y.ravel() - 0.4 * matrix.sum(axis=1))).reshape(side, side, N * N)
+    error = np.sqrt(0.05 - np.einsum("ij,ji->i", cross, np.linalg.solve(data, cross.T))).reshape(side, side, N * N)
+    x, spread = joint.apply(y)
+    np.testing.assert_allclose(x[1, 1], estimate[2, 2], atol=1e-8)  # the middle lenslet of 3x3 sees everything there is
+    np.testing.assert_allclose(spread[1, 1], error[2, 2], atol=1e-8)
+
+
+def test_joint_tikhonov_is_the_full_system():
+    blocks, offsets = neighbours(True)
+    op = BlockToeplitz(blocks, offsets, (2, 3))
+    matrix = np.stack([op.forward(e).ravel() for e in np.eye(op.domain.size).reshape(-1, *op.domain.shape)], axis=1)
+    y = np.random.default_rng(4).random(op.range.shape)
+    x, residual = overlap.joint_tikhonov(blocks, offsets, y, 1e-2, tol=1e-12)
+    assert residual <= 1e-12
+    np.testing.assert_allclose(x.ravel(), np.linalg.solve(matrix.T @ matrix + 1e-2 * np.eye(op.domain.size), matrix.T @ y.ravel()), atol=1e-8)
+
+
+def test_autocovariance_of_known_fields():
+    rng = np.random.default_rng(5)
+    mean, white = natural.autocovariance([0.5 + 0.1 * rng.standard_normal((200, 220))], 3)
+    assert mean == pytest.approx(0.5, abs=2e-3)
+    assert white[3, 3] == pytest.approx(0.01, rel=0.02)
+    assert np.abs(np.delete(white.ravel(), 24)).max() < 2e-4
+    _, lags = natural.autocovariance([np.arange(4.0)[None, :] * np.ones((4, 1))], 1)  # -1.5 -.5 .5 1.5: lag 1 is (.75 -.25 .75) / 3
+    np.testing.assert_allclose(lags[1], [1.25 / 3, 1.25, 1.25 / 3])
+
+
+def test_patches_come_from_the_pictures():
+    picture = np.arange(30.0).reshape(5, 6)
+    patches = natural.draw_patches([picture], (5, 6), 20, np.random.default_rng(0))
+    shapes = {p.tobytes() for p in patches.T}
+    assert shapes == {picture[::a, ::b].tobytes() for a in (1, -1) for b in (1, -1)}
+    with pytest.raises(ValueError, match="at least"):
+        natural.draw_patches([picture], (6, 6), 1, np.random.default_rng(0))
+
+
+def test_block_covariance_reads_the_lags():
+    lags = np.arange(49.0).reshape(7, 7)
+    c = natural.block_covariance(lags, (2, 2), (0, 2))
+    assert c[0, 0] == lags[3, 5] and c[0, 3] == lags[4, 6] and c[3, 0] == lags[2, 4]

@@ -252,12 +252,14 @@ def _to_dark_borders(image, model, index, pitch, near):
 
 def _dark_lines(image, model, index, pitch, axis):
     """Dark lines across one lattice direction: [(distance of the line from the cell's border, cells; depth)]."""
-    chosen = index[:: max(1, len(index) // 800)]
+    chosen = index[:: max(1, len(index) // 300)]
     bins = max(24, int(4 * pitch))
     along = (np.arange(bins) + 0.5) / bins
     across = (np.arange(16) + 0.5) / 16 - 0.5
     grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)[..., :: 1 if axis == 0 else -1]
-    near = np.clip(np.rint(model.at(chosen[:, None, None] + grid)).astype(int), 0, np.array(image.shape) - 1)
+    vectors = np.stack([model.at(chosen + step / 2) - model.at(chosen - step / 2) for step in np.eye(2)], axis=1)
+    where = model.at(chosen)[:, None, None] + np.einsum("abk,nkd->nabd", grid, vectors)
+    near = np.clip(np.rint(where).astype(int), 0, np.array(image.shape) - 1)
     profile = image[near[..., 0], near[..., 1]].mean(axis=(0, 2), dtype=float)
     kernel = np.ones(max(1, bins // 24)) / max(1, bins // 24)
     smooth = np.convolve(np.tile(profile, 3), kernel, "same")[bins : 2 * bins]

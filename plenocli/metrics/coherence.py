@@ -1,7 +1,7 @@
 """Coherence of a dictionary Phi with the system matrix A: what sparse recovery from y = A Phi c can hope for.
 
 Three quantities go by the name; all are reported. D = A Phi is the effective dictionary, what the sensor sees of each
-atom.
+atom. See docs/model.md, "Spatial reconstruction".
 """
 
 import math

@@ -1,7 +1,7 @@
 """Quality of a picture against its truth.
 
 Pictures are (..., row, column) with linear values; white is 1.0 and that is the peak of the PSNR, whatever the picture's
-own maximum. Nothing is clipped or rounded here.
+own maximum. Nothing is clipped or rounded here. See docs/model.md, "Measures".
 """
 
 import numpy as np

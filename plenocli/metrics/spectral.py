@@ -1,6 +1,7 @@
 """Accuracy of spectra against their truth: error per band, spectral angle, colour difference.
 
 Spectra are (..., band); cubes are (band, row, column); labels (row, column) are 0 for "nothing" and 1.. for patches.
+See docs/model.md, "Measures".
 """
 
 import numpy as np

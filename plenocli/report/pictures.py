@@ -134,17 +134,19 @@ def _on_superpixels(column, pixel_shape, offsets):
 def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ranks=None):
     """Singular values of A relative to the largest, one line a band, and the share of light kept by object point.
 
-    singular_values (band, value) or (value,) or None; column_energy (band, point); ranks (band,) or None.
+    singular_values (band, value) or (value,) or None; column_energy (band, point); ranks (band,) or None. Of many bands six are drawn.
     """
     values = None if singular_values is None else np.atleast_2d(singular_values)
     with drawing(9.4, 3.6) as made:
         left, right = made.figure.subplots(1, 2, width_ratios=(1.55, 1))
         ranks = [None] * len(wavelengths) if ranks is None else np.broadcast_to(np.ravel(ranks), len(wavelengths))
-        for band, wavelength in enumerate(wavelengths if values is not None else ()):
+        chosen = np.unique(np.round(np.linspace(0, len(wavelengths) - 1, min(len(wavelengths), 6))).astype(int))
+        for number, band in enumerate(chosen if values is not None else ()):
             one = values[min(band, len(values) - 1)]
             kept = one[one > 0]
             rank = "" if ranks[band] is None else f", rank {int(ranks[band])} of {len(one)}"
-            left.semilogy(np.arange(1, len(kept) + 1), kept / kept[0], color=COLOURS[band % len(COLOURS)], label=nanometres(wavelength) + rank)
+            if len(kept):
+                left.semilogy(np.arange(1, len(kept) + 1), kept / kept[0], color=COLOURS[number], label=nanometres(wavelengths[band]) + rank)
         left.set(xlabel="number", ylabel="singular value, relative to the largest")
         left.grid(True)
         if values is not None:

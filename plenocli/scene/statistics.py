@@ -15,7 +15,8 @@ def radiance_statistics(mean, covariance, light):
     """Statistics of radiance b = diag(E) r from those of reflectance r.
 
     mean (band,), covariance (band, band) of r; light (band,): power E of the light in each band, any unit, which the
-    result inherits. Returns (mu_b = E mu_r, C_b = diag(E) C_r diag(E)); Berkner et al. 2013, spectral model.
+    result inherits. Returns (mu_b = E mu_r, C_b = diag(E) C_r diag(E)); Berkner et al. 2013, spectral
+    model; docs/model.md, "Spectral response: calibration and demultiplexing".
     """
     light = np.asarray(light, dtype=np.float64)
     return light * mean, light[:, None] * np.asarray(covariance) * light[None, :]

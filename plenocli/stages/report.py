@@ -73,8 +73,13 @@ def _spatial(page, run, scores):
     # What an image came from directly is a picture's matrix or capture; without images, whatever no calibration used.
     direct = {digest for file in (*images, *run.of_kind("dictionary")) for digest in file.sources.values()}
     calibrated = {digest for file in (*run.of_kind("calibration"), *run.of_kind("spectra")) for digest in file.sources.values()}
-    matrices = [f for f in run.of_kind("pif") if f.digest in direct] or [f for f in run.of_kind("pif") if not any(u.digest in calibrated for u in run.users(f))]
-    captures = [f for f in run.of_kind("capture") if f.digest in direct or f.digest not in calibrated]
+    homes = {file.folder for file in run.of_kind("calibration")}
+
+    def here(file):  # a DNG does not say what it was for: what lies with a calibration belongs to it
+        return file.digest in direct or not (file.digest in calibrated or homes & {file.folder, *file.folder.parents})
+
+    matrices, captures = filter(here, run.of_kind("pif")), list(filter(here, run.of_kind("capture")))
+    matrices = sorted(matrices, key=lambda file: file.digest not in direct)
     if not (scores or images or matrices or run.of_kind("dictionary") or captures):
         return None
     page.section("Spatial", "Wave optics carries each object point through main lens and lenslet to the pixels behind it: one column of the system matrix A. "
@@ -187,6 +192,10 @@ def _dictionary(page, run, file):
     attrs = artefact.attrs.get("dictionary", {})
     rows = [[name.replace("_", " "), _text(value)] for name, value in attrs.items() if isinstance(value, (int, float, np.number)) and not isinstance(value, bool)]
     page.table(["", ""], rows, text=True)
+    notes = attrs.get("notes")
+    if isinstance(notes, dict) and notes.get("beats_lmmse") is False:
+        page.warning(f"This dictionary does not beat LMMSE on held-out pictures ({notes.get('validation_psnr_db', 0):.2f} against "
+                     f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead.")
     matrix = next((run.by_digest(d) for d in file.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "pif"), None)
     system = pixel_shape = None
     if matrix is not None:
@@ -216,10 +225,13 @@ def _spectral(page, run, scores):
     for file in calibrations:
         _calibration(page, file)
     sources = {digest for file in (*calibrations, *spectra) for digest in file.sources.values()}
-    captures = sorted((f for f in run.of_kind("capture") if f.digest in sources), key=lambda f: ("chart" not in f.name, "white" not in f.name, f.name))
+    captures = [f for f in run.of_kind("capture") if f.digest in sources]
+    # one of each sort before a second of any: the pipelines name files by what they show
+    sorts = [next((f for f in captures if word in f.path.name), None) for word in ("chart", "white", "band")]
+    captures = list(dict.fromkeys(f.digest for f in [*sorts, *captures] if f))
     if captures:
         page.heading("Captures")
-    for file in captures[:_CAPTURES]:
+    for file in map(run.by_digest, captures[:_CAPTURES]):
         _capture(page, run, file)
     return "Spectral"
 

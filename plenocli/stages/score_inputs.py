@@ -1,6 +1,5 @@
 """What score compares: results, truths and label maps from their files, brought to one grid."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -186,11 +185,9 @@ def read_labels(source, grid):
 
 def block_of(result, truth, pif=None):
     """Object samples under one lenslet (h, w) as the files tell it, or None: from the result, the truth or the matrix."""
-    parameters = result.attrs.get("parameters") or {}
-    parameters = json.loads(parameters) if isinstance(parameters, str) and parameters.startswith("{") else parameters
-    for source in (parameters, result.attrs.get("notes") or {}):
-        if isinstance(source, dict) and "object_shape" in source:
-            return tuple(int(n) for n in source["object_shape"])
+    notes = result.attrs.get("notes")
+    if isinstance(notes, dict) and len(notes.get("block") or ()) == 2:
+        return tuple(int(n) for n in notes["block"])
     if pif is not None:
         return tuple(int(n) for n in pif.data["pif/object_shape"])
     if truth is not None and Path(truth).suffix == ".h5":

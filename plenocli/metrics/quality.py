@@ -12,8 +12,8 @@ PEAK = 1.0
 
 DEFINITIONS = {
     "psnr_db": "10 log10(1 / mean squared error) over the whole picture and all bands; peak 1.0, values neither clipped nor rounded",
-    "psnr_inner_db": "the same without the outermost ring of lenslets",
-    "psnr_clipped_db": "the same after clipping the result to 0..1",
+    "psnr_inner_db": "PSNR without the outermost ring of lenslets",
+    "psnr_clipped_db": "PSNR after clipping the result to 0..1",
     "rmse": "square root of the mean squared error over the whole picture",
     "ssim": "mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 pixels, data range 1.0), averaged over bands",
     "block_mean_psnr_db": "PSNR of the truth averaged over each lenslet's block: what a camera without resolution inside the lenslet would get",

@@ -7,8 +7,8 @@ DEFINITIONS = {
     "repeated frames where there are several (temporal), else over the lenslets of one frame (spatial, so that "
     "what flat-fielding leaves counts as noise)",
     "snr_predicted_db": "20 log10(estimate / predicted standard deviation), band by band: what the noise model promises "
-    "before any repetition, taken at the root mean square of the prediction; the noise of a white reference counts, which frames "
-    "over time share: up to 3 dB below their capture SNR",
+    "before any repetition, taken at the root mean square of the prediction; the noise of calibration and white reference counts, "
+    "which frames over time share: it may lie some dB below their capture SNR",
     "snr_sensor_db": "10 log10(mean(y^2) / sigma^2) of the capture: the noise level of a simulation (60 dB in Berkner et al. "
     "2013); the mean square of y, not its variance, is the signal",
 }

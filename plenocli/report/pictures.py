@@ -160,12 +160,12 @@ def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ra
 def reconstructions(entries, truth, columns=4):
     """Reconstructions beside the truth, each above its error; light encoded for the screen, white = 1.
 
-    entries: sequence of (label, values (row, column), caption). One error scale for all: 98 % of the errors fit in.
+    entries: sequence of (label, values (row, column), caption). One error scale for all, that of the typical result.
     """
     truth = np.asarray(truth, dtype=np.float64)
     errors = [np.asarray(values) - truth for _, values, _ in entries]
-    # Methods differ by decades: the scale is that of the typical method, the poor ones may saturate.
-    top = max(float(np.median([np.percentile(np.abs(e), 98) for e in errors])), 1e-6) if errors else 1.0
+    # Methods differ by decades: the scale is that of the typical method and never beyond half of white; poor ones saturate.
+    top = min(max(float(np.median([np.percentile(np.abs(e), 98) for e in errors])), 1e-6), 0.5) if errors else 1.0
     columns = min(columns, len(entries) + 1)
     lines = -(-(len(entries) + 1) // columns)
     panel = 10.2 / columns
@@ -249,7 +249,7 @@ def method_bars(documents):
                 axes.axvline(baseline, color="#777777", linewidth=0.9, linestyle=(0, (4, 3)), label="block mean of the truth")
         axes.set_yticks(range(len(methods)), methods)
         axes.invert_yaxis()
-        axes.set(xlabel="PSNR [dB], peak 1.0, whole picture", xlim=(min(0, low or 0), (high or 1) * 1.08))
+        axes.set(xlabel="PSNR [dB], peak 1.0, whole picture", xlim=(max(min(0, low or 0), -8), max(high or 1, 1) * 1.08))
         axes.grid(True, axis="x")
         axes.tick_params(axis="y", length=0)
         made.figure.legend(loc="outside lower center", ncols=3)
@@ -266,7 +266,7 @@ def dictionary_atoms(atoms, object_shape, matrix=None, pixel_shape=None, per_sid
     parts = [("atoms in object space", chosen, object_shape)]
     if matrix is not None:
         parts.append(("the same atoms on the sensor, A phi", matrix @ chosen, pixel_shape))
-    with drawing(5.1 * len(parts), 5.3) as made:
+    with drawing(5.1 * len(parts), 5.0 * -(-count // per_side) / per_side + 0.35) as made:
         for axes, (title, columns, shape) in zip(np.ravel(made.figure.subplots(1, len(parts))), parts, strict=True):
             axes.imshow(_mosaic_of(columns, shape, per_side), cmap="gray", vmin=-1, vmax=1, interpolation="nearest")
             bare(axes, f"{title} ({count} of {atoms.shape[1]}, each on its own scale)")
@@ -301,5 +301,6 @@ def learning_history(history):
             axes.set_axis_on()
             axes.plot(np.arange(1, len(values) + 1), values, color=COLOURS[0], marker="." if len(values) < 40 else "")
             axes.set(title=name.replace("_", " "), xlabel="iteration")
+            axes.xaxis.get_major_locator().set_params(integer=True)
             axes.grid(True)
     return made.png

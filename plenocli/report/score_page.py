@@ -90,7 +90,7 @@ def _caption(metrics):
 
 def add_spectra(page, document, pairs):
     """Bars per band, spectra of patches and the bands as pictures of spectral results."""
-    from plenocli.report.spectral_pictures import accuracy_bars, band_pictures, patch_spectra
+    from plenocli.report.spectral_pictures import accuracy_bars, band_pictures, patch_errors, patch_spectra
 
     entries = [e for e in document["results"] if e.get("wavelengths_nm") and "rmse_per_band" in e["metrics"]]
     same = [e for e in entries if e["wavelengths_nm"] == entries[0]["wavelengths_nm"]]
@@ -99,6 +99,7 @@ def add_spectra(page, document, pairs):
         chart = [(e["label"], e["patches"]) for e in same if e.get("patches")][:6]
         if chart:
             bands = same[0]["wavelengths_nm"]
+            page.figure(patch_errors(chart, bands), "Error of the six patches of the paper, with one standard deviation of a single lenslet.")
             page.figure(patch_spectra(chart, bands), "Mean over the lenslets that see one patch alone, with one standard deviation. Grey: the chart's full spectrum.")
     for entry, picture in pairs[:4]:
         result = picture["result"]

@@ -128,6 +128,30 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
     return made.png
 
 
+def patch_errors(entries, wavelengths_nm):
+    """Error (mean - truth) of the six patches by band with +- one standard deviation of a lenslet; entries as in patch_spectra."""
+    wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
+    found = {p["label"]: p["name"] for _, patches in entries for p in patches if p["one_of_six"] and p["truth"] is not None}
+    if not found:
+        return b""
+    spread = 0.02 * max(np.ptp(wavelengths_nm), 1.0)
+    with drawing(10.2, 3.1) as made:
+        panels = made.figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
+        for place, (axes, label) in enumerate(zip(panels, sorted(found), strict=True)):
+            axes.axhline(0, color=TRUTH, linewidth=0.9)
+            for number, (name, patches) in enumerate(entries):
+                patch = next((p for p in patches if p["label"] == label and p["truth"] is not None), None)
+                if patch is not None:
+                    shift = (number - (len(entries) - 1) / 2) * spread
+                    axes.errorbar(wavelengths_nm + shift, np.subtract(patch["mean"], patch["truth"]), patch["std"], fmt="o", markersize=3.2, capsize=1.8,
+                                  linewidth=0.9, color=COLOURS[number % len(COLOURS)], label=name if not place else None)
+            axes.set(title=found[label], xlabel="wavelength [nm]")
+            axes.grid(True, axis="y")
+        panels[0].set_ylabel("error in reflectance")
+        made.figure.legend(loc="outside upper center", ncols=min(len(entries), 6))
+    return made.png
+
+
 def accuracy_bars(entries):
     """Error and SNR per band for each result, as the paper's Fig. 7: entries of a score document with bands.
 

@@ -69,8 +69,8 @@ def test_the_page_shows_both_chains(folder, tmp_path):
     summary = run_report(folder, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert summary["sections"] == ["Spatial", "Spectral"] and summary["unreadable"] == [] and summary["scores"] == 3
-    # bars, results, close-up, capture, PIF, matrix, atoms, history; bars, patches, 2 x bands, grid, response, capture
-    assert page.count("<figure>") == 15
+    # bars, results, close-up, capture, PIF, matrix, atoms, history; bars, errors, patches, 2 x bands, grid, response, capture
+    assert page.count("<figure>") == 16
     for word in ("score-same", "lmmse", "PSNR [dB]", "RMSE over the six patches, 450 nm", "symmetry defect", "chart-single-pixel", "plenocli made pif.h5", "# camera"):
         assert word in page
     assert str(folder) not in page
@@ -124,7 +124,7 @@ def test_score_writes_its_own_page(folder, tmp_path, capsys):
     page = (tmp_path / "s.html").read_text()
     assert page.count("<figure>") == 2 and "tikhonov" in page and 'class=best' in page
     assert run(["score", str(folder / "spectral" / "chart-pinv.h5"), "--truth", "colorchecker", "-o", str(tmp_path / "c.json"), "--report", str(tmp_path / "c.html")]) == 0
-    assert (tmp_path / "c.html").read_text().count("<figure>") == 3
+    assert (tmp_path / "c.html").read_text().count("<figure>") == 4
     pif = ["--pif", str(folder / "spatial" / "pif.h5")]
     assert run(["score", str(folder / "spatial" / "dictionary.h5"), *pif, "-o", str(tmp_path / "d.json"), "--report", str(tmp_path / "d.html")]) == 0
     assert (tmp_path / "d.html").read_text().count("<figure>") == 1

@@ -10,7 +10,7 @@ RANK_THRESHOLD = 1e-6
 """Singular values below this share of the largest do not count towards the rank: the rounding of a single-precision A."""
 NOISE_THRESHOLD = 1e-3
 """Singular values above this share stand out of noise at 60 dB."""
-SYMMETRY_WARNING = 0.02
+SYMMETRY_WARNING = 1e-3
 """Symmetry defects below this are worth a warning: the antisymmetric half of the object is all but lost."""
 LARGEST = 4000
 """Above this many object points singular values are left out: they would take minutes."""

@@ -16,9 +16,9 @@ else:  # the one threading layer that ships with numba itself and does not share
     if "NUMBA_THREADING_LAYER" not in os.environ:
         numba.config.THREADING_LAYER = "workqueue"
 
-PIVOT_FLOOR = 1e-12
-"""Least pivot, times its diagonal. Atoms that depend on others then move far along the flat direction, and the line search
-stops them where one of them reaches zero and leaves."""
+JITTER = 1e-12
+"""Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms cannot break the factor. They
+move far along the flat direction, and the line search stops them where one of them reaches zero and leaves."""
 
 if numba is None:
     COMPILED = False
@@ -37,11 +37,11 @@ else:
 
 
 def _factor_by_rows(matrix):
-    """Lower Cholesky factor in place (row-wise, dot products), pivots no less than PIVOT_FLOOR."""
+    """Lower Cholesky factor in place of matrix + JITTER diag (row-wise, dot products)."""
     n = matrix.shape[0]
     for i in range(n):
         row = matrix[i]
-        diagonal = row[i]
+        diagonal = row[i] * (1.0 + JITTER)
         for j in range(i):
             other = matrix[j]
             total = row[j]
@@ -51,15 +51,16 @@ def _factor_by_rows(matrix):
         total = diagonal
         for k in range(i):
             total -= row[k] * row[k]
-        row[i] = np.sqrt(max(total, PIVOT_FLOOR * diagonal))
+        row[i] = np.sqrt(max(total, 0.5 * JITTER * diagonal))
     return matrix
 
 
 def _factor_by_columns(matrix):
     """The same factor, one matrix-vector product a column."""
     for j in range(matrix.shape[0]):
+        diagonal = matrix[j, j] * (1.0 + JITTER)
         column = matrix[j:, j] - matrix[j:, :j] @ matrix[j, :j]
-        pivot = np.sqrt(max(column[0], PIVOT_FLOOR * matrix[j, j]))
+        pivot = np.sqrt(max(column[0] + JITTER * matrix[j, j], 0.5 * JITTER * diagonal))
         matrix[j:, j] = column / pivot
         matrix[j, j] = pivot
     return matrix

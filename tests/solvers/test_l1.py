@@ -92,7 +92,13 @@ def rank_one(d, y):
     return np.outer(d[:, 0], np.linspace(0.5, 1, d.shape[1])), y
 
 
-@pytest.mark.parametrize("spoil", [duplicate, zeros, rank_one])
+def few_directions(d, y):
+    """Many more atoms than directions, all active at once: rounding alone must not make the factor blow up."""
+    rng = np.random.default_rng(6)
+    return rng.standard_normal((30, 8)) @ rng.standard_normal((8, 60)), y
+
+
+@pytest.mark.parametrize("spoil", [duplicate, zeros, rank_one, few_directions])
 def test_degenerate_dictionaries_keep_their_certificate(spoil):
     d, y = spoil(*plenoptic_like())
     code = l1.sparse_code(d, y, 1e-4, tol=1e-7)

@@ -16,7 +16,7 @@ import numpy as np
 
 from plenocli.errors import NumericsError
 from plenocli.optics.pupil import aperture_area, pupil_rows
-from plenocli.optics.quadrature import gauss, nodes_for
+from plenocli.optics.quadrature import Rows, gauss, nodes_for
 
 MAX_NODES = 4000
 """Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays answer the question."""
@@ -64,7 +64,8 @@ def _legendre(t, count, step):
 
 def psf_nodes(geometry, half):
     """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number."""
-    count = nodes_for(2 * geometry.k * geometry.D1 / 2 * half / geometry.z2)
+    # the functions are interpolated, not only integrated: a few degrees more than the integration rule
+    count = nodes_for(2 * geometry.k * geometry.D1 / 2 * half / geometry.z2) + 14
     return count + count % 2
 
 
@@ -74,30 +75,42 @@ def sampled_field(camera, geometry, dy, dx):
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max())
     total = np.zeros((len(dy), len(dx)), complex)
     for rows in pupil_rows(camera, geometry, k * reach / z2):
-        inner = _row_transforms(rows, k / z2 * dx)
-        total += np.exp(-1j * k / z2 * np.outer(dy, rows.y)) @ inner
+        half = len(rows.y) // 2
+        if half and len(rows.y) % 2 == 0 and _mirrored(rows.y, rows.x, rows.weight, 0):
+            upper = Rows(rows.y[half:], rows.x[half:], rows.weight[half:])
+            total += (2 * np.cos(k / z2 * np.outer(dy, upper.y))) @ _row_transforms(upper, k / z2 * dx)
+        else:
+            total += np.exp(-1j * k / z2 * np.outer(dy, rows.y)) @ _row_transforms(rows, k / z2 * dx)
     return total / (geometry.wavelength * z2 * math.sqrt(aperture_area(camera.main_lens)))
 
 
+def _mirrored(y, x, weight, axis):
+    """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of its nodes (axis 1)."""
+    if axis == 0:
+        return np.allclose(y, -y[::-1], rtol=0, atol=1e-14 * np.abs(y).max()) and np.allclose(weight, weight[::-1], rtol=1e-12, atol=0)
+    return np.allclose(x, -x[:, ::-1], rtol=0, atol=1e-14 * np.abs(x).max()) and np.allclose(weight, weight[:, ::-1], rtol=1e-12, atol=0)
+
+
 def _row_transforms(rows, frequency):
-    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)), by slabs that stay in cache."""
-    half = len(frequency) // 2
-    mirrored = len(frequency) % 2 == 0 and np.allclose(frequency[:half], -frequency[::-1][:half], rtol=1e-14, atol=0)
-    f = frequency[half:] if mirrored else frequency
-    out = np.empty((len(rows.y), len(frequency)), complex)
-    weight = np.stack([rows.weight.real, rows.weight.imag], -1)
-    slab = max(1, 2_000_000 // max(1, f.size * rows.x.shape[1]))
+    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows and frequencies cost a quarter."""
+    count, nodes = len(frequency), rows.x.shape[1]
+    paired = count % 2 == 0 and np.allclose(frequency, -frequency[::-1], rtol=1e-14, atol=0)
+    f = frequency[count // 2:] if paired else frequency
+    even = _mirrored(rows.y, rows.x, rows.weight, 1)
+    x, weight = (rows.x[:, nodes // 2:], rows.weight[:, nodes // 2:] * 2) if even else (rows.x, rows.weight)
+    if even and nodes % 2:
+        weight[:, 0] /= 2
+    parts = np.stack([weight.real, weight.imag], -1)
+    c, s = (np.zeros((len(rows.y), len(f)), complex) for _ in range(2))
+    slab = max(1, 500_000 // max(1, f.size * x.shape[1]))
     for start in range(0, len(rows.y), slab):
-        part = slice(start, start + slab)
-        phase = f[None, :, None] * rows.x[part, None, :]
-        c, s = np.cos(phase) @ weight[part], np.sin(phase) @ weight[part]
-        c, s = c[..., 0] + 1j * c[..., 1], s[..., 0] + 1j * s[..., 1]
-        if mirrored:
-            out[part, half:] = c - 1j * s
-            out[part, :half] = (c + 1j * s)[:, ::-1]
-        else:
-            out[part] = c - 1j * s
-    return out
+        some = slice(start, start + slab)
+        phase = f[None, :, None] * x[some, None, :]
+        c[some] = (np.cos(phase) @ parts[some]).view(complex)[..., 0]
+        if not even:
+            s[some] = (np.sin(phase) @ parts[some]).view(complex)[..., 0]
+    here = c - 1j * s
+    return np.concatenate([(c + 1j * s)[:, ::-1], here], axis=1) if paired else here
 
 
 def separable_field(camera, geometry, half, tolerance):

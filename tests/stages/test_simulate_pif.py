@@ -1,0 +1,82 @@
+"""simulate-pif from a camera file to an artefact, through the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import read_artefact
+from plenocli.cli.main import run
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = ROOT / "sample_configs" / "tiny.toml"
+
+
+def test_artefact_summary_and_bytes(tmp_path, capsys):
+    out, again = tmp_path / "pif.h5", tmp_path / "again.h5"
+    assert run(["simulate-pif", str(TINY), "-o", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert run(["simulate-pif", str(TINY), "-o", str(again)]) == 0
+    assert out.read_bytes() == again.read_bytes()
+    artefact = read_artefact(out, "pif")
+    A, offsets = artefact.data["pif/A"], artefact.data["pif/lenslet_offset"]
+    assert A.shape == (1, 9, 169, 64) and A.dtype == np.float32 and [0, 0] in offsets.tolist()
+    assert report["superpixels"] == [3, 3] and report["rank"] == list(np.atleast_1d(artefact.attrs["pif"]["rank"]))
+    assert artefact.data["pif/column_energy"] == pytest.approx(A.sum(axis=(1, 2), dtype=float), rel=1e-6)
+    assert artefact.data["pif/singular_values"].shape == (1, 64)
+    assert "pif" in artefact.provenance.command and artefact.provenance.accuracy["asked"] == 1e-4
+
+
+def test_options_reach_the_matrix(tmp_path, capsys):
+    out = tmp_path / "pif.h5"
+    code = run(["simulate-pif", str(TINY), "-o", str(out), "--wavelength", "650nm", "--wavelength", "450nm", "--superpixels", "1x1",
+                "--coherent-ring", "0", "--dtype", "float64", "--accuracy", "1e-3"])
+    assert code == 0
+    artefact = read_artefact(out, "pif")
+    assert artefact.data["pif/A"].shape == (2, 1, 169, 64) and artefact.data["pif/A"].dtype == np.float64
+    assert artefact.data["pif/wavelength"].tolist() == [450e-9, 650e-9] and artefact.attrs["pif"]["coherent_ring"] == 0
+    assert "2 band(s)" in capsys.readouterr().out
+
+
+def test_explain_writes_nothing(tmp_path, capsys):
+    assert run(["simulate-pif", str(TINY), "--explain"]) == 0
+    assert "nodes across a lenslet" in capsys.readouterr().out and not list(tmp_path.iterdir())
+
+
+def test_warns_where_half_of_the_object_is_invisible(tmp_path, capsys):
+    camera = tmp_path / "conjugate.toml"
+    # f2 z2/(z2 - f2): the lenslets image the pupil onto the sensor
+    camera.write_text(TINY.read_text().replace('[sensor]\ndistance = "208 um"', '[sensor]\ndistance = "208.789605430890 um"'))
+    assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--superpixels", "1x1", "--coherent-ring", "0"]) == 0
+    assert "half of the object is invisible" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments, code, words", [
+    (["--model", "ray", "-o", "x.h5"], 2, "does not exist yet"),
+    ([], 2, "no output file"),
+    (["-o", "x.h5", "--superpixels", "2x2"], 2, "odd"),
+    (["-o", "x.h5", "--accuracy", "1e-13"], 5, "cannot be reached"),
+    (["-o", "x.h5", "--mem-limit", "1MiB"], 5, "--mem-limit"),
+    (["-o", "x.h5", "--wavelength", "550"], 2, "unit"),
+    (["-o", "missing/x.h5"], 4, "missing"),
+], ids=str)
+def test_refusals(tmp_path, monkeypatch, capsys, arguments, code, words):
+    monkeypatch.chdir(tmp_path)
+    assert run(["simulate-pif", str(TINY), *arguments]) == code
+    assert words in capsys.readouterr().err
+
+
+def test_existing_output_and_unreadable_camera(tmp_path, capsys):
+    out = tmp_path / "pif.h5"
+    out.write_text("mine")
+    assert run(["simulate-pif", str(TINY), "-o", str(out)]) == 2 and out.read_text() == "mine"
+    assert run(["simulate-pif", str(tmp_path / "none.toml"), "-o", str(tmp_path / "new.h5")]) == 3
+    capsys.readouterr()
+
+
+def test_spectral_step_gives_the_wavelengths_of_white_light(tmp_path):
+    camera = ROOT / "sample_configs" / "demo_spectral.toml"
+    out = tmp_path / "pif.h5"
+    assert run(["simulate-pif", str(camera), "-o", str(out), "--spectral-step", "50nm", "--superpixels", "1x1", "--accuracy", "1e-2"]) == 0
+    assert read_artefact(out, "pif").data["pif/wavelength"] == pytest.approx(np.arange(400e-9, 701e-9, 50e-9))

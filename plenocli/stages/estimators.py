@@ -7,7 +7,7 @@ import numpy as np
 from plenocli.errors import InputError, NumericsError
 from plenocli.stages.progress import note
 from plenocli.solvers.overlap import by_lenslet
-from plenocli.stages.training import read_training
+from plenocli.stages.training import at_scales, read_training
 
 PATCHES_A_POINT = 6
 """Training patches for the LMMSE covariance, for each object point."""
@@ -207,7 +207,7 @@ class Estimators:
     def _training(self, scene):
         key = ("pictures", scene)
         if key not in self._cache:
-            self._cache[key] = [p for _, p in read_training(self.settings.training, self.system.object_shape, not_scene=scene)]
+            self._cache[key] = [p for _, p in at_scales(read_training(self.settings.training, self.system.object_shape, not_scene=scene), self.system.object_shape)]
         return self._cache[key]
 
     def _lmmse(self, sigma, scene):

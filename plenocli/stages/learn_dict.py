@@ -8,7 +8,7 @@ import numpy as np
 from plenocli.errors import InputError, UsageError
 from plenocli.stages.progress import bar, note
 from plenocli.stages.systems import read_system
-from plenocli.stages.training import files_of, read_training, split_by_scene
+from plenocli.stages.training import at_scales, files_of, read_training, split_by_scene
 
 LAMBDAS = np.logspace(-7, -4, 7)
 """Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
@@ -44,9 +44,12 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
     check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])])
     system = read_system(pif, settings.mem_limit)
     pictures = read_training(images, system.object_shape)
-    training, held = split_by_scene(pictures)
+    training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))
     earlier = _read_resume(resume, system) if resume else None
     chosen = _resolve(settings, system, earlier)
+    names = sorted({Path(n).name for n, _ in training})
+    if earlier and names != earlier[2]:
+        raise UsageError(f"the resumed dictionary was trained on {', '.join(earlier[2])}", "--resume", "give the same pictures")
     svd = decompose(system.own)
 
     def learner(lam):
@@ -86,7 +89,7 @@ def _resolve(settings, system, earlier):
 
 
 def _read_resume(path, system):
-    """(State, Settings as a dict) of a dictionary artefact; InputError where it belongs to another system matrix."""
+    """(State, Settings as a dict, names of the training pictures) of a dictionary artefact; InputError where it belongs to another system matrix."""
     from plenocli.artefacts import file_digest, read_artefact
     from plenocli.solvers.dictionary import State
 
@@ -95,7 +98,7 @@ def _read_resume(path, system):
         raise InputError(f"was learnt for another system matrix than {system.path.name}", path, "give the pif it was learnt with")
     fields = {k.removeprefix("dictionary/state/"): v for k, v in artefact.data.items() if k.startswith("dictionary/state/")}
     try:
-        return State.load(fields), dict(artefact.attrs["dictionary"]["parameters"]["settings"])
+        return State.load(fields), dict(artefact.attrs["dictionary"]["parameters"]["settings"]), list(artefact.attrs["dictionary"]["parameters"]["training"])
     except KeyError as error:
         raise InputError(f"lacks {error}, which a resumed run needs", path, "start a new dictionary") from None
 
@@ -144,7 +147,7 @@ def _write(output, state, machine, chosen, system, summary, origin, overwrite):
              "coherence_effective": measures["coherence_effective"], "coherence_average": measures["coherence_effective_mean"],
              "coherence_raw": measures["coherence_raw"], "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
              "coherence_welch": measures["welch_bound"], "coherence": measures,
-             "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "training": [Path(n).name for n in origin["names"]], "validation": [Path(n).name for n in origin["held"]]},
+             "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "training": sorted({Path(n).name for n in origin["names"]}), "validation": sorted({Path(n).name for n in origin["held"]})},
              "notes": {k: summary[k] for k in ("validation_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap")}}
     attrs = {k: v for k, v in attrs.items() if v is not None}
     provenance = Provenance(origin["command"], describe_inputs({"pif": origin["pif"], "image": origin["files"]}), origin["seed"])

@@ -12,6 +12,9 @@ DEFAULT = ("skimage:camera", "skimage:coffee", "skimage:chelsea", "skimage:rocke
 """Photographs that ship with scikit-image, but for the astronaut, which is the test picture."""
 
 
+SCALES = (1, 2, 4)
+
+
 def read_training(names, shape, *, not_scene=None):
     """Linear luminance pictures [(name, (row, column) float64)] of at least `shape`, from files or skimage:NAME; () means DEFAULT.
 
@@ -52,6 +55,19 @@ def split_by_scene(pictures):
         return pictures, pictures
     held = set(range(2, len(pictures), 5)) or {len(pictures) - 1}
     return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
+
+
+def at_scales(pictures, shape):
+    """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of `shape` fit: scenes come in all sizes."""
+    from plenocli.scene.sample import block_mean
+
+    out = []
+    for name, picture in pictures:
+        for k in SCALES:
+            rows, columns = (n // k * k for n in picture.shape)
+            if k == 1 or min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
+                out.append((name, block_mean(picture[:rows, :columns], (k, k)) if k > 1 else picture))
+    return out
 
 
 def _values(name):

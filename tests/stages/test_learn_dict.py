@@ -1,0 +1,72 @@
+"""Training pictures: what is left out, how scenes are split, and what learn-dict refuses."""
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import Artefact, Provenance, write_artefact
+from plenocli.cli.main import run
+from plenocli.errors import InputError
+from plenocli.stages.training import DEFAULT, at_scales, read_training, split_by_scene
+
+
+def test_the_test_picture_is_never_trained_on(capsys):
+    assert not any("astronaut" in name for name in DEFAULT)
+    left = [name for name, _ in read_training((), (8, 8), not_scene="skimage:coffee")]
+    assert "skimage:coffee" not in left and len(left) == len(DEFAULT) - 1
+    assert "leaves out skimage:coffee" in capsys.readouterr().err
+    with pytest.raises(InputError, match="flatter"):
+        read_training(("skimage:coffee",), (8, 8), not_scene="coffee.png")
+
+
+def test_pictures_are_linear_and_in_range():
+    for _, picture in read_training(("skimage:camera", "skimage:coffee"), (8, 8)):
+        assert picture.ndim == 2 and picture.min() >= 0 and picture.max() <= 1
+    camera = read_training(("skimage:camera",), (8, 8))[0][1]
+    assert np.mean(camera) < 0.4  # its sRGB code values have the mean 0.51
+
+
+def test_split_keeps_scenes_apart():
+    pictures = [(str(k), np.zeros((2, 2))) for k in range(11)]
+    training, held = split_by_scene(pictures)
+    assert [n for n, _ in held] == ["2", "7"] and len(training) == 9
+    assert [n for n, _ in split_by_scene(pictures[:2])[1]] == ["1"]
+
+
+def test_scales_are_area_averages():
+    picture = np.random.default_rng(0).random((33, 40))
+    scaled = at_scales([("a", picture)], (8, 8))
+    assert [p.shape for _, p in scaled] == [(33, 40), (16, 20)]
+    assert scaled[1][1][0, 0] == pytest.approx(picture[:2, :2].mean())
+
+
+@pytest.fixture
+def pif(tmp_path):
+    a = np.random.default_rng(0).random((1, 1, 16, 9)) / 16
+    data = {"pif/A": a, "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": np.zeros((1, 2), int), "pif/pixel_shape": np.array([4, 4]),
+            "pif/object_shape": np.array([3, 3]), "pif/column_energy": a.sum(axis=(1, 2))}
+    write_artefact(tmp_path / "pif.h5", Artefact("pif", data, {}, Provenance("test")))
+    return tmp_path / "pif.h5"
+
+
+def learn(pif, *options):
+    return run(["learn-dict", "skimage:camera", "skimage:coins", "--pif", str(pif), "--batch", "40", "--lambda", "1e-4", *map(str, options)])
+
+
+def test_refusals(pif, tmp_path, capsys):
+    first = tmp_path / "d.h5"
+    assert learn(pif, "--iterations", 1, "-o", first) == 0
+    assert learn(pif, "--iterations", 1, "-o", first) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert learn(pif, "--iterations", 2, "--resume", first, "--atoms", 5, "-o", tmp_path / "e.h5") == 2
+    assert learn(pif, "--iterations", 0, "--resume", first, "-o", tmp_path / "e.h5") == 2
+    assert run(["learn-dict", "skimage:moon", "--pif", str(pif), "--resume", str(first), "-o", str(tmp_path / "e.h5")]) == 2
+    assert "same pictures" in capsys.readouterr().err
+    assert learn(first, "-o", tmp_path / "e.h5") == 3
+    assert not (tmp_path / "e.h5").exists()
+
+
+def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
+    for name in "ab":
+        assert learn(pif, "--iterations", 2, "--seed", 5, "-o", tmp_path / f"{name}.h5") == 0
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+    assert learn(pif, "--iterations", 3, "--seed", 5, "--resume", tmp_path / "a.h5", "-o", tmp_path / "a.h5", "--overwrite") == 0

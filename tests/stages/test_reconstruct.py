@@ -1,0 +1,168 @@
+"""reconstruct and learn-dict through the command line, on a small camera written down here."""
+
+import json
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import Artefact, Provenance, read_artefact, write_artefact
+from plenocli.cli.main import run
+from plenocli.metrics.quality import psnr
+from plenocli.operators import BlockToeplitz
+from plenocli.scene.sample import luminance, sample_picture
+from plenocli.stages.reconstruct import to_blocks, to_picture
+from plenocli.stages.scenes import embedded_photograph
+
+N, PIXELS, COUNT = 6, 9, 8
+
+
+def matrices(coupled):
+    """Blocks (offset, pixel, point): each pixel sees a blurred, slightly shifted part of the block, separably; and a little of the next."""
+    row = np.exp(-(((np.arange(PIXELS)[:, None] + 0.5) * 1.1 * N / PIXELS - 0.4 - np.arange(N)[None, :]) ** 2) / 4)
+    own = np.kron(row, row)
+    own /= 1.2 * own.sum(axis=0).max()
+    if not coupled:
+        return own[None], np.zeros((1, 2), int)
+    ring = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
+    return np.stack([own if not o.any() else 0.02 / np.abs(o).sum() * np.roll(own, 2 * o[0] * PIXELS + 2 * o[1], axis=0)[:, ::-1] for o in ring]), ring
+
+
+def make_files(folder, coupled=False, noise=60.0, **attrs):
+    """pif.h5 and capture.h5 (of the astronaut) in `folder`; returns the true picture."""
+    blocks, offsets = matrices(coupled)
+    data = {"pif/A": blocks[None], "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": offsets, "pif/pixel_shape": np.array([PIXELS] * 2),
+            "pif/object_shape": np.array([N] * 2), "pif/column_energy": blocks.sum(axis=(0, 1))[None]}
+    write_artefact(folder / "pif.h5", Artefact("pif", data, {}, Provenance("test")), overwrite=True)
+    picture = np.asarray(sample_picture(luminance(embedded_photograph("astronaut")), COUNT * N, COUNT * N), float)
+    y = BlockToeplitz(blocks, offsets, (COUNT, COUNT)).forward(to_blocks(picture, (N, N)))
+    sigma = np.sqrt(np.mean(y**2) * 10 ** (-noise / 10))
+    y = y + sigma * np.random.default_rng(0).standard_normal(y.shape)
+    about = dict(units="relative", black=0.0, noise_sigma=float(sigma), superpixel_shape=[PIXELS] * 2, lenslet_count=[COUNT] * 2, target="skimage:astronaut") | attrs
+    mosaic = {"capture/mosaic": to_picture(y, (PIXELS, PIXELS)), "capture/cfa": "mono", "capture/scene": picture[None].astype(np.float32), "capture/wavelength": np.array([550e-9])}
+    write_artefact(folder / "capture.h5", Artefact("capture", mosaic, {"capture": {k: v for k, v in about.items() if v is not None}}, Provenance("test")), overwrite=True)
+    return picture
+
+
+def reconstruct(folder, *options, output="out.h5"):
+    assert run(["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "pif.h5"), "-o", str(folder / output), "--overwrite", *options]) == 0
+    return read_artefact(folder / output, "image")
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("single")
+    return folder, make_files(folder)
+
+
+def test_methods_order_as_they_should(single):
+    folder, truth = single
+    quality = {}
+    for method in ("block-mean", "tikhonov", "tsvd", "nnls", "lmmse"):
+        image = reconstruct(folder, "--method", method)
+        assert image.attrs["image"]["method"] == method
+        quality[method] = psnr(image.data["image/value"], truth)
+    assert quality["tikhonov"] > quality["block-mean"] + 3
+    assert quality["tsvd"] > quality["block-mean"] + 2
+    assert quality["lmmse"] > quality["block-mean"] + 3  # a picture shrunk tenfold is no match for the statistics of photographs
+    assert psnr(reconstruct(folder, "--method", "tikhonov", "--truth", str(folder / "capture.h5")).data["image/value"], truth) >= quality["tikhonov"] - 1e-6
+
+
+def test_block_mean_is_the_mean_of_each_block(single):
+    folder, truth = single
+    from plenocli.scene.sample import block_mean
+
+    image = reconstruct(folder, "--method", "block-mean").data["image/value"]
+    np.testing.assert_allclose(block_mean(image, (N, N)), block_mean(truth, (N, N)), atol=0.08)
+    assert np.ptp(image[:N, :N]) == 0
+
+
+def test_orientation_is_kept(tmp_path):
+    picture = make_files(tmp_path, noise=90.0)
+    image = reconstruct(tmp_path, "--method", "tikhonov").data["image/value"]
+    assert all(psnr(image, picture) > psnr(image, turned) + 5 for turned in (picture[::-1], picture[:, ::-1], picture.T))
+
+
+def test_lmmse_says_how_sure_it_is(single):
+    folder, truth = single
+    image = reconstruct(folder)
+    error = np.sqrt(np.mean((image.data["image/value"] - truth) ** 2))
+    assert 0.3 < np.sqrt(np.mean(image.data["image/sigma"] ** 2)) / error < 3
+    parameters = image.attrs["image"]["parameters"]
+    assert parameters["noise_source"] == "from the capture"
+
+
+def test_unknown_noise_is_estimated_and_said(tmp_path, capsys):
+    make_files(tmp_path, noise_sigma=None)
+    parameters = reconstruct(tmp_path, "--method", "tikhonov").attrs["image"]["parameters"]
+    assert "estimated" in parameters["noise_source"] and "does not say its noise" in capsys.readouterr().err
+    make_files(tmp_path)
+    known = reconstruct(tmp_path, "--method", "tikhonov").attrs["image"]["parameters"]["noise_sigma"]
+    assert parameters["noise_sigma"] == pytest.approx(known, rel=0.1)
+
+
+def test_neighbours_light_is_noticed_and_taken_away(tmp_path, capsys):
+    truth = make_files(tmp_path, coupled=True)
+    quality = {}
+    for method in ("tikhonov", "lmmse", "tsvd"):
+        alone = reconstruct(tmp_path, "--method", method)
+        assert "3x3" in capsys.readouterr().err
+        joint = reconstruct(tmp_path, "--method", method, "--overlap", "3")
+        quality[method] = [psnr(i.data["image/value"], truth) for i in (alone, joint)]
+        assert quality[method][1] > quality[method][0] + 1, quality
+
+
+def test_dictionary_chain(single, capsys):
+    folder, truth = single
+    learn = ["learn-dict", "skimage:camera", "skimage:coffee", "skimage:coins", "--pif", str(folder / "pif.h5"), "--batch", "150", "--lambda", "1e-5"]
+    for name, iterations, more in (("a", 2, []), ("b", 4, ["--resume", str(folder / "a.h5")]), ("c", 4, [])):
+        assert run([*learn, "--iterations", str(iterations), *more, "-o", str(folder / f"{name}.h5"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert report["iterations"] == 4 and report["beats_lmmse"] in (True, False) and 0 < report["coherence"]["coherence_effective"] <= 1
+    resumed, whole = (read_artefact(folder / f"{name}.h5", "dictionary") for name in "bc")
+    for key in whole.data:
+        assert resumed.data[key].tobytes() == whole.data[key].tobytes(), key
+    assert whole.data["dictionary/atoms"].shape == (N * N, N * N) and len(whole.data["dictionary/history/objective"]) == 4
+    image = reconstruct(folder, "--method", "dictionary", "--dictionary", str(folder / "c.h5"))
+    floor = psnr(reconstruct(folder, "--method", "block-mean").data["image/value"], truth)
+    assert psnr(image.data["image/value"], truth) > floor + 2
+    assert image.attrs["image"]["parameters"]["worst_gap"] <= 1e-6
+
+
+def test_several_captures_go_to_a_folder(single, tmp_path, capsys):
+    folder, _ = single
+    copies = [tmp_path / f"{n}.h5" for n in "ab"]
+    for copy in copies:
+        copy.write_bytes((folder / "capture.h5").read_bytes())
+    (tmp_path / "bad.h5").write_bytes(b"nothing")
+    arguments = ["reconstruct", *map(str, copies), str(tmp_path / "bad.h5"), "--pif", str(folder / "pif.h5"), "--method", "tikhonov", "-o", str(tmp_path / "out")]
+    assert run(arguments) == 3
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.h5", "b.h5"]
+    (tmp_path / "bad.h5").unlink()
+    assert run([*arguments[:3], *arguments[4:], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["skipped"] == 2
+
+
+def test_exr_and_determinism(single):
+    folder, _ = single
+    one = reconstruct(folder, output="one.h5")
+    assert one.data["image/value"].tobytes() == reconstruct(folder, output="two.h5").data["image/value"].tobytes()
+    assert (folder / "one.h5").read_bytes() == (folder / "two.h5").read_bytes()
+    from plenocli.artefacts import read_exr
+
+    assert run(["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "pif.h5"), "-o", str(folder / "one.exr")]) == 0
+    np.testing.assert_allclose(read_exr(folder / "one.exr")[0]["Y"], one.data["image/value"], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("options", "code", "words"), [
+    ([], 2, "--pif"),
+    (["--pif", "PIF", "--method", "dictionary"], 2, "learn-dict"),
+    (["--pif", "PIF", "--method", "lmmse", "--truth", "CAPTURE"], 2, "hindsight"),
+    (["--pif", "PIF", "--method", "lmmse", "--rank", "3"], 2, "--rank"),
+    (["--pif", "CAPTURE"], 3, "pif"),
+    (["--pif", "PIF", "--training", "skimage:astronaut"], 3, "flatter"),
+])
+def test_refusals(single, capsys, options, code, words):
+    folder, _ = single
+    names = {"PIF": str(folder / "pif.h5"), "CAPTURE": str(folder / "capture.h5")}
+    assert run(["reconstruct", names["CAPTURE"], "-o", str(folder / "never.h5"), *[names.get(o, o) for o in options]]) == code
+    assert words in capsys.readouterr().err and not (folder / "never.h5").exists()

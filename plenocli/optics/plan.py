@@ -14,7 +14,7 @@ BEST_ACCURACY = 1e-8
 """Finest accuracy on offer: two rings of neighbours and double precision."""
 OWN_WEIGHT, JOINT_WEIGHT = 0.2, 1e-4
 """Effect on a column of the pixel rule's error for fringes within one lenslet's light, and between lenslets (measured bounds)."""
-WINDOW_ERROR = {1: 0.12, 2: 2.5e-3, 3: 1.2e-3}
+WINDOW_ERROR = {1: 0.12, 2: 2.1e-3, 3: 1.0e-3}
 """Error from lenslets beyond w rings past the blur, times the lenslet's diffraction cells (measured; worst point, at the corner)."""
 
 

@@ -150,12 +150,16 @@ def _truth(path, shape, count):
 
 
 def _white_normalised(capture, calibration):
-    """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the white reference; 0 where it cannot be had."""
+    """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the white reference; 0 where it cannot be had.
+
+    Pixels that the calibration masked (dead, or under dust) are left out of both sums.
+    """
     from plenocli.artefacts import read_mosaic
 
     signal, white, valid = calibrated(capture, read_mosaic(capture), calibration)
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = signal.sum(axis=2) / white.sum(axis=2)
+        usable = np.isfinite(signal) & np.isfinite(white)
+        value = np.where(usable, signal, 0).sum(axis=2) / np.where(usable, white, 0).sum(axis=2)
     lost = ~np.isfinite(value)
     if lost.any():
         note(f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the sensor or are dark; they are 0 in the picture")

@@ -12,7 +12,7 @@ from plenocli.optics.quadrature import gauss, nodes_for
 
 BEST_ACCURACY = 1e-8
 """Finest accuracy on offer: two rings of neighbours and double precision."""
-OWN_WEIGHT, JOINT_WEIGHT = 0.2, 1e-4
+OWN_WEIGHT, JOINT_WEIGHT = 0.2, 4e-5
 """Effect on a column of the pixel rule's error for fringes within one lenslet's light, and between lenslets (measured bounds)."""
 WINDOW_ERROR = {1: 0.12, 2: 2.1e-3, 3: 1.0e-3}
 """Error from lenslets beyond w rings past the blur, times the lenslet's diffraction cells (measured; worst point, at the corner)."""
@@ -184,7 +184,7 @@ def pixel_nodes(own, joint, accuracy):
     `joint` from interference with its neighbours, whose fields are weak; error at most about half the accuracy."""
     for count in range(2, 200):
         error = max(OWN_WEIGHT * rule_error(count, own), JOINT_WEIGHT * rule_error(count, joint))
-        if error <= accuracy / 2.5:
+        if error <= accuracy / 2.4:
             return count
     raise NumericsError(f"{joint:.0f} interference fringes a pixel cannot be integrated", "sensor.pixel_pitch", "use smaller pixels")
 

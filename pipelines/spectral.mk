@@ -32,11 +32,11 @@ $(RAW)/chart-long.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target colorchecker --exposure $(LONG) --seed 4 -o $@
 $(RAW)/chart-short.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target colorchecker --exposure $(SHORT) --seed 5 -o $@
-# two frames of a white object at each exposure, for the SNR
-$(RAW)/white-long-1.dng $(RAW)/white-long-2.dng: $(RAW)/white-long-%.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(LONG) --seed 6$* -o $@
-$(RAW)/white-short-1.dng $(RAW)/white-short-2.dng: $(RAW)/white-short-%.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(SHORT) --seed 7$* -o $@
+# another white object at each exposure, for the SNR: over its lenslets, the reference divided out
+$(RAW)/white-long.dng: $(RUN)/pif.h5 | $(RAW)/
+	$(SIM) --target white --exposure $(LONG) --seed 6 -o $@
+$(RAW)/white-short.dng: $(RUN)/pif.h5 | $(RAW)/
+	$(SIM) --target white --exposure $(SHORT) --seed 7 -o $@
 
 BAND_FILES := $(BANDS:%=$(RAW)/band-%.dng)
 $(RUN)/calibration.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
@@ -45,8 +45,8 @@ $(RUN)/calibration.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
 define DEMUX
 $(RUN)/spectra/%-$(1).h5: $(RAW)/%.dng $(RAW)/white.dng $(RUN)/calibration.h5 | $(RUN)/spectra/
 	$(P) demux $$< --calibration $(RUN)/calibration.h5 --method $(1) --reference $(RAW)/white.dng -o $$@ --overwrite
-$(RUN)/score-%-$(1).json: $(RUN)/spectra/chart-%-$(1).h5 $(RUN)/spectra/white-%-1-$(1).h5 $(RUN)/spectra/white-%-2-$(1).h5
-	$(P) score $$< --truth colorchecker --patches colorchecker --white $(RUN)/spectra/white-$$*-1-$(1).h5 --white $(RUN)/spectra/white-$$*-2-$(1).h5 -o $$@ --overwrite
+$(RUN)/score-%-$(1).json: $(RUN)/spectra/chart-%-$(1).h5 $(RUN)/spectra/white-%-$(1).h5
+	$(P) score $$< --truth colorchecker --patches colorchecker --white $(RUN)/spectra/white-$$*-$(1).h5 -o $$@ --overwrite
 endef
 $(foreach m,$(METHODS),$(eval $(call DEMUX,$m)))
 

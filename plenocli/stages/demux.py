@@ -144,7 +144,7 @@ class _Worker:
     def _radiance(self, path, method):
         exposure = read_exposure(path, cfa=self.calibration.cfa)
         values, noise = _values(exposure, self.calibration, path)
-        return estimate(self.calibration, values, noise, method, self.prior)
+        return estimate(self.calibration, values, noise, method, self.prior, ratio=self.settings.reference is not None)
 
     def _demux(self, capture, target):
         from plenocli.artefacts import describe_inputs
@@ -215,11 +215,12 @@ def _values(exposure, c, path):
     return values, None if gain is None else (gain * scale, c.read_variance * scale**2)
 
 
-def estimate(c, values, noise, method, prior=None):
+def estimate(c, values, noise, method, prior=None, ratio=False):
     """Radiances and sigmas (R, C, band) of superpixel values (R, C, pixel), with the method used and why.
 
     Least squares first gives the expected radiance from which the noise of each pixel follows; `auto` compares the mean
-    square errors that the methods predict.
+    square errors that the methods predict. ratio: the radiance will be divided by another one from the same F, so that
+    the error of F divides out (to first order, and but for crosstalk) and does not count.
     """
     from plenocli.solvers.spectral import choose_pixels, demultiplex
 
@@ -229,7 +230,7 @@ def estimate(c, values, noise, method, prior=None):
         value, sigma = demultiplex(c.response, values, used, pixels=pixels)
         return value, sigma, used, "the sensor's noise is not known" if method == "auto" else "asked for"
     start, _ = demultiplex(c.response, values, "pinv")
-    variance = _variance(c, start, noise)
+    variance = _variance(c, start, noise, None if ratio else c.variance)
     if method != "auto":
         value, sigma = demultiplex(c.response, values, method, variance=variance, pixels=pixels, prior=prior)
         return value, sigma, method, "asked for"
@@ -244,7 +245,7 @@ def estimate(c, values, noise, method, prior=None):
     return *tried[used], used, why
 
 
-def _variance(c, radiance, noise):
+def _variance(c, radiance, noise, response_variance):
     """Pixel variance (R, C, pixel) float32 in blocks of lenslet rows: shot and read noise, and what F-hat does not know."""
     from plenocli.solvers.spectral import noise_variance
 
@@ -252,7 +253,7 @@ def _variance(c, radiance, noise):
     out = np.empty((*radiance.shape[:2], c.response.shape[-2]), np.float32)
     for row in range(len(out)):
         response = c.response if c.response.ndim == 2 else c.response[row]
-        out[row] = noise_variance(response, radiance[row], noise[0], noise[1], c.variance)
+        out[row] = noise_variance(response, radiance[row], noise[0], noise[1], response_variance)
     return np.maximum(out, 1e-12)
 
 

@@ -1,5 +1,6 @@
 """Entry point: the list of commands in the order of the pipeline, and the only place where errors become exit codes."""
 
+import difflib
 import importlib
 import os
 import sys
@@ -34,6 +35,13 @@ class Pipeline(click.Group):
         if name not in COMMANDS:
             return None
         return importlib.import_module(f"plenocli.cli.{name.replace('-', '_')}").command
+
+    def resolve_command(self, ctx, args):
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], COMMANDS, 1)
+            hint = f"Did you mean {near[0]}?" if near else f"Choose one of {', '.join(COMMANDS)}."
+            raise click.UsageError(f"No such command {args[0]!r}. {hint}", ctx)
+        return super().resolve_command(ctx, args)
 
 
 @click.group(

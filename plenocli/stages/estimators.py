@@ -178,17 +178,24 @@ class Estimators:
         report["rule"] = f"stopped after {steps} steps of accelerated projected gradient from 0" if steps else "converged, optimality conditions checked"
         return solve
 
-    def _dictionary(self, stacked, sigma, truth, report):
+    @cached_property
+    def _learnt(self):
+        """(atoms, attributes) of the dictionary; a note where it was learnt for another matrix."""
         from plenocli.artefacts import file_digest, read_artefact
-        from plenocli.solvers.l1 import sparse_code
 
         path = self.settings.dictionary
         artefact = read_artefact(path, "dictionary", mem_limit=self.settings.mem_limit)
-        atoms, attrs = np.asarray(artefact.data["dictionary/atoms"], float), artefact.attrs["dictionary"]
+        atoms = np.asarray(artefact.data["dictionary/atoms"], float)
         if len(atoms) != self.system.own.shape[1]:
             raise InputError(f"has atoms of {len(atoms)} points, the system matrix {self.system.own.shape[1]}", path, "learn it with this pif")
         if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(self.system.path):
             note(f"the dictionary was learnt for another system matrix than {self.system.path.name}")
+        return atoms, artefact.attrs["dictionary"]
+
+    def _dictionary(self, stacked, sigma, truth, report):
+        from plenocli.solvers.l1 import sparse_code
+
+        atoms, attrs = self._learnt
         scale = float(self.svd.s[0])
         learnt = float(attrs["parameters"]["sigma"])
         louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0

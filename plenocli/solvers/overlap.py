@@ -3,8 +3,8 @@
 The paper removes block edges "by performing object reconstruction from 3x3 lenslet areas and then averaging" (Berkner et
 al. 2013, section 3-2). Where only own superpixels are modelled, the 3x3 system falls apart into nine single ones and least
 squares gains nothing from it: what couples neighbours is the light between them and the prior. So LMMSE estimates each
-block from the nine superpixels around it, with the covariance of the scene across lenslets, and the other methods take
-the neighbours' light into account. No 3x3 matrix is formed.
+block from the nine superpixels around it, with the covariance of the scene across lenslets; the other methods work on
+superpixels from which the neighbours' light, as that estimate predicts it, is taken away. No 3x3 matrix is formed.
 """
 
 from dataclasses import dataclass
@@ -18,30 +18,6 @@ def by_lenslet(solve, y):
     """`solve` (pixel, signal) -> (point, signal) on all superpixels y (lenslet_row, lenslet_column, pixel) at once."""
     rows, columns = y.shape[:2]
     return solve(y.reshape(rows * columns, -1).T).T.reshape(rows, columns, -1)
-
-
-def joint_tikhonov(blocks, offsets, y, alpha, *, start=None, tol=1e-8, iterations=2000):
-    """argmin |y - Ax|^2 + alpha |x|^2 over the whole array, matrix-free by conjugate gradients on the normal equations.
-
-    y (lenslet_row, lenslet_column, pixel) -> (x, relative residual of the normal equations); x (lenslet_row, lenslet_column, point).
-    """
-    from plenocli.operators import BlockToeplitz
-
-    op = BlockToeplitz(blocks, offsets, y.shape[:2])
-    x = np.zeros(op.domain.shape) if start is None else start.copy()
-    right = op.adjoint(y)
-    residual = right - op.adjoint(op.forward(x)) - alpha * x
-    direction, energy, target = residual, np.vdot(residual, residual), tol * np.linalg.norm(right)
-    for _ in range(iterations):
-        if np.sqrt(energy) <= target:
-            break
-        image = op.adjoint(op.forward(direction)) + alpha * direction
-        length = energy / np.vdot(direction, image)
-        x = x + length * direction
-        residual = residual - length * image
-        before, energy = energy, np.vdot(residual, residual)
-        direction = residual + energy / before * direction
-    return x, float(np.sqrt(energy) / max(np.linalg.norm(right), np.finfo(float).tiny))
 
 
 @dataclass(frozen=True)

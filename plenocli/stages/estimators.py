@@ -14,7 +14,6 @@ PATCHES_A_POINT = 6
 
 
 NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
-SWEEPS = 4
 MISFIT = 1.5
 """Estimated noise over the capture's own from which on the estimate is believed."""
 
@@ -42,33 +41,28 @@ class Estimators:
         if self.settings.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
         if method == "lmmse" and self.settings.overlap == 3:
-            x, spread = self._joint(self._noise(data, data.y, report), data.scene).apply(data.y)
+            x, spread = self._joint(self._joint_noise(data, report), data.scene).apply(data.y)
             return x, spread, report
         hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
-        if self._takes_neighbours():
-            return self._by_sweeps(method, data, hidden, report), None, report
-        sigma = self._noise(data, data.y, report) if method in NOISY else None
+        y = self._own_light(data, report) if self._takes_neighbours() else data.y
+        sigma = self._noise(data, y, report) if method in NOISY else None
         if method == "lmmse":
             estimator = self._lmmse(sigma, data.scene)
-            x = by_lenslet(estimator.apply, data.y)
+            x = by_lenslet(estimator.apply, y)
             return x, np.broadcast_to(estimator.sigma, x.shape), report
-        return by_lenslet(self._solver(method, data.y, sigma, hidden, report), data.y), None, report
+        return by_lenslet(self._solver(method, y, sigma, hidden, report), y), None, report
 
-    def _by_sweeps(self, method, data, truth, report):
-        """Per lenslet, with the neighbours' light taken away by repetition: x <- solve(y - light of x on neighbours).
+    def _own_light(self, data, report):
+        """The superpixels without their neighbours' light, as the joint LMMSE over 3x3 lenslets sees it.
 
-        The first light is that of the block means. Each sweep chooses its weights for what is left, so that a poor first
-        picture is not over-fitted.
+        An estimate per lenslet cannot tell that light from its own and amplifies it; taking it away by repeated estimates
+        diverges where the matrix is ill-conditioned.
         """
         from plenocli.operators import BlockToeplitz
 
-        stray = BlockToeplitz(self.system.blocks, self.system.offsets, data.y.shape[:2]).neighbours_only()
-        left = data.y - self._stray(data.y)
-        for sweep in range(SWEEPS):
-            sigma = self._noise(data, left, report, quiet=sweep < SWEEPS - 1) if method in NOISY else None
-            x = by_lenslet(self._solver(method, left, sigma, truth, report), left)
-            left = data.y - stray.forward(x)
-        return self._joint_tikhonov(data.y, x, report) if method == "tikhonov" else x
+        x, _ = self._joint(self._joint_noise(data, {}), data.scene).apply(data.y)
+        report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
+        return data.y - BlockToeplitz(self.system.blocks, self.system.offsets, data.y.shape[:2]).neighbours_only().forward(x)
 
     def _solver(self, method, y, sigma, truth, report):
         setup = {"block-mean": self._block_mean, "tikhonov": self._tikhonov, "tsvd": self._tsvd, "nnls": self._nnls, "dictionary": self._dictionary}[method]
@@ -82,7 +76,7 @@ class Estimators:
             return "dictionary", "a dictionary was given"
         return "lmmse", "the best of the linear methods, with its own error estimate"
 
-    def _noise(self, data, y, report, quiet=False):
+    def _noise(self, data, y, report):
         """Standard deviation of what in y is not A x: given, the capture's own, or estimated; the report says which.
 
         The estimate also wins over the capture's figure where it is MISFIT times larger: then y holds more than A x and the
@@ -91,9 +85,17 @@ class Estimators:
         if self.settings.noise_sigma is not None:
             sigma, source = self.settings.noise_sigma, "given"
         else:
-            sigma, source = self._estimated(data, y.reshape(-1, y.shape[2]).T, quiet)
+            sigma, source = self._estimated(data, y.reshape(-1, y.shape[2]).T)
         report |= {"noise_sigma": float(sigma), "noise_source": source}
         return float(sigma)
+
+    def _joint_noise(self, data, report):
+        """The noise for the joint estimate, which models the neighbours' light: the capture's own, if it says so."""
+        if not self.coupled or self.settings.noise_sigma is not None or data.sigma is None:
+            return self._noise(data, data.y - self._stray(data.y) if self.coupled else data.y, report)
+        sigma = max(data.sigma, _floor(data.y))
+        report |= {"noise_sigma": sigma, "noise_source": "from the capture"}
+        return sigma
 
     def _takes_neighbours(self):
         return self.coupled and self.settings.overlap == 3
@@ -107,26 +109,23 @@ class Estimators:
         level = y @ uniform / (uniform @ uniform)
         return op.neighbours_only().forward(np.broadcast_to(level[:, :, None], op.domain.shape))
 
-    def _estimated(self, data, stacked, quiet):
+    def _estimated(self, data, stacked):
         from plenocli.solvers.linear import estimate_noise
 
-        floor = max(1e-9 * float(np.abs(stacked).max(initial=0)), np.finfo(float).tiny)
-        joint = self._takes_neighbours() and self._method()[0] == "lmmse"
+        floor = _floor(stacked)
         try:
             sigma = max(estimate_noise(self.svd, stacked), floor)
         except NumericsError:
             if not data.sigma:
                 raise
             return data.sigma, "from the capture"
-        if data.sigma is not None and (joint or sigma <= MISFIT * max(data.sigma, floor)):
-            return max(data.sigma, floor), "from the capture"
-        if quiet:
-            pass
-        elif data.sigma is None:
+        if data.sigma is None:
             note(f"the capture does not say its noise: sigma = {sigma:.3g}, estimated from what the system matrix cannot produce")
+        elif sigma <= MISFIT * max(data.sigma, floor):
+            return max(data.sigma, floor), "from the capture"
         else:
-            note(f"the capture holds {sigma / max(data.sigma, floor):.3g} times more than its noise that the system matrix cannot produce: sigma = {sigma:.3g} is used. "
-                 "If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3")
+            hint = "" if self._takes_neighbours() else ". If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3"
+            note(f"the capture holds {sigma / max(data.sigma, floor):.3g} times more than its noise that the system matrix cannot produce: sigma = {sigma:.3g} is used{hint}")
         return sigma, "estimated from what the system matrix cannot produce"
 
     def _block_mean(self, stacked, sigma, truth, report):
@@ -238,9 +237,7 @@ class Estimators:
             self._cache[key] = overlap.prepare_joint(self.svd, system.blocks, system.offsets, system.object_shape, *statistics, sigma)
         return self._cache[key]
 
-    def _joint_tikhonov(self, y, start, report):
-        from plenocli.solvers.overlap import joint_tikhonov
 
-        x, residual = joint_tikhonov(self.system.blocks, self.system.offsets, y, report["alpha"], start=start, iterations=300)
-        report["normal_residual"] = residual
-        return x
+def _floor(y):
+    """The least noise that is believed: rounding of the data."""
+    return max(1e-9 * float(np.abs(y).max(initial=0)), np.finfo(float).tiny)

@@ -119,16 +119,6 @@ def test_joint_lmmse_is_the_full_covariance(coupled):
     np.testing.assert_allclose(spread[1, 1], error[2, 2], atol=1e-8)
 
 
-def test_joint_tikhonov_is_the_full_system():
-    blocks, offsets = neighbours(True)
-    op = BlockToeplitz(blocks, offsets, (2, 3))
-    matrix = np.stack([op.forward(e).ravel() for e in np.eye(op.domain.size).reshape(-1, *op.domain.shape)], axis=1)
-    y = np.random.default_rng(4).random(op.range.shape)
-    x, residual = overlap.joint_tikhonov(blocks, offsets, y, 1e-2, tol=1e-12)
-    assert residual <= 1e-12
-    np.testing.assert_allclose(x.ravel(), np.linalg.solve(matrix.T @ matrix + 1e-2 * np.eye(op.domain.size), matrix.T @ y.ravel()), atol=1e-8)
-
-
 def test_autocovariance_of_known_fields():
     rng = np.random.default_rng(5)
     mean, white = natural.autocovariance([0.5 + 0.1 * rng.standard_normal((200, 220))], 3)

@@ -141,7 +141,7 @@ def _read_pif(path, camera, settings, wavelengths):
 def _carry(camera, source, scene, settings, matrix):
     """((letters, light on every superpixel by letter), the white superpixel by letter, the object as sampled)."""
     from plenocli.sensor.cfa import sensitivity
-    from plenocli.sensor.irradiance import superpixel_light, to_points
+    from plenocli.sensor.irradiance import superpixel_light
 
     letters, efficiency = sensitivity(camera, source.wavelengths)
     count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
@@ -149,13 +149,13 @@ def _carry(camera, source, scene, settings, matrix):
     grid = tuple(n * k for n, k in zip(count, fine))
     finer = camera.replace(**{"object.samples_per_lenslet": fine}) if settings.refine > 1 else camera
     pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
-    light, whites, points = 0.0, 0.0, None
+    light, whites, picture = 0.0, 0.0, None
     for index, wavelength in enumerate(bar(source.wavelengths, len(source.wavelengths), "wavelengths")):
         response = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
-        if not scene.uniform and (points is None or scene.spectral):
-            points = to_points(scene.at(wavelength, *grid), fine)
+        if not scene.uniform and (picture is None or scene.spectral):
+            picture = scene.at(wavelength, *grid)
         size = max(8, settings.mem_limit // 16 // (8 * len(response.offsets) * pixels))
-        carried, white = superpixel_light(response.blocks(size), response.offsets, points)
+        carried, white = superpixel_light(response.blocks(size), response.offsets, picture, fine)
         if scene.uniform:
             carried = np.broadcast_to(scene.level * white, (*count, pixels))
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2

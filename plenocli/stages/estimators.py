@@ -41,8 +41,7 @@ class Estimators:
         if self.settings.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
         if method == "lmmse" and self.settings.overlap == 3:
-            x, spread = self._joint(self._joint_noise(data, report), data.scene).apply(data.y)
-            return x, spread, report
+            return *self._jointly(data, report), report
         hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
         y = self._own_light(data, report) if self._takes_neighbours() else data.y
         sigma = self._noise(data, y, report) if method in NOISY else None
@@ -52,6 +51,25 @@ class Estimators:
             return x, np.broadcast_to(estimator.sigma, x.shape), report
         return by_lenslet(self._solver(method, y, sigma, hidden, report), y), None, report
 
+    def _jointly(self, data, report):
+        """(x, sigma) of LMMSE over 3x3 lenslets; once more with the noise that is left over, where that is MISFIT times larger."""
+        sigma = self._joint_noise(data, report)
+        x, spread = self._joint(sigma, data.scene).apply(data.y)
+        left = self._left_over(data.y, x)
+        if self.coupled and self.settings.noise_sigma is None and left > MISFIT * sigma:
+            note(f"the capture holds {left / sigma:.3g} times more than its noise that the system matrix cannot produce: sigma = {left:.3g} is used")
+            report |= {"noise_sigma": left, "noise_source": "what the estimate leaves over"}
+            x, spread = self._joint(left, data.scene).apply(data.y)
+        return x, spread
+
+    def _left_over(self, y, x):
+        """Root mean square of y - A x over the lenslets that have all their neighbours (all, where none has)."""
+        from plenocli.operators import BlockToeplitz
+
+        rest = y - BlockToeplitz(self.system.blocks, self.system.offsets, y.shape[:2]).forward(x)
+        inner = rest[1:-1, 1:-1]
+        return float(np.sqrt(np.mean((inner if inner.size else rest) ** 2)))
+
     def _own_light(self, data, report):
         """The superpixels without their neighbours' light, as the joint LMMSE over 3x3 lenslets sees it.
 
@@ -60,7 +78,7 @@ class Estimators:
         """
         from plenocli.operators import BlockToeplitz
 
-        x, _ = self._joint(self._joint_noise(data, {}), data.scene).apply(data.y)
+        x, _ = self._jointly(data, {})
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         return data.y - BlockToeplitz(self.system.blocks, self.system.offsets, data.y.shape[:2]).neighbours_only().forward(x)
 

@@ -49,13 +49,15 @@ def test_the_mosaic_is_the_sum_over_points_and_neighbours(camera, scene, tmp_pat
     got = capture(camera, "--scene", path, "--noise", "none", "--superpixels", "3x3", "--accuracy", "1e-5", "-o", tmp_path / "c.h5").data["capture/mosaic"]
     pif = build_pif(load_camera(camera), superpixels=(3, 3), accuracy=1e-5, dtype=np.float64)
     expected = np.zeros((27, 36))
-    for row in range(12):
-        for column in range(16):
+    mirrored = [3, 2, 1, 0, *range(12), 11, 10, 9, 8], [3, 2, 1, 0, *range(16), 15, 14, 13, 12]
+    wide = x[np.ix_(*mirrored)]  # the scene goes on mirrored for one lenslet
+    for row in range(-4, 16):
+        for column in range(-4, 20):
             home, point = (row // 4, column // 4), (row % 4) * 4 + column % 4
             for block, (down, right) in enumerate(pif.lenslet_offset):
                 r, c = home[0] + down, home[1] + right
                 if 0 <= r < 3 and 0 <= c < 4:
-                    expected[9 * r : 9 * r + 9, 9 * c : 9 * c + 9] += x[row, column] * pif.A[0, block, :, point].reshape(9, 9)
+                    expected[9 * r : 9 * r + 9, 9 * c : 9 * c + 9] += wide[row + 4, column + 4] * pif.A[0, block, :, point].reshape(9, 9)
     assert np.abs(got - expected).max() < 1e-5 * expected.max()
 
 

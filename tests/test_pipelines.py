@@ -1,0 +1,72 @@
+"""The pipelines through make: every stage runs, a second run does nothing, a change reruns what depends on it and no more."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+
+
+def make(pipeline, *variables, check=True):
+    """Run a pipeline with the plenocli of this Python; returns the lines that make printed."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")} | {"PATH": path, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(["make", "-j2", "-f", f"pipelines/{pipeline}.mk", *variables], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert not check or done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.splitlines()
+
+
+def stages(lines):
+    return [line.split()[1] for line in lines if line.startswith("plenocli ")]
+
+
+@pytest.fixture(scope="module")
+def spatial(tmp_path_factory):
+    """(variables of a run on a camera smaller than tiny.toml, its camera file, its folder, what make printed)."""
+    folder = tmp_path_factory.mktemp("spatial")
+    text = (ROOT / "sample_configs" / "tiny.toml").read_text()
+    for old, new in [("[8, 8]", "[4, 4]"), ("[13, 13]", "[9, 9]"), ('"26 um"', '"18 um"'), ('"208 um"', '"144 um"'), ("[5, 5]", "[4, 4]")]:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "camera.toml").write_text(text)
+    variables = [f"RUN={folder}/run", f"CONFIG={folder}/camera.toml", "ITERATIONS=2", "BATCH=64", "METHODS=block-mean tikhonov lmmse dictionary"]
+    return variables, folder / "camera.toml", folder / "run", make("spatial", *variables)
+
+
+def test_every_stage_of_the_spatial_experiment_runs(spatial):
+    _, _, run, lines = spatial
+    assert {"simulate-pif", "capture-sim", "learn-dict", "reconstruct", "score", "report"} == set(stages(lines))
+    paper = {r["label"]: r["metrics"] for r in json.loads((run / "score-paper.json").read_text())["results"]}
+    assert paper["lmmse"]["psnr_db"] > paper["block-mean"]["psnr_db"] + 2
+    stray = {r["label"]: r["metrics"] for r in json.loads((run / "score-stray.json").read_text())["results"]}
+    assert stray["lmmse"]["psnr_db"] > stray["lmmse-no-neighbours"]["psnr_db"] + 2, "the neighbours' light matters and is modelled"
+    assert "data:image/png" in (run / "report.html").read_text()
+
+
+def test_a_second_run_does_nothing_and_a_change_reruns_what_depends_on_it(spatial):
+    variables, _, run, first = spatial
+    assert stages(make("spatial", *variables)) == []
+    os.utime(run / "stray" / "capture.h5")
+    again = stages(make("spatial", *variables, "-n"))
+    assert "learn-dict" not in again and "simulate-pif" not in again and again.count("score") == 1
+    assert 0 < again.count("reconstruct") < stages(first).count("reconstruct")
+
+
+def test_the_same_run_gives_the_same_bytes(spatial, tmp_path):
+    _, camera, run, _ = spatial
+    make("spatial", f"RUN={tmp_path}/run", f"CONFIG={camera}", "ITERATIONS=2", "BATCH=64", "METHODS=block-mean tikhonov lmmse dictionary")
+    files = sorted(p.relative_to(run) for p in run.rglob("*") if p.is_file())
+    assert len(files) > 12
+    assert [p for p in files if (run / p).read_bytes() != (tmp_path / "run" / p).read_bytes()] == []
+
+
+def test_a_broken_camera_leaves_nothing_behind(tmp_path):
+    (tmp_path / "camera.toml").write_text("[main_lens]\n")
+    lines = make("spatial", f"RUN={tmp_path}/run", f"CONFIG={tmp_path}/camera.toml", check=False)
+    assert stages(lines) and not list((tmp_path / "run").rglob("*.h5"))

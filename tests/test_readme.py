@@ -1,0 +1,35 @@
+"""Every plenocli command line in the README and in docs is one that the program understands."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from plenocli.cli.main import COMMANDS, cli
+
+ROOT = Path(__file__).resolve().parents[1]
+LINES = sorted({line.strip() for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")] for line in page.read_text().splitlines() if re.match(r"    plenocli [a-z]", line)})
+
+
+def test_the_readme_shows_every_command():
+    shown = {line.split()[1] for line in LINES}
+    assert set(COMMANDS) - shown <= {"schema"}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_command_lines_parse(line):
+    _, name, *arguments = shlex.split(line)
+    command = cli.get_command(None, name)
+    command.make_context(name, arguments)  # raises click.UsageError for an unknown option or a missing one
+
+
+def test_files_named_in_the_readme_exist():
+    text = (ROOT / "README.md").read_text()
+    for link in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (ROOT / link).exists(), link
+    for name in re.findall(r"\b(?:sample_configs|pipelines|docs)/[\w./]*\w", text):
+        assert (ROOT / name).exists(), name
+    targets = re.findall(r"^([a-z][a-z0-9-]*):", (ROOT / "Makefile").read_text(), re.M)
+    for target in re.findall(r"`make (?:-j2 )?([a-z][\w-]*)`", text):
+        assert target in targets, target

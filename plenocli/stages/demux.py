@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.errors import InputError, NumericsError, OutputError, PlenoError, UsageError
+from plenocli.errors import InputError, NumericsError
+from plenocli.stages.batch import attempt, one_by_one, plan_batch, summarise
 from plenocli.stages.mosaics import read_exposure
-from plenocli.stages.progress import bar, note
+from plenocli.stages.progress import bar
 
 WORTHWHILE = 1.05  # `auto` takes a method that assumes more only where it predicts a mean square error this much smaller
 
@@ -48,58 +49,17 @@ def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".ex
     finished ones are skipped unless overwrite. A capture that fails does not stop the others: its message is printed
     and an error is raised at the end, with the exit code of the worst.
     """
-    from plenocli.artefacts import check_output
-
-    captures, output = [Path(c) for c in captures], Path(output)
-    several = len(captures) > 1 or output.is_dir()
-    jobs = _jobs(captures, output, suffix, several)
-    inputs = [*captures, calibration, settings.reference]
-    if several and output.exists() and not output.is_dir():
-        raise OutputError("is a file; several captures go to a folder", output, "name a folder")
-    if not several:
-        check_output(output, overwrite=overwrite, inputs=inputs)
-    elif not output.is_dir():
-        try:
-            output.mkdir()
-        except OSError as error:
-            raise OutputError(f"the folder cannot be made ({error.strerror})", output, "make its parent folder first") from None
-    todo = [(c, t) for c, t in jobs if overwrite or not several or not t.exists()]
+    batch = plan_batch(captures, output, suffix, "spectra are", overwrite=overwrite, inputs=[*captures, calibration, settings.reference])
     arguments = (calibration, settings, overwrite, command)
-    first = _Worker(*arguments) if todo else None  # a broken calibration ends the run here, before any capture
-    reports, errors = [], []
-    for capture, outcome in _outcomes(todo, first, arguments, workers):
-        if isinstance(outcome, PlenoError):
-            if not several:
-                raise outcome
-            note(f"error: {outcome}")
-            errors.append((capture, outcome))
-        else:
-            reports.append(outcome)
-    summary = {"output": str(output), "done": len(reports), "skipped": len(jobs) - len(todo), "failed": [str(c) for c, _ in errors], "captures": reports}
-    if errors:
-        worst = max(errors, key=lambda pair: pair[1].exit_code)[1]
-        raise type(worst)(f"{len(errors)} of {len(jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", output, f"{len(jobs) - len(errors)} are done; see the messages above")
-    return summary
+    first = _Worker(*arguments) if batch.todo else None  # a broken calibration ends the run here, before any capture
+    return summarise(batch, _outcomes(batch, first, arguments, workers))
 
 
-def _jobs(captures, output, suffix, several):
-    if not several:
-        if output.suffix not in (".exr", ".h5"):
-            raise UsageError(f"spectra are written as .exr or .h5, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
-        return [(captures[0], output)]
-    targets = [output / (capture.stem + suffix) for capture in captures]
-    for target in targets:
-        same = [c for c, t in zip(captures, targets) if t == target]
-        if len(same) > 1:
-            raise UsageError(f"captures {', '.join(str(c) for c in same)} would all become {target.name}", fix="rename one, or use two folders")
-    return list(zip(captures, targets))
-
-
-def _outcomes(todo, first, arguments, workers):
+def _outcomes(batch, first, arguments, workers):
     """(capture, report or PlenoError) of every job, in order; in this process or in several."""
+    todo = batch.todo
     if workers == 1 or len(todo) < 2:
-        for capture, target in bar(todo, len(todo), "captures"):
-            yield capture, first.attempt(capture, target)
+        yield from one_by_one(batch, first.demux if first else None)
         return
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -116,7 +76,7 @@ def _start(*arguments):
 
 
 def _attempt(capture, target):
-    return _worker.attempt(capture, target)
+    return attempt(_worker.demux, capture, target)
 
 
 class _Worker:
@@ -130,12 +90,6 @@ class _Worker:
         if settings.reference is not None:
             self.reference = self._radiance(settings.reference, self._plain_method())[:2]
 
-    def attempt(self, capture, target):
-        try:
-            return self._demux(capture, target)
-        except PlenoError as error:
-            return error
-
     def _plain_method(self):
         """The white reference is demultiplexed without a prior: a prior's pull would not divide out."""
         method = self.settings.method
@@ -146,7 +100,8 @@ class _Worker:
         values, noise = _values(exposure, self.calibration, path)
         return estimate(self.calibration, values, noise, method, self.prior, ratio=self.settings.reference is not None)
 
-    def _demux(self, capture, target):
+    def demux(self, capture, target):
+        """Demultiplex one capture and write it to `target`; returns its report."""
         from plenocli.artefacts import describe_inputs
 
         c = self.calibration

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.errors import InputError, OutputError, PlenoError, UsageError
+from plenocli.errors import InputError, UsageError
+from plenocli.stages.batch import one_by_one, plan_batch, summarise
 from plenocli.stages.estimators import Estimators
-from plenocli.stages.progress import bar, note
+from plenocli.stages.progress import note
 from plenocli.stages.superpixels import calibrated, read_superpixels
 from plenocli.stages.systems import read_system
 from plenocli.stages.training import files_of
@@ -39,27 +40,16 @@ def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, s
     One capture gives the file `output` (.h5 or .exr), several a folder with one file each; finished ones are skipped unless
     overwrite. One that fails does not stop the others; an error with the worst exit code follows at the end.
     """
-    captures, output = [Path(c) for c in captures], Path(output)
     _check_options(settings, pif, calibration)
-    several = len(captures) > 1 or output.is_dir()
     inputs = [*captures, pif, calibration, settings.dictionary, settings.truth, *(files_of(settings.training) or ())]
-    jobs = _jobs(captures, output, suffix, several, overwrite, inputs)
-    todo = [(c, t) for c, t in jobs if overwrite or not several or not t.exists()]
-    estimators = Estimators(read_system(pif, settings.mem_limit), settings) if pif and todo else None
-    reports, errors = [], []
-    for capture, target in bar(todo, len(todo), "captures"):
-        try:
-            reports.append(_one(capture, target, settings, estimators, calibration, overwrite, dict(command=command, pif=pif, calibration=calibration)))
-        except PlenoError as error:
-            if not several:
-                raise
-            note(f"error: {error}")
-            errors.append((capture, error))
-    if errors:
-        worst = max((e for _, e in errors), key=lambda e: e.exit_code)
-        raise type(worst)(f"{len(errors)} of {len(jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", output,
-                          f"{len(jobs) - len(errors)} are done; see the messages above")
-    return {"output": str(output), "done": len(reports), "skipped": len(jobs) - len(todo), "captures": reports}
+    batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
+    estimators = Estimators(read_system(pif, settings.mem_limit), settings) if pif and batch.todo else None
+    origin = dict(command=command, pif=pif, calibration=calibration)
+
+    def work(capture, target):
+        return _one(capture, target, settings, estimators, calibration, overwrite, origin)
+
+    return summarise(batch, one_by_one(batch, work))
 
 
 def _check_options(settings, pif, calibration):
@@ -75,26 +65,6 @@ def _check_options(settings, pif, calibration):
         if getattr(settings, name) is not None and settings.method not in methods:
             option = {"lam": "lambda"}.get(name, name.replace("_", "-"))
             raise UsageError(f"--{option} means nothing to --method {settings.method}", fix=f"leave it out, or use --method {methods[-1]}")
-
-
-def _jobs(captures, output, suffix, several, overwrite, inputs):
-    from plenocli.artefacts import check_output
-
-    if not several:
-        if output.suffix not in (".h5", ".exr"):
-            raise UsageError(f"a picture is written as .h5 or .exr, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
-        check_output(output, overwrite=overwrite, inputs=inputs)
-        return [(captures[0], output)]
-    if output.exists() and not output.is_dir():
-        raise OutputError("is a file; several captures go to a folder", output, "name a folder")
-    targets = [output / (c.stem + suffix) for c in captures]
-    if len(set(targets)) < len(targets):
-        raise UsageError("two captures have the same name and would become one file", output, "rename one, or use two folders")
-    try:
-        output.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made ({error.strerror})", output, "make its parent folder first") from None
-    return list(zip(captures, targets))
 
 
 def _one(capture, target, settings, estimators, calibration, overwrite, origin):

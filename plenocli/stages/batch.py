@@ -1,0 +1,83 @@
+"""Several captures in one run: where each result goes, which are finished already, and what happens when some fail."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from plenocli.errors import OutputError, PlenoError, UsageError
+from plenocli.stages.progress import bar, note
+
+
+@dataclass(frozen=True)
+class Batch:
+    """jobs, todo: (capture, target) pairs, all of them and those not finished before; several: whether `output` is a folder."""
+
+    output: Path
+    several: bool
+    jobs: list
+    todo: list
+
+
+def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
+    """Batch of `captures` (paths): one goes to the file `output`, several go to a folder, each to its own name with `suffix`.
+
+    The folder is made; in it finished results are skipped unless overwrite. what: the result in words, for messages, such
+    as "spectra are". inputs: all files that are read, which no result may replace. Errors: UsageError, OutputError.
+    """
+    from plenocli.artefacts import check_output
+
+    captures, output = [Path(c) for c in captures], Path(output)
+    if len(captures) == 1 and not output.is_dir():
+        if output.suffix not in (".exr", ".h5"):
+            raise UsageError(f"{what} written as .exr or .h5, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
+        check_output(output, overwrite=overwrite, inputs=inputs)
+        jobs = [(captures[0], output)]
+        return Batch(output, False, jobs, jobs)
+    if output.exists() and not output.is_dir():
+        raise OutputError("is a file; several captures go to a folder", output, "name a folder")
+    targets = [output / (capture.stem + suffix) for capture in captures]
+    for target in targets:
+        same = [c for c, t in zip(captures, targets) if t == target]
+        if len(same) > 1:
+            raise UsageError(f"captures {', '.join(str(c) for c in same)} would all become {target.name}", fix="rename one, or use two folders")
+    try:
+        output.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made ({error.strerror})", output, "make its parent folder first") from None
+    jobs = list(zip(captures, targets))
+    return Batch(output, True, jobs, [job for job in jobs if overwrite or not job[1].exists()])
+
+
+def attempt(work, capture, target):
+    """What `work(capture, target)` returns, or the PlenoError that it raises."""
+    try:
+        return work(capture, target)
+    except PlenoError as error:
+        return error
+
+
+def one_by_one(batch, work):
+    """(capture, report or PlenoError) of every job to do, in this process."""
+    for capture, target in bar(batch.todo, len(batch.todo), "captures"):
+        yield capture, attempt(work, capture, target)
+
+
+def summarise(batch, outcomes):
+    """Summary dict of (capture, report or PlenoError) pairs.
+
+    A capture that fails does not stop the others: its message is printed at once, and an error with the exit code of the
+    worst is raised at the end. The error of a single capture is raised as it is.
+    """
+    reports, errors = [], []
+    for capture, outcome in outcomes:
+        if not isinstance(outcome, PlenoError):
+            reports.append(outcome)
+        elif not batch.several:
+            raise outcome
+        else:
+            note(f"error: {outcome}")
+            errors.append((capture, outcome))
+    if errors:
+        worst = max((error for _, error in errors), key=lambda error: error.exit_code)
+        raise type(worst)(f"{len(errors)} of {len(batch.jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", batch.output,
+                          f"{len(batch.jobs) - len(errors)} are done; see the messages above")
+    return {"output": str(batch.output), "done": len(reports), "skipped": len(batch.jobs) - len(batch.todo), "captures": reports}

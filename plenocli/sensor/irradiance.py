@@ -1,14 +1,14 @@
-"""Light from a whole scene onto a whole sensor through one response that serves every lenslet."""
+"""Light from a whole scene onto a whole sensor through one system matrix that serves every lenslet."""
 
 import numpy as np
 
-from plenocli.operators import BlockToeplitz
+from plenocli.operators import BlockToeplitz, to_blocks
 
 
 def superpixel_light(blocks, offsets, picture, samples):
     """Carry a scene to the sensor: (light (lenslet_row, lenslet_column, pixel), white (pixel,)), float64.
 
-    blocks: pairs (object points, A_o (lenslet offset, pixel, point)) that cover every point once, so that a fine response
+    blocks: pairs (object points, A_o (lenslet offset, pixel, point)) that cover every point once, so that a fine matrix
     streams through memory.  offsets (lenslet offset, 2).  picture (row, column): reflectance of the object points of the
     whole array, samples = (rows, columns) of them a lenslet; beyond the array the scene goes on mirrored, as far as the
     offsets reach.  None: no picture, and no light.  white is the superpixel of a uniform white object that goes on beyond
@@ -18,7 +18,7 @@ def superpixel_light(blocks, offsets, picture, samples):
     reach = np.abs(offsets).max(axis=0)
     if picture is not None:
         margins = [(int(n) * k, int(n) * k) for n, k in zip(reach, samples)]
-        points = to_points(np.pad(picture, margins, mode="symmetric"), samples)
+        points = to_blocks(np.pad(picture, margins, mode="symmetric"), samples)
     light, white = 0.0, 0.0
     for part, block in blocks:
         if picture is not None:
@@ -27,15 +27,3 @@ def superpixel_light(blocks, offsets, picture, samples):
     if picture is not None:
         light = light[reach[0] : light.shape[0] - reach[0], reach[1] : light.shape[1] - reach[1]]
     return light, white
-
-
-def to_points(picture, samples):
-    """(R r, C c) object grid -> (R, C, r c) points by lenslet, row by row; samples = (r, c)."""
-    (r, c), (rows, columns) = samples, picture.shape
-    return picture.reshape(rows // r, r, columns // c, c).swapaxes(1, 2).reshape(rows // r, columns // c, r * c)
-
-
-def to_mosaic(superpixels, shape):
-    """(R, C, h w) superpixels -> (R h, C w) sensor; shape = (h, w). Undone by to_points."""
-    (h, w), (rows, columns) = shape, superpixels.shape[:2]
-    return superpixels.reshape(rows, columns, h, w).swapaxes(1, 2).reshape(rows * h, columns * w)

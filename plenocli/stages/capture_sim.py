@@ -180,13 +180,13 @@ def _truth(camera, scene, grid, refine):
 
 def _detect(camera, light, whites, settings):
     """From relative light to what the sensor reports: (capture dict, summary dict)."""
+    from plenocli.operators import to_plane
     from plenocli.sensor.cfa import cfa_map
-    from plenocli.sensor.irradiance import to_mosaic
     from plenocli.sensor.noise import SensorModel, add_white_noise
 
     letters, light = light
     sensor, shape = camera.sensor, camera.sensor.pixels_per_lenslet
-    planes = {letter: to_mosaic(plane, shape) for letter, plane in zip(letters, light)}
+    planes = {letter: to_plane(plane, shape) for letter, plane in zip(letters, light)}
     mosaic = next(iter(planes.values()))
     if sensor.cfa != "mono":
         where = cfa_map(mosaic.shape, sensor.cfa)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
+from plenocli.operators import to_blocks, to_plane
 from plenocli.stages.batch import one_by_one, plan_batch, summarise
 from plenocli.stages.estimators import Estimators
 from plenocli.stages.progress import note
@@ -74,25 +75,13 @@ def _one(capture, target, settings, estimators, calibration, overwrite, origin):
     else:
         data = read_superpixels(capture, estimators.system, calibration, settings.mem_limit)
         blocks, spread, report = estimators.solve(data, _truth(settings.truth, estimators.system.object_shape, data.y.shape[:2]))
-        picture = to_picture(blocks, estimators.system.object_shape)
-        sigma = None if spread is None else to_picture(spread, estimators.system.object_shape)
+        picture = to_plane(blocks, estimators.system.object_shape)
+        sigma = None if spread is None else to_plane(spread, estimators.system.object_shape)
     negative = float(np.mean(picture < 0))
     if settings.clip:
         picture = np.maximum(picture, 0)
     _write(target, picture, sigma, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
     return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": negative, "clipped": settings.clip}
-
-
-def to_picture(blocks, shape):
-    """(lenslet_row, lenslet_column, point) -> (row, column), points numbered row by row in blocks of `shape`."""
-    rows, columns = blocks.shape[:2]
-    return blocks.reshape(rows, columns, *shape).transpose(0, 2, 1, 3).reshape(rows * shape[0], columns * shape[1])
-
-
-def to_blocks(picture, shape):
-    """(row, column) -> (lenslet_row, lenslet_column, point), the inverse of `to_picture`."""
-    rows, columns = picture.shape[0] // shape[0], picture.shape[1] // shape[1]
-    return picture.reshape(rows, shape[0], columns, shape[1]).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
 
 
 def _truth(path, shape, count):

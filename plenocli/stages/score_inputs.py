@@ -163,6 +163,7 @@ def read_labels(source, grid):
     source: "colorchecker" for the chart as capture-sim lays it out, or a single-channel .png/.tif/.exr on this grid or one
     finer by a whole number, where only lenslets that see one label alone keep it.
     """
+    from plenocli.operators import to_blocks
     from plenocli.scene.chart import chart_labels
 
     rows, cols = grid
@@ -179,7 +180,7 @@ def read_labels(source, grid):
     labels = np.rint(values).astype(int)
     if np.abs(labels - values).max() > 1e-3 or labels.min() < 0 or labels.max() > 24:
         raise InputError("holds values that are no labels", source, "use 0 for nothing and 1 to 24 for the patches")
-    blocks = labels.reshape(rows, values.shape[0] // rows, cols, -1).transpose(0, 2, 1, 3).reshape(rows, cols, -1)
+    blocks = to_blocks(labels, (values.shape[0] // rows, values.shape[1] // cols))
     return np.where((blocks == blocks[..., :1]).all(-1), blocks[..., 0], 0)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError
+from plenocli.operators import to_blocks
 from plenocli.stages.progress import note
 
 
@@ -46,9 +47,8 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
     over = float(np.mean(mosaic.values >= mosaic.white)) if np.isfinite(mosaic.white) else 0.0
     if over > 0:
         note(f"{Path(path).name}: {over:.2%} of the pixels are saturated; the picture is too dark there")
-    y = signal.reshape(rows // shape[0], shape[0], columns // shape[1], shape[1]).transpose(0, 2, 1, 3)
     sigma = mosaic.meta.get("noise_sigma")
-    return Superpixels(y.reshape(*y.shape[:2], -1) / unit, None if sigma is None else float(sigma) / unit, mosaic.meta.get("target"))
+    return Superpixels(to_blocks(signal, shape) / unit, None if sigma is None else float(sigma) / unit, mosaic.meta.get("target"))
 
 
 def calibrated(path, mosaic, calibration):

@@ -8,9 +8,8 @@ import pytest
 from plenocli.artefacts import Artefact, Provenance, read_artefact, write_artefact
 from plenocli.cli.main import run
 from plenocli.metrics.quality import psnr
-from plenocli.operators import BlockToeplitz
+from plenocli.operators import BlockToeplitz, to_blocks, to_plane
 from plenocli.scene.sample import luminance, sample_picture
-from plenocli.stages.reconstruct import to_blocks, to_picture
 from plenocli.stages.scenes import embedded_photograph
 
 N, PIXELS, COUNT = 6, 9, 8
@@ -38,7 +37,7 @@ def make_files(folder, coupled=False, noise=60.0, **attrs):
     sigma = np.sqrt(np.mean(y**2) * 10 ** (-noise / 10))
     y = y + sigma * np.random.default_rng(0).standard_normal(y.shape)
     about = dict(units="relative", black=0.0, noise_sigma=float(sigma), superpixel_shape=[PIXELS] * 2, lenslet_count=[COUNT] * 2, target="skimage:astronaut") | attrs
-    mosaic = {"capture/mosaic": to_picture(y, (PIXELS, PIXELS)), "capture/cfa": "mono", "capture/scene": picture[None].astype(np.float32), "capture/wavelength": np.array([550e-9])}
+    mosaic = {"capture/mosaic": to_plane(y, (PIXELS, PIXELS)), "capture/cfa": "mono", "capture/scene": picture[None].astype(np.float32), "capture/wavelength": np.array([550e-9])}
     write_artefact(folder / "capture.h5", Artefact("capture", mosaic, {"capture": {k: v for k, v in about.items() if v is not None}}, Provenance("test")), overwrite=True)
     return picture
 

@@ -66,6 +66,7 @@ def exif(path):
 
 
 def main():
+    """Read sys.argv and answer on stdout, as said above; every failure becomes an answer with "refused"."""
     path, address_space, cpu_seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     channel = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not mix with the answer

@@ -1,12 +1,12 @@
 """Every shared option once, with its unit and default in its help, and the parameter types that read units."""
 
 import json
-import math
 from pathlib import Path
 
 import click
 
 from plenocli.config.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number
+from plenocli.plain import plain
 
 
 class _Quantity(click.ParamType):
@@ -16,6 +16,7 @@ class _Quantity(click.ParamType):
         self.name, self._parse, self._minimum, self._exclusive, self.show = name, parse, minimum, exclusive, show
 
     def convert(self, value, param, ctx):
+        """Text in the units that the command line takes; a default that is a number stays as it is."""
         if not isinstance(value, str):
             return value
         try:
@@ -46,6 +47,7 @@ class Grid(click.ParamType):
         self._words = words
 
     def convert(self, value, param, ctx):
+        """(rows, columns), or the word itself."""
         if not isinstance(value, str) or value in self._words:
             return value
         parts = value.lower().split("x")
@@ -61,6 +63,7 @@ class Pair(click.ParamType):
         self.name, self._convert = f"WAVELENGTH={value_name}", convert_value
 
     def convert(self, value, param, ctx):
+        """(length in m, converted value)."""
         if not isinstance(value, str):
             return value
         key, equals, rest = value.partition("=")
@@ -85,7 +88,6 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print the summar
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
 workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes to use.")
 mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
-snr = click.option("--snr", "snr_db", type=DECIBEL, default=None, help="White noise of this signal-to-noise ratio, such as 60dB: sigma^2 = mean(y^2) 10^(-SNR/10).")
 
 
 def command_line(ctx):
@@ -121,19 +123,6 @@ def _word(value, kind):
 def summary(report, as_json, line):
     """Print what a command did: `report` (a dict) as JSON on request, else the one `line`."""
     if as_json:
-        click.echo(json.dumps(_plain(report), allow_nan=False, sort_keys=True))
+        click.echo(json.dumps(plain(report), allow_nan=False, sort_keys=True))
     else:
         click.echo(line)
-
-
-def _plain(value):
-    """JSON has no NaN, no arrays and no paths: numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

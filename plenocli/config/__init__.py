@@ -3,7 +3,7 @@
 from plenocli.config.units import format_length, parse_length
 
 REFERENCE_REFLECTANCE = 0.99
-"""Of the white reference target, as the paper's Labsphere: what capture-sim shows and demux divides by, unless told otherwise."""
+"""Of the white reference target, as the paper's Labsphere (Spectralon 99%), flat over the visible: what capture-sim shows and demux and score divide by, unless told otherwise."""
 
 __all__ = ["REFERENCE_REFLECTANCE", "Camera", "camera_schema", "format_length", "load_camera", "parse_camera", "parse_length"]
 

@@ -24,6 +24,7 @@ def _quantity(parse, example, low, high, show):
     """An annotated float that is written as text with a unit and lies within [low, high] in SI."""
 
     def read(value: Any, info) -> float:
+        """SI value of text with a unit, or of a number where the context says that it is SI already."""
         if info.context and info.context.get("si"):
             number = value
         elif isinstance(value, str):

@@ -67,7 +67,7 @@ def show_picture(axes, values, title="", **options):
     bare(axes, title)
 
 
-def show_map(axes, values, title="", bar="", figure=None, **options):
+def show_map(axes, values, title="", bar="", **options):
     """A map with a colour bar labelled `bar` (quantity and unit)."""
     image = axes.imshow(values, **options)
     bare(axes, title)

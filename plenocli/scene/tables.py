@@ -15,9 +15,6 @@ from plenocli.errors import ConfigError
 #: The patches over which the spectral experiment averages its error (Berkner et al. 2013, spectral prototype).
 SIX_PATCHES = ("white 9.5 (.05 D)", "black 2 (1.5 D)", "red", "orange", "green", "blue")
 
-#: Reflectance of a white reference standard (Labsphere Spectralon 99%), taken as flat over the visible.
-WHITE_REFERENCE = 0.99
-
 _SECOND_RADIATION_CONSTANT = 1.438776877e-2  # m K, CODATA 2018
 _NORMAL = 560e-9  # m: relative spectral powers are 1 here, the CIE's choice
 

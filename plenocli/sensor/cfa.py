@@ -4,7 +4,6 @@ import numpy as np
 
 from plenocli.errors import ConfigError
 
-PATTERNS = ("mono", "RGGB", "BGGR", "GRBG", "GBRG")
 MONO = "Y"
 
 

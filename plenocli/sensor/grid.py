@@ -64,8 +64,8 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     if sides.max() > 1.3 * sides.min():
         raise NumericsError(f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by {sides[1]:.1f} px, which no square or hexagonal array does", fix=FIX)
     pitch = float(np.hypot(*basis.T).min())
-    index, position, weight_ok, flux = _measured_sites(image, basis, kind, pitch, structured)
-    inside = _whole(position, image.shape, 0.5 * pitch) & weight_ok
+    index, position, clean = _measured_sites(image, basis, kind, pitch, structured)
+    inside = _whole(position, image.shape, 0.5 * pitch) & clean
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
             f"no lenslet lattice in the image: a pitch of {pitch:.1f} px repeats, but only {int(inside.sum())} sites "
@@ -91,7 +91,7 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
         model, lit = moved, _lit_cells(image, moved)
     mean = distortion.fit_model("affine", index[inside], position[inside])
     vectors = mean.coefficients[1:] / mean.scale
-    return _assemble(kind, model, vectors, strength, index, position, miss, weight_ok, image.shape, pitch, lit)
+    return _assemble(kind, model, vectors, strength, index, position, miss, clean, image.shape, pitch, lit)
 
 
 def prepare(white, cfa="mono", dark=None):
@@ -174,7 +174,7 @@ def _brightest_crop(image, window):
 
 
 def _measured_sites(image, basis, kind, pitch, structured):
-    """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool, flux (N,)."""
+    """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool."""
     window = spots.WIDE_WINDOW if structured else spots.WINDOW
     maxima = spots.find_maxima(image, pitch, 0.28 if structured else 0.18)
     if len(maxima) < 9:
@@ -205,7 +205,7 @@ def _measured_sites(image, basis, kind, pitch, structured):
             fix=FIX,
         )
     clean = (level > 0.3) & (np.hypot(*(position - first).T) < 0.25 * pitch)
-    return index, position, clean, flux
+    return index, position, clean
 
 
 def _illumination(position, flux, shape, whole):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.config import REFERENCE_REFLECTANCE
 from plenocli.errors import InputError, NumericsError
 from plenocli.stages.batch import attempt, one_by_one, plan_batch, summarise
 from plenocli.stages.mosaics import read_exposure
@@ -19,7 +20,7 @@ class Settings:
 
     method: str = "auto"
     reference: Path | None = None
-    reference_reflectance: float = 0.99
+    reference_reflectance: float = REFERENCE_REFLECTANCE
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """score: results against the truth, side by side, as JSON, a table and (on request) the report page."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 
 from plenocli.errors import InputError, PlenoError, UsageError
+from plenocli.plain import plain
 from plenocli.stages.progress import note
 from plenocli.stages.score_inputs import CHART, block_of, read_labels, read_result, read_truth, read_white
 
@@ -74,7 +74,7 @@ def run_score(
             "patches": patches if patches and Path(patches).is_file() else None, "pif": pif, "capture": capture,
         }),
     }
-    document = finite(document)
+    document = plain(document)
     publish(output, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode(), overwrite=overwrite)
     if report is not None:
         from plenocli.report.score_page import score_page
@@ -170,7 +170,7 @@ def _score_spectra(path, result, truth, context):
 
 def _reflectance(path, result, context):
     """The result's values as reflectance: as they are, or radiance divided by that of the white target."""
-    from plenocli.scene.tables import WHITE_REFERENCE
+    from plenocli.config import REFERENCE_REFLECTANCE
 
     if result.quantity != "radiance":
         return result.values
@@ -181,7 +181,7 @@ def _reflectance(path, result, context):
     white = context.whites[0].mean(axis=0)
     if white.shape != result.values.shape:
         raise UsageError(f"is {result.values.shape}, the white target {white.shape}", path, "demultiplex both with one calibration")
-    return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * WHITE_REFERENCE
+    return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * REFERENCE_REFLECTANCE
 
 
 def _snr(result, labels, context):
@@ -281,19 +281,6 @@ def _definitions(scored):
                     found[name] = module.DEFINITIONS[name]
                     break
     return found
-
-
-def finite(value):
-    """A JSON-able copy: arrays become lists, numbers that are not finite become None (an infinite PSNR: no error at all)."""
-    if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    if hasattr(value, "tolist"):
-        return finite(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def table(document):

@@ -13,7 +13,7 @@ from plenocli.cli import options
 @click.option("--exposure", type=options.DURATION)
 @click.option("--grid", type=options.Grid("auto"), default="auto")
 @click.option("--band", "bands", multiple=True, type=options.Pair("FILE", options.Path))
-@options.snr
+@click.option("--snr", "snr_db", type=options.DECIBEL)
 @options.seed
 @options.overwrite
 @click.pass_context

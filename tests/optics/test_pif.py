@@ -20,12 +20,6 @@ def seed_camera(**changes):
     return small_camera(**sizes | changes)
 
 
-def central(image):
-    """Pixel coordinates (m) of the centroid of a square image of 2 um pixels, and its sum."""
-    x = (np.arange(image.shape[0]) - (image.shape[0] - 1) / 2) * 2e-6
-    return np.array([x @ image.sum(1), x @ image.sum(0)]) / image.sum(), image.sum()
-
-
 def pixel_mean(function, camera, count=12):
     """Integrals of function(t) over the pixels of one axis."""
     n, pitch = camera.sensor.pixels_per_lenslet[0], camera.sensor.pixel_pitch

@@ -5,7 +5,8 @@ from importlib import import_module
 _HOMES = {
     "Artefact": "container", "write_artefact": "container", "read_artefact": "container", "cfa_text": "container",
     "default_mem_limit": "limits", "SCHEMAS": "kinds",
-    "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "require_file": "provenance",
+    "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "provenance_texts": "provenance", "read_provenance_texts": "provenance",
+    "require_file": "provenance",
     "check_output": "atomic", "publish": "atomic",
     "read_exr": "exr", "write_exr": "exr",
     "Spectral": "spectral_exr", "read_spectral_exr": "spectral_exr", "write_spectral_exr": "spectral_exr", "is_spectral": "spectral_exr",

@@ -1,6 +1,7 @@
 """Where a result came from: the command, its inputs by name and digest, the seed. No clock, host, folder or user."""
 
 import hashlib
+import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,28 @@ def describe_inputs(roles):
         for number, path in enumerate(paths if several else [paths], start=1):
             described[f"{role} {number}" if several else role] = {"name": Path(path).name, "sha256": file_digest(path)}
     return described
+
+
+_TEXT = "plenocli:{}"
+
+
+def provenance_texts(provenance):
+    """The Provenance as text attributes of an EXR, name -> text; what is empty is left out."""
+    texts = {"command": provenance.command, "config": provenance.config, "seed": "" if provenance.seed is None else str(provenance.seed)}
+    texts |= {name: json.dumps(value, sort_keys=True) for name, value in (("inputs", provenance.inputs), ("accuracy", provenance.accuracy)) if value}
+    return {_TEXT.format(name): text for name, text in texts.items() if text}
+
+
+def read_provenance_texts(attrs):
+    """The Provenance that `provenance_texts` put into the text attributes of an EXR; empty where they lack it or it is broken."""
+    found = {name: attrs.get(_TEXT.format(name), "") for name in ("command", "config", "seed", "inputs", "accuracy")}
+    try:
+        inputs, accuracy = (json.loads(found[name] or "{}") for name in ("inputs", "accuracy"))
+        seed = int(found["seed"]) if found["seed"] else None
+    except ValueError:
+        inputs, accuracy, seed = {}, {}, None
+    inputs, accuracy = (value if isinstance(value, dict) else {} for value in (inputs, accuracy))
+    return Provenance(found["command"], inputs, seed, found["config"], accuracy)
 
 
 def file_digest(path):

@@ -1,6 +1,5 @@
 """capture-sim: source -> optics -> detector, one exposure of a plenoptic camera."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -236,7 +235,7 @@ DATASETS = ("mosaic", "cfa", "scene", "wavelength", "lenslet_centre")
 
 
 def _write(output, capture, provenance, overwrite):
-    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_capture_exr, write_dng
+    from plenocli.artefacts import Artefact, Provenance, provenance_texts, write_artefact, write_capture_exr, write_dng
 
     attrs = {k: v for k, v in capture.items() if k not in DATASETS and v is not None}
     if output.suffix == ".h5":
@@ -245,7 +244,7 @@ def _write(output, capture, provenance, overwrite):
         return
     if output.suffix == ".exr":
         words = {name: value for name, value in attrs.items() if value != float("inf")}
-        write_capture_exr(output, capture["mosaic"], words | {"cfa": capture["cfa"]}, attrs={"plenocli:provenance": json.dumps(provenance, sort_keys=True)}, overwrite=overwrite)
+        write_capture_exr(output, capture["mosaic"], words | {"cfa": capture["cfa"]}, attrs=provenance_texts(Provenance(**provenance)), overwrite=overwrite)
     else:
         write_dng(output, capture["mosaic"], cfa=capture["cfa"], black=capture["black"], white=capture["white"], exposure_s=capture["exposure_s"],
                   xmp_json=attrs | {"provenance": provenance}, overwrite=overwrite)
@@ -253,13 +252,14 @@ def _write(output, capture, provenance, overwrite):
 
 def _write_scene(path, truth, camera, provenance, overwrite):
     """The object as sampled, an `image` artefact or EXR: one picture, or one a band of [light] wavelengths."""
-    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_exr, write_spectral_exr
+    from plenocli.artefacts import Artefact, Provenance, provenance_texts, write_artefact, write_exr, write_spectral_exr
 
+    texts = provenance_texts(Provenance(**provenance))
     path, wavelengths = Path(path), np.array(camera.light.wavelengths[: len(truth)])
     if path.suffix == ".exr" and len(truth) == 1:
-        write_exr(path, {"Y": truth[0]}, {}, overwrite=overwrite)
+        write_exr(path, {"Y": truth[0]}, texts, overwrite=overwrite)
     elif path.suffix == ".exr":
-        write_spectral_exr(path, wavelengths, truth, "reflectance", overwrite=overwrite)
+        write_spectral_exr(path, wavelengths, truth, "reflectance", attrs=texts, overwrite=overwrite)
     else:
         data = {"image/value": truth[0]} if len(truth) == 1 else {"image/value": truth, "image/wavelength": wavelengths}
         write_artefact(path, Artefact("image", data, {"image": {"method": "object as sampled"}}, Provenance(**provenance)), overwrite=overwrite)

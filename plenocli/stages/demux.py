@@ -254,12 +254,12 @@ def _reflectance(value, sigma, white, white_sigma, level):
 
 
 def _write(target, wavelengths, value, sigma, attrs, parameters, inputs, overwrite, command):
-    from plenocli.artefacts import Artefact, Provenance, write_artefact, write_spectral_exr
+    from plenocli.artefacts import Artefact, Provenance, provenance_texts, write_artefact, write_spectral_exr
 
-    value, sigma = value.astype(np.float32), sigma.astype(np.float32)
+    value, sigma, provenance = value.astype(np.float32), sigma.astype(np.float32), Provenance(command, inputs)
     if Path(target).suffix == ".h5":
         data = {"spectra/value": value, "spectra/sigma": sigma, "spectra/wavelength": wavelengths}
-        write_artefact(target, Artefact("spectra", data, {"spectra": attrs | {"parameters": parameters}}, Provenance(command, inputs)), overwrite=overwrite)
+        write_artefact(target, Artefact("spectra", data, {"spectra": attrs | {"parameters": parameters}}, provenance), overwrite=overwrite)
         return
     import json
 
@@ -270,8 +270,7 @@ def _write(target, wavelengths, value, sigma, attrs, parameters, inputs, overwri
         rgb = preview_rgb(wavelengths, whole)
     else:  # no light is taken off: shown under the one that was there
         rgb = preview_rgb(wavelengths, whole / max(float(whole.max()), 1e-30), "E")
-    texts = {"method": attrs["method"], "parameters": json.dumps(parameters, sort_keys=True), "inputs": json.dumps(inputs, sort_keys=True), "command": command}
+    texts = {"method": attrs["method"], "parameters": json.dumps(parameters, sort_keys=True)} | provenance_texts(provenance)
     if attrs["quantity"] == "radiance":
         texts["emissiveUnits"] = "relative"
-    texts = {name: text for name, text in texts.items() if text}
     write_spectral_exr(target, wavelengths, value, attrs["quantity"], rgb=rgb, sigma=sigma, attrs=texts, overwrite=overwrite)

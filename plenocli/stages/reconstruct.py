@@ -126,17 +126,17 @@ def _white_normalised(capture, calibration):
 
 
 def _write(target, picture, sigma, report, clipped, settings, estimators, capture, origin, overwrite):
-    from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact, write_exr
+    from plenocli.artefacts import Artefact, Provenance, describe_inputs, provenance_texts, write_artefact, write_exr
 
-    parameters = {k: v for k, v in report.items() if k != "method"}
-    if target.suffix == ".exr":
-        channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
-        write_exr(target, channels, {"method": report["method"]}, overwrite=overwrite)
-        return
     inputs = describe_inputs({"capture": capture, "pif": origin["pif"], "calibration": origin["calibration"], "dictionary": settings.dictionary,
                               "truth": settings.truth, "training": files_of(settings.training)})
+    provenance = Provenance(origin["command"], inputs, settings.seed)
+    if target.suffix == ".exr":
+        channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
+        write_exr(target, channels, {"method": report["method"]} | provenance_texts(provenance), overwrite=overwrite)
+        return
     data = {"image/value": picture} | ({} if sigma is None else {"image/sigma": sigma})
-    attrs = {"method": report["method"], "parameters": parameters, "clipped": clipped}
+    attrs = {"method": report["method"], "parameters": {k: v for k, v in report.items() if k != "method"}, "clipped": clipped}
     if estimators is not None:
         attrs["notes"] = {"block": list(estimators.system.object_shape)}
-    write_artefact(target, Artefact("image", data, {"image": attrs}, Provenance(origin["command"], inputs, settings.seed)), overwrite=overwrite)
+    write_artefact(target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite)

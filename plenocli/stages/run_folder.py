@@ -109,18 +109,14 @@ def _survey_artefact(path, name):
 
 
 def _survey_exr(path, name):
-    from plenocli.artefacts import file_digest, read_exr
+    from plenocli.artefacts import file_digest, read_exr, read_provenance_texts
     from plenocli.artefacts.mosaic import CAPTURE
     from plenocli.artefacts.spectral_exr import is_spectral
 
     attrs = read_exr(path)[1]
     kind = "spectra" if is_spectral(path) else "capture" if CAPTURE in attrs else "image"
-    try:
-        inputs = json.loads(attrs.get("plenocli:inputs", "{}"))
-    except ValueError:
-        inputs = {}
-    return RunFile(path, name, kind, file_digest(path), attrs.get("plenocli:command", ""), attrs.get("plenocli:config", ""),
-                   _digests_of(inputs if isinstance(inputs, dict) else {}))
+    origin = read_provenance_texts(attrs)
+    return RunFile(path, name, kind, file_digest(path), origin.command, origin.config, _digests_of(origin.inputs))
 
 
 def _score_document(path):

@@ -18,8 +18,8 @@ from plenocli.cli import options
 @click.option("--refine", type=click.IntRange(1, 8), default=1, show_default=True, help="Object points per side for each point of [object]: simulate finer than you invert.")
 @click.option("--bandwidth", type=options.LENGTH, default=None, help="Full width at half maximum of each line of light, such as 10nm; default one exact wavelength.")
 @click.option("--spectral-step", type=options.LENGTH, default=None, help="Spacing of wavelengths for cameras with colour; default half of the narrowest filter.")
-@click.option("--superpixels", type=options.Grid("auto"), default="auto", show_default=True, help="Superpixels that one lenslet's light may reach: auto, 1x1, 3x3.")
-@click.option("--coherent-ring", type=click.Choice(["auto", "0", "1", "2"]), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")
+@options.superpixels("Superpixels that one lenslet's light may reach")
+@options.coherent_ring
 @click.option("--accuracy", type=options.POSITIVE, default=1e-3, show_default=True, help="Relative error of the light on the sensor.")
 @click.option("--scene-out", type=options.FILE, help="Also write the object as sampled (.h5 or .exr): the truth that score compares with.")
 @options.seed
@@ -41,9 +41,8 @@ def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **se
     """
     from plenocli.stages.capture_sim import Settings, run_capture_sim
 
-    ring = settings.pop("coherent_ring")
     settings["bandwidth"] = settings["bandwidth"] or 0.0
-    report = run_capture_sim(camera, output, Settings(coherent_ring=ring if ring == "auto" else int(ring), **settings), scene=scene, pif=pif,
+    report = run_capture_sim(camera, output, Settings(**settings), scene=scene, pif=pif,
                              scene_out=scene_out, overwrite=overwrite, command=options.command_line(ctx))
     noise = f"SNR {settings['snr_db']:g} dB, sigma {report['noise_sigma']:.3g}" if settings["snr_db"] is not None else f"peak {report['peak']:.4g} {report['units']}"
     options.summary(report, as_json, f"{output}: {report['rows']} x {report['columns']} pixels, {report['wavelengths']} wavelength{'s'[: report['wavelengths'] > 1]}, {noise}")

@@ -13,7 +13,7 @@ from plenocli.config import REFERENCE_REFLECTANCE
               help="auto takes the one with the least predicted error and says so.")
 @click.option("--reference", type=options.FILE, help="Capture of a white reference: the result is reflectance instead of radiance.")
 @click.option("--reference-reflectance", type=options.FRACTION, default=REFERENCE_REFLECTANCE, show_default=True, help="Reflectance of that white reference.")
-@click.option("--format", "suffix", type=click.Choice(["exr", "h5"]), default="exr", show_default=True, help="File type when OUT is a folder.")
+@options.file_type("exr", "h5")
 @options.output
 @options.workers
 @options.overwrite

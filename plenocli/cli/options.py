@@ -75,6 +75,18 @@ class Pair(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
+class Ring(click.Choice):
+    """A whole number of rings, or auto."""
+
+    def __init__(self):
+        super().__init__(["auto", "0", "1", "2"])
+
+    def convert(self, value, param, ctx):
+        """"auto", or the number."""
+        chosen = super().convert(str(value), param, ctx)
+        return chosen if chosen == "auto" else int(chosen)
+
+
 def input_path(name, **settings):
     """A positional input file; its existence is checked by the reader, so that the exit code is 3 and the message says what is wrong."""
     return click.argument(name, type=click.Path(path_type=Path), **settings)
@@ -88,6 +100,19 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print the summar
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
 workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes to use.")
 mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
+
+
+coherent_ring = click.option("--coherent-ring", type=Ring(), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")
+
+
+def superpixels(meaning):
+    """--superpixels with its meaning for one command."""
+    return click.option("--superpixels", type=Grid("auto"), default="auto", show_default=True, help=f"{meaning}: auto, 1x1, 3x3.")
+
+
+def file_type(first, second):
+    """--format, the suffix of each result where OUT is a folder; the first is the default."""
+    return click.option("--format", "suffix", type=click.Choice([first, second]), default=first, show_default=True, help="File type when OUT is a folder.")
 
 
 def command_line(ctx):

@@ -22,7 +22,7 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 for dictionary; default as learnt.")
 @click.option("--nnls-iterations", type=click.IntRange(1), help="Stop nnls after so many gradient steps; default converged.")
 @click.option("--clip", is_flag=True, help="Set negative values to zero; their share is reported either way.")
-@click.option("--format", "suffix", type=click.Choice(["h5", "exr"]), default="h5", show_default=True, help="File type when OUT is a folder.")
+@options.file_type("h5", "exr")
 @options.output
 @options.seed
 @options.workers

@@ -17,8 +17,8 @@ class _Step(click.ParamType):
 @click.option("-o", "--output", type=options.FILE, metavar="OUT", help="File to write, .h5; not needed with --explain.")
 @click.option("--wavelength", "wavelengths", type=options.LENGTH, multiple=True, help="Wavelength such as 550nm; repeatable; default [light] wavelengths.")
 @click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
-@click.option("--superpixels", type=options.Grid("auto"), default="auto", show_default=True, help="Superpixels whose pixels are kept, odd: auto, 1x1, 3x3.")
-@click.option("--coherent-ring", type=click.Choice(["auto", "0", "1", "2"]), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")
+@options.superpixels("Superpixels whose pixels are kept, odd")
+@options.coherent_ring
 @click.option("--model", type=click.Choice(["auto", "fresnel", "ray", "exact"]), default="auto", show_default=True, help="Propagation model; auto is fresnel, the only one so far.")
 @click.option("--accuracy", type=options.POSITIVE, default=1e-4, show_default=True, help="Relative error of each column against the converged paraxial model.")
 @click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True, help="Type of the stored matrix.")
@@ -42,7 +42,5 @@ def command(ctx, camera, output, model, explain, workers, overwrite, as_json, **
 
     if model in ("ray", "exact"):
         raise click.UsageError(f"--model {model} does not exist yet; use --model fresnel, and see the neglected phase that it reports.")
-    ring = settings.pop("coherent_ring")
-    settings = Settings(coherent_ring=ring if ring == "auto" else int(ring), **settings)
-    report = run_simulate_pif(camera, output, settings, explain=explain, overwrite=overwrite, command=options.command_line(ctx))
+    report = run_simulate_pif(camera, output, Settings(**settings), explain=explain, overwrite=overwrite, command=options.command_line(ctx))
     options.summary(report, as_json, line(report))

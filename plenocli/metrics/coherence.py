@@ -48,9 +48,7 @@ def coherence(system, atoms, block=512):
         raw = max(raw, float(magnitude.max(initial=0)))
         magnitude = magnitude / row_scale[:, None] / atom_scale[part]
         candes = max(candes, float(magnitude.max(initial=0)))
-    norm = np.linalg.norm(effective, axis=0)
-    visible = norm > INVISIBLE * norm.max(initial=0)
-    largest, mean = _gram(effective[:, visible] / norm[visible], block)
+    largest, mean, visible = column_coherence(effective, block)
     return {
         "coherence_raw": raw,
         "coherence_candes_romberg": math.sqrt(points) * candes,
@@ -66,11 +64,17 @@ def coherence(system, atoms, block=512):
     }
 
 
-def _gram(unit, block):
-    """(max, mean) of |<u_i, u_j>| over pairs i < j of unit columns; (None, None) without a pair."""
+def column_coherence(effective, block=512):
+    """(largest, mean, visible): |cosine| over pairs of different columns of D `effective` (pixel, atom), None without a pair.
+
+    visible (atom,) bool: columns of at least INVISIBLE of the largest norm, which alone count.
+    """
+    norm = np.linalg.norm(effective, axis=0)
+    visible = norm > INVISIBLE * norm.max(initial=0)
+    unit = effective[:, visible] / norm[visible]
     count = unit.shape[1]
     if count < 2:
-        return None, None
+        return None, None, visible
     largest, total = 0.0, 0.0
     for start in range(0, count, block):
         left = unit[:, start : start + block]
@@ -80,7 +84,7 @@ def _gram(unit, block):
                 gram = np.triu(gram, 1)
             largest = max(largest, float(gram.max(initial=0)))
             total += float(gram.sum(dtype=np.float64))
-    return min(largest, 1.0), total / (count * (count - 1) / 2)
+    return min(largest, 1.0), total / (count * (count - 1) / 2), visible
 
 
 def welch_bound(atoms, pixels):

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from plenocli.metrics.coherence import column_coherence
 from plenocli.solvers.l1 import sparse_code
 from plenocli.solvers.natural import draw_patches
 
@@ -135,7 +136,7 @@ class Learner:
 
     def _record(self, after, before, dead, gap, residual):
         objective, quality, nonzeros, worst = self.validate(after.atoms)
-        largest, mean = effective_coherence(self.seen @ after.atoms[:, 1:])
+        largest, mean = (value or 0.0 for value in column_coherence(self.seen @ after.atoms[:, 1:])[:2])
         change = float(np.linalg.norm((after.atoms - before.atoms)[:, ~dead]))
         values = (objective, quality, float(dead[1:].mean()), nonzeros, change, mean, largest, max(gap, worst), residual)
         for name, value in zip(HISTORY, values):
@@ -177,16 +178,6 @@ def dictionary_step(energy, basis, gram, right, delta):
     if not residual <= 1e-8:
         raise NumericsError(f"the dictionary step solves its equations only to {residual:.1e}", fix="use a larger --batch or another --delta")
     return atoms, residual
-
-
-def effective_coherence(d):
-    """(largest, mean) |cosine| between two columns of D; columns of zero norm are left out."""
-    norm = np.linalg.norm(d, axis=0)
-    unit = d[:, norm > 0] / norm[norm > 0]
-    cosine = np.abs(unit.T @ unit)
-    np.fill_diagonal(cosine, 0)
-    count = len(cosine)
-    return (float(min(cosine.max(), 1.0)), float(cosine.sum() / (count * (count - 1)))) if count > 1 else (0.0, 0.0)
 
 
 def _unit(atoms, rng):

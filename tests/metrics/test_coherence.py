@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from plenocli.metrics.coherence import coherence, exact_recovery_sparsity, welch_bound
+from plenocli.metrics.coherence import coherence, column_coherence, exact_recovery_sparsity, welch_bound
 
 
 def test_spikes_and_hadamard_are_maximally_incoherent():
@@ -74,3 +74,11 @@ def test_single_precision_is_kept():
     assert coherence(system, atoms)["coherence_effective"] == pytest.approx(
         coherence(system.astype(float), atoms.astype(float))["coherence_effective"], rel=1e-5
     )
+
+
+def test_column_coherence_by_hand():
+    d = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 2.0, 0.0]])
+    largest, mean, visible = column_coherence(d)
+    assert largest == pytest.approx(np.sqrt(0.5)) and mean == pytest.approx(2 * np.sqrt(0.5) / 3)
+    assert visible.tolist() == [True, True, True, False]
+    assert column_coherence(d[:, 3:])[:2] == (None, None)

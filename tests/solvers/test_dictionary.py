@@ -98,9 +98,3 @@ def test_scale_of_the_matrix_does_not_matter(setting):
     louder = linear.Svd(svd.u, 1000 * svd.s, svd.vt)
     one, other = (learner((s, pictures)).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
     assert one == pytest.approx(other, abs=0.05)
-
-
-def test_effective_coherence_by_hand():
-    d = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 2.0, 0.0]])
-    largest, mean = dictionary.effective_coherence(d)
-    assert largest == pytest.approx(np.sqrt(0.5)) and mean == pytest.approx(2 * np.sqrt(0.5) / 3)

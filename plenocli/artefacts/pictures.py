@@ -34,6 +34,8 @@ def read_picture(path, *, mem_limit=None):
         return _from_exr(path, mem_limit)
     if kind is None:
         raise InputError("is no PNG, JPEG, TIFF or EXR", path, "convert it to one of them")
+    if kind == "tiff" and Path(path).suffix.lower() not in (".tif", ".tiff"):
+        raise InputError("is a camera's RAW or a DNG, the mosaic of a sensor and no picture", path, "develop it, or name it .tif if it is a picture")
     stored, names, _ = read_stored(path, kind, mem_limit)
     colours = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     if len(colours) not in (1, 3):

@@ -1,6 +1,7 @@
 """Entry point: the list of commands in the order of the pipeline, and the only place where errors become exit codes."""
 
 import difflib
+import errno
 import importlib
 import os
 import sys
@@ -23,6 +24,9 @@ COMMANDS = (
     "schema",
 )
 """The order is that of the pipeline, and of the help."""
+
+
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class Pipeline(click.Group):
@@ -96,6 +100,9 @@ def run(argv=None):
     except Exception as error:  # the last line of defence: a bug must not look like a usage error
         if debug:
             raise
+        if isinstance(error, OSError) and (error.filename or error.errno in _NO_SPACE):
+            where = error.filename or "standard output"
+            return _fail(f"{where}: {error.strerror}; check the name, the permissions and the space on the disk", 4 if error.errno in _NO_SPACE else 3)
         return _fail(
             f"internal error, a bug of plenocli: {type(error).__name__}: {error}\n"
             "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",

@@ -241,6 +241,8 @@ def load_camera(path):
     """Read and check a camera description; InputError where the file cannot be read, ConfigError for what it says."""
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"is {'a folder' if path.is_dir() else 'no ordinary file'}", path, "give the TOML file of a camera")
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"is larger than {MAX_BYTES} bytes and so no camera description", path, "give a TOML file")
         text = path.read_text(encoding="utf-8")

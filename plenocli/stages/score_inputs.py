@@ -44,7 +44,10 @@ def read_result(path, kinds=("image", "spectra", "dictionary"), mem_limit=None):
         raise InputError(
             f"is {path.suffix or 'a file without a suffix'}, not a result", path, "give an image, spectra or dictionary as .h5, or an .exr"
         )
-    return _from_exr(path, mem_limit)
+    found = _from_exr(path, mem_limit)
+    if found.kind not in kinds:
+        raise InputError(f"is a picture without wavelengths where {' or '.join(kinds)} are due", path, "give a spectral EXR or an .h5 (from demux)")
+    return found
 
 
 def _from_artefact(path, kinds, mem_limit):

@@ -134,3 +134,9 @@ def test_pictures_that_cannot_be_used_say_why(tmp_path):
         assert str(tmp_path / name) in str(caught.value)
     with pytest.raises(InputError, match="memory limit"):
         read_picture(tmp_path / "good.png", mem_limit=1000)
+
+
+def test_a_sensors_mosaic_is_no_picture(tmp_path):
+    path = save(tmp_path / "x.tif", numbers((6, 7), np.uint16)).rename(tmp_path / "x.dng")
+    with pytest.raises(InputError, match="mosaic of a sensor"):
+        read_picture(path)

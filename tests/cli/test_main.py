@@ -1,5 +1,7 @@
 """The error boundary: exit codes, one message, no traceback."""
 
+import errno
+
 import pytest
 
 from plenocli.cli import main as boundary
@@ -44,3 +46,19 @@ def test_help_lists_the_commands_in_the_order_of_the_pipeline(capfd):
     out = capfd.readouterr().out
     places = [out.index(f"\n  {name} ") for name in boundary.COMMANDS]
     assert places == sorted(places) and "Exit codes" in out
+
+
+@pytest.mark.parametrize("arguments", [["score", "x" * 300, "--truth", "colorchecker", "-o", "OUT"], ["score", "a.h5", "--truth", "x" * 300, "-o", "OUT"], ["report", "x" * 300, "-o", "OUT"], ["inspect", "x" * 300], ["simulate-pif", "x" * 300, "-o", "OUT"]])
+def test_names_that_no_file_system_takes_are_no_bugs(capfd, tmp_path, arguments):
+    assert boundary.run([str(tmp_path / "out.json") if a == "OUT" else a for a in arguments]) == 3
+    assert "name too long" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number, filename, code", [(errno.ENOSPC, None, 4), (errno.EROFS, "out.h5", 4), (errno.EACCES, "in.h5", 3), (errno.EIO, None, 70)])
+def test_the_system_s_errors_have_exit_codes(monkeypatch, capfd, number, filename, code):
+    def fail(**_):
+        raise OSError(number, "sorry", filename)
+
+    monkeypatch.setattr(boundary.cli, "main", fail)
+    assert boundary.run([]) == code
+    assert "sorry" in capfd.readouterr().err

@@ -1,5 +1,7 @@
 """Camera descriptions: read exactly, resolved once, refused with every violation named."""
 
+
+import os
 from pathlib import Path
 
 import pytest
@@ -77,6 +79,9 @@ def test_files_that_are_no_description(tmp_path):
         load_camera(tmp_path / "absent.toml")
     with pytest.raises(InputError):
         load_camera(tmp_path)
+    os.mkfifo(tmp_path / "pipe.toml")  # must be refused, not waited for
+    with pytest.raises(InputError, match="no ordinary file"):
+        load_camera(tmp_path / "pipe.toml")
     (tmp_path / "half.toml").write_text('[main_lens]\nfocal_length = "50 m')
     with pytest.raises(ConfigError, match="is not TOML: .*(line 2|end of document)"):
         load_camera(tmp_path / "half.toml")

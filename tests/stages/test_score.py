@@ -198,3 +198,13 @@ def test_command_line(picture, capsys):
     assert run(["score", str(good), "-o", str(folder / "t.json")]) == 2
     assert run(["score", str(folder / "absent.h5"), "--truth", str(capture), "-o", str(folder / "t.json")]) == 3
     assert run(["score", str(good), "--truth", str(capture), "-o", str(folder / "no" / "t.json")]) == 4
+
+
+def test_a_picture_is_no_white_target(tmp_path):
+    from plenocli.artefacts import write_exr
+    from plenocli.stages.score_inputs import read_result
+
+    write_exr(tmp_path / "grey.exr", {"Y": np.ones((4, 4), np.float32)}, {})
+    assert read_result(tmp_path / "grey.exr").kind == "image"
+    with pytest.raises(InputError, match="spectra are due"):
+        read_result(tmp_path / "grey.exr", ("spectra",))

@@ -104,23 +104,7 @@ def _band(name):
 
 
 def preview(wavelengths, cube):
-    """Linear sRGB (3, row, column) of a spectral picture under equal energy, for looking at only; a flat unit spectrum gives white.
+    """Linear sRGB (3, row, column) of a spectral picture under equal energy, for looking at only; a flat unit spectrum gives white."""
+    from plenocli.scene.colour import preview_rgb
 
-    Colour matching functions: the single- and two-lobe fits of Wyman, Sloan & Shirley, "Simple Analytic Approximations to the
-    CIE XYZ Color Matching Functions", JCGT 2(2), 2013. Where all bands are invisible: grey, their mean.
-    """
-    nm = np.asarray(wavelengths) * 1e9
-
-    def lobe(height, centre, low, high):
-        return height * np.exp(-0.5 * ((nm - centre) / np.where(nm < centre, low, high)) ** 2)
-
-    xyz = np.stack([lobe(1.056, 599.8, 37.9, 31.0) + lobe(0.362, 442.0, 16.0, 26.7) + lobe(-0.065, 501.1, 20.4, 26.2),
-                    lobe(0.821, 568.8, 46.9, 40.5) + lobe(0.286, 530.9, 16.3, 31.1),
-                    lobe(1.217, 437.0, 11.8, 36.0) + lobe(0.681, 459.0, 26.0, 13.8)])
-    xyz = xyz * (np.gradient(nm) if nm.size > 1 else 1.0)
-    # IEC 61966-2-1: XYZ to linear sRGB
-    to_rgb = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-    white = to_rgb @ xyz.sum(axis=1)
-    if nm.size < 3 or white.min() <= 0.02 * abs(white).max():
-        return np.repeat(np.asarray(cube, dtype=np.float64).mean(axis=0)[None], 3, axis=0)
-    return np.maximum(np.tensordot(to_rgb @ xyz / white[:, None], cube, axes=1), 0.0)
+    return np.maximum(preview_rgb(wavelengths, cube, "E"), 0.0)

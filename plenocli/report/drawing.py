@@ -95,11 +95,13 @@ def bare(axes, title=""):
 
 def thumbnail(values, limit=1100):
     """`values` (row, column) averaged over whole blocks so that neither side exceeds `limit`, and the block size used."""
-    step = max(1, -(-max(values.shape[:2]) // limit))
-    rows, cols = (n // step * step for n in values.shape[:2])
+    from plenocli.scene.sample import block_mean
+
+    step = max(1, -(-max(values.shape) // limit))
+    rows, cols = (n // step * step for n in values.shape)
     if step == 1 or not rows or not cols:
         return values, 1
-    return values[:rows, :cols].reshape(rows // step, step, cols // step, step).mean(axis=(1, 3)), step
+    return block_mean(values[:rows, :cols], (step, step)), step
 
 
 def nanometres(wavelength):

@@ -29,10 +29,10 @@ class Dark:
         return level + (self.mean - level) * np.float32(exposure / self.exposure)
 
 
-def tiled(level, shape):
-    """A (2, 2) level by position, repeated over (rows, columns), float32."""
+def tiled(level, shape, dtype=np.float32):
+    """A (2, 2) level by position, repeated over (rows, columns)."""
     rows, columns = shape
-    return np.tile(np.asarray(level, np.float32), ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
+    return np.tile(np.asarray(level, dtype), ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
 
 
 def make_dark(frames, exposures, black, shape):

@@ -103,7 +103,7 @@ def _source(camera, settings, scene):
 
 
 class _Stored:
-    """The response of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
+    """The system matrix of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
 
     def __init__(self, artefact, band):
         self.matrix, self.offsets = artefact.data["pif/A"][band], artefact.data["pif/lenslet_offset"]
@@ -113,13 +113,13 @@ class _Stored:
 
 
 def _read_pif(path, camera, settings, wavelengths):
-    """Responses by wavelength from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
+    """System matrices by wavelength from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
     from plenocli.artefacts import read_artefact
     from plenocli.config import parse_camera
 
     artefact = read_artefact(path, "pif", mem_limit=settings.mem_limit)
     if settings.refine != 1:
-        raise UsageError("--refine computes its own finer response and cannot take --pif", fix="leave one of them out")
+        raise UsageError("--refine computes its own finer system matrix and cannot take --pif", fix="leave one of them out")
     made_for = parse_camera(artefact.provenance.config, path)
     for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array"):
         drop = {"count"} if section == "lenslet_array" else {"full_well", "read_noise", "gain", "bits", "black_level", "quantum_efficiency", "cfa", "camera"} if section == "sensor" else set()
@@ -150,11 +150,11 @@ def _carry(camera, source, scene, settings, matrix):
     pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
     light, whites, picture = 0.0, 0.0, None
     for index, wavelength in enumerate(bar(source.wavelengths, len(source.wavelengths), "wavelengths")):
-        response = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
+        system = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
         if not scene.uniform and (picture is None or scene.spectral):
             picture = scene.at(wavelength, *grid)
-        size = max(8, settings.mem_limit // 16 // (8 * len(response.offsets) * pixels))
-        carried, white = superpixel_light(response.blocks(size), response.offsets, picture, fine)
+        size = max(8, settings.mem_limit // 16 // (8 * len(system.offsets) * pixels))
+        carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
         if scene.uniform:
             carried = np.broadcast_to(scene.level * white, (*count, pixels))
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2

@@ -7,6 +7,7 @@ import numpy as np
 
 from plenocli.errors import InputError, UsageError
 from plenocli.stages.progress import bar, note
+from plenocli.stages.seeds import stream
 from plenocli.stages.systems import read_system
 from plenocli.stages.training import at_scales, files_of, read_training, split_by_scene
 
@@ -122,7 +123,7 @@ def _judge(machine, state, svd, training, chosen):
     from plenocli.solvers.natural import draw_patches, mean_covariance
 
     points = machine.seen.shape[1]
-    patches = draw_patches([p for _, p in training], machine.object_shape, 4 * points, np.random.default_rng([chosen.seed, 3]))
+    patches = draw_patches([p for _, p in training], machine.object_shape, 4 * points, stream(chosen.seed, "learn-dict"))
     kept = len(machine.seen)
     scaled = Svd(np.eye(kept), svd.s[:kept] / machine.scale, svd.vt[:kept])
     linear = prepare(scaled, *mean_covariance(patches), machine.sigma).apply(machine.measured)

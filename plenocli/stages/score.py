@@ -26,7 +26,7 @@ GROUPS = {
 }
 """What --metric may ask for, and the numbers that each brings."""
 
-WHITE_LABEL = 19
+WHITE_LABEL = 19  # of the chart's patches row by row, the first of the last row
 
 
 def run_score(

@@ -7,6 +7,7 @@ import numpy as np
 
 from plenocli.errors import InputError
 from plenocli.operators import to_blocks
+from plenocli.sensor.frames import tiled
 from plenocli.stages.progress import note
 
 
@@ -42,7 +43,7 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
     rows, columns = mosaic.values.shape
     if rows % shape[0] or columns % shape[1]:
         raise InputError(f"has {rows} x {columns} pixels, no whole number of superpixels of {shape[0]} x {shape[1]}", path, "give --calibration to find the lenslets")
-    signal = mosaic.values - np.tile(mosaic.black, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns]
+    signal = mosaic.values - tiled(mosaic.black, (rows, columns), float)
     unit = _unit(path, mosaic)
     over = float(np.mean(mosaic.values >= mosaic.white)) if np.isfinite(mosaic.white) else 0.0
     if over > 0:

@@ -6,11 +6,11 @@ import numpy as np
 
 from plenocli.errors import InputError
 from plenocli.stages.progress import note
+from plenocli.stages.scenes import EMBEDDED, embedded_photograph
 
 DEFAULT = ("skimage:camera", "skimage:coffee", "skimage:chelsea", "skimage:rocket", "skimage:coins", "skimage:moon", "skimage:brick",
            "skimage:grass", "skimage:gravel", "skimage:motorcycle_left")
 """Photographs that ship with scikit-image, but for the astronaut, which is the test picture."""
-
 
 SCALES = (1, 2, 4)
 
@@ -23,10 +23,10 @@ def read_training(names, shape, *, not_scene=None):
     """
     from plenocli.scene.sample import luminance
 
-    stem = Path(str(not_scene).removeprefix("skimage:")).stem if not_scene else None
+    stem = Path(str(not_scene).removeprefix(EMBEDDED)).stem if not_scene else None
     pictures = []
     for name in names or DEFAULT:
-        if stem and Path(str(name).removeprefix("skimage:")).stem == stem:
+        if stem and Path(str(name).removeprefix(EMBEDDED)).stem == stem:
             if names:
                 raise InputError("is the captured scene itself; results trained on it would flatter", name, "train on other pictures")
             note(f"training leaves out {name}, which is the captured scene")
@@ -71,8 +71,6 @@ def at_scales(pictures, shape):
 
 
 def _values(name):
-    from plenocli.stages.scenes import EMBEDDED, embedded_photograph
-
     if str(name).startswith(EMBEDDED):
         return embedded_photograph(str(name).removeprefix(EMBEDDED))
     from plenocli.artefacts import read_picture
@@ -82,4 +80,4 @@ def _values(name):
 
 def files_of(names):
     """The paths among the names, for the provenance of an artefact."""
-    return [str(n) for n in names if not str(n).startswith("skimage:")] or None
+    return [str(n) for n in names if not str(n).startswith(EMBEDDED)] or None

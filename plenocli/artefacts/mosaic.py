@@ -36,18 +36,18 @@ class Mosaic:
     meta: dict = field(default_factory=dict)
 
 
-def read_mosaic(path, *, cfa=None, luminance=False, mem_limit=None):
+def read_mosaic(path, *, cfa=None, mem_limit=None):
     """Read the mosaic at `path`, never demosaiced.
 
     cfa: colour filter array of a PNG or TIFF, which cannot say it (default mono); for other files it must agree with theirs.
-    luminance: take the luminance of a colour PNG or TIFF instead of refusing it. Raises InputError, saying why.
+    Raises InputError, saying why.
     """
     path = Path(path)
     kind = file_type(path)
     if kind == "exr":
         found = _from_exr(path, mem_limit)
     elif kind == "png" or (kind == "tiff" and path.suffix.lower() in (".tif", ".tiff")):
-        found = _from_image(path, kind, luminance, mem_limit)
+        found = _from_image(path, kind, mem_limit)
         found.cfa = cfa or "mono"
     elif kind == "jpeg":
         raise InputError("is a JPEG: its values were demosaiced, bent and compressed", path, "give the RAW, a PNG or a TIFF of the sensor")
@@ -114,7 +114,7 @@ def _described(path, values, description, source):
     return found
 
 
-def _from_image(path, kind, luminance, mem_limit):
+def _from_image(path, kind, mem_limit):
     values, names, bits = read_stored(path, kind, mem_limit)
     keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     values, meta = values[..., keep], {"bits": bits, "verified": False}
@@ -123,9 +123,6 @@ def _from_image(path, kind, luminance, mem_limit):
     if values.shape[-1] > 1:
         if (values == values[..., :1]).all():
             meta["note"] = f"{values.shape[-1]} identical channels, one taken"
-        elif luminance and values.shape[-1] == 3:
-            meta["note"] = "luminance (ITU-R BT.709) of three channels"
-            return Mosaic(values @ np.array([0.2126, 0.7152, 0.0722]), white=_top(values, bits), meta=meta)
         else:
             raise InputError(f"is a picture with {values.shape[-1]} different channels, not a mosaic with one value a pixel", path,
                              "give the sensor's mosaic before demosaicing")

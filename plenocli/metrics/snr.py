@@ -46,15 +46,13 @@ def snr_predicted(value, sigma):
     return _ratio(value[:, valid].mean(1), np.sqrt((sigma[:, valid] ** 2).mean(1)))
 
 
-def snr_sensor(signal, sigma, of="power"):
-    """Sensor-model SNR of a noise-free capture `signal` (any shape) with white noise of standard deviation `sigma`.
+def snr_sensor(signal, sigma, noisy=False):
+    """Sensor-model SNR of a capture `signal` (any shape) with white noise of standard deviation `sigma`: 10 log10(mean(y^2)/sigma^2).
 
-    of="power": 10 log10(mean(y^2)/sigma^2), the definition used here; of="variance" takes the variance of y instead,
-    for comparison with work that does.
+    noisy: the signal carries the noise already, whose power is taken off; -inf where nothing is left.
     """
-    signal = np.asarray(signal, dtype=np.float64)
-    level = {"power": np.mean(signal**2), "variance": np.var(signal)}[of]
-    return float(_ratio(np.sqrt(level), float(sigma)))
+    power = np.mean(np.asarray(signal, dtype=np.float64) ** 2) - (sigma**2 if noisy else 0.0)
+    return float(_ratio(np.sqrt(max(power, 0.0)), float(sigma)))
 
 
 def _ratio(mean, deviation):

@@ -98,12 +98,6 @@ class BlockToeplitz:
         keep = np.any(self.offsets != 0, axis=1)
         return BlockToeplitz(self.blocks[keep], self.offsets[keep], self.domain.shape[:2])
 
-    def own(self):
-        """A_0, (pixel, point): the block whose offset is (0, 0)."""
-        at = np.flatnonzero(np.all(self.offsets == 0, axis=1))
-        if at.size == 0:
-            raise ValueError("no block has the offset (0, 0)")
-        return self.blocks[at[0]]
 
 
 def adjoint_gap(op, seed=0):

@@ -72,7 +72,7 @@ def _spacing(centres, shape):
 def _lattice(axes, centres, width):
     """Boundaries between neighbouring superpixels along rows and columns; follows rotated and bent grids."""
     limits = axes.get_xlim(), axes.get_ylim()
-    for points, along in ((centres, 0), (np.swapaxes(centres, 0, 1), 1)):
+    for points in (centres, np.swapaxes(centres, 0, 1)):
         if len(points) < 2:
             continue
         between = (points[1:] + points[:-1]) / 2

@@ -45,10 +45,3 @@ def chart_scene(rows, cols, wavelengths, gap=0.1, frame=FRAME_REFLECTANCE):
     reflectance = colorchecker(wavelengths)[2]
     palette = np.vstack([np.full((1, reflectance.shape[1]), frame), reflectance]).astype(np.float32)
     return np.ascontiguousarray(np.moveaxis(palette[labels], -1, 0)), labels
-
-
-def patch_centres(rows, cols):
-    """Centres of the 24 patches in grid coordinates (row, column), cell centres at integers: (24, 2)."""
-    row = (np.arange(PATCH_ROWS) + 0.5) * rows / PATCH_ROWS - 0.5
-    col = (np.arange(PATCH_COLS) + 0.5) * cols / PATCH_COLS - 0.5
-    return np.stack(np.meshgrid(row, col, indexing="ij"), axis=-1).reshape(-1, 2)

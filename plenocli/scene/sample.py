@@ -69,11 +69,6 @@ def sample_picture(picture, rows, cols, how="fit"):
     return averaged.astype(np.float32)
 
 
-def sample_cube(cube, rows, cols, how="fit"):
-    """sample_picture for a spectral cube (band, height, width) -> (band, rows, cols) float32."""
-    return np.ascontiguousarray(np.moveaxis(sample_picture(np.moveaxis(cube, 0, -1), rows, cols, how), -1, 0))
-
-
 def block_mean(values, block):
     """Mean over non-overlapping blocks (h, w) of the last two axes: (..., R h, C w) -> (..., R, C) float64."""
     values = np.asarray(values, dtype=np.float64)

@@ -26,8 +26,7 @@ class Lattice:
     pitch: lengths of the two lattice vectors, (down, right), px. angle: of the right vector, degrees, positive
     towards larger rows. centres (R, C, 2): the fitted map at every site of the array; valid (R, C): the cell lies
     in the frame and is lit; residual (R, C): measured centroid minus fit, px, NaN where not measured.
-    rms: of all residuals of valid sites; rms_inliers: of those within 4 robust deviations. model: form of the map.
-    basis (2, 2): mean lattice vectors [down, right] px. strength: correlation of the image with itself one pitch away.
+    rms: of all residuals of valid sites. model: form of the map. basis (2, 2): mean lattice vectors [down, right] px.
     """
 
     kind: str
@@ -37,10 +36,8 @@ class Lattice:
     valid: np.ndarray
     residual: np.ndarray
     rms: float
-    rms_inliers: float
     model: str
     basis: np.ndarray
-    strength: float
 
 
 def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, window=1024):
@@ -54,7 +51,7 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     """
     image = prepare(white, cfa, dark)
     crop = _brightest_crop(image, window)
-    basis, strength, structure = lattice.find_basis(crop)
+    basis, _, structure = lattice.find_basis(crop)
     if basis is None:
         raise NumericsError(f"no lenslet lattice in the image: {structure}", fix=FIX)
     structured = structure > STRUCTURED
@@ -91,7 +88,7 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
         model, lit = moved, _lit_cells(image, moved)
     mean = distortion.fit_model("affine", index[inside], position[inside])
     vectors = mean.coefficients[1:] / mean.scale
-    return _assemble(kind, model, vectors, strength, index, position, miss, clean, image.shape, pitch, lit)
+    return _assemble(kind, model, vectors, index, miss, clean, image.shape, pitch, lit)
 
 
 def prepare(white, cfa="mono", dark=None):
@@ -337,7 +334,7 @@ def _whole(position, shape, margin):
     return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
 
 
-def _assemble(kind, model, vectors, strength, index, position, miss, clean, shape, pitch, lit):
+def _assemble(kind, model, vectors, index, miss, clean, shape, pitch, lit):
     """Lay the sites out as an array (R, C) without empty border rows and columns; lit (N, 2): more sites that hold light."""
     site = lattice.to_array(index, kind)
     bright = site[clean] if lit is None else lattice.to_array(lit, kind)
@@ -354,7 +351,6 @@ def _assemble(kind, model, vectors, strength, index, position, miss, clean, shap
         block = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
         centres, residual, valid = centres[block], residual[block], valid[block]
     inner = residual[valid & np.isfinite(residual)]
-    spread = 1.48 * np.median(inner)
     return Lattice(
         kind=kind,
         pitch=np.hypot(*vectors.T),
@@ -363,8 +359,6 @@ def _assemble(kind, model, vectors, strength, index, position, miss, clean, shap
         valid=valid,
         residual=residual,
         rms=float(np.sqrt(np.mean(inner**2))),
-        rms_inliers=float(np.sqrt(np.mean(inner[inner <= 4 * spread] ** 2))) if spread > 0 else 0.0,
         model=model.kind,
         basis=vectors,
-        strength=strength,
     )

@@ -141,7 +141,7 @@ def relative_gap(b, q, x, index, signal_energy, threshold):
 
 
 @_jit
-def _step_length(x, d, h, threshold, sign):
+def _step_length(x, d, h, threshold):
     """(alpha, zero): the minimum of the piecewise quadratic along x + alpha d, 0 < alpha <= 1; `zero` is the value that
     lands on 0 there, or -1.  h = G d, so that the slope at alpha with the first signs is 2 (alpha - 1) d^T h."""
     curvature = np.dot(d, h)
@@ -182,7 +182,7 @@ def _settle(gram, b, threshold, index, x, sign, inner_limit):
                 keep[i] = False
                 rejected = True
         if not rejected:
-            alpha, zero = _step_length(x, d, h, threshold[index], sign)
+            alpha, zero = _step_length(x, d, h, threshold[index])
             x = x + alpha * d
             if zero >= 0:
                 x[zero] = 0.0

@@ -56,13 +56,3 @@ def autocovariance(images, reach):
     half = np.median([min(i.shape) for i in images]) / 2
     taper = np.cos(np.pi / 2 * np.clip((np.abs(lags) - half) / max(reach - half, 1), 0, 1)) ** 2 if reach > half else 1.0 + 0 * lags
     return float(mean), field * taper[:, None] * taper[None, :]
-
-
-def block_covariance(autocovariance_map, shape, shift=(0, 0)):
-    """Covariance (point, point) of a block of `shape` with the block `shift` (rows, columns of points) away, stationary field."""
-    reach = autocovariance_map.shape[0] // 2
-    r, c = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    return autocovariance_map[
-        np.clip(r[None, :] - r[:, None] + shift[0] + reach, 0, 2 * reach),
-        np.clip(c[None, :] - c[:, None] + shift[1] + reach, 0, 2 * reach),
-    ]

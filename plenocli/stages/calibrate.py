@@ -42,9 +42,9 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     check_exposure_times(every)
     reference = white[0].seconds
     dark = make_dark([e.values for e in dark_frames], [e.seconds for e in dark_frames], white[0].black, white[0].values.shape)
-    noise = _noise(white, dark_frames, dark, list(band_frames.values()), description)
+    noise = _noise(white, dark, list(band_frames.values()), description)
 
-    signal, weight = merge([e.values for e in white], [e.seconds for e in white], dark, white[0].white, reference)
+    signal, _ = merge([e.values for e in white], [e.seconds for e in white], dark, white[0].white, reference)
     if np.isnan(signal).mean() > 0.05:
         raise InputError(f"{np.isnan(signal).mean():.0%} of the white image is saturated", white[0].path, "expose it for less time")
     grid = _grid(signal, white[0], lattice, near)
@@ -56,7 +56,7 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     merged = {w: merge([e.values for e in group], [e.seconds for e in group], dark, group[0].white, reference) for w, group in band_frames.items()}
     if merged:
         _response(data, attrs, merged, dict(radiances), bad, noise, dark.variance, shared, grid, white[0].cfa)
-    _add_attrs(attrs, white[0], dark, noise, reference, grid)
+    _add_attrs(attrs, white[0], dark, noise, reference)
     report = _report(grid, attrs, data, whites, noise)
     write_artefact(output, Artefact("calibration", data, attrs, Provenance(command, describe_inputs(roles), None, description.text if description else "")), overwrite=overwrite)
     return report | {"output": str(output)}
@@ -69,7 +69,7 @@ def _band_roles(bands):
     return roles
 
 
-def _noise(white, darks, dark, band_groups, camera):
+def _noise(white, dark, band_groups, camera):
     """Gain and read variance: from the camera description, else the files, else two frames of one scene."""
     from plenocli.sensor.frames import photon_transfer
 
@@ -199,7 +199,7 @@ def _check_shared(grid, origin, valid, cfa):
         raise NumericsError("windows start on different colours of the filter array: no F serves them all", fix="leave --shared out")
 
 
-def _add_attrs(attrs, white, dark, noise, reference, grid):
+def _add_attrs(attrs, white, dark, noise, reference):
     levels = dict(cfa=white.cfa, black=[float(b) for b in white.black.ravel()])
     if np.isfinite(white.white):
         levels["white"] = white.white

@@ -115,7 +115,7 @@ def _white_normalised(capture, calibration):
     """
     from plenocli.artefacts import read_mosaic
 
-    signal, white, valid = calibrated(capture, read_mosaic(capture), calibration)
+    signal, white = calibrated(capture, read_mosaic(capture), calibration)
     with np.errstate(divide="ignore", invalid="ignore"):
         usable = np.isfinite(signal) & np.isfinite(white)
         value = np.where(usable, signal, 0).sum(axis=2) / np.where(usable, white, 0).sum(axis=2)

@@ -211,6 +211,7 @@ def _snr(result, labels, context):
 def _sensor_snr(path, mem_limit):
     """Sensor-model SNR of a capture from its mosaic and the noise it says it got."""
     from plenocli.artefacts import read_artefact
+    from plenocli.metrics.snr import snr_sensor
 
     capture = read_artefact(path, "capture", mem_limit=mem_limit)
     attrs = capture.attrs.get("capture", {})
@@ -218,8 +219,7 @@ def _sensor_snr(path, mem_limit):
     if not sigma > 0:
         raise InputError("names no noise level", path, "simulate it with capture-sim --snr, or leave --capture out")
     signal = np.asarray(capture.data["capture/mosaic"], dtype=np.float64) - float(np.mean(attrs.get("black") or 0))
-    power = np.mean(signal**2) - sigma**2  # the stored mosaic carries the noise already
-    return float(10 * np.log10(power / sigma**2)) if power > 0 else None
+    return snr_sensor(signal, sigma, noisy=True)
 
 
 def _score_dictionary(path, result, system):

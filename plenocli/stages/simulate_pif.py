@@ -97,7 +97,7 @@ def _contents(pif, found):
 
 def _summary(output, pif, found, plan):
     keep = {key: found[key] for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max") if key in found}
-    bands, superpixels, pixels, points = pif.A.shape
+    bands, _, pixels, points = pif.A.shape
     return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
             "wavelengths": pif.wavelength.tolist(), "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
             "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],

@@ -31,7 +31,7 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
     if mosaic.cfa != "mono":
         raise InputError(f"has the colour filter array {mosaic.cfa}; the system matrix knows none", path, "use --calibration with --method block-mean, or demux")
     if calibration is not None:
-        signal, white, _ = calibrated(path, mosaic, calibration)
+        signal, white = calibrated(path, mosaic, calibration)
         if signal.shape[2] != system.own.shape[0]:
             raise InputError(f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}", calibration, "simulate-pif with pixels_per_lenslet as measured")
         lit = np.all(np.isfinite(signal), axis=2)
@@ -53,7 +53,7 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
 
 
 def calibrated(path, mosaic, calibration):
-    """(signal, white, valid): a capture's and the white reference's windows (lenslet_row, lenslet_column, pixel), dark subtracted.
+    """(signal, white): a capture's and the white reference's windows (lenslet_row, lenslet_column, pixel), dark subtracted.
 
     NaN where a superpixel is not wholly on the sensor. InputError where the two sensors differ.
     """
@@ -74,7 +74,7 @@ def calibrated(path, mosaic, calibration):
     valid = data["grid/valid"].astype(bool)
     signal[~valid] = np.nan
     white = np.broadcast_to(data["response/white"], signal.shape)
-    return signal, white, valid
+    return signal, white
 
 
 def _unit(path, mosaic):

@@ -28,7 +28,9 @@ def test_predicted_snr():
 def test_sensor_snr_takes_the_power_and_not_the_variance():
     signal = 1 + 0.1 * np.random.default_rng(2).standard_normal(200000)
     assert snr.snr_sensor(signal, 1e-3) == pytest.approx(60 + 10 * np.log10(1.01), abs=0.01)
-    assert snr.snr_sensor(signal, 1e-3, of="variance") == pytest.approx(40, abs=0.05)
+    noisy = signal + 0.5 * np.random.default_rng(3).standard_normal(signal.size)
+    assert snr.snr_sensor(noisy, 0.5, noisy=True) == pytest.approx(snr.snr_sensor(signal, 0.5), abs=0.03)
+    assert snr.snr_sensor(signal, 10.0, noisy=True) == -np.inf
 
 
 def test_edges_are_named_not_raised():

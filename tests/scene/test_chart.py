@@ -32,8 +32,7 @@ def test_scene_carries_the_table():
     for label in range(1, 25):
         np.testing.assert_allclose(cube[:, labels == label], np.repeat(table[label - 1][:, None], (labels == label).sum(), 1), rtol=1e-6)
     np.testing.assert_allclose(cube[:, labels == 0], 0.03, rtol=1e-6)
-    row, col = np.round(chart.patch_centres(40, 60)).astype(int).T
-    np.testing.assert_array_equal(labels[row, col], np.arange(1, 25))
+    np.testing.assert_array_equal(labels[5::10, 5::10].ravel(), np.arange(1, 25))
 
 
 def test_gap_is_checked():

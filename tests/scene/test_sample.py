@@ -49,13 +49,6 @@ def test_a_flat_picture_stays_flat_on_any_grid(shape):
         assert np.allclose(sample.sample_picture(np.full(shape, 0.37), rows, cols), 0.37)
 
 
-def test_cubes_are_sampled_band_by_band():
-    cube = np.random.default_rng(3).random((4, 30, 20))
-    sampled = sample.sample_cube(cube, 6, 5)
-    for band in range(4):
-        np.testing.assert_allclose(sampled[band], sample.sample_picture(cube[band], 6, 5), rtol=1e-6)
-
-
 def test_luminance_weights():
     picture = np.zeros((2, 2, 4))
     picture[..., :3] = [1, 0.5, 0.25]

@@ -136,9 +136,3 @@ def test_patches_come_from_the_pictures():
     assert shapes == {picture[::a, ::b].tobytes() for a in (1, -1) for b in (1, -1)}
     with pytest.raises(ValueError, match="at least"):
         natural.draw_patches([picture], (6, 6), 1, np.random.default_rng(0))
-
-
-def test_block_covariance_reads_the_lags():
-    lags = np.arange(49.0).reshape(7, 7)
-    c = natural.block_covariance(lags, (2, 2), (0, 2))
-    assert c[0, 0] == lags[3, 5] and c[0, 3] == lags[4, 6] and c[3, 0] == lags[2, 4]

@@ -234,7 +234,10 @@ class Camera(Section):
         for path, value in changes.items():
             section, key = path.split(".")
             data[section][key] = value
-        return Camera.model_validate(data, context={"si": True})
+        try:
+            return Camera.model_validate(data, context={"si": True})
+        except ValidationError as error:
+            raise _violations(error, "camera") from None
 
 
 def load_camera(path):
@@ -262,9 +265,14 @@ def parse_camera(text, where="camera"):
     try:
         return Camera.model_validate(data)
     except ValidationError as error:
-        lines = [_sentence(e) for e in error.errors()]
-        count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
-        raise ConfigError(f"{count}\n  " + "\n  ".join(lines), where) from None
+        raise _violations(error, where) from None
+
+
+def _violations(error, where):
+    """The ConfigError that lists everything a pydantic ValidationError found."""
+    lines = [_sentence(e) for e in error.errors()]
+    count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
+    return ConfigError(f"{count}\n  " + "\n  ".join(lines), where)
 
 
 def camera_schema():

@@ -132,7 +132,7 @@ class Learner:
         """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
         code = self.code(atoms, self.measured)
         error = np.mean((atoms @ code.c - self.validation) ** 2)
-        return float(code.objective.mean()), float(-10 * np.log10(error)), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+        return float(code.objective.mean()), float(-10 * np.log10(max(error, np.finfo(float).tiny))), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
 
     def _record(self, after, before, dead, gap, residual):
         objective, quality, nonzeros, worst = self.validate(after.atoms)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.errors import ConfigError, InputError, UsageError
+from plenocli.errors import ConfigError, InputError, NumericsError, UsageError
 from plenocli.stages.progress import bar, note
 from plenocli.stages.scenes import Chart, Uniform, read_scene
 from plenocli.stages.seeds import stream
@@ -51,10 +51,11 @@ def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scen
         check_output(scene_out, overwrite=overwrite, inputs=[camera_path, pif, scene])
     camera = load_camera(camera_path)
     _check_tiling(camera, camera_path)
+    _check_memory(camera, settings, camera_path)
     source, what = _source(camera, settings, scene)
     matrix = _read_pif(pif, camera, settings, source.wavelengths) if pif else None
     light, whites, truth = _carry(camera, source, what, settings, matrix)
-    capture, summary = _detect(camera, light, whites, settings)
+    capture, summary = _detect(camera, light, whites, settings, scene)
     _describe(capture, camera, settings, truth, scene)
     provenance = dict(command=command, inputs=describe_inputs({"camera": camera_path, "pif": pif, "scene": scene if scene and Path(scene).is_file() else None}),
                       seed=settings.seed, config=camera.text, accuracy={"asked": settings.accuracy})
@@ -73,6 +74,16 @@ def _check_tiling(camera, where):
         raise ConfigError(
             f"the superpixel pitch is {camera.superpixel_pitch / camera.sensor.pixel_pitch:.4f} pixels, not {rows} x {columns}: at the array's edge superpixels would be {drift:.2f} pixels off",
             where, f'set lenslet_array.superpixel_pitch = "{rows * camera.sensor.pixel_pitch * 1e6:.6g} um" instead of pitch')
+
+
+def _check_memory(camera, settings, where):
+    """Refuse, before any work, a sensor or an object larger than the memory granted: light, white and mosaic, float64, by colour."""
+    lenslets, pixels, points = (int(np.prod(n, dtype=object)) for n in (camera.lenslet_array.count, camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet))
+    colours = 1 if camera.sensor.cfa == "mono" else 3
+    needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * settings.refine**2)
+    if needed > settings.mem_limit:
+        raise NumericsError(f"the capture needs about {needed / 2**30:.2g} GiB, more than the limit of {settings.mem_limit / 2**30:.2g} GiB", where,
+                            "take fewer lenslets, pixels or points, a smaller --refine, or raise --mem-limit")
 
 
 def _source(camera, settings, scene):
@@ -177,7 +188,7 @@ def _truth(camera, scene, grid, refine):
     return np.stack([block_mean(scene.at(w, *grid), (refine, refine)) for w in bands]).astype(np.float32)
 
 
-def _detect(camera, light, whites, settings):
+def _detect(camera, light, whites, settings, scene):
     """From relative light to what the sensor reports: (capture dict, summary dict)."""
     from plenocli.operators import to_plane
     from plenocli.sensor.cfa import cfa_map
@@ -206,6 +217,8 @@ def _detect(camera, light, whites, settings):
     exposure = settings.exposure or camera.light.white_exposure
     scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
     model = SensorModel.from_camera(camera)
+    if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
+        raise InputError("holds values below 0 or beyond all numbers, which no light has", scene, "clip it (reconstruct --clip), or use --noise none")
     values = model.expose(mosaic * scale, rng)
     capture |= dict(mosaic=values, units="DN", black=float(sensor.black_level), white=float(model.white_level), gain_e_per_dn=1 / sensor.gain, exposure_s=exposure,
                     electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0))

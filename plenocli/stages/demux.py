@@ -190,6 +190,8 @@ def estimate(c, values, noise, method, prior=None, ratio=False):
     if method != "auto":
         value, sigma = demultiplex(c.response, values, method, variance=variance, pixels=pixels, prior=prior)
         return value, sigma, method, "asked for"
+    if not np.isfinite(start).any():
+        raise NumericsError("no lenslet could be demultiplexed", fix="check that the capture is not saturated and that the bands of the calibration differ")
     tried = {m: demultiplex(c.response, values, m, variance=variance, prior=prior) for m in ("pinv", "wls", *(["lmmse"] if prior else []))}
     error = {m: float(np.nanmean(sigma**2)) for m, (_, sigma) in tried.items()}
     error["single-pixel"] = _single_pixel_error(c, pixels, start, noise)
@@ -236,8 +238,10 @@ def _prior(c):
     from plenocli.solvers.spectral import demultiplex
 
     light, _ = demultiplex(c.response, c.white, "pinv")
-    light = np.nanmedian(light.reshape(-1, len(c.wavelengths)), axis=0)
-    if not (np.isfinite(light).all() and (light > 0).all()):
+    light = light.reshape(-1, len(c.wavelengths))
+    light = light[np.isfinite(light).all(axis=1)]
+    light = np.median(light, axis=0) if len(light) else np.zeros(1)
+    if not (light > 0).all():
         return None
     mean, covariance = reflectance_statistics(colorchecker(c.wavelengths)[2])
     covariance = covariance + 1e-4 * np.eye(len(mean))  # narrow neighbouring bands are nearly the same number on a chart

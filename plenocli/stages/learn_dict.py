@@ -127,7 +127,7 @@ def _judge(machine, state, svd, training, chosen):
     kept = len(machine.seen)
     scaled = Svd(np.eye(kept), svd.s[:kept] / machine.scale, svd.vt[:kept])
     linear = prepare(scaled, *mean_covariance(patches), machine.sigma).apply(machine.measured)
-    lmmse = float(-10 * np.log10(np.mean((linear - machine.validation) ** 2)))
+    lmmse = float(-10 * np.log10(max(np.mean((linear - machine.validation) ** 2), np.finfo(float).tiny)))
     objective, quality, nonzeros, gap = machine.validate(state.atoms)
     measures = coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)
     return {"iterations": state.iteration, "atoms": state.atoms.shape[1], "batch": chosen.batch, "lambda": chosen.lam, "delta": chosen.delta,

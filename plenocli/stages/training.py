@@ -41,6 +41,8 @@ def read_training(names, shape, *, not_scene=None):
         if min(picture.shape[0] - shape[0], picture.shape[1] - shape[1]) < 0:
             note(f"training leaves out {name}: {picture.shape[0]} x {picture.shape[1]} pixels are less than a block of {shape[0]} x {shape[1]}")
             continue
+        if not (picture.min() >= 0 and np.ptp(picture) > 0):
+            raise InputError("has no structure to learn from, or values below 0", name, "train on photographs")
         top = float(picture.max(initial=0))
         pictures.append((str(name), picture / top if top > 1 else picture))
     if not pictures:

@@ -1,6 +1,5 @@
 """Camera descriptions: read exactly, resolved once, refused with every violation named."""
 
-
 import os
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def test_replace_checks_again():
     camera = parse_camera(TINY)
     finer = camera.replace(**{"object.samples_per_lenslet": (24, 24)})
     assert finer.object.samples_per_lenslet == (24, 24) and finer.lenslet_array == camera.lenslet_array
-    with pytest.raises(ValueError):
+    with pytest.raises(ConfigError, match="object.distance"):
         camera.replace(**{"object.distance": -1.0})
 
 

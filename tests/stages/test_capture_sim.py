@@ -186,3 +186,17 @@ def test_the_description_of_a_camera_is_in_the_file(camera, tmp_path):
     assert parse_camera(made.provenance.config) == load_camera(camera)
     assert made.provenance.command == "plenocli capture-sim camera.toml --target white"
     assert str(tmp_path) not in str(made.provenance)
+
+
+def test_light_below_zero_is_refused_by_a_sensor(camera, tmp_path, capsys):
+    from plenocli.artefacts import write_exr
+
+    write_exr(tmp_path / "negative.exr", {"Y": np.full((20, 20), -1, np.float32)}, {})
+    arguments = ["capture-sim", str(camera), "--scene", str(tmp_path / "negative.exr"), "--superpixels", "1x1", "--coherent-ring", "0", "-o", str(tmp_path / "out.h5")]
+    assert run(arguments) == 3 and "below 0" in capsys.readouterr().err and not (tmp_path / "out.h5").exists()
+
+
+def test_more_memory_than_granted_is_refused_before_it_is_taken(camera, tmp_path, capsys):
+    camera.write_text(camera.read_text().replace("count = [3, 4]", "count = [4096, 4096]"))
+    assert run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.h5")]) == 5
+    assert "--mem-limit" in capsys.readouterr().err

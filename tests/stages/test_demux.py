@@ -130,3 +130,16 @@ def test_a_lenslet_cut_by_the_frame_is_masked(files, tmp_path):
     assert valid.sum() == (COUNT - 2) * COUNT
     np.testing.assert_array_equal(np.isfinite(value).all(axis=0), valid)
     np.testing.assert_allclose(value[:, valid], 1.0, atol=0.02)
+
+
+def test_a_saturated_capture_and_bands_that_do_not_differ_are_said(files, tmp_path, capsys):
+    white = capture(tmp_path / "white.h5", 1.0, 1, gain_e_per_dn=2.0)
+    bands = [capture(tmp_path / f"b{k}.h5", np.eye(2)[k], 2 + k, gain_e_per_dn=2.0) for k in range(2)]
+    good, twins, over = tmp_path / "good.h5", tmp_path / "twins.h5", tmp_path / "over.h5"
+    run_calibrate(good, whites=[white], bands=list(zip(BANDS, bands)))
+    run_calibrate(twins, whites=[white], bands=[(w, bands[0]) for w in BANDS])
+    data = {"capture/mosaic": np.full((COUNT * PITCH,) * 2, 4095, np.uint16), "capture/cfa": "mono"}
+    write_artefact(over, Artefact("capture", data, {"capture": dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1, gain_e_per_dn=2.0)}))
+    for shot, calibration in ((over, good), (files["shots"][0], twins)):
+        assert run(["demux", str(shot), "--calibration", str(calibration), "-o", str(tmp_path / "never.h5")]) == 5
+        assert "no lenslet could be demultiplexed" in capsys.readouterr().err and not (tmp_path / "never.h5").exists()

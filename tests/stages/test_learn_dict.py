@@ -70,3 +70,12 @@ def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
         assert learn(pif, "--iterations", 2, "--seed", 5, "-o", tmp_path / f"{name}.h5") == 0
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
     assert learn(pif, "--iterations", 3, "--seed", 5, "--resume", tmp_path / "a.h5", "-o", tmp_path / "a.h5", "--overwrite") == 0
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
+def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
+    from plenocli.artefacts import write_exr
+
+    write_exr(tmp_path / "flat.exr", {"Y": np.full((20, 20), level, np.float32)}, {})
+    with pytest.raises(InputError, match="no structure"):
+        read_training((str(tmp_path / "flat.exr"),), (8, 8))

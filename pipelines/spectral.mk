@@ -13,7 +13,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 RAW := $(RUN)/raw
 EXPOSURES := long short
 SIM = $(P) capture-sim $(CONFIG) --pif $(RUN)/pif.h5 --overwrite
-SPECTRA := $(foreach m,$(METHODS),$(foreach e,$(EXPOSURES),$(RUN)/spectra/chart-$e-$m.h5))
+# named one by one, so that make keeps them and makes them again when they are missing
+SPECTRA := $(foreach m,$(METHODS),$(foreach e,$(EXPOSURES),$(RUN)/spectra/chart-$e-$m.h5 $(RUN)/spectra/white-$e-$m.h5))
 
 all: $(RUN)/report.html
 .PHONY: all
@@ -55,5 +56,5 @@ $(RUN)/chart.exr: $(RAW)/chart-long.dng $(RUN)/calibration.h5
 	$(P) demux $< --calibration $(RUN)/calibration.h5 --method pinv --reference $(RAW)/white.dng -o $@ --overwrite
 
 SCORES := $(foreach m,$(METHODS),$(foreach e,$(EXPOSURES),$(RUN)/score-$e-$m.json))
-$(RUN)/report.html: $(SCORES) $(RUN)/chart.exr
+$(RUN)/report.html: $(SCORES) $(SPECTRA) $(RUN)/chart.exr
 	$(P) report $(RUN) -o $@ --overwrite

@@ -56,6 +56,11 @@ def test_a_second_run_does_nothing_and_a_change_reruns_what_depends_on_it(spatia
     again = stages(make("spatial", *variables, "-n"))
     assert "learn-dict" not in again and "simulate-pif" not in again and again.count("score") == 1
     assert 0 < again.count("reconstruct") < stages(first).count("reconstruct")
+    (run / "score-stray.json").unlink()
+    (run / "paper" / "lmmse.h5").rename(run / "gone")
+    assert {"score", "reconstruct"} < set(stages(make("spatial", *variables, "-n"))), "what is missing is made again"
+    (run / "gone").rename(run / "paper" / "lmmse.h5")
+    make("spatial", *variables)
 
 
 def test_the_same_run_gives_the_same_bytes(spatial, tmp_path):

@@ -43,13 +43,25 @@ class Estimators:
         if method == "lmmse" and self.settings.overlap == 3:
             return *self._jointly(data, report), report
         hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
-        y = self._own_light(data, report) if self._takes_neighbours() else data.y
+        if not self._takes_neighbours():
+            return *self._by_lenslet(method, data, data.y, hidden, report), report
+        x, _ = self._jointly(data, {})
+        inner = (slice(1, -1), slice(1, -1))
+        if min(data.y.shape[:2]) > 2:
+            y = self._own_light(data.y, x)[inner]
+            x[inner], _ = self._by_lenslet(method, data, y, None if truth is None else truth[inner].reshape(-1, truth.shape[2]).T, report)
+        report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
+        report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
+        return x, None, report
+
+    def _by_lenslet(self, method, data, y, truth, report):
+        """(x, sigma or None) of superpixels y (lenslet_row, lenslet_column, pixel), each by itself."""
         sigma = self._noise(data, y, report) if method in NOISY else None
         if method == "lmmse":
             estimator = self._lmmse(sigma, data.scene)
             x = by_lenslet(estimator.apply, y)
-            return x, np.broadcast_to(estimator.sigma, x.shape), report
-        return by_lenslet(self._solver(method, y, sigma, hidden, report), y), None, report
+            return x, np.broadcast_to(estimator.sigma, x.shape)
+        return by_lenslet(self._solver(method, y, sigma, truth, report), y), None
 
     def _jointly(self, data, report):
         """(x, sigma) of LMMSE over 3x3 lenslets; once more with the noise that is left over, where that is MISFIT times larger."""
@@ -70,17 +82,15 @@ class Estimators:
         inner = rest[1:-1, 1:-1]
         return float(np.sqrt(np.mean((inner if inner.size else rest) ** 2)))
 
-    def _own_light(self, data, report):
-        """The superpixels without their neighbours' light, as the joint LMMSE over 3x3 lenslets sees it.
+    def _own_light(self, y, x):
+        """The superpixels y without the light that the objects x under their neighbours send.
 
         An estimate per lenslet cannot tell that light from its own and amplifies it; taking it away by repeated estimates
-        diverges where the matrix is ill-conditioned.
+        diverges where the matrix is ill-conditioned, so that x comes from the joint estimate.
         """
         from plenocli.operators import BlockToeplitz
 
-        x, _ = self._jointly(data, {})
-        report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
-        return data.y - BlockToeplitz(self.system.blocks, self.system.offsets, data.y.shape[:2]).neighbours_only().forward(x)
+        return y - BlockToeplitz(self.system.blocks, self.system.offsets, y.shape[:2]).neighbours_only().forward(x)
 
     def _solver(self, method, y, sigma, truth, report):
         setup = {"block-mean": self._block_mean, "tikhonov": self._tikhonov, "tsvd": self._tsvd, "nnls": self._nnls, "dictionary": self._dictionary}[method]
@@ -116,7 +126,7 @@ class Estimators:
         return sigma
 
     def _takes_neighbours(self):
-        return self.coupled and self.settings.overlap == 3
+        return self.coupled and self.settings.overlap == 3 and self._method()[0] != "block-mean"
 
     def _stray(self, y):
         """The neighbours' light, from the block means: enough to estimate the noise."""

@@ -8,16 +8,25 @@ from pathlib import Path
 from plenocli.errors import OutputError, UsageError
 
 
-def check_output(path, *, overwrite=False, inputs=()):
+def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
     """Refuse an output path that cannot work, before any long computation.
 
-    Raises UsageError if the file exists and `overwrite` is not set; OutputError if `path` is a folder or not an ordinary
-    file, its folder is missing or read-only, or it is one of `inputs`.
+    Raises UsageError if the file exists and `overwrite` is not set, or its suffix is none of `suffixes` (where given);
+    OutputError if `path` is a folder or not an ordinary file, its name is impossible, its folder is missing or read-only, or
+    it is one of `inputs`.
     """
     path = Path(path)
     folder = path.parent
+    try:
+        os.lstat(partial_path(path))
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise OutputError(f"is no possible file name ({error.strerror})", path, "choose another name") from None
     if path.is_dir():
         raise OutputError("is a folder", path, "name a file for the result")
+    if suffixes and path.suffix not in suffixes:
+        raise UsageError(f"the result is written as {' or '.join(suffixes)}, not {path.suffix or 'without a suffix'}", path, "change the suffix of OUT")
     if not folder.is_dir():
         raise OutputError(f"the folder {folder} does not exist", path, "make it first")
     if path.exists():

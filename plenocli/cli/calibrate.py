@@ -11,7 +11,7 @@ from plenocli.cli import options
 @click.option("--white", "whites", multiple=True, required=True, type=options.FILE, help="White image: even light through the main lens. Repeatable: frames are averaged.")
 @click.option("--dark", "darks", multiple=True, type=options.FILE, help="Dark frame. Repeatable; without one the file's black level is used.")
 @click.option("--band", "bands", multiple=True, type=options.Pair("FILE", Path), help="White target under narrow-band light, such as 450nm=band450.dng. Repeatable, also within a band.")
-@click.option("--band-radiance", "radiances", multiple=True, type=options.Pair("NUMBER", float), help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.")
+@click.option("--band-radiance", "radiances", multiple=True, type=options.Pair("NUMBER", options.positive), help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.")
 @click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
 @click.option("--shared", is_flag=True, help="One F for all lenslets (whole-pixel pitch only) instead of one each.")
 @click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
@@ -36,8 +36,6 @@ def command(ctx, output, as_json, radiances, **settings):
     """
     from plenocli.stages.calibrate import run_calibrate
 
-    if any(not value > 0 for _, value in radiances):
-        raise click.BadParameter("a radiance must be above 0", ctx, param_hint="--band-radiance")
     report = run_calibrate(output, radiances=radiances, command=options.command_line(ctx), **settings)
     down, right = report["pitch_px"]
     line = (f"{output}: {report['lattice']} grid, pitch {down:.4f} x {right:.4f} px, angle {report['angle_deg']:.3f} deg, "

@@ -1,19 +1,20 @@
 """Every shared option once, with its unit and default in its help, and the parameter types that read units."""
 
 import json
+import math
 from pathlib import Path
 
 import click
 
-from plenocli.config.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number
+from plenocli.config.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number, parse_wavelength
 from plenocli.plain import plain
 
 
 class _Quantity(click.ParamType):
     """A number with its unit, read by one of the parsers of plenocli.config.units."""
 
-    def __init__(self, name, parse, minimum=None, exclusive=False, show=lambda value: format(value, ".12g")):
-        self.name, self._parse, self._minimum, self._exclusive, self.show = name, parse, minimum, exclusive, show
+    def __init__(self, name, parse, minimum=None, exclusive=False, show=lambda value: format(value, ".12g"), limits=(-math.inf, math.inf)):
+        self.name, self._parse, self._minimum, self._exclusive, self.show, self._limits = name, parse, minimum, exclusive, show, limits
 
     def convert(self, value, param, ctx):
         """Text in the units that the command line takes; a default that is a number stays as it is."""
@@ -26,15 +27,26 @@ class _Quantity(click.ParamType):
         low = self._minimum
         if low is not None and (number < low or (self._exclusive and number == low)):
             self.fail(f"{value!r} must be {'above' if self._exclusive else 'at least'} {low:g}", param, ctx)
+        if number and not self._limits[0] <= number <= self._limits[1]:
+            self.fail(f"{value!r} is outside {self.show(self._limits[0])} ... {self.show(self._limits[1])}", param, ctx)
         return number
 
 
-LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True, show=lambda value: format_length(value).replace(" ", ""))
-DECIBEL = _Quantity("decibel", parse_decibel, show=lambda value: f"{value:.12g}dB")
+# what lies outside the limits is a slip, and would overflow somewhere deep inside
+LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True, show=lambda value: format_length(value).replace(" ", ""), limits=(1e-12, 100e-6))
+WAVELENGTH = _Quantity("length", parse_wavelength, show=LENGTH.show)
+DECIBEL = _Quantity("decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0))
 BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)
-DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True, show=lambda value: format_duration(value).replace(" ", ""))
-POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True)
-NON_NEGATIVE = _Quantity("number", parse_number, 0.0)
+DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True, show=lambda value: format_duration(value).replace(" ", ""), limits=(1e-9, 1e6))
+POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30, 1e12))
+NON_NEGATIVE = _Quantity("number", parse_number, 0.0, limits=(1e-30, 1e12))
+
+
+def positive(text):
+    """A number within the limits of POSITIVE; click's BadParameter otherwise."""
+    return POSITIVE.convert(text, None, None)
+
+
 FRACTION = click.FloatRange(0.0, 1.0, min_open=True)
 
 
@@ -70,7 +82,7 @@ class Pair(click.ParamType):
         if not equals or not rest:
             self.fail(f"{value!r} is not {self.name}; write for example 450nm={'band450.dng' if self._convert is Path else '0.8'}", param, ctx)
         try:
-            return parse_length(key), self._convert(rest)
+            return parse_wavelength(key), self._convert(rest)
         except (UnitError, ValueError) as error:
             self.fail(str(error), param, ctx)
 
@@ -87,12 +99,22 @@ class Ring(click.Choice):
         return chosen if chosen == "auto" else int(chosen)
 
 
+class _File(click.Path):
+    """A path with a name: an empty one, often a shell variable that is not set, would mean the current folder."""
+
+    def convert(self, value, param, ctx):
+        if value == "":
+            self.fail("the file name is empty", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+FILE = _File(path_type=Path)
+
+
 def input_path(name, **settings):
     """A positional input file; its existence is checked by the reader, so that the exit code is 3 and the message says what is wrong."""
-    return click.argument(name, type=click.Path(path_type=Path), **settings)
+    return click.argument(name, type=FILE, **settings)
 
-
-FILE = click.Path(path_type=Path)
 
 output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="File to write; a folder when there are several inputs.")
 overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")

@@ -15,7 +15,7 @@ class _Step(click.ParamType):
 @click.command("simulate-pif", short_help="Compute the system matrix A of a camera by wave optics.")
 @options.input_path("camera")
 @click.option("-o", "--output", type=options.FILE, metavar="OUT", help="File to write, .h5; not needed with --explain.")
-@click.option("--wavelength", "wavelengths", type=options.LENGTH, multiple=True, help="Wavelength such as 550nm; repeatable; default [light] wavelengths.")
+@click.option("--wavelength", "wavelengths", type=options.WAVELENGTH, multiple=True, help="Wavelength such as 550nm; repeatable; default [light] wavelengths.")
 @click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
 @options.superpixels("Superpixels whose pixels are kept, odd")
 @options.coherent_ring

@@ -36,6 +36,16 @@ def parse_length(text):
     return _parse(text, LENGTHS, "length", "250 um")
 
 
+def parse_wavelength(text):
+    """Metres from text such as "550nm", from 100 nm to 100 um (UnitError otherwise)."""
+    value = parse_length(text)
+    if value <= 0:
+        raise UnitError(f"{text!r} must be above 0")
+    if not 100e-9 <= value <= 100e-6:
+        raise UnitError(f"{text!r} is no wavelength of this model, which goes from 100 nm to 100 um")
+    return value
+
+
 def parse_duration(text):
     """Seconds from text such as "10 ms"; a bare number is refused (UnitError)."""
     return _parse(text, DURATIONS, "duration", "10 ms")

@@ -32,7 +32,7 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
 
     bands = sorted(bands, key=lambda pair: pair[0])
     roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
-    check_output(output, overwrite=overwrite, inputs=[*whites, *darks, camera, *(path for _, path in bands)])
+    check_output(output, overwrite=overwrite, inputs=[*whites, *darks, camera, *(path for _, path in bands)], suffixes=(".h5",))
     description = load_camera(camera) if camera else None
     cfa = cfa or (description.sensor.cfa if description else None)
     white = read_exposures(whites, cfa=cfa)

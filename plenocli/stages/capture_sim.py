@@ -48,7 +48,7 @@ def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scen
         raise UsageError("a DNG holds whole numbers of a sensor; --snr and --noise none give real numbers", output, "write .h5 or .exr")
     check_output(output, overwrite=overwrite, inputs=[camera_path, pif, scene])
     if scene_out:
-        check_output(scene_out, overwrite=overwrite, inputs=[camera_path, pif, scene])
+        check_output(scene_out, overwrite=overwrite, inputs=[camera_path, pif, scene], suffixes=(".h5", ".exr"))
     camera = load_camera(camera_path)
     _check_tiling(camera, camera_path)
     _check_memory(camera, settings, camera_path)
@@ -88,8 +88,8 @@ def _check_memory(camera, settings, where):
 
 def _source(camera, settings, scene):
     """(Quadrature of the light, scene) from --target and --scene."""
-    from plenocli.config import REFERENCE_REFLECTANCE, parse_length
-    from plenocli.config.units import UnitError
+    from plenocli.config import REFERENCE_REFLECTANCE
+    from plenocli.config.units import UnitError, parse_wavelength
     from plenocli.scene.tables import illuminant
     from plenocli.sensor.light import broadband, broadened, has_colour, narrow_band
 
@@ -103,7 +103,7 @@ def _source(camera, settings, scene):
         return white, read_scene(scene, sampling=settings.sampling, spectral=has_colour(camera))
     if target.startswith("mono:"):
         try:
-            centre = parse_length(target.removeprefix("mono:"))
+            centre = parse_wavelength(target.removeprefix("mono:"))
         except UnitError as error:
             raise UsageError(str(error), "--target", "write for example mono:450nm") from None
         return narrow_band(centre, settings.bandwidth), Uniform(REFERENCE_REFLECTANCE)

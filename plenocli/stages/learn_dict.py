@@ -42,7 +42,7 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
     from plenocli.solvers.linear import decompose
 
     files = files_of(images)
-    check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])])
+    check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])], suffixes=(".h5",))
     system = read_system(pif, settings.mem_limit)
     pictures = read_training(images, system.object_shape)
     training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))

@@ -44,8 +44,9 @@ def run_score(
 
     inputs = [*results, truth, *whites, patches, pif, capture]
     files = [path for path in inputs if path is not None and Path(path).is_file()]
-    for target in filter(None, (output, report)):
-        check_output(target, overwrite=overwrite, inputs=files)
+    for target, suffix in ((output, ".json"), (report, ".html")):
+        if target is not None:
+            check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
     if report is not None and Path(report) == Path(output):
         raise UsageError("--output and --report name the same file", output, "give the report another name, such as report.html")
     system = read_artefact(pif, "pif", mem_limit=mem_limit) if pif else None

@@ -36,7 +36,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     if not explain:
         if output is None:
             raise UsageError("no output file given", "--output", "write -o pif.h5, or --explain to see the plan only")
-        check_output(output, overwrite=overwrite, inputs=[camera_path])
+        check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
     camera = load_camera(camera_path)
     request = dict(wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
                    accuracy=settings.accuracy, dtype=np.dtype(settings.dtype))

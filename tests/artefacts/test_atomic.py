@@ -133,3 +133,11 @@ def test_read_only_folder_is_refused(tmp_path):
     folder.chmod(0o555)
     with pytest.raises(OutputError, match="read-only"):
         check_output(folder / "a")
+
+
+def test_names_that_cannot_be_and_suffixes_that_mislead(tmp_path):
+    with pytest.raises(OutputError, match="possible file name"):
+        check_output(tmp_path / ("y" * 246 + ".h5"))  # the temporary name beside it would be too long
+    with pytest.raises(UsageError, match="written as .h5"):
+        check_output(tmp_path / "camera.toml", overwrite=True, suffixes=(".h5",))
+    check_output(tmp_path / "pif.h5", suffixes=(".h5",))

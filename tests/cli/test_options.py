@@ -50,3 +50,10 @@ def test_json_has_no_nan_and_no_arrays(capsys):
 
     options.summary({"a": np.float64("nan"), "b": np.arange(2), "c": (1.5, None), "d": options.Path("x")}, True, "")
     assert capsys.readouterr().out == '{"a": null, "b": [0, 1], "c": [1.5, null], "d": "x"}\n'
+
+
+@pytest.mark.parametrize("kind, value", [(options.WAVELENGTH, "1e-308nm"), (options.WAVELENGTH, "1m"), (options.LENGTH, "1e308nm"), (options.DURATION, "1e308ms"), (options.DECIBEL, "1e308dB"), (options.POSITIVE, "1e-308"), (options.NON_NEGATIVE, "1e300"), (options.Pair("NUMBER", options.positive), "450nm=inf"), (options.Pair("NUMBER", options.positive), "450nm=0"), (options.FILE, "")])
+def test_values_that_would_overflow_later_are_refused(kind, value):
+    with pytest.raises(click.BadParameter):
+        kind.convert(value, None, None)
+    assert options.NON_NEGATIVE.convert("0", None, None) == 0

@@ -14,7 +14,7 @@ import numpy as np
 from plenocli import __version__
 from plenocli.artefacts.atomic import check_output, replacement
 from plenocli.artefacts.limits import require_room
-from plenocli.artefacts.provenance import require_file
+from plenocli.artefacts.provenance import first_bytes
 from plenocli.errors import InputError, OutputError
 
 DIGEST = "plenocli:sha256"
@@ -150,13 +150,7 @@ def _opened(path):
     import OpenImageIO as oiio
 
     path = Path(path)
-    require_file(path)
-    try:
-        with open(path, "rb") as stream:
-            magic = stream.read(4)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
-    if magic != _EXR_MAGIC:
+    if first_bytes(path, len(_EXR_MAGIC)) != _EXR_MAGIC:
         raise InputError("is not an EXR file", path, "give an .exr")
     try:
         source = oiio.ImageInput.open(str(path))

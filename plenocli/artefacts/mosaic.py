@@ -9,6 +9,7 @@ import numpy as np
 
 from plenocli.artefacts.exr import read_exr, write_exr
 from plenocli.artefacts.pictures import file_type, read_stored
+from plenocli.artefacts.provenance import first_bytes
 from plenocli.artefacts.raw import read_raw
 from plenocli.errors import InputError
 
@@ -72,10 +73,10 @@ def write_capture_exr(path, mosaic, description, *, attrs=None, overwrite=False)
 
 
 def is_hdf5(path):
+    """Whether the file at `path` is an artefact or another HDF5 file, by its first bytes. Raises InputError."""
     from plenocli.artefacts.container import HDF5_SIGNATURE, MAGIC
 
-    with open(path, "rb") as stream:
-        head = stream.read(1024)
+    head = first_bytes(path, 1024)
     return head.startswith(MAGIC) or HDF5_SIGNATURE in head
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from plenocli.artefacts.exr import oiio_error
 from plenocli.artefacts.limits import require_room
-from plenocli.artefacts.provenance import require_file
+from plenocli.artefacts.provenance import first_bytes
 from plenocli.errors import InputError
 
 _MAGIC = ((b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8\xff", "jpeg"), (b"II*\0", "tiff"), (b"MM\0*", "tiff"), (b"\x76\x2f\x31\x01", "exr"),
@@ -57,12 +57,7 @@ def srgb_to_linear(encoded):
 
 def file_type(path):
     """"png", "jpeg", "tiff", "exr" or None, by the first bytes. Raises InputError for what is no readable file."""
-    require_file(path)
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(8)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+    head = first_bytes(path, 8)
     return next((kind for magic, kind in _MAGIC if head.startswith(magic)), None)
 
 

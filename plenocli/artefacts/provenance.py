@@ -68,6 +68,16 @@ def file_digest(path):
         raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
 
 
+def first_bytes(path, count):
+    """The first `count` bytes of a file, or all of a shorter one. Raises InputError."""
+    require_file(path)
+    try:
+        with open(path, "rb") as stream:
+            return stream.read(count)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+
+
 def require_file(path):
     """Raise InputError, saying which, unless `path` is an existing, non-empty, ordinary file. Returns its size in bytes."""
     path = Path(path)

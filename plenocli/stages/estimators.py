@@ -7,6 +7,7 @@ import numpy as np
 from plenocli.errors import InputError, NumericsError
 from plenocli.stages.progress import note
 from plenocli.solvers.overlap import by_lenslet
+from plenocli.stages.seeds import stream
 from plenocli.stages.training import at_scales, read_training
 
 PATCHES_A_POINT = 6
@@ -250,7 +251,7 @@ class Estimators:
         pictures = self._training(scene)
         if ("statistics", scene) not in self._cache:
             count = PATCHES_A_POINT * self.system.own.shape[1]
-            patches = natural.draw_patches(pictures, self.system.object_shape, count, np.random.default_rng([self.settings.seed, 1]))
+            patches = natural.draw_patches(pictures, self.system.object_shape, count, stream(self.settings.seed, "reconstruct"))
             self._cache["statistics", scene] = natural.mean_covariance(patches)
         if ("lmmse", sigma, scene) not in self._cache:
             self._cache["lmmse", sigma, scene] = lmmse.prepare(self.svd, *self._cache["statistics", scene], sigma)

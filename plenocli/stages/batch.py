@@ -1,5 +1,6 @@
 """Several captures in one run: where each result goes, which are finished already, and what happens when some fail."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,16 +27,19 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
     from plenocli.artefacts import check_output
 
     captures, output = [Path(c) for c in captures], Path(output)
-    if len(captures) == 1 and not output.is_dir():
+    if len(captures) == 1 and not os.path.isdir(output):  # Path.is_dir raises where a name is too long
         if output.suffix not in (".exr", ".h5"):
             raise UsageError(f"{what} written as .exr or .h5, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
         check_output(output, overwrite=overwrite, inputs=inputs)
         jobs = [(captures[0], output)]
         return Batch(output, False, jobs, jobs)
-    if output.exists() and not output.is_dir():
+    if os.path.exists(output) and not os.path.isdir(output):
         raise OutputError("is a file; several captures go to a folder", output, "name a folder")
     targets = [output / (capture.stem + suffix) for capture in captures]
+    read = [i for i in inputs if i is not None and os.path.exists(i)]
     for target in targets:
+        if os.path.exists(target) and any(os.path.samefile(target, i) for i in read):
+            raise OutputError("is also an input of this command", target, "give another folder")
         same = [c for c, t in zip(captures, targets) if t == target]
         if len(same) > 1:
             raise UsageError(f"captures {', '.join(str(c) for c in same)} would all become {target.name}", fix="rename one, or use two folders")

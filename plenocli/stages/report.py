@@ -19,7 +19,7 @@ def run_report(folder, output, *, title=None, overwrite=False):
     """
     from plenocli.artefacts import check_output, publish
 
-    check_output(output, overwrite=overwrite)
+    check_output(output, overwrite=overwrite, suffixes=(".html",))
     run = RunFolder(folder)
     page = Page(title or f"plenocli report: {run.root.resolve().name}", "A plenoptic camera modelled end to end: what it captured, what was recovered, and how good that is.")
     scores = run.of_kind("score")

@@ -48,9 +48,9 @@ def test_help_lists_the_commands_in_the_order_of_the_pipeline(capfd):
     assert places == sorted(places) and "Exit codes" in out
 
 
-@pytest.mark.parametrize("arguments", [["score", "x" * 300, "--truth", "colorchecker", "-o", "OUT"], ["score", "a.h5", "--truth", "x" * 300, "-o", "OUT"], ["report", "x" * 300, "-o", "OUT"], ["inspect", "x" * 300]])
+@pytest.mark.parametrize("arguments", [["score", "x" * 300, "--truth", "colorchecker", "-o", "OUT"], ["score", "a.h5", "--truth", "x" * 300, "-o", "OUT"], ["report", "x" * 300, "-o", "OUT.html"], ["inspect", "x" * 300]])
 def test_names_that_no_file_system_takes_are_no_bugs(capfd, tmp_path, arguments):
-    assert boundary.run([str(tmp_path / "out.json") if a == "OUT" else a for a in arguments]) == 3
+    assert boundary.run([str(tmp_path / {"OUT": "out.json", "OUT.html": "out.html"}[a]) if a.startswith("OUT") else a for a in arguments]) == 3
     assert "name too long" in capfd.readouterr().err
 
 

@@ -165,3 +165,18 @@ def test_refusals(single, capsys, options, code, words):
     names = {"PIF": str(folder / "pif.h5"), "CAPTURE": str(folder / "capture.h5")}
     assert run(["reconstruct", names["CAPTURE"], "-o", str(folder / "never.h5"), *[names.get(o, o) for o in options]]) == code
     assert words in capsys.readouterr().err and not (folder / "never.h5").exists()
+
+
+@pytest.mark.parametrize("more", [[], ["--overwrite"]])
+def test_a_folder_of_captures_is_never_written_over_them(single, tmp_path, capsys, more):
+    folder, _ = single
+    copies = [tmp_path / f"{n}.h5" for n in "ab"]
+    for copy in copies:
+        copy.write_bytes((folder / "capture.h5").read_bytes())
+    assert run(["reconstruct", *map(str, copies), "--pif", str(folder / "pif.h5"), "--method", "tikhonov", "-o", str(tmp_path), *more]) == 4
+    assert "also an input" in capsys.readouterr().err and read_artefact(copies[0]).kind == "capture"
+
+
+def test_an_impossible_output_name_is_an_output_error(single):
+    folder, _ = single
+    assert run(["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "pif.h5"), "-o", str(folder / ("y" * 300 + ".h5"))]) == 4

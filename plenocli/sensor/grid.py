@@ -13,7 +13,7 @@ from plenocli.errors import InputError, NumericsError
 from plenocli.sensor import distortion, lattice, spots
 
 CLIP = 0.8  # of a spot's bright level; measured best on real white images, where spots have structure inside
-STRUCTURED = 0.3
+STRUCTURED = 0.2
 FRAME_TOLERANCE = 0.4  # px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
 FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
 

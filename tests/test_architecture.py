@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "plenocli"
-KERNELS = ("optics", "sensor", "scene", "operators", "solvers", "metrics")
+KERNELS = ("optics", "sensor", "scene", "operators", "solvers", "metrics", "accuracy")
 FILES = {"h5py", "click", "OpenImageIO", "OpenEXR", "rawpy", "exifread", "tqdm", "tifffile", "imageio", "PIL"}
 UPPER = {"plenocli.cli", "plenocli.stages", "plenocli.artefacts", "plenocli.report"}
 BUILD_ONLY = {PACKAGE / "scene" / "make_tables.py"}

@@ -9,12 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from plenocli.errors import NumericsError
-from plenocli.optics.fields import RoundLenslets, SquareLenslets
 from plenocli.optics.geometry import geometry
-from plenocli.optics.plan import plan_pif
-from plenocli.optics.psf import separable_field
-
-__all__ = ["Pif", "PifBuilder", "build_pif", "plan_pif"]
+from plenocli.optics.shaped import RoundLenslets
+from plenocli.optics.square import SquareLenslets
 
 BLOCK_BYTES = 1 << 28
 """Size of a block of columns while a matrix is filled."""
@@ -44,23 +41,20 @@ class PifBuilder:
     offsets: (superpixels, 2) rows and columns; symmetry: (flip rows, flip columns, transpose) that map columns onto columns.
     """
 
-    def __init__(self, camera, wavelength, *, superpixels="auto", coherent_ring="auto", accuracy=1e-4, dtype=np.float32, plan=None):
-        """Prepare `camera` (plenocli.config.Camera) at `wavelength` (m); arguments as plan_pif, or a `plan` made by it."""
-        plan = plan or plan_pif(camera, wavelengths=(wavelength,), superpixels=superpixels, coherent_ring=coherent_ring,
-                                accuracy=accuracy, dtype=dtype)
+    def __init__(self, camera, wavelength, plan, *, dtype=np.float32):
+        """Prepare `camera` (plenocli.config.Camera) at `wavelength` (m), one of those of the PifPlan `plan`."""
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength), np.dtype(dtype)
-        self.field = separable_field(camera, self.geometry, band.half, plan.tolerance)
-        maker = SquareLenslets if camera.lenslet_array.aperture_shape == "square" else RoundLenslets
-        self._lenslets = maker(self.geometry, self.field, plan.superpixels, band.window, band.lenslet_nodes, band.pixel_nodes,
-                               np.complex128 if plan.double else np.complex64)
+        self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
+        self.notes = self._lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
         self.points = self.object_shape[0] * self.object_shape[1]
         ry, rx = ((n - 1) // 2 for n in plan.superpixels)
         self.offsets = np.array([(r, c) for r in range(-ry, ry + 1) for c in range(-rx, rx + 1)])
         self.shape = (len(self.offsets), self.pixel_shape[0] * self.pixel_shape[1])
         turn = self.object_shape[0] == self.object_shape[1] and self.pixel_shape[0] == self.pixel_shape[1] and ry == rx
-        self.symmetry = (self.field.symmetry[0], self.field.symmetry[1], self.field.symmetry[2] and turn)
+        flips = self._lenslets.symmetry
+        self.symmetry = (flips[0], flips[1], flips[2] and turn)
 
     def columns(self, points):
         """A for object points `points` (flat indices or a slice): (superpixel, pixel, len(points)), a view that may not be contiguous.
@@ -137,22 +131,23 @@ class PifBuilder:
                 "ask for a finer accuracy and report this camera")
 
 
-def build_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="auto", accuracy=1e-4, dtype=np.float32, points=None,
-              progress=None):
-    """Compute the system matrix of `camera` (plenocli.config.Camera) as a Pif.
+def _maker(camera, plan):
+    """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
+    return SquareLenslets if camera.lenslet_array.aperture_shape == "square" else RoundLenslets
 
-    wavelengths: metres (default: camera.light.wavelengths); superpixels: "auto" or odd (rows, columns) whose rows are kept;
-    coherent_ring: "auto", 0 (isolated lenslets), 1 or 2 rings of lenslets whose fields add; accuracy: relative L2 error of a
-    column against the converged paraxial model; points: slice of flat point indices; progress: called as progress(done, total).
-    UsageError, ConfigError or NumericsError where the request cannot be met.
+
+def build_pif(camera, plan, *, points=None, progress=None):
+    """Compute the system matrix of `camera` (plenocli.config.Camera) as a Pif by a PifPlan (plenocli.accuracy.plan_pif).
+
+    points: slice of flat point indices, as planned; progress: called as progress(done, total). NumericsError where a column
+    holds more energy than entered the lenslets.
     """
-    plan = plan_pif(camera, wavelengths=wavelengths, superpixels=superpixels, coherent_ring=coherent_ring, accuracy=accuracy,
-                    dtype=dtype, points=points)
+    dtype = np.dtype(plan.dtype)
     A = np.empty(plan.shape, dtype)
     energy = np.empty((plan.shape[0], plan.shape[3]))
     tails, builder = [], None
     for b, band in enumerate(plan.bands):
-        builder = PifBuilder(camera, band.wavelength, dtype=dtype, plan=plan)
+        builder = PifBuilder(camera, band.wavelength, plan, dtype=dtype)
         done, columns = 0, np.empty((plan.shape[3], *plan.shape[1:3]), dtype)
         chosen = None if points is None else np.arange(builder.points)[points]
         source = builder.blocks() if points is None else _chunks(builder, chosen)
@@ -163,7 +158,7 @@ def build_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="au
                 progress(b * plan.shape[3] + done, plan.shape[0] * plan.shape[3])
         energy[b] = columns.sum(axis=(1, 2), dtype=float)
         A[b] = columns.transpose(1, 2, 0)
-        tails.append(builder.field.tail)
+        tails.append(builder.notes["field_tail"])
     return Pif(A, np.array([b.wavelength for b in plan.bands]), builder.offsets, builder.pixel_shape, builder.object_shape, energy,
                _notes(plan, builder, tails, energy))
 
@@ -178,14 +173,14 @@ def _chunks(builder, points):
 def _notes(plan, builder, tails, energy):
     g = builder.geometry
     return {
-        "model": "fresnel",
+        "model": plan.model,
         "coherent_ring": plan.coherent_ring,
         "superpixels": list(plan.superpixels),
         "accuracy": plan.accuracy,
         "estimated_accuracy": plan.estimated,
         "precision": "double" if plan.double else "single",
         "nodes": plan.nodes,
-        "separable_terms": builder.field.terms,
+        "separable_terms": builder.notes["separable_terms"],
         "field_tail": max(tails),
         "kappa": g.kappa,
         "eps": g.eps,

@@ -175,9 +175,9 @@ def _carry(camera, source, scene, settings, matrix):
 
 
 def _build(camera, wavelength, settings):
-    from plenocli.optics.pif import PifBuilder
+    from plenocli.accuracy import pif_builder
 
-    return PifBuilder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy)
+    return pif_builder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy)
 
 
 def _truth(camera, scene, grid, refine):

@@ -31,7 +31,8 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.config import load_camera
     from plenocli.optics.diagnose import describe
-    from plenocli.optics.pif import build_pif, plan_pif
+    from plenocli.accuracy import plan_pif
+    from plenocli.optics.pif import build_pif
 
     if not explain:
         if output is None:
@@ -52,7 +53,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     for warning in plan.warnings:
         note(warning)
     with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
-        pif = build_pif(camera, **request, progress=lambda done, total: progress.update(done - progress.n))
+        pif = build_pif(camera, plan, progress=lambda done, total: progress.update(done - progress.n))
     found = describe(pif)
     for warning in found["warnings"]:
         note(warning)

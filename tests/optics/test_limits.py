@@ -9,7 +9,7 @@ from scipy.special import j1, roots_legendre
 from plenocli.config import load_camera
 from plenocli.optics.diagnose import describe
 from plenocli.optics.geometry import geometry
-from plenocli.optics.pif import PifBuilder, build_pif
+from plenocli.accuracy import pif_builder, system_matrix
 from plenocli.optics.psf import sampled_field
 from tests.optics.cameras import WAVELENGTH, pupil_conjugate, small_camera
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
@@ -42,7 +42,7 @@ def test_kernel_and_matrix_are_those_of_the_reversed_system(change, ring):
     """Light that runs from the sensor back to the object meets the same kernel, quadratic phases included; its square,
     integrated over the pixels, is A."""
     camera = small_camera(main_lens__aperture_shape="square", object__samples_per_lenslet=(5, 5), **change)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=1e-8, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=1e-8, dtype=np.float64)
     window = builder.plan.bands[0].window or 0
     distances, lenses = square_system(camera, range(-window, window + 1))
     t, w = roots_legendre(12)
@@ -61,8 +61,8 @@ def test_kernel_and_matrix_are_those_of_the_reversed_system(change, ring):
 def test_field_on_the_sensor_is_the_kernel_with_its_phases():
     """What the model leaves out of its fields is exp(jk xi^2/(2 z1)) exp(jk t^2/(2 z3)) and one constant."""
     camera = small_camera(main_lens__aperture_shape="square", object__samples_per_lenslet=(5, 5), **BENT)
-    builder = PifBuilder(camera, WAVELENGTH, accuracy=1e-8, dtype=np.float64, **ISOLATED)
-    assert builder.field.terms == 1
+    builder = pif_builder(camera, WAVELENGTH, accuracy=1e-8, dtype=np.float64, **ISOLATED)
+    assert builder.notes["separable_terms"] == 1
     count = builder.plan.bands[0].pixel_nodes
     t, w = roots_legendre(count)
     sensor = (1e-6 * t[:, None] + (np.arange(13) - 6) * 2e-6).ravel()
@@ -101,7 +101,7 @@ def test_matrix_of_the_reversed_camera(pupil, lenslet):
     densities = []
     for camera, view in ((there, one), (back, other)):
         area = camera.main_lens.aperture_diameter**2 * (np.pi / 4 if camera.main_lens.aperture_shape == "circle" else 1)
-        matrix = build_pif(camera, accuracy=1e-8, dtype=np.float64, **ISOLATED).A[0, 0]
+        matrix = system_matrix(camera, accuracy=1e-8, dtype=np.float64, **ISOLATED).A[0, 0]
         densities.append(matrix * area / (WAVELENGTH * view.z1) ** 2 / view.pixel_active**2)
     # both images are inverted, so both numberings turn
     expected = densities[1].T[::-1, ::-1]
@@ -136,7 +136,7 @@ def test_distance_to_the_pupil_image_halves_with_the_wavelength():
     for wavelength in (1100e-9, 550e-9, 275e-9, 137.5e-9):
         camera = small_camera(sensor__distance=z3, sensor__pixel_pitch=0.5e-6, sensor__pixels_per_lenslet=(104, 104),
                               object__samples_per_lenslet=(1, 1), light__wavelengths=(wavelength,))
-        image = build_pif(camera, **ISOLATED).A[0, 0, :, 0].reshape(104, 104)
+        image = system_matrix(camera, **ISOLATED).A[0, 0, :, 0].reshape(104, 104)
         errors.append(np.abs(image - disc / disc.sum()).sum())
     ratios = np.array(errors[1:]) / errors[:-1]
     assert np.all((ratios > 0.45) & (ratios < 0.65)) and np.all(np.diff(ratios) < 0) and ratios[2] < 0.55 and errors[3] < 0.08
@@ -156,7 +156,7 @@ def test_a_twentieth_of_a_wave_restores_the_rank(shape):
                  sensor__distance=1 / (1 / 832e-6 - 1 / 55e-3), sensor__pixels_per_lenslet=(52, 52), object__samples_per_lenslet=(1, 40))
     found = []
     for distance in (0.55, twentieth_wave(6.875e-3 / 2)):
-        pif = build_pif(small_camera(object__distance=distance, **sizes), dtype=np.float64, accuracy=1e-8, **ISOLATED)
+        pif = system_matrix(small_camera(object__distance=distance, **sizes), dtype=np.float64, accuracy=1e-8, **ISOLATED)
         found.append(describe(pif))
     values = [f["singular_values"][0] / f["singular_values"][0][0] for f in found]
     assert values[0][19] > 1e-6 and values[0][20] < 1e-13 and values[1][39] > 1e-6
@@ -166,7 +166,7 @@ def test_a_twentieth_of_a_wave_restores_the_rank(shape):
 
 def test_a_twentieth_of_a_wave_restores_the_rank_of_a_square_of_points():
     z3 = pupil_conjugate(small_camera())
-    ranks = [describe(build_pif(small_camera(object__distance=z1, sensor__distance=z3), dtype=np.float64, accuracy=1e-8, **ISOLATED))["rank"][0]
+    ranks = [describe(system_matrix(small_camera(object__distance=z1, sensor__distance=z3), dtype=np.float64, accuracy=1e-8, **ISOLATED))["rank"][0]
              for z1 in (0.55, twentieth_wave(6.875e-3 / 2))]
     assert ranks == [32, 64]
 
@@ -195,10 +195,10 @@ def test_light_missing_from_a_lenslet_is_with_its_neighbours():
     places = [(view.points(0)[q // 40], view.points(1)[q % 40]) for q in points]
     blocks = {}
     for ring in (0, 1):
-        builder = PifBuilder(camera, wavelength, superpixels=(5, 5), coherent_ring=ring, accuracy=1e-3)
+        builder = pif_builder(camera, wavelength, superpixels=(5, 5), coherent_ring=ring, accuracy=1e-3)
         blocks[ring] = builder.columns(points).sum(1)
     airy = np.array([[airy_share(view, place, offset) for place in places] for offset in builder.offsets])
-    alone = PifBuilder(camera, wavelength, accuracy=1e-4, **ISOLATED).columns(points)[0].sum(0)
+    alone = pif_builder(camera, wavelength, accuracy=1e-4, **ISOLATED).columns(points)[0].sum(0)
     own = int(np.flatnonzero((builder.offsets == 0).all(1))[0])
     # a cut-off image of a point spreads beyond its superpixel: isolated lenslets hold less than they let in
     assert blocks[0][own] == pytest.approx(alone, abs=1e-4) and np.all(blocks[0] < airy * (1 + 1e-4))
@@ -269,7 +269,7 @@ def open_pupil(camera):
 
 def disagreement(camera, rng, ring, pupil):
     """Relative L2 difference of one random column of A from the brute-force integrals."""
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=1e-6, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=1e-6, dtype=np.float64)
     window, (rows, columns) = builder.plan.bands[0].window or 0, camera.object.samples_per_lenslet
     i, j = rng.integers(rows), rng.integers(columns)
     pitch = camera.lenslet_array.pitch

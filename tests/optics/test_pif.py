@@ -6,8 +6,9 @@ from scipy.special import j1, roots_legendre, sici
 
 from plenocli.errors import NumericsError, UsageError
 from plenocli.optics import pif as pif_module
+from plenocli.optics.pif import PifBuilder
 from plenocli.optics.diagnose import describe, singular_values
-from plenocli.optics.pif import PifBuilder, build_pif, plan_pif
+from plenocli.accuracy import pif_builder, plan_pif, system_matrix
 from tests.optics.cameras import WAVELENGTH, pupil_conjugate, small_camera
 
 ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
@@ -33,7 +34,7 @@ def test_lenslet_as_a_camera(shape):
     """A pinhole pupil far away lights the lenslet evenly: sinc^2 or the Airy pattern of the lenslet at its focus."""
     camera = small_camera(lenslet_array__aperture_shape=shape, main_lens__aperture_diameter=1e-4, lenslet_array__distance=5.0,
                           object__distance=5.0, main_lens__focal_length=2.5, object__samples_per_lenslet=(1, 1))
-    matrix = build_pif(camera, accuracy=1e-7, dtype=np.float64, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
+    matrix = system_matrix(camera, accuracy=1e-7, dtype=np.float64, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
     width, z3 = camera.lenslet_array.pitch, camera.sensor.distance
     # kappa = 1/z2 is a trace of curvature, 1e-4 rad across the lenslet
     if shape == "square":
@@ -52,7 +53,7 @@ def test_square_pupil_image_in_closed_form():
     """kappa = 0, on axis: U(t) = [Si(b(t + tp)) - Si(b(t - tp))]/pi per axis, b = pi D2/(lambda z3), tp = D1 z3/(2 z2)."""
     plain = small_camera(main_lens__aperture_shape="square", object__samples_per_lenslet=(1, 1))
     camera = small_camera(main_lens__aperture_shape="square", object__samples_per_lenslet=(1, 1), sensor__distance=pupil_conjugate(plain))
-    matrix = build_pif(camera, accuracy=1e-8, dtype=np.float64, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
+    matrix = system_matrix(camera, accuracy=1e-8, dtype=np.float64, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
     z2, z3, D1 = camera.lenslet_array.distance, camera.sensor.distance, camera.main_lens.aperture_diameter
     b, tp = np.pi * camera.lenslet_array.pitch / (WAVELENGTH * z3), D1 * z3 / (2 * z2)
     line = pixel_mean(lambda t: ((sici(b * (t + tp))[0] - sici(b * (t - tp))[0]) / np.pi) ** 2, camera) * z2 / (z3 * D1)
@@ -63,9 +64,9 @@ def test_pupil_image_is_inverted():
     """Light through the lower right filter lands in the upper left of the superpixel."""
     cells = [dict(center=c, fwhm=10e-9, peak=1.0, blocking=0.0) for c in (450e-9, 480e-9, 510e-9, 550e-9)]
     camera = small_camera(filter_array={"layout": (2, 2), "gap": 0.0, "filters": cells}, object__samples_per_lenslet=(1, 1))
-    image = build_pif(camera, wavelengths=(550e-9,), **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
+    image = system_matrix(camera, wavelengths=(550e-9,), **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
     assert image[:6, :6].sum() > 0.8 * image.sum()
-    upper_right = build_pif(camera, wavelengths=(480e-9,), **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
+    upper_right = system_matrix(camera, wavelengths=(480e-9,), **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
     assert upper_right[7:, :6].sum() > 0.8 * upper_right.sum()
 
 
@@ -79,7 +80,7 @@ def test_geometric_pupil_image_as_the_wavelength_shrinks():
     errors = []
     for wavelength in (550e-9, 275e-9, 137.5e-9):
         camera = small_camera(sensor__distance=z3, object__samples_per_lenslet=(1, 1), light__wavelengths=(wavelength,))
-        image = build_pif(camera, accuracy=1e-4, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
+        image = system_matrix(camera, accuracy=1e-4, **ISOLATED).A[0, 0, :, 0].reshape(13, 13)
         errors.append(np.abs(image - disc / disc.sum()).sum())
     assert errors[2] < 0.45 * errors[0] and errors[1] < 0.75 * errors[0] and errors[2] < 0.1
 
@@ -89,23 +90,23 @@ def test_half_of_the_object_is_invisible_at_the_pupil_conjugate():
     z3 = pupil_conjugate(small_camera())
     for shape, share in (("circle", 2), ("square", 4)):
         camera = small_camera(sensor__distance=z3, main_lens__aperture_shape=shape)
-        found = describe(build_pif(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED))
+        found = describe(system_matrix(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED))
         assert found["symmetry_defect"][0] < 1e-12 and found["rank"][0] <= 64 // share
         assert "half of the object is invisible" in found["warnings"][0]
-    broken = describe(build_pif(small_camera(), dtype=np.float64, accuracy=1e-6, **ISOLATED))
+    broken = describe(system_matrix(small_camera(), dtype=np.float64, accuracy=1e-6, **ISOLATED))
     assert broken["symmetry_defect"][0] > 0.01 and broken["rank"][0] > 48 and not broken["warnings"]
 
 
 @pytest.mark.parametrize("change", [{"object__distance": 0.545}, {"main_lens__aberrations": (dict(noll=8, coefficient=30e-9),)}], ids=str)
 def test_a_little_defocus_or_coma_makes_it_visible(change):
     camera = small_camera(sensor__distance=pupil_conjugate(small_camera()), **change)
-    assert describe(build_pif(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED))["symmetry_defect"][0] > 0.01
+    assert describe(system_matrix(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED))["symmetry_defect"][0] > 0.01
 
 
 def test_published_configuration():
     """Columns hold 0.98 of the light at the centre and 0.40 at the corner of the lenslet's field; the neighbours get the rest."""
     camera = seed_camera()
-    pif = build_pif(camera, dtype=np.float64, **ISOLATED)
+    pif = system_matrix(camera, dtype=np.float64, **ISOLATED)
     assert pif.A.shape == (1, 1, 2704, 1600) and pif.A.min() >= 0
     energy = pif.column_energy[0].reshape(40, 40)
     assert energy[20, 20] == pytest.approx(0.982, abs=1e-3) and energy[0, 0] == pytest.approx(0.402, abs=5e-3)
@@ -114,14 +115,14 @@ def test_published_configuration():
     # 106 above 60 dB and 1495 in all at a pupil distance of 52 mm, where one lenslet holds slightly more cells
     assert found["rank_60db"][0] == pytest.approx(105, abs=8) and found["rank"][0] == pytest.approx(1490, abs=40)
     assert found["symmetry_defect"][0] == pytest.approx(0.24, abs=0.05)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1, accuracy=1e-4)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1, accuracy=1e-4)
     corner, middle = builder.columns([0, 820]).sum(axis=(0, 1))
     assert 0.95 < corner < 1 and 0.99 < middle < 1
 
 
 def test_energy_is_bounded_by_what_enters():
     camera = small_camera(object__distance=0.53)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(5, 5), coherent_ring=1, accuracy=1e-6, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(5, 5), coherent_ring=1, accuracy=1e-6, dtype=np.float64)
     points = np.arange(0, 64, 9)
     sensor, entered = builder.columns(points).sum(axis=(0, 1)), builder._lenslets.incident(points // 8, points % 8)
     assert np.all(sensor <= entered * (1 + 1e-9)) and np.all(sensor > 0.97 * entered) and np.all(entered < 1)
@@ -133,7 +134,7 @@ def test_too_few_nodes_are_caught(monkeypatch):
     bad = plan.bands[0].__class__(**vars(plan.bands[0]) | {"lenslet_nodes": 12})
     broken = plan.__class__(**vars(plan) | {"bands": (bad,)})
     with pytest.raises(NumericsError, match="sampled too coarsely"):
-        PifBuilder(camera, WAVELENGTH, plan=broken).columns(slice(None))
+        PifBuilder(camera, WAVELENGTH, broken).columns(slice(None))
 
 
 @pytest.mark.parametrize("change", [
@@ -143,7 +144,7 @@ def test_too_few_nodes_are_caught(monkeypatch):
 ], ids=str)
 def test_blocks_by_symmetry_are_the_columns(change):
     camera = small_camera(**change)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=0, accuracy=1e-5, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=0, accuracy=1e-5, dtype=np.float64)
     whole, seen = builder.columns(slice(None)), []
     for points, block in builder.blocks(13):
         assert np.abs(block - whole[:, :, points]).max() < 2e-5 * whole.max()
@@ -153,7 +154,7 @@ def test_blocks_by_symmetry_are_the_columns(change):
 
 def test_object_points_are_numbered_in_image_orientation():
     """Points further down and right send more light to the lenslet below and to the right."""
-    pif = build_pif(small_camera(), superpixels=(3, 3), coherent_ring=1)
+    pif = system_matrix(small_camera(), superpixels=(3, 3), coherent_ring=1)
     energy = pif.A[0].sum(axis=1).reshape(3, 3, 8, 8)
     assert energy[1, 2, 3, 7] > 5 * energy[1, 2, 3, 0] and energy[2, 1, 7, 3] > 5 * energy[2, 1, 0, 3]
 
@@ -183,7 +184,7 @@ def test_defocus_disc_against_rays():
     for wavelength in (800e-9, 400e-9, 200e-9):
         camera = seed_camera(object__distance=0.46, object__samples_per_lenslet=(1, 1), light__wavelengths=(wavelength,),
                              sensor__pixel_pitch=8e-6, sensor__pixels_per_lenslet=(13, 13))
-        builder = PifBuilder(camera, wavelength, superpixels=(3, 3), coherent_ring=1, accuracy=1e-3)
+        builder = pif_builder(camera, wavelength, superpixels=(3, 3), coherent_ring=1, accuracy=1e-3)
         waves = builder.columns([0])[..., 0].reshape(3, 3, 13, 13)
         rays = ray_histogram(builder.geometry, 13)
         differences.append(0.5 * np.abs(waves - rays).sum())
@@ -193,8 +194,8 @@ def test_defocus_disc_against_rays():
 
 def test_each_wavelength_stands_alone():
     camera = small_camera(light__wavelengths=(500e-9, 600e-9), main_lens__glass="N-BK7")
-    both = build_pif(camera, superpixels=(1, 1), coherent_ring=1)
-    one = build_pif(camera, wavelengths=(600e-9,), superpixels=(1, 1), coherent_ring=1)
+    both = system_matrix(camera, superpixels=(1, 1), coherent_ring=1)
+    one = system_matrix(camera, wavelengths=(600e-9,), superpixels=(1, 1), coherent_ring=1)
     assert np.array_equal(both.A[1:], one.A) and both.wavelength.tolist() == [500e-9, 600e-9]
     assert np.abs(both.A[0] - both.A[1]).max() > 0.05 * both.A.max()
 
@@ -202,14 +203,14 @@ def test_each_wavelength_stands_alone():
 def test_the_matrix_varies_smoothly_with_wavelength():
     """Halving a spectral step changes the band average little: midpoint against the two quarter points of a 4 nm band."""
     camera = small_camera()
-    middle, low, high = (build_pif(camera, wavelengths=(w,), **ISOLATED).A for w in (550e-9, 549e-9, 551e-9))
+    middle, low, high = (system_matrix(camera, wavelengths=(w,), **ISOLATED).A for w in (550e-9, 549e-9, 551e-9))
     assert np.linalg.norm((low + high) / 2 - middle) < 1e-3 * np.linalg.norm(middle)
 
 
 def test_single_precision_and_slices():
     camera = small_camera()
-    double = build_pif(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED)
-    single = build_pif(camera, dtype=np.float32, accuracy=1e-4, points=slice(10, 30), **ISOLATED)
+    double = system_matrix(camera, dtype=np.float64, accuracy=1e-6, **ISOLATED)
+    single = system_matrix(camera, dtype=np.float32, accuracy=1e-4, points=slice(10, 30), **ISOLATED)
     assert single.A.dtype == np.float32 and single.A.shape == (1, 1, 169, 20)
     assert np.linalg.norm(single.A - double.A[..., 10:30]) < 1e-4 * np.linalg.norm(double.A[..., 10:30])
 
@@ -243,6 +244,6 @@ def test_singular_values_through_the_gram_matrix(monkeypatch):
 
 def test_progress_counts_every_column():
     calls = []
-    build_pif(small_camera(), progress=lambda done, total: calls.append((done, total)), **ISOLATED)
+    system_matrix(small_camera(), progress=lambda done, total: calls.append((done, total)), **ISOLATED)
     assert calls[-1] == (64, 64)
     assert pif_module.BLOCK_BYTES > 0

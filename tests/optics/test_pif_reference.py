@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from plenocli.optics.pif import PifBuilder
+from plenocli.accuracy import pif_builder
 from tests.optics.cameras import WAVELENGTH, small_camera
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 
@@ -19,7 +19,7 @@ def image_point(camera, index):
 
 def compare(camera, index, *, ring=0, accuracy=1e-6, lenslets=None, **oracle):
     """Relative L2 error of one column of A for the object's own superpixel."""
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=accuracy, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(1, 1), coherent_ring=ring, accuracy=accuracy, dtype=np.float64)
     column = builder.columns([index])[0, :, 0].reshape(camera.sensor.pixels_per_lenslet)
     truth = pixel_energies(camera, WAVELENGTH, image_point(camera, index), lenslets or (NEIGHBOURS if ring else ISOLATED), (0, 0), **oracle)
     return np.linalg.norm(column - truth) / np.linalg.norm(truth)
@@ -107,7 +107,7 @@ def test_whole_grid_of_superpixels_shifts_with_the_true_pitch(aperture):
     oracle = dict(lenslet_nodes=32, pupil_nodes=(24, 56))
     pitch, index = camera.lenslet_array.pitch, 12
     y, x = image_point(camera, index)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=0, accuracy=1e-6, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=0, accuracy=1e-6, dtype=np.float64)
     images = builder.columns([index])[..., 0].reshape(3, 3, 13, 13)
     moved = pixel_energies(camera, WAVELENGTH, (y, x + pitch), [(0, 1)], (0, camera.superpixel_pitch), **oracle)
     assert np.linalg.norm(moved - images[1, 1]) < 1e-6 * np.linalg.norm(moved)
@@ -121,7 +121,7 @@ def test_whole_grid_of_superpixels_shifts_with_the_true_pitch(aperture):
 
 def test_neighbouring_superpixels_out_of_focus_with_all_lenslets_of_the_window():
     camera = small_camera(object__distance=0.52)
-    builder = PifBuilder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1, accuracy=1e-6, dtype=np.float64)
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1, accuracy=1e-6, dtype=np.float64)
     assert builder.geometry.blur > 0.3 * camera.lenslet_array.pitch
     window = range(-builder.plan.bands[0].window, builder.plan.bands[0].window + 1)
     images = builder.columns([1])[..., 0].reshape(3, 3, 13, 13)

@@ -1,0 +1,48 @@
+"""From the field on the lenslet array to pixel energies: matrix transforms on quadrature nodes.
+
+In coordinates x' from a lenslet's centre and v from its superpixel's centre (which lies at D2 (1 + z3/z2) per lenslet),
+lenslet n of the neighbourhood contributes, per axis,
+
+    exp(j k [n^2 D2^2/2 (1/z2 + 1/z3) - n D2 v/z3]) / sqrt(lambda z3)
+      * integral of h(n D2 + x' - xp) exp(j k kappa x'^2/2) exp(-j k x' (v - n D2 (1 + z3/z2))/z3) dx'
+
+with kappa = 1/z2 + 1/z3 - 1/f2, the same for every lenslet. Fields of one object point add before the square is taken.
+Pixel energies are Gauss-Legendre sums over `nodes` points per axis; sub-nodes run slowest, so that summing them is adding
+whole planes.
+"""
+
+import numpy as np
+
+from plenocli.optics.quadrature import gauss
+
+
+def sensor_nodes(geometry, axis, count):
+    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel along `axis`: (count, pixels)."""
+    t, w = gauss(count)
+    half = geometry.pixel_active / 2
+    return half * t[:, None] + geometry.pixels(axis), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
+
+
+def lenslet_kernel(geometry, n, v, weight, x):
+    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and lenslet nodes x: (v, x)."""
+    g = geometry
+    relay = 1 / g.z2 + 1 / g.z3
+    phase = n * n * g.D2**2 / 2 * relay - n * g.D2 / g.z3 * v
+    phase = phase[:, None] + g.kappa / 2 * x * x - x * (v - n * g.superpixel_pitch)[:, None] / g.z3
+    return np.sqrt(weight / (g.wavelength * g.z3))[:, None] * np.exp(1j * g.k * phase)
+
+
+def lit_lenslets(reach, window):
+    """Lenslets (along one axis) whose light is followed: |m| <= window, or each superpixel's own where window is None."""
+    far = reach if window is None else window
+    return range(-far, far + 1)
+
+
+def pixel_energy(field):
+    """Sum |field|^2 over the sub-nodes of each pixel: (points, p, rows, p, columns) complex, weights included, overwritten."""
+    count, p, py, _, px = field.shape
+    parts = field.view(field.real.dtype).reshape(count, p, py, p, px, 2)
+    np.multiply(parts, parts, out=parts)
+    energy = parts[:, :, :, 0] if p == 1 else parts.sum(axis=3)
+    energy = energy.sum(axis=1)
+    return energy[..., 0] + energy[..., 1]

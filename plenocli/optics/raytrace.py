@@ -180,24 +180,25 @@ class Pupil:
     magnification: float
 
 
+_TELECENTRIC = Pupil(math.inf, math.inf, math.inf)
+
+
 def entrance_pupil(lens, wavelength):
     """The stop as seen from the object, a Pupil."""
     front = paraxial_matrix(lens.surfaces[: lens.stop], wavelength) if lens.stop else np.eye(2)
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
     gap = lens.surfaces[lens.stop - 1].thickness / n if lens.stop else 0.0
     (a, b), _ = np.array([[1.0, gap], [0.0, 1.0]]) @ front  # height at the stop = a y + b u of the ray at the first vertex
-    return _pupil(-b / a if a else math.inf, 1 / a if a else math.inf, lens.stop_radius) if abs(a) > 1e-12 else Pupil(math.inf, math.inf, math.inf)
+    return _TELECENTRIC if abs(a) < 1e-12 else _pupil(-b / a, 1 / a, lens.stop_radius)
 
 
 def exit_pupil(lens, wavelength):
     """The stop as seen from the image, a Pupil."""
     behind = lens.surfaces[lens.stop :]
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
-    (a, b), (c, d) = paraxial_matrix(behind, wavelength, n)
-    if abs(d) < 1e-12:
-        return Pupil(math.inf, math.inf, math.inf)
+    (_, b), (_, d) = paraxial_matrix(behind, wavelength, n)
     last = lens.surfaces[-1].medium.index(wavelength)
-    return _pupil(-b / d * last, a - b * c / d, lens.stop_radius)
+    return _TELECENTRIC if abs(d) < 1e-12 else _pupil(-b / d * last, 1 / d, lens.stop_radius)
 
 
 def _pupil(position, magnification, stop_radius):
@@ -220,15 +221,22 @@ def aim(lens, wavelength, points, *, angle=0.0, object_distance=math.inf, real=T
     if not real:
         return source.rays(start)
     chief = _chief(lens, wavelength, angle, object_distance)
-    aimed, ok = _solve(lens, wavelength, source, start + chief, target)
-    if not ok.all():  # a second try from nearer neighbours: pull the stop points out from the chief ray
-        shrunk, fine = start + chief, ok
-        for share in (0.25, 0.5, 0.75, 1.0):
-            guess = aimed_guess = chief + (shrunk - chief) * share if share == 0.25 else chief + (aimed_guess - chief) * (share / last)
-            aimed_guess, fine = _solve(lens, wavelength, source, guess, target * share)
-            last = share
-        aimed, ok = np.where(ok, aimed, aimed_guess), ok | fine
+    aimed, ok = _solve(lens, wavelength, source, chief + start, target)
+    if not ok.all():
+        walked, fine = _walk(lens, wavelength, source, chief, start, target)
+        aimed, ok = np.where(ok, aimed, walked), ok | fine
     return source.rays(np.where(ok, aimed, np.nan))
+
+
+def _walk(lens, wavelength, source, chief, start, target):
+    """`_solve` from the chief ray outwards in four steps, for strongly deformed pupils."""
+    at, before = chief + start / 4, None
+    for share in (0.25, 0.5, 0.75, 1.0):
+        if before is not None:
+            at = chief + (at - chief) * (share / before)
+        at, ok = _solve(lens, wavelength, source, at, target * share)
+        before = share
+    return at, ok
 
 
 class _Source:

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError, WithJsonSchema, model_validator
 
 from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
@@ -65,6 +66,25 @@ Unit = Annotated[float, Field(gt=0.0, le=1.0)]
 Pair = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
 
 
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
+ROW_SPACING = math.sqrt(3) / 2
+"""Spacing of the rows of a hexagonal lattice, in units of its pitch."""
+
+
+class Samples:
+    """Values on a square grid that a camera carries beside its description: float64, read-only; equal where the values are."""
+
+    def __init__(self, values):
+        self.values = np.array(values, float)
+        self.values.flags.writeable = False
+
+    def __eq__(self, other):
+        return isinstance(other, Samples) and np.array_equal(self.values, other.values)
+
+    def __hash__(self):
+        return hash(self.values.tobytes())
+
+
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -77,21 +97,43 @@ class Aberration(Section):
 
 
 class MainLens(Section):
+    """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files with values on a square
+    grid of cells over the square of side aperture_diameter: rows in the sense of the sensor's rows, downwards, looking
+    along the light. Their values are attached by Camera.attach; nothing here opens a file."""
+
     focal_length: Length
     aperture_diameter: Length | None = None
     f_number: Annotated[float, Field(gt=0.1, le=1000)] | None = None
-    aperture_shape: Literal["circle", "square", "annulus"] = "circle"
+    aperture_shape: Literal["circle", "square", "annulus", "image"] | None = None
+    aperture_image: FileName | None = None
     obscuration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     glass: str = "none"
     aberrations: tuple[Aberration, ...] = ()
+    wavefront: FileName | None = None
+    _samples: dict = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_aperture(self):
         if (self.aperture_diameter is None) == (self.f_number is None):
             raise ValueError("give exactly one of aperture_diameter and f_number")
+        if self.aperture_shape is None:
+            self.__dict__["aperture_shape"] = "circle" if self.aperture_image is None else "image"
+        if (self.aperture_shape == "image") != (self.aperture_image is not None):
+            raise ValueError("aperture_image is the whole aperture: it goes with aperture_shape = \"image\" (or none), and only with it")
         if (self.aperture_shape == "annulus") != (self.obscuration > 0):
             raise ValueError("obscuration (above 0) goes with aperture_shape = \"annulus\", and only with it")
         return self
+
+    def samples(self, name):
+        """Values (rows, columns) of the file that key `name` ("aperture_image" or "wavefront") names; None where it names none.
+
+        ConfigError where they have not been attached.
+        """
+        if getattr(self, name) is None:
+            return None
+        if name not in self._samples:
+            raise ConfigError(f"the values of {getattr(self, name)!r} are missing", f"main_lens.{name}", "read the camera from its file")
+        return self._samples[name].values
 
 
 class Object(Section):
@@ -106,7 +148,7 @@ class LensletArray(Section):
     focal_length: Length
     glass: str = "none"
     lattice: Literal["square", "hexagonal"] = "square"
-    aperture_shape: Literal["square", "circle"] = "square"
+    aperture_shape: Literal["square", "circle", "hexagon"] | None = None
     fill_factor: Unit = 1.0
     count: Pair = (11, 11)
 
@@ -114,7 +156,17 @@ class LensletArray(Section):
     def _one_pitch(self):
         if (self.pitch is None) == (self.superpixel_pitch is None):
             raise ValueError("give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)")
+        if self.aperture_shape is None:
+            self.__dict__["aperture_shape"] = "square" if self.lattice == "square" else "hexagon"
+        other = {"square": "hexagon", "hexagonal": "square"}[self.lattice]
+        if self.aperture_shape == other and self.fill_factor > ROW_SPACING:
+            raise ValueError(f"lenslets of aperture_shape = \"{other}\" overlap on a {self.lattice} lattice where fill_factor is above {ROW_SPACING:.4f}")
         return self
+
+    @property
+    def row_spacing(self):
+        """Distance of neighbouring rows of lenslets over the pitch: 1, or sqrt(3)/2 on a hexagonal lattice."""
+        return ROW_SPACING if self.lattice == "hexagonal" else 1.0
 
 
 class Sensor(Section):
@@ -219,9 +271,10 @@ class Camera(Section):
 
     @property
     def pixel_mismatch(self):
-        """(rows, columns): superpixel pitch in pixels minus pixels_per_lenslet; zero when superpixels tile whole pixels."""
+        """(rows, columns): spacing of superpixels in pixels minus pixels_per_lenslet; zero when they tile whole pixels."""
         pitch = self.superpixel_pitch / self.sensor.pixel_pitch
-        return tuple(pitch - n for n in self.sensor.pixels_per_lenslet)
+        rows, columns = self.sensor.pixels_per_lenslet
+        return pitch * self.lenslet_array.row_spacing - rows, pitch - columns
 
     @property
     def text(self):
@@ -235,9 +288,52 @@ class Camera(Section):
             section, key = path.split(".")
             data[section][key] = value
         try:
-            return Camera.model_validate(data, context={"si": True})
+            changed = Camera.model_validate(data, context={"si": True})
         except ValidationError as error:
             raise _violations(error, "camera") from None
+        kept = {name: old for name, old in self.main_lens._samples.items() if getattr(changed.main_lens, name) == getattr(self.main_lens, name)}
+        return changed.attach(**{name: old.values for name, old in kept.items()})
+
+    def attach(self, **samples):
+        """A camera that carries the values of its files: attach(aperture_image=..., wavefront=...), square arrays of floats.
+
+        aperture_image: intensity transmittance 0..1; wavefront: m, positive for phase advance, at least 4 x 4. ConfigError for
+        keys that the description does not have and for values that cannot be.
+        """
+        lens = self.main_lens.model_copy()
+        lens._samples = dict(lens._samples)
+        for name, values in samples.items():
+            where = f"main_lens.{name}"
+            if name not in ("aperture_image", "wavefront") or getattr(lens, name) is None:
+                raise ConfigError("names no file, so that values cannot belong to it", where)
+            trouble = _trouble(name, np.asarray(values))
+            if trouble:
+                raise ConfigError(trouble, where)
+            lens._samples[name] = Samples(values)
+        return self.model_copy(update={"main_lens": lens})
+
+
+MAX_SAMPLES = 1024
+"""Largest side of an aperture image or a wavefront grid."""
+MAX_WAVEFRONT = 1e-3
+"""Largest wavefront error, m."""
+
+
+def _trouble(name, values):
+    """Why values cannot be an aperture image or a wavefront, in words; None where they can."""
+    if values.ndim != 2 or values.shape[0] != values.shape[1] or values.dtype.kind not in "biuf":
+        return f"must be a square grid of numbers, not of shape {values.shape}"
+    least = 4 if name == "wavefront" else 1
+    if not least <= len(values) <= MAX_SAMPLES:
+        return f"must have {least} to {MAX_SAMPLES} values a side, not {len(values)}"
+    if not np.isfinite(values).all():
+        return f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite"
+    low, high = float(values.min()), float(values.max())
+    if name == "wavefront":
+        return None if max(-low, high) <= MAX_WAVEFRONT else f"holds {max(-low, high):g} m; a wavefront error is at most {MAX_WAVEFRONT:g} m"
+    if low < 0 or high > 1:
+        return f"holds values from {low:g} to {high:g}; an intensity transmittance lies within 0 ... 1"
+    return None if high > 0 else "lets no light through: all values are 0"
 
 
 def load_camera(path):

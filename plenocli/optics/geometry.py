@@ -91,6 +91,8 @@ def geometry(camera, wavelength):
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     if array.lattice != "square":
         raise ConfigError("the wave model knows square lattices only", "lenslet_array.lattice", 'use lattice = "square"')
+    if array.aperture_shape == "hexagon" or lens.aperture_shape == "image" or lens.wavefront:
+        raise ConfigError("hexagonal lenslets and pupils given as files are not computed yet", "camera", "use other shapes")
     design = camera.light.design_wavelength or wavelength
     return Geometry(
         wavelength=wavelength,

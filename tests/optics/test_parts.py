@@ -40,9 +40,11 @@ def test_wavelength_moves_both_focal_lengths():
     assert view.kappa == pytest.approx(1 / view.z2 + 1 / view.z3 - 1 / view.f2)
 
 
-def test_lattices_that_are_not_modelled_are_refused():
-    with pytest.raises(ConfigError, match="square lattices"):
-        geometry(small_camera(lenslet_array__lattice="hexagonal"), WAVELENGTH)
+@pytest.mark.parametrize("lattice, shape", [("hexagonal", "square"), ("square", "hexagon")])
+def test_lenslets_that_overlap_are_refused(lattice, shape):
+    with pytest.raises(ValueError, match="overlap"):
+        small_camera(lenslet_array__lattice=lattice, lenslet_array__aperture_shape=shape)
+    small_camera(lenslet_array__lattice=lattice, lenslet_array__aperture_shape=shape, lenslet_array__fill_factor=0.86)
 
 
 def test_disc_rows_give_the_airy_amplitude():

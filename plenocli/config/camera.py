@@ -99,7 +99,11 @@ class Aberration(Section):
 class MainLens(Section):
     """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files with values on a square
     grid of cells over the square of side aperture_diameter: rows in the sense of the sensor's rows, downwards, looking
-    along the light. Their values are attached by Camera.attach; nothing here opens a file."""
+    along the light. Their values are attached by Camera.attach; nothing here opens a file.
+
+    apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps Abbe's sine condition, as
+    lenses corrected over a field do), "uniform-pupil" (an evenly lit plane aperture) or "uniform-sine" (even in direction
+    cosines, which gives Airy's pattern)."""
 
     focal_length: Length
     aperture_diameter: Length | None = None
@@ -109,6 +113,7 @@ class MainLens(Section):
     obscuration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     glass: str = "none"
     aberrations: tuple[Aberration, ...] = ()
+    apodisation: Literal["aplanatic", "uniform-pupil", "uniform-sine"] = "aplanatic"
     wavefront: FileName | None = None
     _samples: dict = PrivateAttr(default_factory=dict)
 
@@ -142,6 +147,9 @@ class Object(Section):
 
 
 class LensletArray(Section):
+    """The lenslets. profile: their phase in the exact model, "hyperbolic" (a plane wave comes to a point at the focal length)
+    or "parabolic" (the paraxial phase, which leaves spherical aberration)."""
+
     distance: Length
     pitch: Length | None = None
     superpixel_pitch: Length | None = None
@@ -150,6 +158,7 @@ class LensletArray(Section):
     lattice: Literal["square", "hexagonal"] = "square"
     aperture_shape: Literal["square", "circle", "hexagon"] | None = None
     fill_factor: Unit = 1.0
+    profile: Literal["hyperbolic", "parabolic"] = "hyperbolic"
     count: Pair = (11, 11)
 
     @model_validator(mode="after")

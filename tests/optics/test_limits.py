@@ -69,7 +69,7 @@ def test_field_on_the_sensor_is_the_kernel_with_its_phases():
     distances, lenses = square_system(camera, (0,))
     start, k = object_points(camera), 2 * np.pi / WAVELENGTH
     backward = coherent_kernel(sensor, start, WAVELENGTH, distances[::-1], lenses[::-1], (90, 130)).T * np.repeat(np.sqrt(w), 13)[:, None]
-    field = builder._lenslets.tables[1][0, :, :, 0].T
+    field = builder._lenslets.wide[0, :, :, 0].T
     field = field * np.exp(0.5j * k * (start**2 / distances[0] + sensor[:, None] ** 2 / distances[2]))
     strongest = np.unravel_index(np.abs(backward).argmax(), backward.shape)
     assert np.abs(field / field[strongest] - backward / backward[strongest]).max() < 1e-8

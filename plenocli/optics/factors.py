@@ -1,0 +1,65 @@
+"""From factor tables to pixel energies: the inner loop of every rung whose sensor field is a short sum of products.
+
+The field of the point (row r, column c) on superpixel (sy, sx) is
+
+    U[v, u] = sum_j high[sy, r, v, j] wide[sx, c, u, j]
+
+on quadrature nodes v, u of the pixels, so all fields of an object column are one matrix product. The product is made in
+pieces that stay in the cache, real and imaginary parts side by side, and is squared and summed over the nodes of each
+pixel before it leaves it.
+"""
+
+import numpy as np
+
+WORK_BYTES = 3 << 18
+"""Size of the product before it is squared: about what a core's own cache holds beside the factors."""
+
+
+class Factors:
+    """Pixel energies from factor tables.
+
+    high: (superpixel rows, point rows, nodes x pixel rows, terms), wide: (superpixel columns, point columns, nodes x pixel
+    columns, terms), both complex and of one type; the nodes of a pixel run slowest along v and u (as relay.sensor_nodes
+    orders them), square roots of the quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel
+    is the share of the light that it receives. pixel_shape: (rows, columns); pixel_nodes: nodes per axis.
+    """
+
+    def __init__(self, high, wide, pixel_shape, pixel_nodes):
+        if high.shape[2] != pixel_nodes * pixel_shape[0] or wide.shape[2] != pixel_nodes * pixel_shape[1] or high.shape[3] != wide.shape[3]:
+            raise ValueError(f"tables {high.shape} and {wide.shape} do not fit {pixel_nodes} nodes in pixels {pixel_shape}")
+        self.high, self.wide = np.ascontiguousarray(high), np.ascontiguousarray(wide, dtype=high.dtype)
+        self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
+
+    def columns(self, rows, columns, out):
+        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows, superpixel columns, pixel rows, pixel columns)."""
+        real = self.high.real.dtype
+        terms, lines = self.high.shape[3], self.high.shape[2]
+        step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
+        work = np.empty((step * lines, 2 * self.wide.shape[2]), real)
+        order = np.argsort(columns, kind="stable")
+        starts = np.flatnonzero(np.r_[True, np.diff(columns[order]) > 0])
+        for group in np.split(order, starts[1:]):
+            for sx in range(self.wide.shape[0]):
+                right = _real_form(self.wide[sx, columns[group[0]]])
+                for start in range(0, len(group), step):
+                    part = group[start:start + step]
+                    for sy in range(self.high.shape[0]):
+                        left = self.high[sy, rows[part]].view(real).reshape(-1, 2 * terms)
+                        product = np.matmul(left, right, out=work[:len(left)])
+                        out[part, sy, sx] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
+
+    def _energy(self, parts):
+        """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part, node, pixel column)) real."""
+        (py, px), p = self.pixel_shape, self.pixel_nodes
+        lines = np.einsum("nqk,nqk->nk", parts, parts)
+        return lines.reshape(len(parts), py, 2 * p, px).sum(axis=2)
+
+
+def _real_form(factor):
+    """(node, term) complex as the right-hand side of a real product: (term x (real, imaginary), (real, imaginary) x node)."""
+    turned = factor.T
+    right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
+    right[:, 0, 0] = right[:, 1, 1] = turned.real
+    right[:, 0, 1] = turned.imag
+    np.negative(turned.imag, out=right[:, 1, 0])
+    return right.reshape(2 * len(turned), -1)

@@ -203,16 +203,38 @@ class Sensor(Section):
         return self
 
 
-class Light(Section):
-    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full well in `white_exposure`."""
+class Band(Section):
+    """A band of light around `center`, `fwhm` wide: photons per wavelength fall off as a Gaussian or are constant (box)."""
 
-    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)]
+    center: Wavelength
+    fwhm: Length
+    shape: Literal["gaussian", "box"] = "gaussian"
+
+    @model_validator(mode="after")
+    def _narrow(self):
+        if self.fwhm > self.center / 2:
+            raise ValueError(f"fwhm {format_length(self.fwhm)} is more than half of the centre, {format_length(self.center)}: give several bands' wavelengths instead")
+        return self
+
+
+class Light(Section):
+    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full well in `white_exposure`.
+
+    Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths` resolves to its centre.
+    """
+
+    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)] | None = None
+    band: Band | None = None
     design_wavelength: Wavelength | None = None
     illuminant: str = "D65"
     white_exposure: Duration = 0.01
 
     @model_validator(mode="after")
     def _ascending(self):
+        if self.band is not None and self.wavelengths is None:
+            self.__dict__["wavelengths"] = (self.band.center,)
+        if self.wavelengths is None or (self.band is not None and self.wavelengths != (self.band.center,)):
+            raise ValueError("give exactly one of wavelengths and band")
         if any(b <= a for a, b in zip(self.wavelengths, self.wavelengths[1:])):
             raise ValueError("wavelengths must ascend without repetition")
         return self

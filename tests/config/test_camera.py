@@ -88,3 +88,22 @@ def test_files_that_are_no_description(tmp_path):
 
 def test_schema_names_every_section():
     assert {"main_lens", "object", "lenslet_array", "sensor", "light", "filter_array"} <= set(camera_schema()["properties"])
+
+
+@pytest.mark.parametrize("shape", ["", ', shape = "box"'])
+def test_a_band_of_light_instead_of_lines(shape):
+    text = TINY.replace('wavelengths = ["550 nm"]', f'band = {{ center = "550 nm", fwhm = "10 nm"{shape} }}')
+    camera = parse_camera(text)
+    assert camera.light.wavelengths == (550e-9,) and camera.light.band.fwhm == 10e-9 and camera.light.design_wavelength == 550e-9
+    assert camera.light.band.shape == ("box" if shape else "gaussian")
+    assert parse_camera(camera.text) == camera
+
+
+@pytest.mark.parametrize("light, words", [
+    ('wavelengths = ["540 nm"]\nband = { center = "550 nm", fwhm = "10 nm" }', "exactly one of wavelengths and band"),
+    ('illuminant = "D65"', "exactly one of wavelengths and band"),
+    ('band = { center = "550 nm", fwhm = "300 nm" }', "more than half of the centre"),
+])
+def test_bands_that_cannot_be(light, words):
+    with pytest.raises(ConfigError, match=words):
+        parse_camera(TINY.replace('wavelengths = ["550 nm"]', light))

@@ -30,11 +30,11 @@ all: $(RUN)/report.html
 
 # the paper's matrix: one isolated lenslet
 $(RUN)/pif.h5: $(CONFIG) | $(RUN)
-	$(P) simulate-pif $< --superpixels 1x1 --coherent-ring 0 --accuracy 1e-5 -o $@ --overwrite
+	$(P) simulate-pif $< --model fresnel --superpixels 1x1 --coherent-ring 0 --accuracy 1e-5 -o $@ --overwrite
 
 # the same lenslet among its neighbours, with the light that it sends to them
 $(RUN)/pif-3x3.h5: $(CONFIG) | $(RUN)
-	$(P) simulate-pif $< --superpixels 3x3 --coherent-ring 1 --accuracy 1e-3 -o $@ --overwrite
+	$(P) simulate-pif $< --model fresnel --superpixels 3x3 --coherent-ring 1 --accuracy 1e-3 -o $@ --overwrite
 
 $(RUN)/paper/capture.h5: $(CONFIG) $(RUN)/pif.h5 | $(RUN)/paper/
 	$(P) capture-sim $< --pif $(RUN)/pif.h5 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 1 -o $@ --overwrite

@@ -21,7 +21,7 @@ all: $(RUN)/report.html
 
 # every wavelength that white light brings, once for all captures
 $(RUN)/pif.h5: $(CONFIG) | $(RUN)
-	$(P) simulate-pif $< --spectral-step auto --superpixels $(SUPERPIXELS) --accuracy 1e-3 -o $@ --overwrite
+	$(P) simulate-pif $< --model fresnel --spectral-step auto --superpixels $(SUPERPIXELS) --accuracy 1e-3 -o $@ --overwrite
 
 $(RAW)/white.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target white --exposure $(LONG) --seed 1 -o $@

@@ -1,60 +1,216 @@
-"""The dial: which computation of a system matrix meets the accuracy asked for at the least cost."""
+"""The dial: which computation of a system matrix meets the accuracy asked for at the least cost (docs/model.md)."""
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.accuracy.needs import seen_wavelengths, sensor_noise, visible_accuracy
+from plenocli.accuracy.rates import NOMINAL, product_rate
+from plenocli.accuracy.rungs import RUNGS
 from plenocli.errors import NumericsError, UsageError
 from plenocli.optics.geometry import geometry
-from plenocli.optics.plan import PifPlan, blur_ring, coherent_window, predicted_outside, size_band, window_error
+from plenocli.optics.plan import PifPlan, blur_ring, predicted_outside, window_error
 
 BEST_ACCURACY = 1e-8
-"""Finest accuracy on offer: two rings of neighbours and double precision."""
+"""Finest sampling on offer: double precision."""
+MODELS = ("auto", "ray", "fresnel", "exact")
+MAX_RING = 6
+"""Rings of coherent neighbours that the dial adds by itself."""
+SINGLE_LIMIT = 1e-5
+"""Single precision serves sampling errors down to this."""
+SHARE = 0.2
+"""Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
 
 
-def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="auto", accuracy=1e-4, dtype=np.float32, points=None):
+@dataclass(frozen=True)
+class Candidate:
+    """One rung as it was considered. `why`: why it was not chosen (None: it was); split: error by its source; rings and bands as
+    PifPlan; seconds: of one core at nominal rates; bytes: result and work."""
+
+    name: str
+    model: str
+    why: str | None
+    error: float = math.inf
+    split: dict | None = None
+    ring: int = 0
+    sampling: float = 0.0
+    double: bool = False
+    bands: tuple = ()
+    operations: float = 0.0
+    fixed_seconds: float = 0.0
+    bytes: int = 0
+
+    def seconds(self, rate=None):
+        """Seconds of one core, at the nominal rate or at `rate` (a function of `double`)."""
+        return self.operations / (rate(self.double) if rate else NOMINAL[self.double]) + self.fixed_seconds
+
+
+def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="auto", accuracy=None, model="auto", dtype="auto", points=None,
+             needs=None):
     """Choose how to compute the system matrix of `camera`; no optics is computed.
 
-    wavelengths: metres (default: the camera's); superpixels: "auto" or odd (rows, columns); coherent_ring: "auto", 0, 1 or 2;
-    accuracy: relative L2 error of each column against the converged paraxial model. Returns a PifPlan; UsageError or
-    NumericsError where the request cannot be met.
+    wavelengths: metres (default: the camera's); superpixels: "auto" or odd (rows, columns); coherent_ring: "auto" or a number of
+    rings (0: isolated lenslets); accuracy: relative L2 error of the worst column, against the finest model for model "auto" and
+    within the model where one is named; None takes what the noise of the sensor or of the scene lets be seen, or the best
+    there is; dtype: "auto", float32 or float64 of the stored matrix; points: slice of flat point indices; needs: a Needs that
+    narrows the request. Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
     """
-    wavelengths = tuple(wavelengths or camera.light.wavelengths)
-    if not BEST_ACCURACY <= accuracy < 1:
-        raise NumericsError(f"accuracy {accuracy:g} cannot be reached", "accuracy", f"ask for {BEST_ACCURACY:g} to below 1")
-    views = [geometry(camera, w) for w in wavelengths]
-    reasons, warnings = [], []
-    grid = _superpixels(superpixels, views, accuracy, reasons)
-    ring = _ring(coherent_ring, views, grid, accuracy, reasons, warnings)
-    tolerance = accuracy / 2
-    bands = tuple(size_band(view, grid, ring, accuracy, tolerance) for view in views)
-    double = np.dtype(dtype) == np.float64 or accuracy < 1e-5
-    reasons.append(f"{'double' if double else 'single'} precision: rounding stays below the accuracy asked for")
-    _check(views, grid, warnings)
-    count = int(np.prod(views[0].object_shape)) if points is None else len(range(*points.indices(int(np.prod(views[0].object_shape)))))
-    shape = (len(bands), grid[0] * grid[1], int(np.prod(views[0].pixel_shape)), count)
-    seconds = sum(_seconds(b, views[0], shape, double, camera.lenslet_array.aperture_shape) for b in bands)
-    nodes = {"lenslet": [b.lenslet_nodes for b in bands], "pixel": [b.pixel_nodes for b in bands], "psf": [b.psf_nodes for b in bands]}
-    return PifPlan("fresnel", grid, ring, accuracy, tolerance, double, bands, shape, seconds, int(np.prod(shape)) * np.dtype(dtype).itemsize,
-                   tuple(reasons), tuple(warnings), nodes,
-                   math.hypot(0.5 * accuracy, max(window_error(v, grid, ring) for v in views)), np.dtype(dtype).name)
+    request = _Request(camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs)
+    found = [_consider(request, rung) for rung in RUNGS if model in ("auto", rung.model)]
+    best = _cheapest(found)
+    if best is None:
+        request, found, best = _fall_back(request, found)
+    return _plan(request, found, best)
 
 
-def _ring(asked, views, grid, accuracy, reasons, warnings):
-    """Rings of lenslets beyond the superpixels kept and beyond the blur whose fields add."""
-    if asked not in ("auto", 0, 1, 2):
-        raise UsageError(f"coherent ring {asked!r} is not auto, 0, 1 or 2", "coherent_ring")
-    if asked == 0:
-        reasons.append("isolated lenslets as asked: light of neighbours is left out")
-        return 0
-    rings = (1, 2) if asked == "auto" else (asked,)
-    errors = {ring: max(window_error(v, grid, ring) for v in views) for ring in rings}
-    ring = next((r for r in rings if errors[r] <= accuracy), rings[-1])
-    reasons.append(f"{ring} ring(s) of neighbour lenslets join coherently{'' if asked == 'auto' else ' as asked'}: "
-                   f"what lies further out changes a column by about {errors[ring]:.1g}")
-    if errors[ring] > accuracy:
-        warnings.append(f"lenslets beyond the coherent window change columns by about {errors[ring]:.1g}, more than the accuracy {accuracy:g}")
-    return ring
+class _Request:
+    """What was asked, narrowed to what the scene needs, with the geometry at each wavelength."""
+
+    def __init__(self, camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs):
+        if model not in MODELS:
+            raise UsageError(f"model {model!r} is not one of {', '.join(MODELS)}", "model")
+        if coherent_ring != "auto" and not (isinstance(coherent_ring, int) and 0 <= coherent_ring <= 20):
+            raise UsageError(f"coherent ring {coherent_ring!r} is not auto or a whole number from 0 to 20", "coherent_ring")
+        if accuracy is not None and not BEST_ACCURACY <= accuracy < 1:
+            raise NumericsError(f"accuracy {accuracy:g} cannot be reached", "accuracy", f"ask for {BEST_ACCURACY:g} to below 1")
+        self.camera, self.model, self.needs, self.points = camera, model, needs, points
+        self.reasons, self.left_out, self.warnings = [], [], []
+        kept, dropped = seen_wavelengths(wavelengths or camera.light.wavelengths, needs)
+        if dropped:
+            self.left_out.append(f"{len(dropped)} wavelength(s) without light in the scene: no error")
+        self.views = [geometry(camera, w) for w in kept]
+        self.explicit = accuracy is not None
+        self.accuracy, self.asked_by = self._accuracy(accuracy)
+        self.dtype = np.dtype((np.float32 if self.accuracy >= 1e-6 else np.float64) if isinstance(dtype, str) and dtype == "auto" else dtype)
+        self.depths = self._depths()
+        self.grid = _superpixels(superpixels, self.depths, self.accuracy, self.reasons)
+        self.rings = self._rings(coherent_ring)
+        if needs is not None and needs.lenslets is not None:
+            total, lit = int(np.prod(camera.lenslet_array.count)), int(np.prod(needs.lenslets))
+            if lit < total:
+                self.left_out.append(f"{total - lit} of {total} lenslets see no light of the scene: no error")
+
+    def _accuracy(self, asked):
+        noise, who = (sensor_noise(self.camera), "sensor noise") if self.needs is None or self.needs.noise is None else (self.needs.noise, f"noise of the {self.needs.source}")
+        seen = visible_accuracy(noise)
+        if asked is None:
+            self.reasons.append(f"accuracy {seen:.2g}: {who} is {noise:.2g} of the signal, and a third of that cannot be seen beside it")
+            return seen, who
+        if self.needs is not None and self.needs.noise is not None and seen > asked:
+            self.left_out.append(f"accuracy beyond {seen:.2g} ({asked:g} asked): the {who} is {noise:.2g} of the signal and hides it")
+            return seen, who
+        return asked, "request"
+
+    def _depths(self):
+        """The geometries that size the neighbourhood: those of the camera, or at both ends of the scene's depth."""
+        if self.needs is None or self.needs.depth is None:
+            return self.views
+        ends = [replace(view, z1=z) for view in self.views for z in self.needs.depth]
+        self.reasons.append(f"depth {self.needs.depth[0]:.4g} to {self.needs.depth[1]:.4g} m: neighbourhood sized for the blur at both ends")
+        return ends
+
+    def _rings(self, asked):
+        if asked != "auto":
+            if asked == 0:
+                self.reasons.append("isolated lenslets as asked: light of neighbours is left out")
+            return (asked,)
+        return tuple(range(1, MAX_RING + 1))
+
+    @property
+    def shape(self):
+        """(band, lenslet, pixel, point) of the matrix."""
+        count = int(np.prod(self.views[0].object_shape))
+        count = count if self.points is None else len(range(*self.points.indices(count)))
+        return len(self.views), self.grid[0] * self.grid[1], int(np.prod(self.views[0].pixel_shape)), count
+
+
+def _consider(request, rung):
+    """The Candidate of one rung: its error by source, and the rings, precision and node counts that it would take."""
+    reason = next((r for r in (rung.valid_for(request.camera, v) for v in request.views) if r), None)
+    if reason:
+        return Candidate(rung.name, rung.model, reason)
+    fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
+             "spectrum": 0.0, "storage": 3e-8 if request.dtype == np.float32 else 0.0}
+    best = None
+    for ring in request.rings:
+        outside = max(window_error(v, request.grid, ring) for v in request.depths)
+        # the rings that a user asks for are the user's model
+        split = fixed | {"neighbourhood": outside if len(request.rings) > 1 else 0.0}
+        best = _sized(request, rung, ring, split)
+        if best.why is None:
+            break
+    return best
+
+
+def _sized(request, rung, ring, split):
+    """Node counts for the accuracy that the other errors leave to sampling."""
+    rest = math.hypot(*split.values())
+    room = math.sqrt(max(request.accuracy**2 - rest**2, 0))
+    why = None
+    if room < SHARE * request.accuracy:
+        worst = max(split, key=split.get)
+        why = f"{worst} error {split[worst]:.1g}"
+        room = max(rest, BEST_ACCURACY)
+    sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
+    double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
+    try:
+        bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in request.views)
+    except NumericsError as error:
+        return Candidate(rung.name, rung.model, str(error))
+    split = split | {"sampling": max(0.5 * sampling, 3e-8)}
+    costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
+    size = int(np.prod(request.shape)) * request.dtype.itemsize
+    return Candidate(rung.name, rung.model, why, math.hypot(*split.values()), split, ring, sampling, double, bands,
+                     sum(c["operations"] for c in costs), sum(c["seconds"] for c in costs), size + max(c["bytes"] for c in costs))
+
+
+def _cheapest(found):
+    serving = [c for c in found if c.why is None]
+    return min(serving, key=Candidate.seconds) if serving else None
+
+
+def _fall_back(request, found):
+    """Where nothing serves: the best there is for a default accuracy, exit 5 for one that was asked for."""
+    possible = [c for c in found if math.isfinite(c.error)]
+    if not possible:
+        reasons = "; ".join(f"{c.name}: {c.why}" for c in found)
+        raise NumericsError(f"no model serves this camera ({reasons})", "model", "change the camera, or leave --model at auto")
+    best = min(possible, key=lambda c: c.error)
+    reachable = 1.3 * math.hypot(*(v for k, v in best.split.items() if k != "sampling")) + 1.1 * BEST_ACCURACY
+    if request.explicit:
+        advice = f"ask for {reachable:.1g} or coarser"
+        if request.model == "auto" and best.split["model"] > 0.5 * best.error:
+            advice += f", or name a model (--model {best.model}) to ask for accuracy within that model only"
+        raise NumericsError(f"accuracy {request.accuracy:g} cannot be reached: the best is about {reachable:.1g} ({best.name}: {best.why})", "accuracy", advice)
+    request.warnings.append(f"the {request.asked_by} calls for accuracy {request.accuracy:.1g}; the best there is for this camera is "
+                            f"about {reachable:.1g} ({best.name}: {best.why})")
+    request.accuracy = min(reachable, 0.99)
+    again = [_consider(request, rung) for rung in RUNGS if request.model in ("auto", rung.model)]
+    best = _cheapest(again)
+    if best is None:
+        raise NumericsError("no model serves this camera at any accuracy", "accuracy", "name a model with --model")
+    return request, again, best
+
+
+def _plan(request, found, best):
+    """The PifPlan of the chosen Candidate, with what was considered and left out."""
+    table = tuple(replace(c, why=c.why or f"serves, at {c.seconds() / max(best.seconds(), 1e-9):.2g} times the cost") if c is not best else c for c in found)
+    warnings = [*request.warnings, *_warnings(request, best)]
+    view_error = max(window_error(v, request.grid, best.ring) for v in request.depths)
+    if best.ring:
+        request.left_out.append(f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {view_error:.1g}")
+        if len(request.rings) == 1 and view_error > request.accuracy:
+            warnings.append(f"lenslets beyond the coherent window change columns by about {view_error:.1g}, more than the accuracy {request.accuracy:g}")
+    size = int(np.prod(request.shape)) * request.dtype.itemsize
+    return PifPlan(best.model, best.name, request.grid, best.ring, request.accuracy, request.asked_by, best.sampling / 2, best.double, best.bands,
+                   request.shape, size, best.bytes, best.error, best.split, request.dtype.name, tuple(request.reasons), tuple(request.left_out),
+                   tuple(warnings), table)
+
+
+def seconds_here(candidate):
+    """Seconds of one core of this machine that a Candidate will take."""
+    return candidate.seconds(product_rate)
 
 
 def _superpixels(asked, views, accuracy, reasons):
@@ -78,26 +234,18 @@ def _superpixels(asked, views, accuracy, reasons):
     return 2 * ring + 1, 2 * ring + 1
 
 
-def _check(views, grid, warnings):
-    view = views[0]
+def _warnings(request, best):
+    view, grid, found = request.views[0], request.grid, []
     for axis, name in ((0, "rows"), (1, "columns")):
         size = view.pixel_shape[axis] * view.pixel_pitch
         if abs(size / view.superpixel_pitch - 1) > 1e-4:
-            warnings.append(
+            found.append(
                 f"superpixels are {view.superpixel_pitch / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
                 "grid centred on each superpixel, not for one sensor raster")
-    phase = max(v.quartic_phase for v in views)
-    if phase > 0.1:
-        warnings.append(f"the paraxial model drops {phase:.2f} rad at a lenslet's edge: fringes differ from exact propagation there")
-    ring = (min(grid) - 1) // 2
-    if max(v.blur / (2 * v.D2) for v in views) > ring + 1e-9:
-        warnings.append("the geometric blur reaches beyond the superpixels kept: their light is missing from the columns")
-
-
-def _seconds(band, view, shape, double, aperture):
-    """One-core estimate from the product count (8 flops a complex multiply-add, 30 or 60 GFLOP/s sustained) and the squares."""
-    fine = view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
-    terms = band.terms if aperture == "square" else (1 if band.window is None else 2 * band.window + 1) * band.lenslet_nodes
-    work = 8.0 * fine * terms / (30e9 if double else 60e9) + fine * (3e-9 if double else 1.5e-9)
-    setup = band.psf_nodes**3 * 8e-9 + 0.05
-    return work * shape[1] * shape[3] + setup
+    if request.model != "auto" and best.model != "exact":
+        error = max(r.error_bound(request.camera, v) for r in RUNGS if r.name == best.name for v in request.views)
+        if error > request.accuracy:
+            found.append(f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; that model is off by about {error:.1g} itself")
+    if max(v.blur / (2 * v.D2) for v in request.depths) > (min(grid) - 1) // 2 + 1e-9:
+        found.append("the geometric blur reaches beyond the superpixels kept: their light is missing from the columns")
+    return found

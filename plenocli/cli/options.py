@@ -87,16 +87,18 @@ class Pair(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
-class Ring(click.Choice):
+class Ring(click.ParamType):
     """A whole number of rings, or auto."""
 
-    def __init__(self):
-        super().__init__(["auto", "0", "1", "2"])
+    name = "auto|0|1|2..."
 
     def convert(self, value, param, ctx):
         """"auto", or the number."""
-        chosen = super().convert(str(value), param, ctx)
-        return chosen if chosen == "auto" else int(chosen)
+        if value == "auto" or isinstance(value, int):
+            return value
+        if not value.isdigit() or int(value) > 20:
+            self.fail(f"{value!r} is not auto or a whole number from 0 to 20", param, ctx)
+        return int(value)
 
 
 class _File(click.Path):

@@ -19,28 +19,28 @@ class _Step(click.ParamType):
 @click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
 @options.superpixels("Superpixels whose pixels are kept, odd")
 @options.coherent_ring
-@click.option("--model", type=click.Choice(["auto", "fresnel", "ray", "exact"]), default="auto", show_default=True, help="Propagation model; auto is fresnel, the only one so far.")
-@click.option("--accuracy", type=options.POSITIVE, default=1e-4, show_default=True, help="Relative error of each column against the converged paraxial model.")
-@click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True, help="Type of the stored matrix.")
+@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Propagation model; auto takes the cheapest that meets the accuracy, a named one is accurate within itself.")
+@click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of the worst column, against the finest model; default: what the sensor's noise lets be seen.")
+@click.option("--scene", type=options.FILE, metavar="SCENE", help="Model only what this scene requires: a scene .toml (depth, spectrum, lenslets, snr), a photograph or a spectral EXR.")
+@click.option("--dtype", type=click.Choice(["auto", "float32", "float64"]), default="auto", show_default=True, help="Type of the stored matrix.")
 @click.option("--explain", is_flag=True, help="Print the plan, its cost and its reasons; compute nothing.")
 @options.mem_limit
 @options.workers
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, camera, output, model, explain, workers, overwrite, as_json, **settings):
+def command(ctx, camera, output, explain, workers, overwrite, as_json, **settings):
     """Compute the system matrix A of CAMERA (a .toml file): for every object point over one lenslet's field the share of
-    its light that lands on each pixel, by wave optics in the paraxial model. Reports rank, condition, energy and symmetry.
+    its light that lands on each pixel, by the cheapest model that meets --accuracy. Reports rank, condition, energy and symmetry.
 
     \b
     Examples:
       plenocli simulate-pif camera.toml -o pif.h5
-      plenocli simulate-pif camera.toml --superpixels 1x1 --coherent-ring 0 -o isolated.h5
       plenocli simulate-pif camera.toml --wavelength 450nm --wavelength 650nm --accuracy 1e-3 --explain
+      plenocli simulate-pif camera.toml --scene scene.toml -o pif.h5
+      plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 --coherent-ring 0 -o isolated.h5
     """
     from plenocli.stages.simulate_pif import Settings, line, run_simulate_pif
 
-    if model in ("ray", "exact"):
-        raise click.UsageError(f"--model {model} does not exist yet; use --model fresnel, and see the neglected phase that it reports.")
     report = run_simulate_pif(camera, output, Settings(**settings), explain=explain, overwrite=overwrite, command=options.command_line(ctx))
     options.summary(report, as_json, line(report))

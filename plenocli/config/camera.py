@@ -21,7 +21,7 @@ MAX_BYTES = 1 << 20
 """No camera description is longer; what is, is some other file."""
 
 
-def _quantity(parse, example, low, high, show):
+def quantity(parse, example, low, high, show):
     """An annotated float that is written as text with a unit and lies within [low, high] in SI."""
 
     def read(value: Any, info) -> float:
@@ -55,13 +55,13 @@ def _plain(unit):
     return lambda number: f"{number:g} {unit}"
 
 
-Length = _quantity(parse_length, "50 mm", 1e-9, 1e6, format_length)
-Gap = _quantity(parse_length, "0.1 mm", 0.0, 1.0, format_length)
-Wavelength = _quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)
-SignedLength = _quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)
-Electrons = _quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))
-Gain = _quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))
-Duration = _quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)
+Length = quantity(parse_length, "50 mm", 1e-9, 1e6, format_length)
+Gap = quantity(parse_length, "0.1 mm", 0.0, 1.0, format_length)
+Wavelength = quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)
+SignedLength = quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)
+Electrons = quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))
+Gain = quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))
+Duration = quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)
 Unit = Annotated[float, Field(gt=0.0, le=1.0)]
 Pair = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
 
@@ -321,7 +321,7 @@ class Camera(Section):
         try:
             changed = Camera.model_validate(data, context={"si": True})
         except ValidationError as error:
-            raise _violations(error, "camera") from None
+            raise violations(error, "camera") from None
         kept = {name: old for name, old in self.main_lens._samples.items() if getattr(changed.main_lens, name) == getattr(self.main_lens, name)}
         return changed.attach(**{name: old.values for name, old in kept.items()})
 
@@ -369,18 +369,21 @@ def _trouble(name, values):
 
 def load_camera(path):
     """Read and check a camera description; InputError where the file cannot be read, ConfigError for what it says."""
-    path = Path(path)
+    return parse_camera(read_text(Path(path), "camera"), path)
+
+
+def read_text(path, what):
+    """The text of the TOML file of a `what` (camera, scene); InputError where it cannot be read."""
     try:
         if path.exists() and not path.is_file():
-            raise InputError(f"is {'a folder' if path.is_dir() else 'no ordinary file'}", path, "give the TOML file of a camera")
+            raise InputError(f"is {'a folder' if path.is_dir() else 'no ordinary file'}", path, f"give the TOML file of a {what}")
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"is larger than {MAX_BYTES} bytes and so no camera description", path, "give a TOML file")
-        text = path.read_text(encoding="utf-8")
+            raise InputError(f"is larger than {MAX_BYTES} bytes and so no {what} description", path, "give a TOML file")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path, "give the TOML file of a camera, see `plenocli schema camera`") from None
+        raise InputError(f"cannot be read: {error.strerror}", path, f"give the TOML file of a {what}, see `plenocli schema {what}`") from None
     except UnicodeDecodeError:
-        raise InputError("is not UTF-8 text", path, "give the TOML file of a camera") from None
-    return parse_camera(text, path)
+        raise InputError("is not UTF-8 text", path, f"give the TOML file of a {what}") from None
 
 
 def parse_camera(text, where="camera"):
@@ -392,12 +395,12 @@ def parse_camera(text, where="camera"):
     try:
         return Camera.model_validate(data)
     except ValidationError as error:
-        raise _violations(error, where) from None
+        raise violations(error, where) from None
 
 
-def _violations(error, where):
+def violations(error, where, model=Camera):
     """The ConfigError that lists everything a pydantic ValidationError found."""
-    lines = [_sentence(e) for e in error.errors()]
+    lines = [_sentence(e, model) for e in error.errors()]
     count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
     return ConfigError(f"{count}\n  " + "\n  ".join(lines), where)
 
@@ -407,23 +410,22 @@ def camera_schema():
     return Camera.model_json_schema()
 
 
-def _sentence(error):
+def _sentence(error, model):
     """One violation in words: path, what is wrong, and the nearest known key where a key is unknown."""
     path = [str(p) for p in error["loc"]]
     if error["type"] == "extra_forbidden":
-        known = _keys(path[:-1])
+        known = _keys(path[:-1], model)
         near = difflib.get_close_matches(path[-1], known, 1, 0.5)
         hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
         return f"{'.'.join(path)}: unknown key; {hint}"
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "missing":
         message = "is missing"
-    return f"{'.'.join(path) or 'camera'}: {message}"
+    return f"{'.'.join(path) or model.__name__.lower()}: {message}"
 
 
-def _keys(path):
+def _keys(path, model):
     """Names that a section knows; `path` as in a pydantic error location."""
-    model = Camera
     for name in path:
         if name.isdigit() or name not in model.model_fields:
             continue

@@ -1,7 +1,7 @@
 """How a system matrix is computed: node counts, coherent neighbours, precision. Chosen before any work (plenocli.accuracy)."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,8 +11,9 @@ from plenocli.optics.quadrature import gauss, nodes_for
 
 OWN_WEIGHT, JOINT_WEIGHT = 0.2, 4e-5
 """Effect on a column of the pixel rule's error for fringes within one lenslet's light, and between lenslets (measured bounds)."""
-WINDOW_ERROR = {1: 0.12, 2: 2.1e-3, 3: 1.0e-3}
-"""Error from lenslets beyond w rings past the blur, times the lenslet's diffraction cells (measured; worst point, at the corner)."""
+WINDOW_ERROR = (1.0, 0.17, 0.015, 0.007, 0.002, 0.0013)
+"""Error of a column from lenslets further than w = 0, 1, 2, ... from its own, times the square of the lenslet's diffraction
+cells (measured for 1.6 to 100 cells, corner point; beyond the table it falls as 1/w^2)."""
 
 
 @dataclass(frozen=True)
@@ -31,51 +32,44 @@ class BandPlan:
 
 @dataclass(frozen=True)
 class PifPlan:
-    """The chosen computation.
+    """The chosen computation (plenocli.accuracy.plan_pif makes it).
 
-    model: ray, fresnel or exact; superpixels: (rows, columns) odd numbers; tolerance: root-energy cut of the spread function;
-    seconds of one core and bytes of the result are estimates; reasons: one sentence for each choice; estimated: relative error
-    of the worst column within the model (isolated lenslets: of that model); dtype: of the stored matrix.
+    model: ray, fresnel or exact; rung: its name; superpixels: (rows, columns) odd numbers; accuracy: as asked or found, by
+    `asked_by`; tolerance: root-energy cut of the spread function; double: precision of the fields; shape: of the matrix;
+    bytes: of the result; memory: with the work; estimated: relative error of the worst column; split: that error by source;
+    dtype: of the stored matrix; reasons, left_out, warnings: a sentence each; candidates: the rungs considered.
     """
 
     model: str
+    rung: str
     superpixels: tuple
     coherent_ring: int
     accuracy: float
+    asked_by: str
     tolerance: float
     double: bool
     bands: tuple
     shape: tuple
-    seconds: float
     bytes: int
-    reasons: tuple = ()
-    warnings: tuple = ()
-    nodes: dict = field(default_factory=dict)
-    estimated: float = 0.0
+    memory: int
+    estimated: float
+    split: dict
     dtype: str = "float32"
-
-    def explain(self):
-        """The plan in words, one choice a line."""
-        rows, columns = self.superpixels
-        head = [
-            f"matrix: {self.shape[0]} band(s) x {self.shape[1]} superpixels ({rows}x{columns}) x {self.shape[2]} pixels "
-            f"x {self.shape[3]} points, {self.bytes / 2**20:.0f} MiB",
-            f"estimated time: {self.seconds:.1f} s on one core in {'double' if self.double else 'single'} precision",
-        ]
-        nodes = [
-            f"{b.wavelength * 1e9:.1f} nm: {b.lenslet_nodes} nodes across a lenslet, {b.pixel_nodes} across a pixel, "
-            f"{b.psf_nodes} across the spread function, about {b.terms} separable terms"
-            for b in self.bands
-        ]
-        return "\n".join([*head, *(f"- {r}" for r in self.reasons), *(f"- {n}" for n in nodes), *(f"! {w}" for w in self.warnings)])
+    reasons: tuple = ()
+    left_out: tuple = ()
+    warnings: tuple = ()
+    candidates: tuple = ()
 
 
 def window_error(view, grid, ring):
     """Estimated relative error of a column because lenslets beyond the coherent window are left out; 0 if ring is 0 by choice."""
     if ring == 0:
         return 0.0
-    beyond = coherent_window(view, grid, ring) - blur_ring(view)
-    return WINDOW_ERROR[min(beyond, 3)] / view.diffraction_cells * (1 if max(grid) > 1 or beyond > 1 else 0.25)
+    blur = blur_ring(view)
+    # light spread over several lenslets has no sharp peak at a border, whose interference reaches furthest
+    beyond = coherent_window(view, grid, ring) - blur + (blur > 0)
+    last = len(WINDOW_ERROR) - 1
+    return min(1.0, WINDOW_ERROR[min(beyond, last)] * min(1.0, last / beyond) ** 2 / view.diffraction_cells**2)
 
 
 def blur_ring(view):

@@ -26,6 +26,7 @@ class Settings:
     superpixels: object = "auto"
     coherent_ring: object = "auto"
     accuracy: float = 1e-3
+    model: str = "fresnel"
     snr_db: float | None = None
     noise: str = "sensor"
     exposure: float | None = None
@@ -177,7 +178,8 @@ def _carry(camera, source, scene, settings, matrix):
 def _build(camera, wavelength, settings):
     from plenocli.accuracy import pif_builder
 
-    return pif_builder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy)
+    return pif_builder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy,
+                       model=settings.model)
 
 
 def _truth(camera, scene, grid, refine):

@@ -17,8 +17,10 @@ class Settings:
     spectral_step: object = None
     superpixels: object = "auto"
     coherent_ring: object = "auto"
-    accuracy: float = 1e-4
-    dtype: str = "float32"
+    accuracy: float | None = None
+    model: str = "auto"
+    scene: str | None = None
+    dtype: str = "auto"
     mem_limit: int = 8 << 30
 
 
@@ -29,22 +31,22 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     suffice, OutputError where the file cannot be written.
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
+    from plenocli.accuracy import plan_pif
     from plenocli.config import load_camera
     from plenocli.optics.diagnose import describe
-    from plenocli.accuracy import plan_pif
     from plenocli.optics.pif import build_pif
+    from plenocli.stages.needs import read_needs
 
     if not explain:
         if output is None:
             raise UsageError("no output file given", "--output", "write -o pif.h5, or --explain to see the plan only")
         check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
     camera = load_camera(camera_path)
-    request = dict(wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
-                   accuracy=settings.accuracy, dtype=np.dtype(settings.dtype))
-    plan = plan_pif(camera, **request)
+    needs = read_needs(settings.scene, camera) if settings.scene else None
+    plan = plan_pif(camera, wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
+                    accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs)
     if explain:
-        return {"plan": plan.explain(), "seconds": plan.seconds, "bytes": plan.bytes, "superpixels": list(plan.superpixels),
-                "coherent_ring": plan.coherent_ring, "nodes": plan.nodes, "estimated_accuracy": plan.estimated}
+        return _explained(plan)
     # the matrix, its copy while columns are gathered, and the file's image in memory
     needed = 3 * plan.bytes + (1 << 27)
     if needed > settings.mem_limit:
@@ -58,10 +60,25 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     for warning in found["warnings"]:
         note(warning)
     data, attrs = _contents(pif, found)
-    accuracy = {"asked": plan.accuracy, "estimated": plan.estimated, "model": "fresnel", "reasons": [*plan.reasons, *plan.warnings]}
-    provenance = Provenance(command, describe_inputs({"camera": camera_path}), None, camera.text, accuracy)
+    scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
+    provenance = Provenance(command, describe_inputs({"camera": camera_path, "scene": scene}), None, camera.text, accuracy_record(plan))
     write_artefact(output, Artefact("pif", data, attrs, provenance), overwrite=overwrite)
     return _summary(output, pif, found, plan)
+
+
+def accuracy_record(plan):
+    """What an artefact says of the accuracy it was made with, JSON-able: asked (and by whom), estimated, by source, model, reasons."""
+    return {"asked": plan.accuracy, "asked_by": plan.asked_by, "estimated": plan.estimated, "by_source": plan.split, "model": plan.model, "rung": plan.rung,
+            "reasons": [*plan.reasons, *plan.warnings], "left_out": list(plan.left_out)}
+
+
+def _explained(plan):
+    from plenocli.accuracy.explain import candidates, explain
+
+    considered = candidates(plan)
+    return {"plan": explain(plan), "accuracy": accuracy_record(plan), "considered": considered,
+            "seconds": next(c["seconds"] for c in considered if c["chosen"]), "bytes": plan.bytes, "superpixels": list(plan.superpixels),
+            "coherent_ring": plan.coherent_ring, "estimated_accuracy": plan.estimated}
 
 
 def _wavelengths(camera, settings):
@@ -100,7 +117,7 @@ def _summary(output, pif, found, plan):
     keep = {key: found[key] for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max") if key in found}
     bands, _, pixels, points = pif.A.shape
     return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
-            "wavelengths": pif.wavelength.tolist(), "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
+            "wavelengths": pif.wavelength.tolist(), "model": plan.model, "rung": plan.rung, "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
             "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],
             "quartic_phase_rad": pif.notes["quartic_phase_rad"], "warnings": [*plan.warnings, *found["warnings"]], **keep}
 
@@ -116,4 +133,4 @@ def line(report):
         text += f"; rank {min(report['rank'])} ({min(report['rank_60db'])} above 60 dB noise), condition {max(report['condition']):.1e}"
     if "symmetry_defect" in report:
         text += f"; symmetry defect {min(report['symmetry_defect']):.1e}"
-    return f"{text}; neglected phase {report['quartic_phase_rad']:.2g} rad"
+    return f"{text}; {report['rung']}, estimated error {report['estimated_accuracy']:.1g}"

@@ -1,5 +1,6 @@
 """Small cameras for the tests of the optics."""
 
+from plenocli import accuracy
 from plenocli.config import Camera, parse_camera
 
 TEXT = """
@@ -38,3 +39,18 @@ def pupil_conjugate(camera):
     """Sensor distance (m) at which the lenslets image the main lens's pupil: kappa = 0."""
     f2, z2 = camera.lenslet_array.focal_length, camera.lenslet_array.distance
     return f2 * z2 / (z2 - f2)
+
+
+def plan_pif(camera, **request):
+    """The plan of the paraxial model at 1e-4, unless `request` says otherwise."""
+    return accuracy.plan_pif(camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)
+
+
+def system_matrix(camera, **request):
+    """The matrix of the paraxial model at 1e-4, unless `request` says otherwise."""
+    return accuracy.system_matrix(camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)
+
+
+def pif_builder(camera, wavelength, **request):
+    """A builder of the paraxial model at 1e-4, unless `request` says otherwise."""
+    return accuracy.pif_builder(camera, wavelength, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)

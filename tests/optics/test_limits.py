@@ -9,9 +9,8 @@ from scipy.special import j1, roots_legendre
 from plenocli.config import load_camera
 from plenocli.optics.diagnose import describe
 from plenocli.optics.geometry import geometry
-from plenocli.accuracy import pif_builder, system_matrix
 from plenocli.optics.psf import sampled_field
-from tests.optics.cameras import WAVELENGTH, pupil_conjugate, small_camera
+from tests.optics.cameras import WAVELENGTH, pif_builder, pupil_conjugate, small_camera, system_matrix
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 from tests.reference.kernel import coherent_kernel
 

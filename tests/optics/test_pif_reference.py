@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from plenocli.accuracy import pif_builder
-from tests.optics.cameras import WAVELENGTH, small_camera
+from tests.optics.cameras import WAVELENGTH, pif_builder, small_camera
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 
 ISOLATED = [(0, 0)]

@@ -1,0 +1,48 @@
+"""A plan in words and as a table: which models were considered, which serve and why not, and what each would cost."""
+
+from plenocli.accuracy.dial import seconds_here
+
+
+def explain(plan):
+    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was left out, warnings."""
+    rows, columns = plan.superpixels
+    head = [
+        f"asked: accuracy {plan.accuracy:.2g} ({plan.asked_by})",
+        f"matrix: {plan.shape[0]} band(s) x {plan.shape[1]} superpixels ({rows}x{columns}) x {plan.shape[2]} pixels x {plan.shape[3]} points, "
+        f"{_size(plan.bytes)} as {plan.dtype}; {'double' if plan.double else 'single'} precision, coherent ring {plan.coherent_ring}",
+        "",
+        *_table(candidates(plan)),
+        "",
+        "error by source: " + ", ".join(f"{name} {value:.1g}" for name, value in plan.split.items()) + f"; together {plan.estimated:.1g}",
+    ]
+    nodes = [
+        f"{b.wavelength * 1e9:.1f} nm: {b.lenslet_nodes} nodes across a lenslet, {b.pixel_nodes} across a pixel, "
+        f"{b.psf_nodes} across the spread function, about {b.terms} terms"
+        for b in plan.bands
+    ]
+    return "\n".join([*head, *(f"- {r}" for r in plan.reasons), *(f"- left out: {t}" for t in plan.left_out), *(f"- {n}" for n in nodes),
+                      *(f"! {w}" for w in plan.warnings)])
+
+
+def candidates(plan):
+    """The rungs considered, as JSON-able dicts: rung, model, chosen, serves, reason, error, split, seconds (of one core here), bytes."""
+    found = []
+    for c in plan.candidates:
+        known = c.split is not None
+        found.append({"rung": c.name, "model": c.model, "chosen": c.why is None, "reason": c.why, "error": c.error if known else None, "split": c.split,
+                      "coherent_ring": c.ring if known else None, "seconds": seconds_here(c) if known else None, "bytes": c.bytes if known else None})
+    return found
+
+
+def _table(rows):
+    cells = [("rung", "error", "time", "memory", "")]
+    for r in rows:
+        known = r["error"] is not None
+        cells.append((r["rung"], f"{r['error']:.1g}" if known else "-", f"{r['seconds']:.2g} s" if known else "-", _size(r["bytes"]) if known else "-",
+                      "chosen" if r["chosen"] else r["reason"]))
+    widths = [max(len(row[i]) for row in cells) for i in range(4)]
+    return ["  ".join((row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in (1, 2, 3)), row[4])).rstrip() for row in cells]
+
+
+def _size(count):
+    return f"{count / 2**30:.2f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"

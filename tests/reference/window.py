@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import roots_legendre
 
 
-def column_energies(camera, wavelength, image_point, window, superpixels, *, pixel_nodes=8, extra=1.2):
+def column_energies(camera, wavelength, image_point, window, superpixels, *, pixel_nodes=8, extra=1.0):
     """Energy in each pixel of several superpixels from one point: dict (row, column) -> (pixel rows, pixel columns).
 
     image_point: (y, x) m on the array; window: lenslets |m| <= window of both axes act coherently (None: each superpixel's own
@@ -43,7 +43,8 @@ class _Rule:
         self.wavelength = wavelength
         reach = max(abs(n) for place in superpixels for n in place) if window is None else window
         defocus = abs(1 / self.z1 + 1 / self.z2 - 1 / self.f1) * self.radius
-        self.pupil = self.count(self.k * self.radius * ((reach + 1) * self.D2 / self.z2 + defocus))
+        # twice the phase: the round pupil's weights interpolate where other rules integrate, which takes a node per radian
+        self.pupil = self.count(2 * self.k * self.radius * ((reach + 1) * self.D2 / self.z2 + defocus))
 
     def count(self, phase):
         return int(np.ceil(self.extra * (phase / 2 + 3 * np.cbrt(phase) + 12)))

@@ -204,8 +204,13 @@ def _plan(request, found, best):
             warnings.append(f"lenslets beyond the coherent window change columns by about {view_error:.1g}, more than the accuracy {request.accuracy:g}")
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(best.model, best.name, request.grid, best.ring, request.accuracy, request.asked_by, best.sampling / 2, best.double, best.bands,
-                   request.shape, size, best.bytes, best.error, best.split, request.dtype.name, tuple(request.reasons), tuple(request.left_out),
+                   request.shape, size, best.bytes, best.error, best.split, _model_error(request, best), request.dtype.name, tuple(request.reasons), tuple(request.left_out),
                    tuple(warnings), table)
+
+
+def _model_error(request, best):
+    rung = next(r for r in RUNGS if r.name == best.name)
+    return max(rung.error_bound(request.camera, v) for v in request.views)
 
 
 def seconds_here(candidate):
@@ -243,7 +248,7 @@ def _warnings(request, best):
                 f"superpixels are {view.superpixel_pitch / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
                 "grid centred on each superpixel, not for one sensor raster")
     if request.model != "auto" and best.model != "exact":
-        error = max(r.error_bound(request.camera, v) for r in RUNGS if r.name == best.name for v in request.views)
+        error = _model_error(request, best)
         if error > request.accuracy:
             found.append(f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; that model is off by about {error:.1g} itself")
     if max(v.blur / (2 * v.D2) for v in request.depths) > (min(grid) - 1) // 2 + 1e-9:

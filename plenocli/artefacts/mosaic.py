@@ -85,7 +85,9 @@ def _from_capture(path, mem_limit):
 
     artefact = read_artefact(path, "capture", mem_limit=mem_limit)
     attrs = dict(artefact.attrs.get("capture", {}))
-    return _described(path, artefact.data["capture/mosaic"], {**attrs, "cfa": cfa_text(artefact.data["capture/cfa"])}, "capture")
+    found = _described(path, artefact.data["capture/mosaic"], {**attrs, "cfa": cfa_text(artefact.data["capture/cfa"])}, "capture")
+    found.meta["accuracy"], found.meta["inputs"] = artefact.provenance.accuracy, artefact.provenance.inputs
+    return found
 
 
 def _from_exr(path, mem_limit):

@@ -18,6 +18,9 @@ DEFINITIONS = {
     "ssim": "mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 pixels, data range 1.0), averaged over bands",
     "block_mean_psnr_db": "PSNR of the truth averaged over each lenslet's block: what a camera without resolution inside the lenslet would get",
     "gain_over_block_mean_db": "psnr_db - block_mean_psnr_db",
+    "noise_relative": "noise of the capture over its root mean square",
+    "model_error_relative": "estimated error of the system matrix against the capture, relative; 0 where the capture was simulated with the same matrix",
+    "limited_by": "the larger of the two: noise or model",
 }
 
 

@@ -36,8 +36,10 @@ class PifPlan:
 
     model: ray, fresnel or exact; rung: its name; superpixels: (rows, columns) odd numbers; accuracy: as asked or found, by
     `asked_by`; tolerance: root-energy cut of the spread function; double: precision of the fields; shape: of the matrix;
-    bytes: of the result; memory: with the work; estimated: relative error of the worst column; split: that error by source;
-    dtype: of the stored matrix; reasons, left_out, warnings: a sentence each; candidates: the rungs considered.
+    bytes: of the result; memory: with the work; estimated: relative error of the worst column; split: that error by source; model_error: of the
+    model itself against the finest one, whether asked for by name or not;
+    dtype: of the stored matrix; reasons, left_out, warnings: a sentence each; candidates: the rungs considered; pixel_shift: of
+    an off-axis lenslet on the sensor's own raster (plenocli.optics.geometry.lenslet_shift), None where windows are centred.
     """
 
     model: str
@@ -54,11 +56,13 @@ class PifPlan:
     memory: int
     estimated: float
     split: dict
+    model_error: float
     dtype: str = "float32"
     reasons: tuple = ()
     left_out: tuple = ()
     warnings: tuple = ()
     candidates: tuple = ()
+    pixel_shift: tuple | None = None
 
 
 def window_error(view, grid, ring):
@@ -74,7 +78,7 @@ def window_error(view, grid, ring):
 
 def blur_ring(view):
     """Lenslets that the geometric blur of a point at the lenslet's edge reaches beyond its own, per side."""
-    return math.ceil(view.blur / (2 * view.D2) - 1e-9)
+    return math.ceil(view.blur / (2 * view.D2 * view.row_spacing) - 1e-9)
 
 
 def predicted_outside(view, ring):
@@ -92,18 +96,20 @@ def coherent_window(view, grid, ring):
     All of them act on every superpixel kept: an image point on a border between lenslets would else lose the interference
     of its two halves, which cancels their edge diffraction far out.
     """
-    return None if ring == 0 else max(max(grid) // 2, blur_ring(view)) + ring
+    return None if ring == 0 else max(math.ceil(max(view.reach(grid))), blur_ring(view)) + ring
 
 
 def size_band(view, grid, ring, accuracy, tolerance):
     """Node counts at one wavelength; the phase across a lenslet counts the far edge of the outermost superpixel it lights."""
     half_width, window = view.lenslet_width / 2, coherent_window(view, grid, ring)
-    far = 0 if window is None else max(grid) // 2 + window
-    reach = max(view.pixel_shape) * view.pixel_pitch / 2 + far * view.superpixel_pitch
+    lit = max(view.reach(grid, window))
+    far = 0 if window is None else max(view.reach(grid)) + lit
+    raster = 0 if view.pixel_shift is None else 1
+    reach = (max(view.pixel_shape) + raster) * view.pixel_pitch / 2 + far * view.superpixel_pitch
     slope = half_width * view.k * (reach / view.z3 + view.D1 / 2 / view.z2 + abs(view.kappa) * half_width)
     active = view.pixel_active / (view.wavelength * view.z3)
-    own, joint = view.lenslet_width * active, (1 if window is None else 2 * window + 1) * view.D2 * active
-    half = ((max(grid) // 2 if window is None else window) + 1) * view.D2
+    own, joint = view.lenslet_width * active, (1 if window is None else 2 * lit + 1) * view.D2 * active
+    half = view.field_half(grid, window)
     count = psf_nodes(view, half)
     phase = view.k * view.D1 / 2 * half / view.z2
     terms = int(0.27 * phase + 3 + 0.6 * math.log10(1 / tolerance)) if view.blur < view.D2 else int(0.4 * phase + 10)

@@ -54,12 +54,12 @@ def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scen
     _check_tiling(camera, camera_path)
     _check_memory(camera, settings, camera_path)
     source, what = _source(camera, settings, scene)
-    matrix = _read_pif(pif, camera, settings, source.wavelengths) if pif else None
+    matrix, accuracy = _read_pif(pif, camera, settings, source.wavelengths) if pif else (None, _accuracy(camera, settings, source.wavelengths))
     light, whites, truth = _carry(camera, source, what, settings, matrix)
     capture, summary = _detect(camera, light, whites, settings, scene)
     _describe(capture, camera, settings, truth, scene)
     provenance = dict(command=command, inputs=describe_inputs({"camera": camera_path, "pif": pif, "scene": scene if scene and Path(scene).is_file() else None}),
-                      seed=settings.seed, config=camera.text, accuracy={"asked": settings.accuracy})
+                      seed=settings.seed, config=camera.text, accuracy=accuracy)
     _write(output, capture, provenance, overwrite)
     if scene_out:
         _write_scene(scene_out, truth, camera, provenance, overwrite)
@@ -125,7 +125,7 @@ class _Stored:
 
 
 def _read_pif(path, camera, settings, wavelengths):
-    """System matrices by wavelength from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
+    """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
     from plenocli.artefacts import read_artefact
     from plenocli.config import parse_camera
 
@@ -146,7 +146,7 @@ def _read_pif(path, camera, settings, wavelengths):
             raise InputError(f"has no wavelength {wavelength * 1e9:.4g} nm, which this capture needs", path,
                              "run simulate-pif with the same --spectral-step, or leave --pif out")
         stored[wavelength] = _Stored(artefact, band)
-    return stored
+    return stored, artefact.provenance.accuracy
 
 
 def _carry(camera, source, scene, settings, matrix):
@@ -180,6 +180,15 @@ def _build(camera, wavelength, settings):
 
     return pif_builder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy,
                        model=settings.model)
+
+
+def _accuracy(camera, settings, wavelengths):
+    """The accuracy record of a capture that computes its own system matrices: that of the middle wavelength's plan."""
+    from plenocli.accuracy import plan_pif
+    from plenocli.stages.simulate_pif import accuracy_record
+
+    return accuracy_record(plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), superpixels=settings.superpixels,
+                                    coherent_ring=settings.coherent_ring, accuracy=settings.accuracy, model=settings.model))
 
 
 def _truth(camera, scene, grid, refine):

@@ -77,11 +77,24 @@ def _one(capture, target, settings, estimators, calibration, overwrite, origin):
         blocks, spread, report = estimators.solve(data, _truth(settings.truth, estimators.system.object_shape, data.y.shape[:2]))
         picture = to_plane(blocks, estimators.system.object_shape)
         sigma = None if spread is None else to_plane(spread, estimators.system.object_shape)
+        report |= _limits(data, estimators.system, report)
     negative = float(np.mean(picture < 0))
     if settings.clip:
         picture = np.maximum(picture, 0)
     _write(target, picture, sigma, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
     return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": negative, "clipped": settings.clip}
+
+
+def _limits(data, system, report):
+    """{"limits": ...} of a picture: whether the capture's noise or the error of the matrix decides; {} where that is not known."""
+    from plenocli.accuracy.limits import what_limits
+    from plenocli.artefacts.provenance import file_digest
+
+    sigma = report.get("noise_sigma") or data.sigma
+    signal = float(np.sqrt(np.mean(np.square(data.y))))
+    same = data.matrix is not None and data.matrix == file_digest(system.path)
+    found = what_limits(sigma / signal if sigma and signal else None, system.accuracy, data.accuracy, same)
+    return {} if found is None else {"limits": found}
 
 
 def _truth(path, shape, count):

@@ -18,6 +18,7 @@ GROUPS = {
     "patches": ("patches", "patch_rmse_per_band", "six_patch_rmse", "six_patch_rmse_per_band", "six_patches_seen"),
     "spectral-angle": ("spectral_angle_deg",),
     "delta-e": ("delta_e_2000",),
+    "limits": ("noise_relative", "model_error_relative", "limited_by"),
     "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
     "coherence": (
         "coherence_raw", "coherence_candes_romberg", "coherence_effective", "coherence_effective_mean", "welch_bound",
@@ -124,6 +125,9 @@ def _score_one(path, context):
         entry["wavelengths_nm"] = [round(float(w) * 1e9, 6) for w in result.wavelengths]
         entry["metrics"], entry["patches"] = _score_spectra(path, result, truth, context)
         picture["patches"] = entry["patches"]
+    limits = result.attrs.get("parameters", {}).get("limits") if isinstance(result.attrs.get("parameters"), dict) else None
+    if limits:
+        entry["metrics"] |= {"noise_relative": limits["noise"], "model_error_relative": limits["model_error"], "limited_by": limits["limited_by"]}
     if context.sensor_snr is not None:
         entry["metrics"]["snr_sensor_db"] = context.sensor_snr
     return entry, picture
@@ -256,6 +260,7 @@ _NEEDS = {
     "block-mean": "give the object samples per lenslet with --block 40x40",
     "coherence": "give a dictionary and --pif",
     "spectral-angle": "give a spectral result",
+    "limits": "give a picture that reconstruct made with a --pif of known accuracy",
     "delta-e": "give a spectral result",
 }
 

@@ -68,7 +68,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
 
 def accuracy_record(plan):
     """What an artefact says of the accuracy it was made with, JSON-able: asked (and by whom), estimated, by source, model, reasons."""
-    return {"asked": plan.accuracy, "asked_by": plan.asked_by, "estimated": plan.estimated, "by_source": plan.split, "model": plan.model, "rung": plan.rung,
+    return {"asked": plan.accuracy, "asked_by": plan.asked_by, "estimated": plan.estimated, "by_source": plan.split, "model": plan.model, "model_error": plan.model_error, "rung": plan.rung,
             "reasons": [*plan.reasons, *plan.warnings], "left_out": list(plan.left_out)}
 
 

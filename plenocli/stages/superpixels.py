@@ -13,11 +13,14 @@ from plenocli.stages.progress import note
 
 @dataclass(frozen=True)
 class Superpixels:
-    """y (lenslet_row, lenslet_column, pixel) in units of A x; sigma: known noise in these units, or None; scene: its name or None."""
+    """y (lenslet_row, lenslet_column, pixel) in units of A x; sigma: known noise in these units, or None; scene: its name or None;
+    accuracy, matrix: of a simulated capture the record of its accuracy and the SHA-256 of the pif it was made with."""
 
     y: np.ndarray
     sigma: float | None
     scene: str | None
+    accuracy: dict | None = None
+    matrix: str | None = None
 
 
 def read_superpixels(path, system, calibration=None, mem_limit=None):
@@ -49,7 +52,8 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
     if over > 0:
         note(f"{Path(path).name}: {over:.2%} of the pixels are saturated; the picture is too dark there")
     sigma = mosaic.meta.get("noise_sigma")
-    return Superpixels(to_blocks(signal, shape) / unit, None if sigma is None else float(sigma) / unit, mosaic.meta.get("target"))
+    return Superpixels(to_blocks(signal, shape) / unit, None if sigma is None else float(sigma) / unit, mosaic.meta.get("target"),
+                       mosaic.meta.get("accuracy"), mosaic.meta.get("inputs", {}).get("pif", {}).get("sha256"))
 
 
 def calibrated(path, mosaic, calibration):

@@ -1,6 +1,6 @@
 """The system matrix as learn-dict and reconstruct use it: one matrix (superpixel, pixel, point) in float64."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,15 @@ from plenocli.stages.progress import note
 
 @dataclass(frozen=True)
 class System:
-    """blocks (offset, pixel, point); offsets (offset, 2); shapes (rows, columns) of a superpixel and an object block."""
+    """blocks (offset, pixel, point); offsets (offset, 2); shapes (rows, columns) of a superpixel and an object block; accuracy: the
+    record that simulate-pif left."""
 
     path: Path
     blocks: np.ndarray
     offsets: np.ndarray
     pixel_shape: tuple
     object_shape: tuple
+    accuracy: dict = field(default_factory=dict)
 
     @property
     def own(self):
@@ -39,4 +41,4 @@ def read_system(path, mem_limit=None):
     shapes = [tuple(int(n) for n in artefact.data[f"pif/{name}_shape"]) for name in ("pixel", "object")]
     if blocks.shape[1:] != (np.prod(shapes[0]), np.prod(shapes[1])):
         raise InputError(f"has matrices of {blocks.shape[1:]} for superpixels {shapes[0]} and object blocks {shapes[1]}", path, "run simulate-pif again")
-    return System(Path(path), blocks, offsets, *shapes)
+    return System(Path(path), blocks, offsets, *shapes, artefact.provenance.accuracy)

@@ -158,7 +158,7 @@ def _sized(request, rung, ring, split):
         bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in request.views)
     except NumericsError as error:
         return Candidate(rung.name, rung.model, str(error))
-    split = split | {"sampling": max(0.5 * sampling, 3e-8)}
+    split = split | {"sampling": max(0.5 * sampling, 1e-9 if double else 1e-7)}
     costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(rung.name, rung.model, why, math.hypot(*split.values()), split, ring, sampling, double, bands,

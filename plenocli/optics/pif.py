@@ -10,7 +10,7 @@ import numpy as np
 
 from plenocli.errors import NumericsError
 from plenocli.optics.geometry import geometry
-from plenocli.optics.shaped import RoundLenslets
+from plenocli.optics.shaped import ShapedLenslets
 from plenocli.optics.square import SquareLenslets
 
 BLOCK_BYTES = 1 << 28
@@ -44,7 +44,7 @@ class PifBuilder:
     def __init__(self, camera, wavelength, plan, *, dtype=np.float32):
         """Prepare `camera` (plenocli.config.Camera) at `wavelength` (m), one of those of the PifPlan `plan`."""
         band = next(b for b in plan.bands if b.wavelength == wavelength)
-        self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength), np.dtype(dtype)
+        self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength, plan.pixel_shift), np.dtype(dtype)
         self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
         self.notes = self._lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
@@ -53,7 +53,7 @@ class PifBuilder:
         self.offsets = np.array([(r, c) for r in range(-ry, ry + 1) for c in range(-rx, rx + 1)])
         self.shape = (len(self.offsets), self.pixel_shape[0] * self.pixel_shape[1])
         turn = self.object_shape[0] == self.object_shape[1] and self.pixel_shape[0] == self.pixel_shape[1] and ry == rx
-        flips = self._lenslets.symmetry
+        flips = [a and b for a, b in zip(self._lenslets.symmetry, self.geometry.mirrors(plan.superpixels))]
         self.symmetry = (flips[0], flips[1], flips[2] and turn)
 
     def columns(self, points):
@@ -133,7 +133,8 @@ class PifBuilder:
 
 def _maker(camera, plan):
     """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
-    return SquareLenslets if camera.lenslet_array.aperture_shape == "square" else RoundLenslets
+    array = camera.lenslet_array
+    return SquareLenslets if (array.aperture_shape, array.lattice) == ("square", "square") else ShapedLenslets
 
 
 def build_pif(camera, plan, *, points=None, progress=None):

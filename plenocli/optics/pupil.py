@@ -3,18 +3,24 @@
 P(x, y) = P1 sqrt(T) exp(+j k W) exp(+j k eps (x^2 + y^2)/2): P1 the aperture, T the INTENSITY transmittance of the filter
 cell, W the wavefront error in metres (W > 0 advances the phase), eps the defocus (Berkner et al. 2013, section 2-3-1).
 Filter cells are laid out row by row in a centred square, rows downwards, gaps and surroundings opaque.
+
+An aperture image is the intensity transmittance of the cells of a square grid over the square of side D1: n x n cells,
+constant in each, rows downwards looking along the light. A wavefront grid holds W at the centres of such cells; between
+them it is the interpolating cubic spline, which goes on by half a cell to the edge of the square.
 """
 
 import math
 
 import numpy as np
 
-from plenocli.optics.quadrature import Rows, cell_rows, disc_rows
+from plenocli.optics.quadrature import Rows, cell_rows, disc_rows, gauss, smooth_nodes
 
 
 def aperture_area(lens):
-    """Area (m^2) of the open main-lens aperture P1, filters not counted."""
+    """Area (m^2) of the open main-lens aperture P1, filters not counted; of an aperture image the integral of its values."""
     radius = lens.aperture_diameter / 2
+    if lens.aperture_shape == "image":
+        return lens.aperture_diameter**2 * float(lens.samples("aperture_image").mean())
     if lens.aperture_shape == "square":
         return lens.aperture_diameter**2
     return math.pi * radius**2 * (1 - (lens.obscuration or 0.0) ** 2)
@@ -71,25 +77,71 @@ def unit_radius(lens):
 
 
 def wavefront(lens, y, x):
-    """Wavefront error W (m) at pupil coordinates y, x (m): the sum of the lens's Noll terms, coefficients in metres rms."""
+    """Wavefront error W (m) at pupil coordinates y, x (m): the lens's wavefront grid plus its Noll terms, coefficients in m rms."""
     unit = unit_radius(lens)
     total = np.zeros(np.broadcast(y, x).shape)
+    spline = _spline(lens)
+    if spline is not None:
+        total = total + spline(np.stack(np.broadcast_arrays(y, x), axis=-1))
     for term in lens.aberrations or ():
         noll, coefficient = (term.noll, term.coefficient) if hasattr(term, "noll") else term
         total = total + coefficient * zernike(noll, y / unit, x / unit)
     return total
 
 
+def _spline(lens):
+    """The interpolating cubic spline W(y, x) through the lens's wavefront grid, or None where it has none."""
+    values = lens.samples("wavefront")
+    if values is None:
+        return None
+    from scipy.interpolate import NdBSpline, make_interp_spline
+
+    n = len(values)
+    centres = ((np.arange(n) + 0.5) / n - 0.5) * lens.aperture_diameter
+    down = make_interp_spline(centres, values, axis=0)
+    across = make_interp_spline(centres, down.c, axis=1)
+    return NdBSpline((down.t, across.t), np.ascontiguousarray(np.moveaxis(across.c, 0, 1)), 3, extrapolate=True)
+
+
+def has_wavefront(lens):
+    """Whether the lens has any wavefront error."""
+    return bool(lens.aberrations) or lens.wavefront is not None
+
+
+def _sampled_slopes(lens):
+    """(y, x, dW/dy, dW/dx) at points over the open aperture, for bounds; flat arrays, m and dimensionless."""
+    half, count = lens.aperture_diameter / 2, 129
+    if lens.wavefront is not None:
+        count = min(2 * len(lens.samples("wavefront")) + 1, 513)
+    axis = np.linspace(-half, half, max(count, 129))
+    slopes = np.gradient(wavefront(lens, axis[:, None], axis[None, :]), axis[1] - axis[0])
+    y, x = np.broadcast_arrays(axis[:, None], axis[None, :])
+    if lens.aperture_shape == "image":
+        image = lens.samples("aperture_image")
+        cell = np.clip(((axis / lens.aperture_diameter + 0.5) * len(image)).astype(int), 0, len(image) - 1)
+        inside = image[np.ix_(cell, cell)] > 0
+    else:
+        inside = np.hypot(y, x) <= unit_radius(lens) * (1 + 1e-9)
+    return y[inside], x[inside], slopes[0][inside], slopes[1][inside]
+
+
 def wavefront_slope(lens):
     """An upper estimate of |grad W| over the aperture (dimensionless), for sizing quadratures."""
-    if not lens.aberrations:
+    if not has_wavefront(lens):
         return 0.0
-    half = lens.aperture_diameter / 2
-    axis = np.linspace(-half, half, 129)
-    values = wavefront(lens, axis[:, None], axis[None, :])
-    slopes = np.hypot(*np.gradient(values, axis[1] - axis[0]))
-    inside = np.hypot(axis[:, None], axis[None, :]) <= unit_radius(lens)
-    return 1.1 * float(slopes[inside].max())
+    _, _, down, across = _sampled_slopes(lens)
+    return 1.1 * float(np.hypot(down, across).max(initial=0.0))
+
+
+def ray_reach(lens, eps, distance):
+    """Farthest that a ray lands from the image point along rows or columns (m), `distance` behind a pupil of defocus eps (1/m).
+
+    A ray through (y, x) lands at distance * (eps y + dW/dy, eps x + dW/dx). None for a lens without wavefront error.
+    """
+    if not has_wavefront(lens):
+        return None
+    y, x, down, across = _sampled_slopes(lens)
+    return distance * float(max(np.abs(eps * y + down).max(initial=0.0), np.abs(eps * x + across).max(initial=0.0)))
 
 
 def pupil_rows(camera, geometry, slope):
@@ -99,11 +151,14 @@ def pupil_rows(camera, geometry, slope):
     Weights carry sqrt(T), exp(j k W) and exp(j k eps r^2/2) and the sign -1 over a central obscuration.
     """
     lens, k, eps = camera.main_lens, geometry.k, geometry.eps
-    slope = slope + k * (abs(eps) * unit_radius(lens) + wavefront_slope(lens))
-    cells = filter_cells(camera, geometry.wavelength)
     radius = lens.aperture_diameter / 2
+    corner = radius * (1 if lens.aperture_shape in ("circle", "annulus") else math.sqrt(2))
+    slope = slope + k * (abs(eps) * corner + wavefront_slope(lens))
+    cells = filter_cells(camera, geometry.wavelength)
     panels = []
-    if lens.aperture_shape == "square":
+    if lens.aperture_shape == "image":
+        panels = [(1.0, _image_rows(lens, cells, slope))]
+    elif lens.aperture_shape == "square":
         for (y0, y1, x0, x1), t in cells or [((-radius, radius, -radius, radius), 1.0)]:
             box = (max(y0, -radius), min(y1, radius), max(x0, -radius), min(x1, radius))
             panels += [(math.sqrt(t), rows) for rows in cell_rows(box, None, slope)]
@@ -117,6 +172,37 @@ def pupil_rows(camera, geometry, slope):
             else:
                 panels += [(sign * math.sqrt(t), rows) for cell, t in cells for rows in cell_rows(cell, r, slope)]
     return [_weighted(lens, k, eps, amplitude, rows) for amplitude, rows in panels]
+
+
+def _image_rows(lens, cells, slope):
+    """Rows over an aperture image, exact for its constant cells (and those of a filter array), weighted with sqrt(T).
+
+    Neighbouring rows or columns of cells that do not differ are one panel; dark margins are left out.
+    """
+    image, radius = lens.samples("aperture_image"), lens.aperture_diameter / 2
+    grid = np.linspace(-radius, radius, len(image) + 1)
+    edges = []
+    for axis in (0, 1):
+        line = np.moveaxis(image, axis, 0)
+        steps = np.any(line[1:] != line[:-1], axis=1)
+        lit = np.flatnonzero(line.any(axis=1))
+        low, high = grid[lit[0]], grid[lit[-1] + 1]
+        inner = np.concatenate([grid[1:-1][steps], *([c[2 * axis:2 * axis + 2] for c, _ in cells or ()])])
+        edges.append(np.unique(np.r_[low, inner[(inner > low) & (inner < high)], high]))
+    middle = [(e[:-1] + e[1:]) / 2 for e in edges]
+    where = [np.clip(np.searchsorted(grid, m) - 1, 0, len(image) - 1) for m in middle]
+    transmittance = image[np.ix_(*where)]
+    if cells is not None:
+        y, x = middle[0][:, None], middle[1][None, :]
+        transmittance = transmittance * sum(t * ((y > y0) & (y < y1) & (x > x0) & (x < x1)) for (y0, y1, x0, x1), t in cells)
+    axes = []
+    for e in edges:
+        t, w = gauss(smooth_nodes(slope * float(np.diff(e).max()) / 2))
+        half = np.diff(e)[:, None] / 2
+        axes.append((((e[:-1] + e[1:])[:, None] / 2 + half * t).ravel(), (half * w).ravel(), len(t)))
+    (y, wy, py), (x, wx, px) = axes
+    amplitude = np.sqrt(transmittance).repeat(py, axis=0).repeat(px, axis=1)
+    return Rows(y, np.broadcast_to(x, amplitude.shape), amplitude * np.outer(wy, wx))
 
 
 def _weighted(lens, k, eps, amplitude, rows):

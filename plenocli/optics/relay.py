@@ -16,11 +16,14 @@ import numpy as np
 from plenocli.optics.quadrature import gauss
 
 
-def sensor_nodes(geometry, axis, count):
-    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel along `axis`: (count, pixels)."""
+def sensor_nodes(geometry, axis, count, place=0.0):
+    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel along `axis`: (count, pixels).
+
+    place: where the superpixel's centre lies along the axis, in superpixel pitches; it matters on a sensor's own raster only.
+    """
     t, w = gauss(count)
     half = geometry.pixel_active / 2
-    return half * t[:, None] + geometry.pixels(axis), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
+    return half * t[:, None] + (geometry.pixels(axis) + geometry.window_shift(axis, place)), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
 
 
 def lenslet_kernel(geometry, n, v, weight, x):
@@ -29,7 +32,11 @@ def lenslet_kernel(geometry, n, v, weight, x):
     relay = 1 / g.z2 + 1 / g.z3
     phase = n * n * g.D2**2 / 2 * relay - n * g.D2 / g.z3 * v
     phase = phase[:, None] + g.kappa / 2 * x * x - x * (v - n * g.superpixel_pitch)[:, None] / g.z3
-    return np.sqrt(weight / (g.wavelength * g.z3))[:, None] * np.exp(1j * g.k * phase)
+    phase *= g.k
+    amplitude = np.sqrt(weight / (g.wavelength * g.z3))[:, None]
+    kernel = np.empty(phase.shape, complex)
+    kernel.real, kernel.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)  # twice as fast as a complex exponential
+    return kernel
 
 
 def lit_lenslets(reach, window):

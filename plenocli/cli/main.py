@@ -21,6 +21,7 @@ COMMANDS = (
     "score",
     "report",
     "inspect",
+    "lens",
     "schema",
 )
 """The order is that of the pipeline, and of the help."""

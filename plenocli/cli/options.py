@@ -34,6 +34,7 @@ class _Quantity(click.ParamType):
 
 # what lies outside the limits is a slip, and would overflow somewhere deep inside
 LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True, show=lambda value: format_length(value).replace(" ", ""), limits=(1e-12, 100e-6))
+DISTANCE = _Quantity("length", parse_length, 0.0, exclusive=True, show=LENGTH.show, limits=(1e-6, 1e6))
 WAVELENGTH = _Quantity("length", parse_wavelength, show=LENGTH.show)
 DECIBEL = _Quantity("decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0))
 BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)

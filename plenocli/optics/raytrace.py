@@ -189,7 +189,7 @@ def entrance_pupil(lens, wavelength):
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
     gap = lens.surfaces[lens.stop - 1].thickness / n if lens.stop else 0.0
     (a, b), _ = np.array([[1.0, gap], [0.0, 1.0]]) @ front  # height at the stop = a y + b u of the ray at the first vertex
-    return _TELECENTRIC if abs(a) < 1e-12 else _pupil(-b / a, 1 / a, lens.stop_radius)
+    return _TELECENTRIC if abs(a) < 1e-12 else _pupil(b / a, 1 / a, lens.stop_radius)
 
 
 def exit_pupil(lens, wavelength):

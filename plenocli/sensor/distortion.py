@@ -1,106 +1,163 @@
-"""Smooth maps from lattice indices to pixels: affine, homography, polynomials; fitted robustly and chosen by the data."""
+"""Smooth maps from lattice indices to pixels: affine, homography, homography with cubic distortion, polynomials; fitted robustly and chosen by the data."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-POLYNOMIAL_ORDER = {"affine": 1, "poly2": 2, "poly3": 3, "poly5": 5}
-PARAMETERS = {"affine": 3, "homography": 4, "poly2": 6, "poly3": 10, "poly5": 21}  # per axis
+ORDER = {"affine": 1, "poly2": 2, "poly3": 3, "poly5": 5}
+FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20, "poly5": 42}  # parameters, simplest first
+
+MARGIN = 0.12  # of the residual
 
 
 @dataclass(frozen=True)
 class GridModel:
-    """Map from lattice index (m, n) to (row, column) px. `at` evaluates it; kind names its form."""
+    """Map from lattice index (m, n) to (row, column) px. `at` evaluates it; kind names its form.
+
+    With u = (index - shift) / scale, coefficients (K, 2) are those of the monomials of u for "affine" and "polyN".
+    Homography: rows 0-2 affine q, row 3 the perspective p: q / (1 + u.p). Radial: that, then with d = (q - middle) / span
+    q + span (k |d|^2 d + 2 (d.g) d + |d|^2 g); row 4 is g, which moves the centre of the distortion, row 5 is (k, 0).
+    """
 
     kind: str
     coefficients: np.ndarray
     shift: np.ndarray
     scale: float
+    middle: np.ndarray
+    span: float
 
     def at(self, index):
         """Positions (..., 2), px, of indices (..., 2) (need not be integers)."""
         u = (np.asarray(index, float) - self.shift) / self.scale
+        if self.kind in ORDER:
+            return _monomials(u, ORDER[self.kind]) @ self.coefficients
+        q = _monomials(u, 1) @ self.coefficients[:3] / (1 + u @ self.coefficients[3])[..., None]
         if self.kind == "homography":
-            top = _monomials(u, 1) @ self.coefficients[:3]
-            return top / (1 + u @ self.coefficients[3:, 0])[..., None]
-        return _monomials(u, POLYNOMIAL_ORDER[self.kind]) @ self.coefficients
+            return q
+        d = (q - self.middle) / self.span
+        g, k = self.coefficients[4], self.coefficients[5, 0]
+        square = (d**2).sum(axis=-1, keepdims=True)
+        return q + self.span * ((k * square + 2 * (d @ g)[..., None]) * d + square * g)
 
 
-def fit_model(kind, index, position, rounds=6):
-    """Robust fit (Tukey weights on the residual's median scale) of one kind of map.
+def fit_model(kind, index, position, weight=None, robust=True):
+    """Robust fit of one kind of map: least absolute residuals first, which a wrong border row does not tilt, then Tukey weights.
 
-    index (N, 2), position (N, 2) px. Returns GridModel.
+    index (N, 2), position (N, 2) px, weight (N,) of the sites; robust=False: plain least squares. Returns GridModel.
     """
     index, position = np.asarray(index, float), np.asarray(position, float)
-    shift = index.mean(axis=0)
-    scale = max(1.0, np.abs(index - shift).max())
-    u = (index - shift) / scale
-    weight = np.ones(len(u))
-    coefficients = None
-    for _ in range(rounds):
-        coefficients = _weighted_fit(kind, u, position, weight, coefficients)
-        model = GridModel(kind, coefficients, shift, scale)
-        miss = np.hypot(*(position - model.at(index)).T)
-        spread = max(1.48 * np.median(miss), 1e-9)
-        weight = np.clip(1 - (miss / (5 * spread)) ** 2, 0, None) ** 2
+    prior = np.ones(len(index)) if weight is None else np.asarray(weight, float)
+    model = _start(kind, index, position)
+    for _ in range(1 if kind in ORDER else 4):
+        model = _least_squares(model, index, position, prior)
+    if not robust:
+        return model
+    for _ in range(8):
+        miss = _miss(model, index, position)
+        model = _least_squares(model, index, position, prior / np.maximum(miss, 0.05 * np.median(miss) + 1e-9))
+    for _ in range(5):
+        model = _least_squares(model, index, position, prior * _tukey(_miss(model, index, position)))
     return model
 
 
-def choose_model(index, position, folds=8, seed=0):
-    """The simplest map whose cross-validated residual is within the scatter of the best one.
+def choose_model(index, position, weight=None):
+    """The simplest map whose leave-one-out residual is within a margin of the best one.
 
-    All kinds are compared on one common set of inliers (trimming each by its own residual would flatter the
-    stiff ones). The margin is two standard errors of an rms over N sites, at least 3 %.
-    Returns (GridModel fitted to all, {kind: cross-validated rms in px}).
+    All kinds are compared with one common set of weights, those of the richest (trimming each by its own residual
+    would flatter the stiff ones). Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
+    The margin is two standard errors of an rms over N sites, at least MARGIN: what sampling and the frame's edges do to
+    exact lattices (a bend of half a site's own scatter passes unseen). index (N, 2), position (N, 2) px,
+    weight (N,). Returns (GridModel fitted to all, {kind: leave-one-out rms in px}).
     """
-    count = len(index)
-    allowed = [kind for kind, size in PARAMETERS.items() if count >= 3 * size]
-    if not allowed:
-        return fit_model("affine", index, position), {}
-    rich = fit_model(allowed[-1], index, position)
-    miss = np.hypot(*(position - rich.at(index)).T)
-    keep = np.flatnonzero(miss < 6 * max(1.48 * np.median(miss), 1e-9))
-    rng = np.random.default_rng(seed)
-    keep = rng.permutation(keep)[:20000]
-    error = {}
-    for kind in allowed:
-        total = 0.0
-        for fold in range(folds):
-            out = np.arange(len(keep)) % folds == fold
-            model = fit_model(kind, index[keep[~out]], position[keep[~out]], rounds=3)
-            total += ((position[keep[out]] - model.at(index[keep[out]])) ** 2).sum()
-        error[kind] = float(np.sqrt(total / len(keep)))
-    margin = 1 + max(0.03, 2 / np.sqrt(2 * len(keep)))
+    count = len(index) if weight is None else weight.sum()
+    allowed = [kind for kind, size in FREEDOM.items() if count >= 1.5 * size]
+    if len(allowed) < 2:
+        return fit_model("affine", index, position, weight), {}
+    index, position = np.asarray(index, float), np.asarray(position, float)
+    fitted = {kind: fit_model(kind, index, position, weight) for kind in allowed}
+    common = _tukey(_miss(fitted[allowed[-1]], index, position)) * (1 if weight is None else weight)
+    error = {kind: _left_out(model, index, position, common) for kind, model in fitted.items()}
+    margin = 1 + max(MARGIN, 2 / np.sqrt(2 * count))
     best = min(error.values())
     kind = next(kind for kind in allowed if error[kind] <= margin * best + 1e-9)
-    return fit_model(kind, index, position), error
+    return fitted[kind], error
+
+
+def _tukey(miss):
+    return np.clip(1 - (miss / (5 * max(1.48 * np.median(miss), 1e-9))) ** 2, 0, None) ** 2
+
+
+def _miss(model, index, position):
+    return np.hypot(*(position - model.at(index)).T)
+
+
+def _left_out(model, index, position, weight):
+    """Weighted rms of the residuals, px, each as if its site had had no part in the fit."""
+    for _ in range(1 if model.kind in ORDER else 2):
+        model = _least_squares(model, index, position, weight)
+    design = _jacobian(model, index)
+    rows = design.reshape(-1, design.shape[-1])
+    normal = rows.T @ (rows * np.repeat(weight, 2)[:, None])
+    leverage = (design @ np.linalg.pinv(normal, rcond=1e-13, hermitian=True)) @ design.transpose(0, 2, 1) * weight[:, None, None]
+    rest = np.linalg.solve(np.eye(2) - np.minimum(leverage, 0.98), (position - model.at(index))[..., None])[..., 0]
+    return float(np.sqrt((weight[:, None] * rest**2).sum() / weight.sum()))
+
+
+def _start(kind, index, position):
+    shift = index.mean(axis=0)
+    scale = max(1.0, np.abs(index - shift).max())
+    middle, span = position.mean(axis=0), max(1.0, np.abs(position - position.mean(axis=0)).max())
+    rows = _monomials(np.zeros(2), ORDER[kind]).size if kind in ORDER else {"homography": 4, "radial": 6}[kind]
+    blank = GridModel(kind, np.zeros((rows, 2)), shift, scale, middle, span)
+    if kind in ORDER:
+        return blank
+    affine = _least_squares(replace(blank, kind="affine", coefficients=np.zeros((3, 2))), index, position, np.ones(len(index)))
+    blank.coefficients[:3] = affine.coefficients
+    return blank
+
+
+def _least_squares(model, index, position, weight):
+    """The model after weighted least squares; for kinds not linear in their parameters, after one step towards it."""
+    if model.kind in ORDER:
+        basis = _monomials((index - model.shift) / model.scale, ORDER[model.kind])
+        return replace(model, coefficients=_solve(basis.T @ (basis * weight[:, None]), basis.T @ (position * weight[:, None])))
+    design, rest = _jacobian(model, index), position - model.at(index)  # a Gauss-Newton step
+    rows, heavy = design.reshape(-1, design.shape[-1]), np.repeat(weight, 2)
+    step = _solve(rows.T @ (rows * heavy[:, None]), rows.T @ (rest.ravel() * heavy))
+    step = np.concatenate([step, np.zeros(2 * len(model.coefficients) - len(step))])
+    return replace(model, coefficients=model.coefficients + step.reshape(-1, 2))
+
+
+def _solve(normal, right):
+    """Solution of the normal equations, columns scaled to one, null directions left at zero."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal * scale[:, None] * scale, rcond=1e-13, hermitian=True)
+    return scale[:, None] * (inverse @ (scale[:, None] * right)) if right.ndim == 2 else scale * (inverse @ (scale * right))
+
+
+def _jacobian(model, index):
+    """Derivatives (N, 2, parameters) of the position with the parameters: the coefficients, row by row."""
+    u = (index - model.shift) / model.scale
+    both = np.eye(2)
+    if model.kind in ORDER:
+        return np.einsum("nk,ab->nakb", _monomials(u, ORDER[model.kind]), both).reshape(len(u), 2, -1)
+    basis, bottom = _monomials(u, 1), 1 + u @ model.coefficients[3]
+    q = basis @ model.coefficients[:3] / bottom[:, None]
+    linear = np.einsum("nk,ab->nakb", basis / bottom[:, None], both).reshape(len(u), 2, 6)
+    design = np.concatenate([linear, -q[:, :, None] * (u / bottom[:, None])[:, None, :]], axis=2)
+    if model.kind == "homography":
+        return design
+    d = (q - model.middle) / model.span
+    g, k = model.coefficients[4], model.coefficients[5, 0]
+    square, outer = (d**2).sum(axis=1)[:, None, None] * both, d[:, :, None] * d[:, None, :]
+    along = 2 * (d[:, :, None] * g + (d @ g)[:, None, None] * both + g[:, None] * d[:, None, :])
+    turn = both + k * (square + 2 * outer) + along
+    shift = model.span * np.concatenate([2 * outer + square, (square @ d[:, :, None])], axis=2)
+    return np.concatenate([turn @ design, shift], axis=2)
 
 
 def _monomials(u, order):
-    return np.stack([u[..., 0] ** (total - j) * u[..., 1] ** j for total in range(order + 1) for j in range(total + 1)], axis=-1)
-
-
-def _weighted_fit(kind, u, position, weight, start):
-    root = np.sqrt(weight)[:, None]
-    if kind != "homography":
-        design = _monomials(u, POLYNOMIAL_ORDER[kind])
-        return np.linalg.lstsq(design * root, position * root, rcond=None)[0]
-    if start is None:
-        affine = np.linalg.lstsq(_monomials(u, 1) * root, position * root, rcond=None)[0]
-        start = np.vstack([affine, np.zeros((2, 2))])
-    p = start.copy()
-    for _ in range(4):  # Gauss-Newton on (top / bottom)
-        basis, bottom = _monomials(u, 1), 1 + u @ p[3:, 0]
-        value = (basis @ p[:3]) / bottom[:, None]
-        left = basis / bottom[:, None]
-        blocks = []
-        for axis in range(2):
-            row = np.zeros((len(u), 8))
-            row[:, 3 * axis : 3 * axis + 3] = left
-            row[:, 6:] = -value[:, axis : axis + 1] * u / bottom[:, None]
-            blocks.append(row * root)
-        step = np.linalg.lstsq(np.vstack(blocks), ((position - value) * root).T.ravel(), rcond=None)[0]
-        p[:3, 0] += step[:3]
-        p[:3, 1] += step[3:6]
-        p[3:] += step[6:, None]
-    return p
+    powers = [np.ones(u.shape)]
+    for _ in range(order):
+        powers.append(powers[-1] * u)
+    return np.stack([powers[total - j][..., 0] * powers[j][..., 1] for total in range(order + 1) for j in range(total + 1)], axis=-1)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.errors import InputError, NumericsError
-from plenocli.sensor import distortion, lattice, spots
+from plenocli.sensor import distortion, lattice, spots, template
 
-CLIP = 0.8  # of a spot's bright level; measured best on real white images, where spots have structure inside
 STRUCTURED = 0.2
+BORDER_WEIGHT = 0.1  # of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it
 FRAME_TOLERANCE = 0.4  # px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
 FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
 
@@ -61,7 +61,7 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     if sides.max() > 1.3 * sides.min():
         raise NumericsError(f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by {sides[1]:.1f} px, which no square or hexagonal array does", fix=FIX)
     pitch = float(np.hypot(*basis.T).min())
-    index, position, clean = _measured_sites(image, basis, kind, pitch, structured)
+    index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
     inside = _whole(position, image.shape, 0.5 * pitch) & clean
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
@@ -69,7 +69,8 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
             "in the frame follow it",
             fix=FIX,
         )
-    model, _ = distortion.choose_model(index[inside], position[inside])
+    weight = np.where(lattice.surrounded(index[inside], kind), 1.0, BORDER_WEIGHT)
+    model, _ = distortion.choose_model(index[inside], position[inside], weight)
     miss = np.hypot(*(position - model.at(index)).T)
     if np.sqrt(np.mean(miss[inside] ** 2)) > 0.07 * pitch:
         raise NumericsError(
@@ -77,18 +78,15 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
             "the best grid",
             fix=FIX,
         )
+    position[inside], _ = template.register(image, model.at(index[inside]), basis, slope[inside], symmetric=not structured)
+    model, _ = distortion.choose_model(index[inside], position[inside], weight)
     lit = None
-    if structured:
-        position[inside] = spots.register(image, model.at(index[inside]), pitch)
-        model, _ = distortion.choose_model(index[inside], position[inside])
-        miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
     if structured and kind == "square":
         moved = _to_dark_borders(image, model, index[inside], pitch, near)
         position = position + moved.at(index) - model.at(index)
         model, lit = moved, _lit_cells(image, moved)
-    mean = distortion.fit_model("affine", index[inside], position[inside])
-    vectors = mean.coefficients[1:] / mean.scale
-    return _assemble(kind, model, vectors, index, miss, clean, image.shape, pitch, lit)
+    miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
+    return _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
 
 
 def prepare(white, cfa="mono", dark=None):
@@ -190,9 +188,6 @@ def _measured_sites(image, basis, kind, pitch, structured):
     index, first, flux = chosen[best], position[best], flux[best]
     surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
     slope = slope / np.maximum(surface, 1e-9)[:, None]
-    if not structured:
-        slope *= _share_within(image, first, pitch, slope, _whole(first, image.shape, 0.5 * pitch))
-    position, flux = spots.windowed_centroids(image, first, pitch, slope=slope, window=window, clip=CLIP)
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
     if spread > 0.1:  # real white images have 0.02 at most
@@ -201,8 +196,7 @@ def _measured_sites(image, basis, kind, pitch, structured):
             f"{100 * spread:.0f} % from one to the next (a chart or a scene, not even light)",
             fix=FIX,
         )
-    clean = (level > 0.3) & (np.hypot(*(position - first).T) < 0.25 * pitch)
-    return index, position, clean
+    return index, first, level > 0.3, slope
 
 
 def _illumination(position, flux, shape, whole):
@@ -300,41 +294,12 @@ def _lit_cells(image, model):
     return cells[inside & (light > 0.3 * np.median(light[inside]))]
 
 
-def _share_within(image, position, pitch, slope, whole, most=1500):
-    """How much (0..1) of the illumination's gradient across lenslets also holds within a superpixel.
-
-    Light that falls off continuously over the sensor has it all, a vignetting that dims whole superpixels none. The
-    gradient shifts centroids in a large window more than in a small one; the share is the one at which both agree.
-    Where the data cannot tell, it tends to 1.
-    """
-    chosen = np.flatnonzero(whole)
-    chosen = chosen[:: max(1, len(chosen) // most)]
-    if len(chosen) < 9:
-        return 1.0
-    centre, tilt = position[chosen], slope[chosen]
-    plain, tilted = (
-        spots.windowed_centroids(image, centre, pitch, slope=t)[0] - spots.windowed_centroids(image, centre, pitch, slope=t, window=spots.SMALL_WINDOW)[0]
-        for t in (0 * tilt, tilt)
-    )
-    plain = plain - np.median(plain, axis=0)
-    gain = (plain - tilted) - np.median(plain - tilted, axis=0)
-    size = np.hypot(*plain.T)
-    keep = size < 5 * max(np.median(size), 1e-9)
-    energy = (gain[keep] ** 2).sum()
-    if energy == 0:
-        return 1.0
-    share = (gain[keep] * plain[keep]).sum() / energy
-    spread = np.sqrt(((plain[keep] - share * gain[keep]) ** 2).mean() / energy)
-    trust = 1 / max(spread, 1e-6) ** 2
-    return float(np.clip((share * trust + 4.0) / (trust + 4.0), 0, 1))  # 4: a prior of 1 +- 0.5
-
-
 def _whole(position, shape, margin):
     low = margin - 0.5 - FRAME_TOLERANCE
     return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
 
 
-def _assemble(kind, model, vectors, index, miss, clean, shape, pitch, lit):
+def _assemble(kind, model, index, miss, clean, shape, pitch, lit):
     """Lay the sites out as an array (R, C) without empty border rows and columns; lit (N, 2): more sites that hold light."""
     site = lattice.to_array(index, kind)
     bright = site[clean] if lit is None else lattice.to_array(lit, kind)
@@ -345,12 +310,16 @@ def _assemble(kind, model, vectors, index, miss, clean, shape, pitch, lit):
     residual, valid = np.full(grid.shape[:2], np.nan), np.zeros(grid.shape[:2], bool)
     residual[tuple((site[keep] - low).T)] = miss[keep]
     valid[tuple((bright - low).T)] = True
-    valid &= _whole(centres, shape, 0.5 * pitch)
+    frame = _whole(centres, shape, 0.5 * pitch)
+    valid = (valid & frame) | lattice.enclosed(valid & frame, frame, lattice.from_array(grid, kind), kind)  # under dust: still a lenslet
     rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
     if rows.size:  # a border of cells that the frame cuts everywhere is of no use
         block = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
         centres, residual, valid = centres[block], residual[block], valid[block]
     inner = residual[valid & np.isfinite(residual)]
+    place = lattice.from_array(grid[valid] if not rows.size else grid[block][valid], kind)
+    mean = distortion.fit_model("affine", place, centres[valid], robust=False)
+    vectors = mean.coefficients[1:] / mean.scale
     return Lattice(
         kind=kind,
         pitch=np.hypot(*vectors.T),

@@ -156,6 +156,29 @@ def index_sites(spots, basis, kind, start, gate=0.28):
     return index, found
 
 
+def surrounded(index, kind):
+    """Which (N,) of the sites `index` (N, 2) have all neighbours, 6 on a hexagonal and 8 on a square lattice, among them."""
+    return _neighbours(index, np.ones(len(index), bool), kind) == len(_ring(kind))
+
+
+def enclosed(there, possible, index, kind):
+    """Which (R, C) of the `possible` (R, C) sites with indices (R, C, 2) have three quarters of their possible neighbours `there` (R, C)."""
+    have, could = (_neighbours(index.reshape(-1, 2), x.ravel(), kind).reshape(there.shape) for x in (there, possible))
+    return possible & (have >= 0.75 * could) & (have >= 2)
+
+
+def _ring(kind):
+    return HEXAGONAL_STEPS if kind == "hexagonal" else np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+
+
+def _neighbours(index, there, kind):
+    """How many (N,) neighbours of each site are `there` (N,)."""
+    site = index - index.min(axis=0) + 1
+    taken = np.zeros(site.max(axis=0) + 2, int)
+    taken[tuple(site.T)] = there
+    return sum(taken[tuple((site + step).T)] for step in _ring(kind))
+
+
 def to_array(index, kind):
     """(row, column) of the lenslet array for lattice indices (m, n): hexagonal rows stay upright (offset rows)."""
     index = np.asarray(index)

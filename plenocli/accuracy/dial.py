@@ -9,7 +9,7 @@ from plenocli.accuracy.needs import seen_wavelengths, sensor_noise, visible_accu
 from plenocli.accuracy.rates import NOMINAL, product_rate
 from plenocli.accuracy.rungs import RUNGS
 from plenocli.errors import NumericsError, UsageError
-from plenocli.optics.geometry import geometry
+from plenocli.optics.geometry import geometry, lenslet_shift
 from plenocli.optics.plan import PifPlan, blur_ring, predicted_outside, window_error
 
 BEST_ACCURACY = 1e-8
@@ -47,16 +47,16 @@ class Candidate:
 
 
 def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="auto", accuracy=None, model="auto", dtype="auto", points=None,
-             needs=None):
+             needs=None, lenslet=None):
     """Choose how to compute the system matrix of `camera`; no optics is computed.
 
     wavelengths: metres (default: the camera's); superpixels: "auto" or odd (rows, columns); coherent_ring: "auto" or a number of
     rings (0: isolated lenslets); accuracy: relative L2 error of the worst column, against the finest model for model "auto" and
     within the model where one is named; None takes what the noise of the sensor or of the scene lets be seen, or the best
     there is; dtype: "auto", float32 or float64 of the stored matrix; points: slice of flat point indices; needs: a Needs that
-    narrows the request. Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
+    narrows the request; lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster. Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
     """
-    request = _Request(camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs)
+    request = _Request(camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs, lenslet)
     found = [_consider(request, rung) for rung in RUNGS if model in ("auto", rung.model)]
     best = _cheapest(found)
     if best is None:
@@ -67,7 +67,7 @@ def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="aut
 class _Request:
     """What was asked, narrowed to what the scene needs, with the geometry at each wavelength."""
 
-    def __init__(self, camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs):
+    def __init__(self, camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs, lenslet):
         if model not in MODELS:
             raise UsageError(f"model {model!r} is not one of {', '.join(MODELS)}", "model")
         if coherent_ring != "auto" and not (isinstance(coherent_ring, int) and 0 <= coherent_ring <= 20):
@@ -79,7 +79,8 @@ class _Request:
         kept, dropped = seen_wavelengths(wavelengths or camera.light.wavelengths, needs)
         if dropped:
             self.left_out.append(f"{len(dropped)} wavelength(s) without light in the scene: no error")
-        self.views = [geometry(camera, w) for w in kept]
+        self.pixel_shift, self.off_axis = _place(camera, lenslet)
+        self.views = [geometry(camera, w, self.pixel_shift) for w in kept]
         self.explicit = accuracy is not None
         self.accuracy, self.asked_by = self._accuracy(accuracy)
         self.dtype = np.dtype((np.float32 if self.accuracy >= 1e-6 else np.float64) if isinstance(dtype, str) and dtype == "auto" else dtype)
@@ -125,9 +126,21 @@ class _Request:
         return len(self.views), self.grid[0] * self.grid[1], int(np.prod(self.views[0].pixel_shape)), count
 
 
+def _place(camera, lenslet):
+    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; (None, False) for the one on the axis."""
+    if lenslet is None:
+        return None, False
+    count = camera.lenslet_array.count
+    if not all(0 <= n < m for n, m in zip(lenslet, count)):
+        raise UsageError(f"lenslet {lenslet[0]},{lenslet[1]} is not on the array of {count[0]} x {count[1]}", "lenslet", "count rows and columns from 0")
+    return lenslet_shift(camera, *lenslet)[2], any(2 * n != m - 1 for n, m in zip(lenslet, count))
+
+
 def _consider(request, rung):
     """The Candidate of one rung: its error by source, and the rings, precision and node counts that it would take."""
     reason = next((r for r in (rung.valid_for(request.camera, v) for v in request.views) if r), None)
+    if request.off_axis and rung.model == "exact":
+        reason = reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
     if reason:
         return Candidate(rung.name, rung.model, reason)
     fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
@@ -205,7 +218,7 @@ def _plan(request, found, best):
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(best.model, best.name, request.grid, best.ring, request.accuracy, request.asked_by, best.sampling / 2, best.double, best.bands,
                    request.shape, size, best.bytes, best.error, best.split, _model_error(request, best), request.dtype.name, tuple(request.reasons), tuple(request.left_out),
-                   tuple(warnings), table)
+                   tuple(warnings), table, request.pixel_shift)
 
 
 def _model_error(request, best):
@@ -243,10 +256,10 @@ def _warnings(request, best):
     view, grid, found = request.views[0], request.grid, []
     for axis, name in ((0, "rows"), (1, "columns")):
         size = view.pixel_shape[axis] * view.pixel_pitch
-        if abs(size / view.superpixel_pitch - 1) > 1e-4:
+        if request.pixel_shift is None and abs(size / view.superpixel_pitch - 1) > 1e-4:
             found.append(
                 f"superpixels are {view.superpixel_pitch / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
-                "grid centred on each superpixel, not for one sensor raster")
+                "grid centred on each superpixel, not for one sensor raster (--lenslet)")
     if request.model != "auto" and best.model != "exact":
         error = _model_error(request, best)
         if error > request.accuracy:

@@ -20,6 +20,7 @@ class Settings:
     accuracy: float | None = None
     model: str = "auto"
     scene: str | None = None
+    lenslet: tuple | None = None
     dtype: str = "auto"
     mem_limit: int = 8 << 30
 
@@ -44,7 +45,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     camera = load_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
     plan = plan_pif(camera, wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
-                    accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs)
+                    accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs, lenslet=settings.lenslet)
     if explain:
         return _explained(plan)
     # the matrix, its copy while columns are gathered, and the file's image in memory
@@ -60,10 +61,20 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     for warning in found["warnings"]:
         note(warning)
     data, attrs = _contents(pif, found)
+    if settings.lenslet is not None:
+        attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
     provenance = Provenance(command, describe_inputs({"camera": camera_path, "scene": scene}), None, camera.text, accuracy_record(plan))
     write_artefact(output, Artefact("pif", data, attrs, provenance), overwrite=overwrite)
     return _summary(output, pif, found, plan)
+
+
+def _window(camera, lenslet):
+    """Where the pixels of an off-axis lenslet's own superpixel lie on the sensor."""
+    from plenocli.optics.geometry import lenslet_shift
+
+    row, column, shift = lenslet_shift(camera, *lenslet)
+    return {"lenslet": list(lenslet), "first_pixel": [row, column], "pixel_shift": list(shift)}
 
 
 def accuracy_record(plan):

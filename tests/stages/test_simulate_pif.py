@@ -80,3 +80,22 @@ def test_spectral_step_gives_the_wavelengths_of_white_light(tmp_path):
     out = tmp_path / "pif.h5"
     assert run(["simulate-pif", str(camera), "-o", str(out), "--spectral-step", "50nm", "--superpixels", "1x1", "--accuracy", "1e-2", "--model", "fresnel"]) == 0
     assert read_artefact(out, "pif").data["pif/wavelength"] == pytest.approx(np.arange(400e-9, 701e-9, 50e-9))
+
+
+def test_an_off_axis_lenslet_on_the_sensors_raster(tmp_path, capsys):
+    camera, out, centred = tmp_path / "drift.toml", tmp_path / "pif.h5", tmp_path / "centred.h5"
+    camera.write_text(TINY.read_text().replace('superpixel_pitch = "26 um"', 'superpixel_pitch = "26.3 um"'))
+    common = ["--model", "fresnel", "--accuracy", "1e-4", "--superpixels", "1x1", "--coherent-ring", "0"]
+    assert run(["simulate-pif", str(camera), "-o", str(out), "--lenslet", "0,1", *common]) == 0
+    assert run(["simulate-pif", str(camera), "-o", str(centred), *common]) == 0
+    artefact = read_artefact(out, "pif")
+    notes, count = artefact.attrs["pif"]["notes"], read_artefact(out, "pif").provenance.config.count("count")
+    assert notes["lenslet"] == [0, 1] and count == 1
+    # off by 0.15 pixel a lenslet from the middle one; the light is where the shifted window sees it, but for what it cuts off
+    shift = np.array(notes["pixel_shift"])
+    rows, columns = 13, 13
+    image, plain = (read_artefact(p, "pif").data["pif/A"][0, 0].sum(axis=1).reshape(rows, columns) for p in (out, centred))
+    centroid = lambda a: np.array([np.arange(rows) @ a.sum(axis=1), np.arange(columns) @ a.sum(axis=0)]) / a.sum()
+    assert centroid(image) - centroid(plain) == pytest.approx(-shift, abs=0.08) and np.abs(shift).max() > 0.25
+    assert run(["simulate-pif", str(TINY), "--explain", "--lenslet", "9,9"]) == 2
+    assert "is not on the array" in capsys.readouterr().err

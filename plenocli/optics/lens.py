@@ -145,10 +145,12 @@ class Wavefront:
     centre: np.ndarray
     radius: float
 
-    @property
-    def rms(self):
-        """Root mean square (m) of W about its mean over the points."""
-        return float(np.nanstd(self.error))
+    def rms(self, weights=None):
+        """Root mean square (m) of W about its mean over the points that light reaches; `weights` (ray,) as of disc_points."""
+        lit = np.isfinite(self.error)
+        weights = None if weights is None else weights[lit]
+        mean = np.average(self.error[lit], weights=weights)
+        return float(np.sqrt(np.average((self.error[lit] - mean) ** 2, weights=weights)))
 
 
 def wavefront(lens, wavelength, points, angle=0.0, object_distance=math.inf, image_distance=None, clip=True):

@@ -62,13 +62,14 @@ def _field(lens, wavelengths, angle, distance):
         report["transmitted"] = transmitted(lens, lens.design_wavelength, angle, distance)
         report["distortion"] = distortion(lens, lens.design_wavelength, angle, distance) if angle else 0.0
         colour = lateral_colour(lens, wavelengths, angle, distance)
-        points, _ = disc_points(16, 64)
+        points, weights = disc_points(16, 64)
         report["wavelengths"] = []
         for w, shift in zip(wavelengths, colour):
             wave = wavefront(lens, w, points, angle=angle, object_distance=distance)
+            rms = wave.rms(weights)
             terms, rest = noll_coefficients(lens, w, 22, angle=angle, object_distance=distance)
-            report["wavelengths"].append({"wavelength_m": w, "lateral_colour_m": float(shift), "image_height_m": float(wave.centre[1]), "wavefront_rms_m": wave.rms,
-                                          "wavefront_rms_waves": wave.rms / w, "noll_m": [float(c) for c in terms], "noll_rest_m": rest})
+            report["wavelengths"].append({"wavelength_m": w, "lateral_colour_m": float(shift), "image_height_m": float(wave.centre[1]), "wavefront_rms_m": rms,
+                                          "wavefront_rms_waves": rms / w, "noll_m": [float(c) for c in terms], "noll_rest_m": rest})
     except NumericsError as error:
         report["trouble"] = error.what
     return report

@@ -27,13 +27,14 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     to any superpixel's centre (see find_grid). Errors: InputError for files, NumericsError where there is no lattice or no light.
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
-    from plenocli.config import load_camera
+    from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.sensor.frames import make_dark, merge
 
     bands = sorted(bands, key=lambda pair: pair[0])
     roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
     check_output(output, overwrite=overwrite, inputs=[*whites, *darks, camera, *(path for _, path in bands)], suffixes=(".h5",))
-    description = load_camera(camera) if camera else None
+    description = read_camera(camera) if camera else None
+    roles |= camera_files(camera, description) if camera else {}
     cfa = cfa or (description.sensor.cfa if description else None)
     white = read_exposures(whites, cfa=cfa)
     dark_frames = read_exposures(darks, white[0], cfa)

@@ -40,7 +40,7 @@ def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scen
     Errors: ConfigError where the camera does not tile the sensor, UsageError for contradicting options, InputError for files.
     """
     from plenocli.artefacts import check_output, describe_inputs
-    from plenocli.config import load_camera
+    from plenocli.stages.cameras import camera_files, read_camera
 
     output = Path(output)
     if output.suffix not in (".h5", ".exr", ".dng"):
@@ -50,15 +50,15 @@ def run_capture_sim(camera_path, output, settings, *, scene=None, pif=None, scen
     check_output(output, overwrite=overwrite, inputs=[camera_path, pif, scene])
     if scene_out:
         check_output(scene_out, overwrite=overwrite, inputs=[camera_path, pif, scene], suffixes=(".h5", ".exr"))
-    camera = load_camera(camera_path)
+    camera = read_camera(camera_path)
     _check_tiling(camera, camera_path)
     _check_memory(camera, settings, camera_path)
     source, what = _source(camera, settings, scene)
-    matrix, accuracy = _read_pif(pif, camera, settings, source.wavelengths) if pif else (None, _accuracy(camera, settings, source.wavelengths))
+    matrix, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path) if pif else (None, _accuracy(camera, settings, source.wavelengths))
     light, whites, truth = _carry(camera, source, what, settings, matrix)
     capture, summary = _detect(camera, light, whites, settings, scene)
     _describe(capture, camera, settings, truth, scene)
-    provenance = dict(command=command, inputs=describe_inputs({"camera": camera_path, "pif": pif, "scene": scene if scene and Path(scene).is_file() else None}),
+    provenance = dict(command=command, inputs=describe_inputs(camera_files(camera_path, camera) | {"pif": pif, "scene": scene if scene and Path(scene).is_file() else None}),
                       seed=settings.seed, config=camera.text, accuracy=accuracy)
     _write(output, capture, provenance, overwrite)
     if scene_out:
@@ -124,10 +124,11 @@ class _Stored:
         yield np.arange(self.matrix.shape[2]), self.matrix
 
 
-def _read_pif(path, camera, settings, wavelengths):
+def _read_pif(path, camera, settings, wavelengths, camera_path):
     """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
     from plenocli.artefacts import read_artefact
     from plenocli.config import parse_camera
+    from plenocli.stages.cameras import require_same_files
 
     artefact = read_artefact(path, "pif", mem_limit=settings.mem_limit)
     if settings.refine != 1:
@@ -138,6 +139,7 @@ def _read_pif(path, camera, settings, wavelengths):
         ours, theirs = getattr(camera, section), getattr(made_for, section)
         if (ours and ours.model_dump(exclude=drop)) != (theirs and theirs.model_dump(exclude=drop)):
             raise InputError(f"was made for another camera: [{section}] differs", path, "run simulate-pif on this camera")
+    require_same_files(camera_path, camera, artefact, path)
     known = artefact.data["pif/wavelength"]
     stored = {}
     for wavelength in wavelengths:

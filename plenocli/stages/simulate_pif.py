@@ -33,7 +33,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.accuracy import plan_pif
-    from plenocli.config import load_camera
+    from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.optics.diagnose import describe
     from plenocli.optics.pif import build_pif
     from plenocli.stages.needs import read_needs
@@ -42,7 +42,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
         if output is None:
             raise UsageError("no output file given", "--output", "write -o pif.h5, or --explain to see the plan only")
         check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
-    camera = load_camera(camera_path)
+    camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
     plan = plan_pif(camera, wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
                     accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs, lenslet=settings.lenslet)
@@ -64,7 +64,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     if settings.lenslet is not None:
         attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
-    provenance = Provenance(command, describe_inputs({"camera": camera_path, "scene": scene}), None, camera.text, accuracy_record(plan))
+    provenance = Provenance(command, describe_inputs(camera_files(camera_path, camera) | {"scene": scene}), None, camera.text, accuracy_record(plan))
     write_artefact(output, Artefact("pif", data, attrs, provenance), overwrite=overwrite)
     return _summary(output, pif, found, plan)
 

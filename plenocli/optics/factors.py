@@ -21,32 +21,38 @@ class Factors:
     high: (superpixel rows, point rows, nodes x pixel rows, terms), wide: (superpixel columns, point columns, nodes x pixel
     columns, terms), both complex and of one type; the nodes of a pixel run slowest along v and u (as relay.sensor_nodes
     orders them), square roots of the quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel
-    is the share of the light that it receives. pixel_shape: (rows, columns); pixel_nodes: nodes per axis.
+    is the share of the light that it receives. pixel_shape: (rows, columns); pixel_nodes: nodes per axis; signs: (terms,)
+    of +-1 that multiply the terms, so that one table may serve as both.
     """
 
-    def __init__(self, high, wide, pixel_shape, pixel_nodes):
+    def __init__(self, high, wide, pixel_shape, pixel_nodes, signs=None):
         if high.shape[2] != pixel_nodes * pixel_shape[0] or wide.shape[2] != pixel_nodes * pixel_shape[1] or high.shape[3] != wide.shape[3]:
             raise ValueError(f"tables {high.shape} and {wide.shape} do not fit {pixel_nodes} nodes in pixels {pixel_shape}")
         self.high, self.wide = np.ascontiguousarray(high), np.ascontiguousarray(wide, dtype=high.dtype)
         self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
+        self.signs = None if signs is None else signs.astype(high.real.dtype)
 
     def columns(self, rows, columns, out):
         """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows, superpixel columns, pixel rows, pixel columns)."""
+        for sy in range(len(self.high)):
+            for sx in range(len(self.wide)):
+                self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
+
+    def superpixel(self, sy, sx, rows, columns, out):
+        """Pixel energies on one superpixel, as counted in the tables, of points (rows[i], columns[i]) into out (points, pixel rows, pixel columns)."""
         real = self.high.real.dtype
-        terms, lines = self.high.shape[3], self.high.shape[2]
+        lines, terms = self.high.shape[2:]
         step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
         work = np.empty((step * lines, 2 * self.wide.shape[2]), real)
         order = np.argsort(columns, kind="stable")
-        starts = np.flatnonzero(np.r_[True, np.diff(columns[order]) > 0])
-        for group in np.split(order, starts[1:]):
-            for sx in range(self.wide.shape[0]):
-                right = _real_form(self.wide[sx, columns[group[0]]])
-                for start in range(0, len(group), step):
-                    part = group[start:start + step]
-                    for sy in range(self.high.shape[0]):
-                        left = self.high[sy, rows[part]].view(real).reshape(-1, 2 * terms)
-                        product = np.matmul(left, right, out=work[:len(left)])
-                        out[part, sy, sx] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
+        starts = np.flatnonzero(np.diff(columns[order]) > 0) + 1
+        for group in np.split(order, starts):
+            right = self._right(self.wide[sx, columns[group[0]]])
+            for start in range(0, len(group), step):
+                part = group[start:start + step]
+                left = self.high[sy, rows[part]].view(real).reshape(-1, 2 * terms)
+                product = np.matmul(left, right, out=work[:len(left)])
+                out[part] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
 
     def _energy(self, parts):
         """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part, node, pixel column)) real."""
@@ -54,12 +60,11 @@ class Factors:
         lines = np.einsum("nqk,nqk->nk", parts, parts)
         return lines.reshape(len(parts), py, 2 * p, px).sum(axis=2)
 
-
-def _real_form(factor):
-    """(node, term) complex as the right-hand side of a real product: (term x (real, imaginary), (real, imaginary) x node)."""
-    turned = factor.T
-    right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
-    right[:, 0, 0] = right[:, 1, 1] = turned.real
-    right[:, 0, 1] = turned.imag
-    np.negative(turned.imag, out=right[:, 1, 0])
-    return right.reshape(2 * len(turned), -1)
+    def _right(self, factor):
+        """(node, term) complex as the right-hand side of a real product: (term x (real, imaginary), (real, imaginary) x node)."""
+        turned = factor.T if self.signs is None else factor.T * self.signs[:, None]
+        right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
+        right[:, 0, 0] = right[:, 1, 1] = turned.real
+        right[:, 0, 1] = turned.imag
+        np.negative(turned.imag, out=right[:, 1, 0])
+        return right.reshape(2 * len(turned), -1)

@@ -81,6 +81,96 @@ class PifBuilder:
                     yield points[fresh], self._flat(images[fresh]).transpose(1, 2, 0)
                 done = np.union1d(done, points)
 
+    def orbits(self):
+        """Superpixels that the symmetry maps onto each other: [(index of the first, [(index, (turned, flipped rows, flipped columns))])]."""
+        (cy, cx), found = ((n - 1) // 2 for n in self.plan.superpixels), {}
+        place = {tuple(o): i for i, o in enumerate(self.offsets.tolist())}
+        for (r, c), index in place.items():
+            flips = r < 0 and self.symmetry[0], c < 0 and self.symmetry[1]
+            a, b = (-n if flip else n for n, flip in zip((r, c), flips))
+            turned = self._turns and a > b
+            found.setdefault(place[(b, a) if turned else (a, b)], []).append((index, (turned, *flips)))
+        return list(found.items())
+
+    @property
+    def _turns(self):
+        return self.symmetry[2] and self.symmetry[0] == self.symmetry[1]
+
+    def fill(self, A, *, workers=1, progress=None):
+        """Write the whole matrix of this wavelength into A (superpixel, pixel, point); the same bytes for any number of threads.
+
+        progress: called with the number of columns x superpixels that are done. Errors as `columns`.
+        """
+        if not hasattr(self._lenslets, "superpixel"):
+            for points, block in self.blocks(max(8, self.points // 8)):
+                A[:, :, points] = block
+                if progress:
+                    progress(len(points) * len(self.offsets))
+            return
+        for first, members in self.orbits():
+            self._slab(first, A[first], workers)
+            for index, how in members:
+                if index != first:
+                    np.copyto(self._planes(A[index]), _mapped(self._planes(A[first]), how))
+                if progress:
+                    progress(self.points)
+
+    def pieces(self, *, workers=1):
+        """The matrix superpixel by superpixel, as (superpixel, A of it (pixel, point)), in the order of `orbits`.
+
+        The array is a work array, overwritten by the next one. Makers that compute all superpixels of a point at once hold
+        the whole matrix meanwhile.
+        """
+        if not hasattr(self._lenslets, "superpixel"):
+            whole = np.empty((*self.shape, self.points), self.dtype)
+            self.fill(whole)
+            yield from enumerate(whole)
+            return
+        slab, other = np.empty((2, self.shape[1], self.points), self.dtype)
+        for first, members in self.orbits():
+            self._slab(first, slab, workers)
+            for index, how in members:
+                if how == (False, False, False):
+                    yield index, slab
+                else:
+                    np.copyto(self._planes(other), _mapped(self._planes(slab), how))
+                    yield index, other
+
+    def _planes(self, slab):
+        return slab.reshape(*self.pixel_shape, *self.object_shape)
+
+    def _slab(self, index, out, workers):
+        """A of one superpixel into out (pixel, point); points that the symmetry of this superpixel joins are computed once."""
+        (oy, ox), (r, c) = self.object_shape, self.offsets[index].tolist()
+        sy, sx = (int(n) for n in self.offsets[index] - self.offsets[0])
+        mirror_y, mirror_x = self.symmetry[0] and r == 0, self.symmetry[1] and c == 0
+        turn = self._turns and r == c
+        rows, columns = (oy + 1) // 2 if mirror_y else oy, (ox + 1) // 2 if mirror_x else ox
+        planes = self._planes(out)
+        share = np.empty((oy, ox))
+        entered = self._lenslets.incident(*(a.ravel() for a in np.indices((oy, ox)))).reshape(oy, ox)
+
+        def work(start, stop):
+            count = stop if turn else rows
+            j, i = (a.ravel() for a in np.meshgrid(np.arange(start, stop), np.arange(count), indexing="ij"))
+            images = np.empty((len(i), *self.pixel_shape), self.dtype)
+            self._lenslets.superpixel(sy, sx, i, j, images)
+            share[:count, start:stop] = images.reshape(stop - start, count, -1).sum(axis=2, dtype=float).T
+            planes[:, :, :count, start:stop] = images.reshape(stop - start, count, *self.pixel_shape).transpose(2, 3, 1, 0)
+
+        # a cache line of points at a time; where columns differ in length, fewer
+        step = 4 if turn else 16
+        spread([(start, min(start + step, columns)) for start in range(0, columns, step)], work, workers)
+        if turn:
+            _complete(planes, share, rows)
+        if mirror_y:
+            planes[:, :, rows:, :columns] = planes[::-1, :, :oy - rows, :columns][:, :, ::-1]
+            share[rows:, :columns] = share[:oy - rows, :columns][::-1]
+        if mirror_x:
+            planes[:, :, :, columns:] = planes[:, ::-1, :, :ox - columns][:, :, :, ::-1]
+            share[:, columns:] = share[:, :ox - columns][:, ::-1]
+        self._within(share, entered, *np.indices((oy, ox)))
+
     def _seeds(self):
         """One flat index of each set of points that the symmetry maps onto each other, columns together."""
         rows, columns = self.object_shape
@@ -119,8 +209,11 @@ class PifBuilder:
         return np.ascontiguousarray(images).reshape(len(images), *self.shape)
 
     def _guard(self, rows, columns, out):
-        sensor = out.sum(axis=(1, 2, 3, 4), dtype=float)
-        entered = self._lenslets.incident(rows, columns)
+        self._within(out.sum(axis=(1, 2, 3, 4), dtype=float), self._lenslets.incident(rows, columns), rows, columns)
+
+    def _within(self, sensor, entered, rows, columns):
+        """NumericsError where points (rows, columns) put more light on the `sensor` than `entered` the lenslets."""
+        sensor, entered, rows, columns = (np.ravel(a) for a in (sensor, entered, rows, columns))
         excess = sensor - entered
         slack = 1e-6 if self.plan.double else 1e-5
         worst = int(np.argmax(excess))
@@ -137,31 +230,91 @@ def _maker(camera, plan):
     return SquareLenslets if (array.aperture_shape, array.lattice) == ("square", "square") else ShapedLenslets
 
 
-def build_pif(camera, plan, *, points=None, progress=None):
+def _mapped(planes, how):
+    """(pixel row, pixel column, point row, point column) of the superpixel that (turned, flipped rows, flipped columns) leads to: a view."""
+    turned, rows, columns = how
+    planes = planes.transpose(1, 0, 3, 2) if turned else planes
+    planes = planes[::-1, :, ::-1] if rows else planes
+    return planes[:, ::-1, :, ::-1] if columns else planes
+
+
+def _complete(planes, share, count):
+    """Fill points below the diagonal of the first count x count from those above, rows and columns exchanged."""
+    turned = planes.transpose(1, 0, 3, 2)
+    for j in range(count):
+        planes[:, :, j + 1:count, j] = turned[:, :, j + 1:count, j]
+        share[j + 1:count, j] = share[j, j + 1:count]
+
+
+def spread(parts, work, workers):
+    """work(*part) for all parts on `workers` threads; products of matrices stay on the thread that asks for them."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        if workers <= 1 or len(parts) < 2:
+            for part in parts:
+                work(*part)
+            return
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(workers) as pool:
+            for done in [pool.submit(work, *part) for part in parts]:
+                done.result()
+
+
+def build_pif(camera, plan, *, points=None, progress=None, workers=1):
     """Compute the system matrix of `camera` (plenocli.config.Camera) as a Pif by a PifPlan (plenocli.accuracy.plan_pif).
 
-    points: slice of flat point indices, as planned; progress: called as progress(done, total). NumericsError where a column
-    holds more energy than entered the lenslets.
+    points: slice of flat point indices, as planned; progress: called as progress(done, total); workers: threads.
+    NumericsError where a column holds more energy than entered the lenslets.
     """
     dtype = np.dtype(plan.dtype)
     A = np.empty(plan.shape, dtype)
-    energy = np.empty((plan.shape[0], plan.shape[3]))
-    tails, builder = [], None
+    count = _Count(plan, progress)
+    builders = []
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=dtype)
-        done, columns = 0, np.empty((plan.shape[3], *plan.shape[1:3]), dtype)
-        chosen = None if points is None else np.arange(builder.points)[points]
-        source = builder.blocks() if points is None else _chunks(builder, chosen)
-        for where, block in source:
-            columns[where] = block.transpose(2, 0, 1)
-            done += len(where)
-            if progress:
-                progress(b * plan.shape[3] + done, plan.shape[0] * plan.shape[3])
-        energy[b] = columns.sum(axis=(1, 2), dtype=float)
-        A[b] = columns.transpose(1, 2, 0)
-        tails.append(builder.notes["field_tail"])
-    return Pif(A, np.array([b.wavelength for b in plan.bands]), builder.offsets, builder.pixel_shape, builder.object_shape, energy,
-               _notes(plan, builder, tails, energy))
+        if points is None:
+            builder.fill(A[b], workers=workers, progress=count)
+        else:
+            for where, block in _chunks(builder, np.arange(builder.points)[points]):
+                A[b][:, :, where] = block
+                count(len(where) * len(builder.offsets))
+        builders.append(builder)
+    return Pif(A, *described(plan, builders, A.sum(axis=(1, 2), dtype=float)))
+
+
+def pif_pieces(camera, plan, *, progress=None, workers=1):
+    """The system matrix in pieces, for one too large to hold: yields (builder, band, superpixel, A of it (pixel, point)).
+
+    The array is overwritten by the next piece; see PifBuilder.pieces and `described`. Arguments and errors as build_pif.
+    """
+    count = _Count(plan, progress)
+    for b, band in enumerate(plan.bands):
+        builder = PifBuilder(camera, band.wavelength, plan, dtype=plan.dtype)
+        for index, slab in builder.pieces(workers=workers):
+            yield builder, b, index, slab
+            count(builder.points)
+
+
+class _Count:
+    """Progress in columns of A from numbers of columns of single superpixels."""
+
+    def __init__(self, plan, progress):
+        self._superpixels, self._total, self._done, self._report = plan.shape[1], plan.shape[0] * plan.shape[3], 0, progress
+
+    def __call__(self, columns):
+        self._done += columns
+        if self._report:
+            self._report(self._done // self._superpixels, self._total)
+
+
+def described(plan, builders, energy):
+    """What a Pif holds beside A, in its order, from the PifBuilders of all bands and the energy (band, point) of all columns."""
+    last = builders[-1]
+    tails = [builder.notes["field_tail"] for builder in builders]
+    return (np.array([band.wavelength for band in plan.bands]), last.offsets, last.pixel_shape, last.object_shape, energy,
+            _notes(plan, last, tails, energy))
 
 
 def _chunks(builder, points):
@@ -183,6 +336,7 @@ def _notes(plan, builder, tails, energy):
         "nodes": {"lenslet": [b.lenslet_nodes for b in plan.bands], "pixel": [b.pixel_nodes for b in plan.bands], "psf": [b.psf_nodes for b in plan.bands]},
         "error_by_source": plan.split,
         "left_out": list(plan.left_out),
+        "symmetry": list(builder.symmetry),
         "separable_terms": builder.notes["separable_terms"],
         "field_tail": max(tails),
         "kappa": g.kappa,

@@ -9,8 +9,9 @@ from plenocli.errors import NumericsError
 from plenocli.optics.psf import psf_nodes
 from plenocli.optics.quadrature import gauss, nodes_for
 
-OWN_WEIGHT, JOINT_WEIGHT = 0.2, 4e-5
-"""Effect on a column of the pixel rule's error for fringes within one lenslet's light, and between lenslets (measured bounds)."""
+FRINGES = ((0.55, 0.5), (0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
+"""Weight a N^-b of the fringes between lenslets 0, 1, 2, ... apart in a column, N the lenslet's diffraction cells (measured,
+worst column, N from 1.3 to 140; beyond the table as its end)."""
 WINDOW_ERROR = (1.0, 0.17, 0.015, 0.007, 0.002, 0.0013)
 """Error of a column from lenslets further than w = 0, 1, 2, ... from its own, times the square of the lenslet's diffraction
 cells (measured for 1.6 to 100 cells, corner point; beyond the table it falls as 1/w^2)."""
@@ -113,21 +114,36 @@ def size_band(view, grid, ring, accuracy, tolerance):
     count = psf_nodes(view, half)
     phase = view.k * view.D1 / 2 * half / view.z2
     terms = int(0.27 * phase + 3 + 0.6 * math.log10(1 / tolerance)) if view.blur < view.D2 else int(0.4 * phase + 10)
-    return BandPlan(view.wavelength, window, nodes_for(slope), pixel_nodes(own, joint, accuracy), count, terms, half)
+    return BandPlan(view.wavelength, window, nodes_for(slope), pixel_nodes(own, joint, view.diffraction_cells, accuracy), count, terms, half)
 
 
-def pixel_nodes(own, joint, accuracy):
-    """Gauss-Legendre nodes per axis of a pixel whose irradiance holds up to `own` cycles a pixel from one lenslet and up to
-    `joint` from interference with its neighbours, whose fields are weak; error at most about half the accuracy."""
+def pixel_nodes(own, joint, cells, accuracy):
+    """Fewest Gauss-Legendre nodes per axis of a pixel with an error of at most two thirds of `accuracy`.
+
+    own: cycles a pixel up to which one lenslet's light makes fringes; joint: up to which all lenslets together do; cells:
+    diffraction cells of a lenslet.
+    """
     for count in range(2, 200):
-        error = max(OWN_WEIGHT * rule_error(count, own), JOINT_WEIGHT * rule_error(count, joint))
-        if error <= accuracy / 2.4:
+        if pixel_error(count, own, joint, cells) <= accuracy / 1.5:
             return count
     raise NumericsError(f"{joint:.0f} interference fringes a pixel cannot be integrated", "sensor.pixel_pitch", "use smaller pixels")
 
 
+def pixel_error(count, own, joint, cells):
+    """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis.
+
+    The light of two lenslets n apart makes fringes of (n - 1) own to (n + 1) own cycles a pixel, most of them in the middle.
+    """
+    worst = 0.0
+    for apart in range(round(joint / own)):
+        size, power = FRINGES[min(apart, len(FRINGES) - 1)]
+        share = np.linspace(-1 if apart else 0, 1, 65)[1:-1]
+        error = rule_error(count, (apart + share) * own) * (1 - np.abs(share))
+        worst = max(worst, min(0.5, size * cells**-power) * float(error.max()))
+    return worst
+
+
 def rule_error(count, cycles):
-    """Largest error of the rule for cos(2 pi c t) on a unit pixel, c up to `cycles`."""
+    """Error of the rule for cos(2 pi c t) on a unit pixel at each c of `cycles`."""
     t, w = gauss(count)
-    c = np.linspace(0, cycles, 65)
-    return float(np.abs(np.cos(np.pi * np.outer(c, t)) @ w / 2 - np.sinc(c)).max())
+    return np.abs(np.cos(np.pi * np.outer(cycles, t)) @ w / 2 - np.sinc(cycles))

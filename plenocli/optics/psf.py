@@ -17,17 +17,21 @@ import numpy as np
 from plenocli.errors import NumericsError
 from plenocli.optics.pupil import aperture_area, pupil_rows
 from plenocli.optics.quadrature import Rows, gauss, nodes_for
+from plenocli.optics.radial import is_radial, radial_field
 
 MAX_NODES = 4000
 """Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays answer the question."""
+SLAB = 1 << 11
+"""Positions at which the series are summed together: the basis of a slab stays in the cache."""
 
 
 @dataclass(frozen=True)
 class SeparableField:
     """h(dy, dx) = sum_j a_j(dy) b_j(dx) for |dy|, |dx| <= `half`.
 
-    `rows`, `columns`: Legendre coefficients (degrees, terms) of a_j and b_j, complex; `even`: only even degrees are stored.
-    `symmetry`: (flip rows, flip columns, transpose) under which h does not change; `tail`: root energy of what was cut.
+    `rows`, `columns`: Legendre coefficients (degrees, terms) of a_j and b_j, real where h is; `even`: only even degrees are stored.
+    `symmetry`: (flip rows, flip columns, transpose) under which h does not change; `tail`: root energy of what was cut;
+    `signs`: (terms,) of +-1 where b_j is that times a_j, else None.
     """
 
     half: float
@@ -36,6 +40,7 @@ class SeparableField:
     even: bool
     symmetry: tuple
     tail: float
+    signs: np.ndarray | None = None
 
     @property
     def terms(self):
@@ -43,22 +48,29 @@ class SeparableField:
         return self.rows.shape[1]
 
     def evaluate(self, d, axis):
-        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,), complex128."""
+        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,), complex128, or float64 where h is real."""
         d = np.asarray(d, float)
-        coefficients = self.columns if axis else self.rows
-        basis = _legendre(d.ravel() / self.half, len(coefficients), 2 if self.even else 1)
-        parts = np.ascontiguousarray(coefficients).view(float)
-        return (basis @ parts).view(complex).reshape(*d.shape, -1)
+        coefficients = np.ascontiguousarray(self.columns if axis else self.rows)
+        t, parts = d.ravel() / self.half, coefficients.view(float)
+        out = np.empty((len(t), parts.shape[1]))
+        for start in range(0, len(t), SLAB):
+            part = slice(start, start + SLAB)
+            np.matmul(legendre(t[part], len(coefficients), 2 if self.even else 1), parts, out=out[part])
+        return out.view(coefficients.dtype).reshape(*d.shape, -1)
 
 
-def _legendre(t, count, step):
+def legendre(t, count, step):
     """Legendre polynomials of degrees 0, step, 2 step, ... at t: (len(t), count)."""
     out = np.empty((count, len(t)))
-    previous, current = np.zeros_like(t), np.ones_like(t)
+    previous, current, scaled = np.zeros_like(t), np.ones_like(t), np.empty_like(t)
     for degree in range((count - 1) * step + 1):
         if degree % step == 0:
             out[degree // step] = current
-        previous, current = current, ((2 * degree + 1) * t * current - degree * previous) / (degree + 1)
+        np.multiply(t, (2 * degree + 1) / (degree + 1), out=scaled)
+        scaled *= current
+        previous *= -degree / (degree + 1)
+        previous += scaled
+        previous, current = current, previous
     return out.T
 
 
@@ -70,13 +82,18 @@ def psf_nodes(geometry, half):
 
 
 def sampled_field(camera, geometry, dy, dx):
-    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: complex (len(dy), len(dx)). Source: see the module."""
+    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: (len(dy), len(dx)), real where a radial pupil makes it so.
+
+    Source: see the module.
+    """
+    if is_radial(camera):
+        return radial_field(camera, geometry, dy, dx)
     k, z2 = geometry.k, geometry.z2
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max())
     total = np.zeros((len(dy), len(dx)), complex)
     for rows in pupil_rows(camera, geometry, k * reach / z2):
         half = len(rows.y) // 2
-        if half and len(rows.y) % 2 == 0 and _mirrored(rows.y, rows.x, rows.weight, 0):
+        if half and len(rows.y) % 2 == 0 and mirrored(rows.y, rows.x, rows.weight, 0):
             upper = Rows(rows.y[half:], rows.x[half:], rows.weight[half:])
             total += (2 * np.cos(k / z2 * np.outer(dy, upper.y))) @ _row_transforms(upper, k / z2 * dx)
         else:
@@ -84,7 +101,7 @@ def sampled_field(camera, geometry, dy, dx):
     return total / (geometry.wavelength * z2 * math.sqrt(aperture_area(camera.main_lens)))
 
 
-def _mirrored(y, x, weight, axis):
+def mirrored(y, x, weight, axis):
     """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of its nodes (axis 1)."""
     if axis == 0:
         return np.allclose(y, -y[::-1], rtol=0, atol=1e-14 * np.abs(y).max()) and np.allclose(weight, weight[::-1], rtol=1e-12, atol=0)
@@ -96,7 +113,7 @@ def _row_transforms(rows, frequency):
     count, nodes = len(frequency), rows.x.shape[1]
     paired = count % 2 == 0 and np.allclose(frequency, -frequency[::-1], rtol=1e-14, atol=0)
     f = frequency[count // 2:] if paired else frequency
-    even = _mirrored(rows.y, rows.x, rows.weight, 1)
+    even = mirrored(rows.y, rows.x, rows.weight, 1)
     x, weight = (rows.x[:, nodes // 2:], rows.weight[:, nodes // 2:] * 2) if even else (rows.x, rows.weight)
     if even and nodes % 2:
         weight[:, 0] /= 2
@@ -113,10 +130,11 @@ def _row_transforms(rows, frequency):
     return np.concatenate([(c + 1j * s)[:, ::-1], here], axis=1) if paired else here
 
 
-def separable_field(camera, geometry, half, tolerance):
+def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of at most `tolerance`.
 
-    NumericsError where the node rule asks for more than MAX_NODES.
+    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field. NumericsError where the node rule
+    asks for more than MAX_NODES.
     """
     count = psf_nodes(geometry, half)
     if count > MAX_NODES:
@@ -124,10 +142,10 @@ def separable_field(camera, geometry, half, tolerance):
             f"the field on the array needs {count} nodes per axis, more than {MAX_NODES}",
             "main_lens and lenslet_array", "take fewer superpixels, a longer wavelength or a slower lens")
     t, w = gauss(count)
-    h = sampled_field(camera, geometry, half * t, half * t)
+    h = sample(camera, geometry, half * t, half * t)
     scale = np.abs(h).max()
     if scale == 0:
-        empty = np.zeros((1, 1), complex)
+        empty = np.zeros((1, 1))
         return SeparableField(half, empty, empty, False, (True, True, True), 0.0)
     same = [np.abs(h - other).max() < 1e-10 * scale for other in (h[::-1], h[:, ::-1], h.T)]
     even = bool(same[0] and same[1])
@@ -136,12 +154,25 @@ def separable_field(camera, geometry, half, tolerance):
     if np.abs(h.imag).max() < 1e-13 * scale:
         h = h.real
     root = np.sqrt(w * half)
-    u, s, v = np.linalg.svd(root[:, None] * h * root)
+    u, s, v, signs = _factors(root[:, None] * h * root, same[2])
     tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
     terms = max(1, int(np.count_nonzero(tails > tolerance)))
     s_root = np.sqrt(s[:terms])
-    a, b = u[:, :terms] * s_root / root[:, None], v[:terms].T * s_root / root[:, None]
+    a = u[:, :terms] * s_root / root[:, None]
+    b = a if signs is not None else v[:terms].T * s_root / root[:, None]
     tail = float(tails[terms]) if terms < len(s) else 0.0
     step = 2 if even else 1
-    project = _legendre(t, len(t), step).T * w * ((2 * step * np.arange(len(t)) + 1) / 2)[:, None]
-    return SeparableField(half, (project @ a).astype(complex), (project @ b).astype(complex), even, tuple(bool(x) for x in same), tail)
+    project = legendre(t, len(t), step).T * w * ((2 * step * np.arange(len(t)) + 1) / 2)[:, None]
+    rows = project @ a
+    signs = None if signs is None else signs[:terms]
+    columns = project @ b if signs is None else rows * signs
+    return SeparableField(half, rows, columns, even, tuple(bool(x) for x in same), tail, signs)
+
+
+def _factors(matrix, symmetric):
+    """Singular value decomposition u, s, v of a square matrix; for a real symmetric one also the signs with v^T = u * signs."""
+    if not symmetric or np.iscomplexobj(matrix):
+        return *np.linalg.svd(matrix), None
+    values, u = np.linalg.eigh((matrix + matrix.T) / 2)
+    order = np.argsort(-np.abs(values), kind="stable")
+    return u[:, order], np.abs(values[order]), None, np.where(values[order] < 0, -1.0, 1.0)

@@ -3,46 +3,110 @@
 import numpy as np
 
 from plenocli.optics.factors import Factors
-from plenocli.optics.psf import separable_field
+from plenocli.optics.psf import legendre, psf_nodes, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lenslet_kernel, lit_lenslets, sensor_nodes
 
+SLAB = 1 << 21
+"""Values of the spread function's terms in memory at a time while tables are filled."""
+
 
 class SquareLenslets(Factors):
-    """Sensor fields behind square lenslets: every separable term of h stays separable up to the sensor."""
+    """Sensor fields behind square lenslets: every separable term of h stays separable up to the sensor.
+
+    Within one lenslet a term is a polynomial of far lower degree than the kernel to a distant superpixel, so it is sampled
+    on few nodes and the kernel is brought onto these. Where h is even, points that mirror each other share their tables.
+    """
 
     def __init__(self, camera, geometry, plan, band):
-        self.geometry, self.superpixels, self._nodes = geometry, plan.superpixels, band.pixel_nodes
-        self.dtype = np.complex128 if plan.double else np.complex64
+        self.geometry, self.superpixels, self.pixel_nodes, self._band = geometry, plan.superpixels, band.pixel_nodes, band
+        self.dtype, self._real = (np.dtype(t) for t in ((np.complex128, np.float64) if plan.double else (np.complex64, np.float32)))
+        # off the sensor's own raster every superpixel has its pixels around its centre
+        self._centred = geometry.pixel_shift is None
         field = separable_field(camera, geometry, band.half, plan.tolerance)
         self.symmetry, self.notes = field.symmetry, {"separable_terms": field.terms, "field_tail": field.tail}
-        t, w = gauss(band.lenslet_nodes)
-        half = geometry.lenslet_width / 2
-        self._x, self._w = half * t, half * w
-        (high, rows), (wide, columns) = (self._table(field, axis, band.window) for axis in (0, 1))
-        self._grams = rows, columns
-        super().__init__(high, wide, geometry.pixel_shape, band.pixel_nodes)
+        self._x, self._w, self._basis = self._lenslet_nodes()
+        self._kernels = {}
+        high, down = self._table(field, 0)
+        if field.signs is not None and self._axes_agree():
+            wide, across, signs = high, down * np.outer(field.signs, field.signs).ravel(), field.signs
+        else:
+            (wide, across), signs = self._table(field, 1), None
+        self._entering = (down @ across.T).real
+        self._kernels.clear()
+        super().__init__(high, wide, geometry.pixel_shape, band.pixel_nodes, signs)
 
-    def _table(self, field, axis, window):
-        """The factor table along one axis (as Factors takes it), and the (point, term, term) Gram matrices over the lenslets."""
+    def _axes_agree(self):
         g = self.geometry
-        v, wv = (a.ravel() for a in sensor_nodes(g, axis, self._nodes))
+        return self._centred and all(a[0] == a[1] for a in (g.pixel_shape, g.object_shape, self.superpixels))
+
+    def _lenslet_nodes(self):
+        """Nodes x and weights (m) on which the terms are sampled, and the kernel's own nodes with what carries it onto the former.
+
+        The last is (nodes, weights x Legendre interpolation (kernel node, term node)); the nodes alone where both are the same.
+        """
+        g = self.geometry
+        half = g.lenslet_width / 2
+        fine, few = self._band.lenslet_nodes, psf_nodes(g, half)
+        t, w = gauss(min(fine, few))
+        if few >= fine:
+            return half * t, half * w, (half * t, (half * w).astype(self._real))
+        tf, wf = gauss(fine)
+        degrees = np.arange(few) + 0.5
+        carry = (legendre(tf, few, 1) * degrees) @ (legendre(t, few, 1).T * w)
+        return half * t, half * w, (half * tf, (half * wf[:, None] * carry).astype(self._real))
+
+    def _kernel(self, axis, n, place):
+        """The kernel (sensor node, 2, term node), real and imaginary part, from a lenslet to the superpixel n before it, which
+        stands at `place` (superpixel pitches; it matters on a sensor's own raster only)."""
+        key = axis, n, None if self._centred else place
+        if key not in self._kernels:
+            v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self._band.pixel_nodes, place))
+            x, carry = self._basis
+            kernel = lenslet_kernel(self.geometry, n, v, wv, x)
+            parts = np.stack([kernel.real, kernel.imag], axis=1).astype(self._real)
+            self._kernels[key] = parts * carry if carry.ndim == 1 else (parts.reshape(-1, len(x)) @ carry).reshape(*parts.shape[:2], -1)
+        return self._kernels[key]
+
+    def _table(self, field, axis):
+        """The factor table along one axis (as Factors takes it), and the (point, term x term) Gram matrices over the lenslets."""
+        g, window, terms = self.geometry, self._band.window, field.terms
         reach = (self.superpixels[axis] - 1) // 2
         points = g.points(axis)
-        table = np.zeros((2 * reach + 1, len(v), len(points) * field.terms), self.dtype)
-        gram = 0
-        for m in lit_lenslets(reach, window):
-            values = field.evaluate(self._x[:, None] + m * g.D2 - points, axis)
-            moved = np.ascontiguousarray(values.transpose(1, 2, 0))
-            gram = gram + (moved * self._w) @ moved.conj().transpose(0, 2, 1)
-            values = values.reshape(len(self._x), -1).astype(self.dtype)
-            for s in range(-reach, reach + 1):
-                if window is not None or m == s:
-                    table[s + reach] += (lenslet_kernel(g, m - s, v, wv, self._x) * self._w).astype(self.dtype) @ values
-        table = table.reshape(2 * reach + 1, len(v), len(points), field.terms).transpose(0, 2, 1, 3)
-        return np.ascontiguousarray(table), gram
+        half = (len(points) + 1) // 2 if field.even and self._centred else len(points)
+        lenslets = list(lit_lenslets(reach, window))
+        table = np.empty((2 * reach + 1, len(points), self.pixel_nodes * g.pixel_shape[axis], terms), self.dtype)
+        entering = np.empty((len(points), terms * terms), self.dtype if field.rows.dtype.kind == "c" else self._real)
+        kernels = []
+        for s in range(-reach, reach + 1):
+            chosen = lenslets if window is not None else [s]
+            whole = np.concatenate([self._kernel(axis, m - s, s) for m in chosen], axis=2)
+            kernels.append((lenslets.index(chosen[0]) * len(self._x), whole.reshape(-1, whole.shape[2])))
+        where = (self._x + np.array(lenslets)[:, None] * g.D2).ravel()
+        weight = np.tile(self._w, len(lenslets))[:, None].astype(self._real)
+        step = max(1, SLAB // (len(where) * terms))
+        for start in range(0, half, step):
+            block = field.evaluate(where - points[start:min(start + step, half), None], axis).astype(entering.dtype)
+            for i, values in enumerate(block, start):
+                entering[i] = (values.T @ (values.conj() * weight)).ravel()
+                for s, (first, kernel) in enumerate(kernels):
+                    _product(kernel, values[first:first + kernel.shape[1]], table[s, i])
+        if half < len(points):  # the mirror image: points, superpixels and sensor nodes reversed
+            table[:, half:] = table[::-1, :len(points) - half, ::-1][:, ::-1]
+            entering[half:] = entering[:len(points) - half][::-1]
+        return table, entering
 
     def incident(self, rows, columns):
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
-        gy, gx = self._grams
-        return np.einsum("iab,iab->i", gy[rows], gx[columns]).real
+        return self._entering[rows, columns]
+
+
+def _product(kernel, values, out):
+    """The kernel (sensor node x (real, imaginary), term node), real, times values (term node, term) into complex `out`."""
+    parts = (kernel @ values.view(kernel.dtype).reshape(len(values), -1)).reshape(len(out), 2, -1)
+    if not np.iscomplexobj(values):
+        out.real, out.imag = parts[:, 0], parts[:, 1]
+    else:
+        parts = parts.view(values.dtype)
+        np.multiply(parts[:, 1], 1j, out=out)
+        out += parts[:, 0]

@@ -15,10 +15,12 @@ from plenocli.optics.plan import PifPlan, blur_ring, predicted_outside, window_e
 BEST_ACCURACY = 1e-8
 """Finest sampling on offer: double precision."""
 MODELS = ("auto", "ray", "fresnel", "exact")
-MAX_RING = 6
+MAX_RING = 8
 """Rings of coherent neighbours that the dial adds by itself."""
 SINGLE_LIMIT = 1e-5
 """Single precision serves sampling errors down to this."""
+ROUNDING = {False: 3e-7, True: 3e-10}
+"""Error of a column from rounding in single and double precision (measured)."""
 SHARE = 0.2
 """Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
 
@@ -171,7 +173,7 @@ def _sized(request, rung, ring, split):
         bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in request.views)
     except NumericsError as error:
         return Candidate(rung.name, rung.model, str(error))
-    split = split | {"sampling": max(0.5 * sampling, 1e-9 if double else 1e-7)}
+    split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(rung.name, rung.model, why, math.hypot(*split.values()), split, ring, sampling, double, bands,

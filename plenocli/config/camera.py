@@ -99,7 +99,9 @@ class Aberration(Section):
 class MainLens(Section):
     """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files with values on a square
     grid of cells over the square of side aperture_diameter: rows in the sense of the sensor's rows, downwards, looking
-    along the light. Their values are attached by Camera.attach; nothing here opens a file.
+    along the light. `prescription` names a lens file (plenocli.config.lens): its focal shift and wavefront error at the object
+    and aperture of this camera take the place of `glass`; focal_length must be the lens's own. What files hold is attached
+    by Camera.attach; nothing here opens a file.
 
     apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps Abbe's sine condition, as
     lenses corrected over a field do), "uniform-pupil" (an evenly lit plane aperture) or "uniform-sine" (even in direction
@@ -115,6 +117,7 @@ class MainLens(Section):
     aberrations: tuple[Aberration, ...] = ()
     apodisation: Literal["aplanatic", "uniform-pupil", "uniform-sine"] = "aplanatic"
     wavefront: FileName | None = None
+    prescription: FileName | None = None
     _samples: dict = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
@@ -127,10 +130,13 @@ class MainLens(Section):
             raise ValueError("aperture_image is the whole aperture: it goes with aperture_shape = \"image\" (or none), and only with it")
         if (self.aperture_shape == "annulus") != (self.obscuration > 0):
             raise ValueError("obscuration (above 0) goes with aperture_shape = \"annulus\", and only with it")
+        if self.prescription is not None and self.glass.lower() != "none":
+            raise ValueError("glass and prescription exclude each other: a lens file names its own glasses")
         return self
 
     def samples(self, name):
-        """Values (rows, columns) of the file that key `name` ("aperture_image" or "wavefront") names; None where it names none.
+        """What the file that key `name` names holds: the values (rows, columns) of "aperture_image" and "wavefront", the Prescription
+        of "prescription"; None where it names none.
 
         ConfigError where they have not been attached.
         """
@@ -138,7 +144,7 @@ class MainLens(Section):
             return None
         if name not in self._samples:
             raise ConfigError(f"the values of {getattr(self, name)!r} are missing", f"main_lens.{name}", "read the camera from its file")
-        return self._samples[name].values
+        return getattr(self._samples[name], "values", self._samples[name])
 
 
 class Object(Section):
@@ -323,20 +329,24 @@ class Camera(Section):
         except ValidationError as error:
             raise violations(error, "camera") from None
         kept = {name: old for name, old in self.main_lens._samples.items() if getattr(changed.main_lens, name) == getattr(self.main_lens, name)}
-        return changed.attach(**{name: old.values for name, old in kept.items()})
+        return changed.attach(**{name: getattr(old, "values", old) for name, old in kept.items()})
 
     def attach(self, **samples):
-        """A camera that carries the values of its files: attach(aperture_image=..., wavefront=...), square arrays of floats.
+        """A camera that carries what its files hold: attach(aperture_image=..., wavefront=..., prescription=...).
 
-        aperture_image: intensity transmittance 0..1; wavefront: m, positive for phase advance, at least 4 x 4. ConfigError for
+        aperture_image: square array, intensity transmittance 0..1; wavefront: square array, m, positive for phase advance, at least
+        4 x 4; prescription: a plenocli.optics.prescription.Prescription. ConfigError for
         keys that the description does not have and for values that cannot be.
         """
         lens = self.main_lens.model_copy()
         lens._samples = dict(lens._samples)
         for name, values in samples.items():
             where = f"main_lens.{name}"
-            if name not in ("aperture_image", "wavefront") or getattr(lens, name) is None:
+            if name not in ("aperture_image", "wavefront", "prescription") or getattr(lens, name) is None:
                 raise ConfigError("names no file, so that values cannot belong to it", where)
+            if name == "prescription":
+                lens._samples[name] = values
+                continue
             trouble = _trouble(name, np.asarray(values))
             if trouble:
                 raise ConfigError(trouble, where)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from plenocli.config.camera import ROW_SPACING
 from plenocli.errors import ConfigError
 from plenocli.optics.glass import focal_length
+from plenocli.optics.lens import at_wavelength
 from plenocli.optics.pupil import ray_reach
 
 
@@ -178,6 +179,7 @@ def geometry(camera, wavelength, pixel_shift=None):
 
     pixel_shift: (rows, columns) as lenslet_shift gives it, for pixels on the sensor's own raster; None: centred on chief rays.
     """
+    camera = at_wavelength(camera, wavelength)
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     design = camera.light.design_wavelength or wavelength
     f1, z1, z2 = focal_length(lens.focal_length, lens.glass, design, wavelength), camera.object.distance, array.distance

@@ -4,13 +4,14 @@ Lenses and rays as in plenocli.optics.prescription and plenocli.optics.raytrace;
 ray in object space, towards +y; image planes are distances (m) from the last vertex. docs/model.md, "Real lenses".
 """
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from plenocli.errors import ConfigError, NumericsError
-from plenocli.optics.pupil import zernike
+from plenocli.optics.pupil import unit_radius, zernike
 from plenocli.optics.raytrace import Pupil, aim, entrance_pupil, exit_pupil, paraxial_matrix, to_plane, trace
 
 
@@ -275,3 +276,32 @@ def camera_lens(lens, object_distance, aperture_diameter, design_wavelength):
         raise ConfigError(f"the lens opens to {widest * 1e3:.5g} mm at most, not to {aperture_diameter * 1e3:.5g} mm", "main_lens.aperture_diameter", "stop it down")
     stopped = replace(lens, stop_radius=lens.stop_radius * aperture_diameter / widest)
     return CameraLens(stopped, from_vertex, object_distance, z2)
+
+
+def at_wavelength(camera, wavelength):
+    """`camera` (plenocli.config.Camera) with its lens prescription, if it names one, resolved for `wavelength` (m): a thin main lens
+    of the traced focal length, whose aberrations are those of the description and the traced ones together.
+
+    ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be used so (see camera_lens).
+    """
+    thin = camera.main_lens
+    if thin.prescription is None:
+        return camera
+    from plenocli.config.camera import Aberration
+
+    focal_length, terms = _resolved(thin.samples("prescription"), camera.object.distance, 2 * unit_radius(thin), camera.light.design_wavelength, wavelength,
+                                    thin.focal_length)
+    traced = tuple(Aberration.model_construct(noll=j, coefficient=c) for j, c in terms)
+    changed = thin.model_copy(update={"focal_length": focal_length, "aberrations": (*thin.aberrations, *traced), "prescription": None})
+    return camera.model_copy(update={"main_lens": changed})
+
+
+@functools.lru_cache(maxsize=512)
+def _resolved(lens, object_distance, aperture_diameter, design_wavelength, wavelength, nominal):
+    """(focal length (m), Noll terms) of a prescription in a camera whose description says `nominal` (m)."""
+    inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
+    own = first_order(lens, design_wavelength).focal_length
+    if abs(own / nominal - 1) > 0.02:
+        raise ConfigError(f"the lens file has a focal length of {own * 1e3:.5g} mm at {design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm",
+                          "main_lens.focal_length", "write the lens's own, or scale the lens: plenocli lens import --focal-length")
+    return inside.focal_length(wavelength), inside.aberrations(wavelength)

@@ -10,6 +10,7 @@ import numpy as np
 
 from plenocli.errors import NumericsError
 from plenocli.optics.geometry import geometry
+from plenocli.optics.lens import at_wavelength
 from plenocli.optics.shaped import ShapedLenslets
 from plenocli.optics.square import SquareLenslets
 
@@ -45,6 +46,7 @@ class PifBuilder:
         """Prepare `camera` (plenocli.config.Camera) at `wavelength` (m), one of those of the PifPlan `plan`."""
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength, plan.pixel_shift), np.dtype(dtype)
+        camera = at_wavelength(camera, wavelength)
         self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
         self.notes = self._lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape

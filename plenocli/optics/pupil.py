@@ -83,7 +83,7 @@ def wavefront(lens, y, x):
     spline = _spline(lens)
     if spline is not None:
         total = total + spline(np.stack(np.broadcast_arrays(y, x), axis=-1))
-    for term in lens.aberrations or ():
+    for term in _terms(lens):
         noll, coefficient = (term.noll, term.coefficient) if hasattr(term, "noll") else term
         total = total + coefficient * zernike(noll, y / unit, x / unit)
     return total
@@ -103,9 +103,16 @@ def _spline(lens):
     return NdBSpline((down.t, across.t), np.ascontiguousarray(np.moveaxis(across.c, 0, 1)), 3, extrapolate=True)
 
 
+def _terms(lens):
+    """The lens's Noll terms. A real lens has others at every wavelength: plenocli.optics.lens.at_wavelength comes first."""
+    if getattr(lens, "prescription", None) is not None:
+        raise RuntimeError("the wavefront error of a lens prescription was asked for without a wavelength")
+    return lens.aberrations or ()
+
+
 def has_wavefront(lens):
     """Whether the lens has any wavefront error."""
-    return bool(lens.aberrations) or lens.wavefront is not None
+    return bool(_terms(lens)) or lens.wavefront is not None
 
 
 def _sampled_slopes(lens):

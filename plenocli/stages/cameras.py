@@ -4,20 +4,20 @@ from pathlib import Path
 
 from plenocli.errors import ConfigError, InputError
 
-_READERS = {"aperture_image": "read_transmittance", "wavefront": "read_wavefront"}
+_READERS = {"aperture_image": "read_transmittance", "wavefront": "read_wavefront", "prescription": "load_lens"}
 
 
 def read_camera(path):
-    """The Camera described at `path`, with its aperture image and wavefront read and attached; names are relative to `path`'s folder.
+    """The Camera described at `path`, with its aperture image, wavefront and lens file read and attached; names are relative to `path`'s folder.
 
     InputError for a file that cannot be read or whose values cannot be, ConfigError for the description.
     """
     from plenocli.artefacts import maps
-    from plenocli.config import load_camera
+    from plenocli.config import lens, load_camera
 
     camera = load_camera(path)
     for key, file in _named(path, camera).items():
-        values = getattr(maps, _READERS[key])(file)
+        values = getattr(lens if key == "prescription" else maps, _READERS[key])(file)
         try:
             camera = camera.attach(**{key: values})
         except ConfigError as error:

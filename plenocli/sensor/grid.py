@@ -49,7 +49,8 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     that fits most whole superpixels into the frame is taken, or else the darkest lines. Raises NumericsError, saying what was seen, where there is no
     lattice, InputError for an image too small or not finite.
     """
-    image = prepare(white, cfa, dark)
+    mosaic = prepare(white, cfa, dark)
+    image = mosaic if cfa == "mono" else template.smoothed(mosaic)  # what is left of the 2x2 pattern goes
     crop = _brightest_crop(image, window)
     basis, _, structure = lattice.find_basis(crop)
     if basis is None:
@@ -78,7 +79,7 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
             "the best grid",
             fix=FIX,
         )
-    position[inside], _ = template.register(image, model.at(index[inside]), basis, slope[inside], symmetric=not structured)
+    position[inside], _ = template.register(mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured)
     model, _ = distortion.choose_model(index[inside], position[inside], weight)
     lit = None
     if structured and kind == "square":
@@ -111,8 +112,6 @@ def prepare(white, cfa="mono", dark=None):
             for j in (0, 1):
                 image[i::2, j::2] *= np.float32(means.mean() / means[i, j])
     image = _replace_dead(image, step)
-    if cfa != "mono":
-        image = _remove_nyquist(image)
     sample = image[:: max(1, image.shape[0] // 1000), :: max(1, image.shape[1] // 1000)]
     return image - np.float32(np.percentile(sample, 0.5))
 
@@ -144,15 +143,6 @@ def _neighbours(image, step):
         padded[step : step + rows, :columns],
         padded[step : step + rows, 2 * step :],
     ]
-
-
-def _remove_nyquist(image):
-    """Symmetric (1 2 1)/4 smoothing along both axes: what is left of the 2x2 mosaic pattern vanishes exactly."""
-    for axis in (0, 1):
-        padded = np.pad(image, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="reflect")
-        lower, middle, upper = (np.take(padded, np.arange(k, k + image.shape[axis]), axis=axis) for k in range(3))
-        image = (lower + 2 * middle + upper) / 4
-    return image
 
 
 def _brightest_crop(image, window):

@@ -10,7 +10,9 @@ import numpy as np
 
 REACH = 0.56  # of the pitch: radius of the window
 PHASES = 8  # sub-pixel phases an axis, at which the template is tabled; the rest is first order
-SIZE = 32  # px: larger superpixels are shrunk by whole block means to below twice this
+SIZE = 24  # px: larger superpixels are shrunk by whole block means to below twice this
+VARIANCE = 0.5  # px^2 of that smoothing: it moves a spot under uneven light by VARIANCE times the relative slope, towards the dark
+DEGENERATE = 0.1  # share of a tilt that is no shift, below which the two are not told apart: bells have 0.03, discs 0.4 and more
 SMOOTHING = 0.8  # px: sampled discs and edges are aliased beyond
 
 
@@ -40,7 +42,7 @@ class _Window:
         return (share * self.place + (1 - share) * self.owner).astype(np.float32)
 
 
-def register(image, centres, basis, slope=None, symmetric=True, rounds=2):
+def register(image, centres, basis, slope=None, symmetric=True):
     """Places (N, 2), px, of the superpixels near `centres` (N, 2) px, of whole cells in `image` (rows, columns).
 
     Each patch is a * template(r - shift) + b under light that changes by `slope` (N, 2), relative per px: a share of it
@@ -58,7 +60,9 @@ def register(image, centres, basis, slope=None, symmetric=True, rounds=2):
     window = _make_window(np.asarray(basis) / shrink)
     share, quality = 1.0, np.ones(len(place))
     first = place.copy()
-    for turn in range(rounds):
+    for turn in range(2):
+        if turn == 1:  # edges sharper than two pixels cannot be interpolated
+            small = smoothed(small)
         template = _template(small, place, slope, window.lever(share), quality, window)
         bank = _bank(template, window)
         spread = _spread(small, place, slope, window.lever(share), bank, window)
@@ -66,12 +70,26 @@ def register(image, centres, basis, slope=None, symmetric=True, rounds=2):
             share = _share_within(small, place, slope, bank, spread, window)
         place, quality = _fit_all(small, place, slope, window.lever(share), bank, spread, window)
         place = place + (_centre(template, window) if symmetric else -np.median(place - first, axis=0))
+    place = place + share * VARIANCE * slope
     return place * shrink + (shrink - 1) / 2, quality
 
 
 def _block_means(image, shrink):
     rows, columns = (n // shrink for n in image.shape)
     return np.ascontiguousarray(image[: rows * shrink, : columns * shrink].reshape(rows, shrink, columns, shrink).mean(axis=(1, 3)))
+
+
+def smoothed(image):
+    """(1 2 1)/4 smoothing of `image` (rows, columns) along both axes: a pattern of period two vanishes exactly."""
+    for axis in (0, 1):
+        image = np.moveaxis(image, axis, 0)
+        out = 0.5 * image
+        out[1:] += 0.25 * image[:-1]
+        out[:-1] += 0.25 * image[1:]
+        out[0] += 0.25 * image[0]
+        out[-1] += 0.25 * image[-1]
+        image = np.moveaxis(out, 0, axis)
+    return np.ascontiguousarray(image)
 
 
 def _make_window(basis):
@@ -229,25 +247,30 @@ def _share_within(image, place, slope, bank, spread, window):
     """How much (0..1) of the illumination's gradient across lenslets also holds within a superpixel.
 
     Light that falls off continuously over the sensor has it all, a vignetting that dims whole superpixels none. Fitted
-    to the pixels of all sites together, beside the shift of each; where these cannot tell (bells: a tilted bell is a
-    moved one) it tends to 1.
+    to the pixels of all sites together, beside the shift of each. Where these cannot tell (a tilted bell is a moved
+    one: nearly nothing of the tilt is left beside the shift) it tends to 1.
     """
-    chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 300)
+    chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 2000)
     whole = window.lever(0)
-    arm = (window.lever(1) - whole).reshape(-1, 2)[window.flat]
-    value = trust = 0.0
-    for number, _, sites, pixel in _groups(place[chosen], 4096):
-        for site, here in zip(chosen[sites], pixel):
-            if not slope[site].any():
-                continue
-            patch, inside = _patches(image, here[None], slope[[site]], whole, window)
-            tilt = arm @ slope[site]
-            columns = np.concatenate([bank[number], (bank[number][0] * tilt)[None]]).astype(np.float32)
-            base = np.broadcast_to(inside * (window.taper / spread**2), patch.shape)
-            fit, _ = _solve(columns, patch, base)
-            for _ in range(2):
-                fit, normal = _solve(columns, patch, base * _trust(fit, columns, patch, spread))
-            known = normal[0, 4, 4] - normal[0, 4, :4] @ np.linalg.solve(normal[0, :4, :4], normal[0, :4, 4])
-            value += max(known, 0) * fit[0, 4] / max(fit[0, 0], 1e-20)
-            trust += max(known, 0)
-    return float(np.clip((value + 4.0) / (trust + 4.0), 0, 1))  # 4: a prior of 1 +- 0.5
+    arms = (window.lever(1) - whole).reshape(-1, 2)[window.flat].T
+    value, trust, total = [], [], []
+    for number, _, sites, pixel in _groups(place[chosen], 1 + 400_000 // len(spread)):
+        tilt = slope[chosen[sites]]
+        patch, inside = _patches(image, pixel, tilt, whole, window)
+        columns = np.concatenate([bank[number], bank[number][0] * arms])
+        base = np.broadcast_to(inside * (window.taper / spread**2), patch.shape)
+        fit, _ = _solve(columns, patch, base)
+        weight = base * _trust(fit, columns, patch, spread)
+        fit, normal = _solve(columns, patch, weight)
+        level = np.maximum(fit[:, 0], 1e-9)
+        joint = np.einsum("nij,nj->ni", normal[:, :, 4:], tilt)  # the tilt's column, with all columns
+        own = np.einsum("ni,ni->n", joint[:, 4:], tilt)
+        beside = np.linalg.solve(normal[:, :4, :4], joint[:, :4, None])[..., 0]
+        right = (weight * patch) @ columns.T
+        value.append((np.einsum("ni,ni->n", right[:, 4:], tilt) - np.einsum("ni,ni->n", right[:, :4], beside)) / level)
+        trust.append(own - np.einsum("ni,ni->n", joint[:, :4], beside))
+        total.append(own)
+    value, trust, total = (np.concatenate(x) for x in (value, trust, total))
+    if trust.sum() <= DEGENERATE * total.sum():
+        return 1.0
+    return float(np.clip((value.sum() + 1.0) / (trust.sum() + 1.0), 0, 1))  # 1: a prior of 1 +- 1

@@ -1,0 +1,370 @@
+"""Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first integral as low rank.
+
+The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor. The kernel's path along
+each axis, the lens and the curvature of h separate; the rest is the short sum of residual.Residuals, and so is h
+(debye.spherical_field), hence
+
+    M = sum over lenslets m, n of X_m (C_mn (x) S_mn) X_n^T,
+    X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
+
+Its 1000 or so columns are compressed to the rank of M by a randomised range finder (Halko, Martinsson, Tropp 2011) that
+takes columns of M itself as its sketch; what is left are factor tables as the paraxial rung has them (optics.factors).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.errors import NumericsError
+from plenocli.optics.debye import spherical_field
+from plenocli.optics.factors import Factors
+from plenocli.optics.plan import BandPlan, size_band
+from plenocli.optics.psf import legendre, separable_field
+from plenocli.optics.quadrature import gauss
+from plenocli.optics.relay import lit_lenslets, sensor_nodes
+from plenocli.optics.residual import Residuals, path
+
+MAX_SKETCH = 2500
+"""Columns of the largest sketch: beyond it the set-up takes minutes and the model is refused."""
+
+
+@dataclass(frozen=True)
+class ExactBand(BandPlan):
+    """A BandPlan of the exact rung. cut: root-energy error of a mean point's field; sensor_count: Gauss-Legendre nodes across a
+    superpixel that carry the field before it goes to the pixels' nodes, 0: the pixels' nodes serve."""
+
+    cut: float = 1e-5
+    sensor_count: int = 0
+
+
+def exact_band(view, grid, ring, accuracy, tolerance):
+    """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and accuracy as in size_band."""
+    base = size_band(view, grid, ring, accuracy, tolerance)
+    phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
+    count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4))
+    count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
+    return ExactBand(**vars(base), cut=accuracy / 10, sensor_count=count)
+
+
+def valid_for(camera, view):
+    """None, or one sentence why this rung cannot serve `camera` at the Geometry `view`."""
+    array = camera.lenslet_array
+    if array.lattice != "square" or array.aperture_shape != "square":
+        return f"exact propagation is built for square lenslets on a square lattice, not for {array.aperture_shape} ones on a {array.lattice} lattice"
+    if view.z3 < 10 * view.wavelength:
+        return "the sensor lies within ten wavelengths of the lenslets, where evanescent waves reach it"
+    return None
+
+
+class ExactSquareLenslets:
+    """Sensor fields behind square lenslets by the exact kernel; see the module and optics.square.SquareLenslets."""
+
+    def __init__(self, camera, geometry, plan, band):
+        self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
+        self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
+        self._parabolic = camera.lenslet_array.profile == "parabolic"
+        self._field = separable_field(camera, geometry, band.half, band.cut / 2, spherical_field)
+        self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, geometry.mirrors(plan.superpixels)))
+        alike = geometry.pixel_shape[0] == geometry.pixel_shape[1] and geometry.object_shape[0] == geometry.object_shape[1]
+        self._turn = alike and self.symmetry[2]
+        t, w = gauss(band.lenslet_nodes)
+        half = geometry.lenslet_width / 2
+        self._x, self._w = half * t, half * w
+        self._offsets = self._interval_list()
+        tolerance = band.cut / 3
+        extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
+        self._extent = extent
+        self._residuals = Residuals([o for o, _ in self._offsets.values()], [c for _, c in self._offsets.values()], max(extent), half,
+                                    geometry.z3, geometry.k, None if self._parabolic else geometry.f2, tolerance)
+        self._number = {key: i for i, key in enumerate(self._offsets)}
+        self._sheets, self._local = {}, {}
+        self._grams = [self._gram(axis) for axis in (0, 1)]
+        self._tables, ranks = {}, []
+        for sy, sx in self._pairs():
+            self._tables[sy, sx] = self._compressed(sy, sx)
+            ranks.append(self._tables[sy, sx].high.shape[3])
+        self._sheets, self._local = {}, {}
+        self.notes = {"separable_terms": max(ranks), "field_tail": self._field.tail, "psf_terms": self._field.terms,
+                      "residual_terms": max(m.shape[1] for m in self._residuals._mix)}
+
+    # which lenslets light which superpixels
+
+    def _reach(self, axis):
+        return (self.superpixels[axis] - 1) // 2
+
+    def _lenslets(self, s, axis):
+        """Lenslets along one axis whose light is followed to superpixel s."""
+        window = self.band.window
+        return [m for m in lit_lenslets(self._reach(axis), window) if window is not None or m == s]
+
+    def _interval_list(self):
+        """{(s, m): (displacement of the superpixel's centre from the lenslet's, share of the amplitude)}."""
+        g = self.geometry
+        cells = g.D2**2 / (g.wavelength * g.z3)
+        found = {}
+        for axis in (0, 1):
+            for s in range(-self._reach(axis), self._reach(axis) + 1):
+                if s < 0 and self.symmetry[axis]:
+                    continue
+                for m in self._lenslets(s, axis):
+                    share = 1.0 if m == s else min(1.0, math.sqrt(1 / (cells * abs(m - s))))
+                    found[s, m] = (s * g.superpixel_pitch - m * g.D2, share)
+        return found
+
+    def _pairs(self):
+        """Superpixels (rows, columns) whose tables are made; the others' follow by symmetry."""
+        ry, rx = (self._reach(axis) for axis in (0, 1))
+        return sorted({self._canonical(sy, sx)[:2] for sy in range(-ry, ry + 1) for sx in range(-rx, rx + 1)})
+
+    def _canonical(self, sy, sx):
+        sy, sx = abs(sy) if self.symmetry[0] else sy, abs(sx) if self.symmetry[1] else sx
+        turned = self._turn and sy < sx
+        return (sx, sy, True) if turned else (sy, sx, False)
+
+    # the factors of one axis
+
+    def _gram(self, axis):
+        """(point, term, term): overlaps of the terms of h over the lenslets."""
+        g, total = self.geometry, 0
+        for m in lit_lenslets(self._reach(axis), self.band.window):
+            values = self._field.evaluate(self._x + m * g.D2 - g.points(axis)[:, None], axis).transpose(0, 2, 1)
+            total = total + (values * self._w) @ values.conj().transpose(0, 2, 1)
+        return total
+
+    def _points(self, s, axis):
+        """Object points (m, on the array) along one axis that are computed for superpixel s; the others mirror them."""
+        points = self.geometry.points(axis)
+        return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
+
+    def _nodes(self, s, axis):
+        """Sensor positions (m, from the centre of superpixel s) of the field, and the roots of their weights."""
+        if self.band.sensor_count:
+            t, w = gauss(self.band.sensor_count)
+            return self._extent[axis] * t, np.sqrt(self._extent[axis] * w)
+        u, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s)
+        return u.ravel(), np.sqrt(w.ravel())
+
+    def _sheet(self, s, axis):
+        """X of superpixel s along one axis: list of (m, (sensor nodes x points, r, i) array, e in Legendre form)."""
+        axis = 0 if self._turn else axis
+        if (s, axis) in self._sheets:
+            return self._sheets[s, axis]
+        g, k = self.geometry, self.geometry.k
+        u, root = self._nodes(s, axis)
+        points, x = self._points(s, axis), self._x
+        sheets = []
+        for m in self._lenslets(s, axis):
+            offset, share = self._offsets[s, m]
+            d = offset + u[:, None] - x
+            place = m * g.D2 + x
+            phase = path(d, g.z3) - path(u, g.z3)[:, None] + place**2 / (2 * g.z2)
+            phase = phase - (x * x / (2 * g.f2) if self._parabolic else path(x, g.f2))
+            wave = (root[:, None] * self._w / math.sqrt(g.wavelength * g.z3)) * np.exp(1j * k * phase)
+            terms = self._residuals.functions(self._number[s, m], u, x)
+            local = self._local_terms(s, m, axis)
+            values = local.evaluate(place[:, None] - points)
+            flat = values.reshape(len(x), -1).astype(self.dtype)
+            sheet = np.empty((len(u), len(points), len(terms), values.shape[2]), self.dtype)
+            for r, term in enumerate(terms):
+                sheet[:, :, r] = ((wave * term).astype(self.dtype) @ flat).reshape(len(u), len(points), -1)
+            sheets.append((m, sheet.reshape(len(u) * len(points), len(terms), -1), local))
+        self._sheets[s, axis] = sheets
+        return sheets
+
+    def _local_terms(self, s, m, axis):
+        key = (s, m, axis)
+        if key not in self._local:
+            g, share = self.geometry, self._offsets[s, m][1]
+            reach = self._x[-1] + np.abs(g.points(axis)).max()
+            low, high = max(m * g.D2 - reach, -self.band.half), min(m * g.D2 + reach, self.band.half)
+            self._local[key] = LocalTerms(self._field, axis, low, high, self.band.cut / 3 / share)
+        return self._local[key]
+
+    # products of two axes
+
+    def _couplings(self, left, right, sy, sx):
+        """{(a, b): (C, S)} for the sheets a, b of the two axes."""
+        found = {}
+        for a, (m, _, rows) in enumerate(left):
+            for b, (n, _, columns) in enumerate(right):
+                c = self._residuals.core[self._number[sy, m], self._number[sx, n]]
+                s = rows.coefficients(0) @ columns.coefficients(1).T
+                found[a, b] = c.astype(self.dtype), s.astype(self.dtype)
+        return found
+
+    def _compressed(self, sy, sx):
+        """Factors of superpixel (sy, sx)."""
+        left, right = self._sheet(sy, 0), self._sheet(sx, 1)
+        product = Product(left, right, self._couplings(left, right, sy, sx), self._turn and sy == sx)
+        count = len(self._points(sy, 0)) * len(self._points(sx, 1))
+        high, wide = product.factors(self.band.cut * math.sqrt(count), self._first_guess())
+        return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes)
+
+    def _first_guess(self):
+        g = self.geometry
+        corner = g.k * (g.D2 / 2 + max(g.pixel_shape) * g.pixel_pitch / 2) ** 4 / (4 * g.z3**3)
+        return int(1.8 * self._field.terms * (1.6 + 0.5 * corner**0.57) * (1 if self._parabolic else 1.2)) + 16
+
+    def _to_pixels(self, factor, s, axis):
+        """(sensor nodes x points, terms) to (points, pixel nodes, terms)."""
+        u, root = self._nodes(s, axis)
+        factor = factor.reshape(len(u), -1)
+        points = len(self._points(s, axis))
+        if self.band.sensor_count:
+            v, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s)
+            t, wt = gauss(len(u))
+            degrees = np.arange(len(u))
+            back = legendre(t, len(u), 1).T * wt * ((2 * degrees + 1) / 2)[:, None]
+            matrix = np.sqrt(w.ravel())[:, None] * (legendre(v.ravel() / self._extent[axis], len(u), 1) @ back) / root
+            real = factor.real.dtype
+            factor = (matrix.astype(real) @ factor.view(real)).view(factor.dtype)
+        return np.ascontiguousarray(factor.reshape(len(factor), points, -1).transpose(1, 0, 2))
+
+    # what the builder asks for
+
+    def incident(self, rows, columns):
+        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
+        gy, gx = self._grams
+        return np.einsum("iab,iab->i", gy[rows], gx[columns]).real
+
+    def columns(self, rows, columns, out):
+        """As SquareLenslets.columns; mirrored points and superpixels are computed as their mirror images."""
+        ry, rx = (self._reach(axis) for axis in (0, 1))
+        shape = self.geometry.object_shape
+        for sy in range(-ry, ry + 1):
+            for sx in range(-rx, rx + 1):
+                a, b, turned = self._canonical(sy, sx)
+                table = self._tables[a, b]
+                if turned:
+                    table = Factors(table.wide, table.high, self.geometry.pixel_shape[::-1], self.band.pixel_nodes)
+                flip_y, flip_x = (self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))
+                                  for axis, s, index in ((0, sy, rows), (1, sx, columns)))
+                for fy in (False, True):
+                    for fx in (False, True):
+                        some = np.flatnonzero((flip_y == fy) & (flip_x == fx))
+                        if len(some):
+                            images = np.empty((len(some), 1, 1, *self.geometry.pixel_shape), out.dtype)
+                            table.columns(shape[0] - 1 - rows[some] if fy else rows[some],
+                                          shape[1] - 1 - columns[some] if fx else columns[some], images)
+                            out[some, sy + ry, sx + rx] = images[:, 0, 0, :: -1 if fy else 1, :: -1 if fx else 1]
+
+
+class LocalTerms:
+    """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at `tolerance` of the whole field."""
+
+    def __init__(self, field, axis, low, high, tolerance):
+        self.middle, self.half = (low + high) / 2, (high - low) / 2
+        count = max(8, int(len(field.rows) * (2 if field.even else 1) * self.half / field.half) + 24)
+        t, w = gauss(count)
+        root = np.sqrt(self.half * w)[:, None]
+        values = [root * field.evaluate(self.middle + self.half * t, a) for a in (0, 1)]
+        # the partner of a term has the norm sqrt(s), which weighs it
+        u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
+        tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
+        basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
+        self._mixing = [basis.conj().T @ v for v in values]
+        degrees = np.arange(count)
+        self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root)).astype(complex)
+
+    def coefficients(self, axis):
+        """(i, term): the terms of h along `axis` in this basis."""
+        return self._mixing[axis]
+
+    def evaluate(self, d):
+        """e_i at d (m): d.shape + (i,)."""
+        t = (np.asarray(d, float).ravel() - self.middle) / self.half
+        return (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
+
+
+def field_norms(field, axis):
+    """Root energy of each term of h along one axis: (terms,)."""
+    coefficients = field.columns if axis else field.rows
+    degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
+    return np.sqrt((np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half)
+
+
+class Product:
+    """M = sum_ab X_a (C_ab (x) S_ab) X_b^T, never formed: its compression to two factors."""
+
+    def __init__(self, left, right, couplings, symmetric):
+        self.left, self.right = [x for _, x, _ in left], [x for _, x, _ in right]
+        self.couplings, self.symmetric = couplings, symmetric
+        self.rng = np.random.default_rng(20130701)
+
+    def _through(self, side, blocks):
+        """The core times blocks (r, i, t) of the other side's columns: list of (r x i, t) for this side's sheets."""
+        out = []
+        mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
+        for a, x in enumerate(mine):
+            total = 0
+            for b, y in enumerate(blocks):
+                c, s = self.couplings[(a, b) if side == 0 else (b, a)]
+                if side:
+                    c, s = c.T, s.T
+                moved = np.matmul(s, y)
+                total = total + (c @ moved.reshape(len(moved), -1)).reshape(len(c), *moved.shape[1:])
+            out.append(total.reshape(-1, total.shape[-1]))
+        return out
+
+    def _range(self, side, count):
+        """Orthonormal basis of the range of M (side 0) or M^T (1) from `count` of its columns."""
+        mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
+        rows = len(other[0])
+        chosen = _jittered(rows, min(count, rows), self.rng)
+        core = self._through(side, [x[chosen].transpose(1, 2, 0) for x in other])
+        sketch = sum(x.reshape(len(x), -1) @ c for x, c in zip(mine, core))
+        return _orthonormal(sketch)
+
+    def factors(self, cut, count):
+        """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
+
+        NumericsError where no sketch of MAX_SKETCH columns holds M.
+        """
+        limit = min(len(self.left[0]), len(self.right[0]))
+        while True:
+            count = min(count, limit)
+            q = self._range(0, count)
+            p = q if self.symmetric else self._range(1, count)
+            inner = [(p.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in self.right]
+            outer = inner if self.symmetric else [(q.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in self.left]
+            core = sum(o.reshape(-1, o.shape[-1]).T @ c for o, c in zip(outer, self._through(0, inner)))
+            u, s, vh = np.linalg.svd(core)
+            tails = np.sqrt(np.cumsum(s.astype(float)[::-1] ** 2)[::-1])
+            terms = max(1, int(np.count_nonzero(tails > cut)))
+            root = np.sqrt(s[:terms])
+            high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
+            self.error = self._missed(high, wide)
+            if count == limit or (terms <= 0.7 * count and self.error <= 3 * cut):
+                return high, wide
+            if count >= MAX_SKETCH:
+                raise NumericsError(
+                    f"the exact field has more than {terms} separable terms (error {self.error / cut:.1g} of what is allowed)",
+                    "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
+            count = min(MAX_SKETCH, int(1.7 * max(count, terms)))
+
+    def _missed(self, high, wide):
+        """Root sum of squares of M - H B^T, estimated on random entries."""
+        rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
+        core = self._through(0, [x[columns].transpose(1, 2, 0) for x in self.right])
+        exact = sum(x[rows].reshape(len(rows), -1) @ c for x, c in zip(self.left, core))
+        difference = exact - high[rows] @ wide[columns].T
+        return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
+
+
+def _jittered(n, count, rng):
+    """`count` of 0..n-1, one at random from each of as many equal pieces."""
+    edges = np.linspace(0, n, count + 1)
+    return np.minimum((edges[:-1] + rng.random(count) * np.diff(edges)).astype(int), n - 1)
+
+
+def _orthonormal(columns):
+    """An orthonormal basis of the columns; single precision by the eigenvectors of their Gram matrix in double."""
+    if columns.dtype == np.complex128:
+        return np.linalg.qr(columns)[0]
+    double = columns.astype(np.complex128)
+    gram = double.conj().T @ double
+    values, vectors = np.linalg.eigh(gram)
+    keep = values > 1e-13 * values[-1]
+    # in double as well: the weakest directions are differences of nearly equal columns
+    return (double @ (vectors[:, keep] / np.sqrt(values[keep]))).astype(columns.dtype)

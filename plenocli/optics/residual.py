@@ -1,0 +1,130 @@
+"""What is left of an exact kernel when its separable part is taken out, as a short sum of products.
+
+Rayleigh and Sommerfeld's first kernel from the array to the sensor (docs/model.md, "Exact propagation") is
+
+    K = z/(j lambda R^2) (1 + j/(k R)) exp(j k (R - z)) = exp(j k phi(dx)) exp(j k phi(dy)) kappa(dx, dy)/(j lambda z),
+
+R^2 = z^2 + dx^2 + dy^2, phi(d) = d^2/(sqrt(z^2 + d^2) + z) the exact path of one axis. kappa differs from 1 by a phase of
+about -k dx^2 dy^2/(4 z^3); a lens of hyperbolic profile leaves an ell(x, y) of the same form. Their product on the
+displacements d = offset + u - x that occur between a lenslet and a superpixel is
+
+    kappa(dy, dx) ell(y, x) = sum_rs P_r(u_y, y) C_rs P_s(u_x, x)
+
+with one set of functions P for each offset, by singular value decompositions.
+"""
+
+import numpy as np
+
+from plenocli.optics.psf import legendre
+from plenocli.optics.quadrature import gauss
+
+
+def path(d, z):
+    """sqrt(z^2 + d^2) - z without cancellation."""
+    return d * d / (np.sqrt(z * z + d * d) + z)
+
+
+def kappa(dy, dx, z, k):
+    """The residual of the kernel at displacements dy, dx (m) over the distance z (m)."""
+    q = dy * dy + dx * dx
+    r = np.sqrt(z * z + q)
+    # (R - z) - phi(dy) - phi(dx), each term without cancellation, is small: their difference is taken in one expression
+    ry, rx = np.sqrt(z * z + dy * dy) + z, np.sqrt(z * z + dx * dx) + z
+    psi = dy * dy * (1 / (r + z) - 1 / ry) + dx * dx * (1 / (r + z) - 1 / rx)
+    return np.exp(1j * k * psi) * (z / r) ** 2 * (1 + 1j / (k * r))
+
+
+def ell(y, x, f, k):
+    """The residual of a hyperbolic lens of focal length f (m) at (y, x) from its centre."""
+    q = y * y + x * x
+    r = np.sqrt(f * f + q) + f
+    psi = y * y * (1 / r - 1 / (np.sqrt(f * f + y * y) + f)) + x * x * (1 / r - 1 / (np.sqrt(f * f + x * x) + f))
+    return np.exp(-1j * k * psi)
+
+
+class Residuals:
+    """kappa ell for all pairs of `offsets` (m) along the two axes.
+
+    offsets: displacement of a superpixel's centre from a lenslet's, one per interval; reach_u, reach_x: half widths (m) of
+    superpixel and lenslet; weights: share of the field amplitude that an offset carries, which scales what may be left out;
+    f: focal length of a hyperbolic lens, or None for a parabolic one, which is separable.
+    """
+
+    def __init__(self, offsets, weights, reach_u, reach_x, z, k, f, tolerance):
+        self.offsets, self.z, self.k, self.f = np.asarray(offsets, float), z, k, f
+        self.reach = reach_u + reach_x
+        weights = np.asarray(weights, float)
+        nodes = _nodes(np.abs(self.offsets).max() + self.reach, self.reach, z, k)
+        t, _ = gauss(nodes)
+        # nodes weigh alike, which favours the edges of the lenslet, where a point's column is most sensitive
+        d = self.offsets[:, None] + self.reach * t
+        blocks = {(a, b): kappa(d[a][:, None], d[b], z, k) / nodes for a in range(len(d)) for b in range(len(d))}
+        count = range(len(d))
+        bases = [_left(np.hstack([weights[a] * weights[b] * blocks[a, b] for b in count]), tolerance / 4) for a in count]
+        core = {(a, b): bases[a].conj().T @ blocks[a, b] @ bases[b].conj() for a, b in blocks}
+        self._series = [_series(t) @ (basis * np.sqrt(nodes)) for basis in bases]
+        self._lens, lens_core = self._lens_terms(reach_x, tolerance)
+        grid_u, _ = gauss(min(nodes, 64))
+        sampled = [self._products(o, reach_u * grid_u, reach_x * grid_u, a).reshape(len(grid_u) ** 2, -1) / len(grid_u)
+                   for a, o in enumerate(self.offsets)]
+        self._mix, into = [], []
+        full = {(a, b): np.kron(lens_core, core[a, b]) for a, b in core}
+        for a in count:
+            u, s, vh = np.linalg.svd(sampled[a], full_matrices=False)
+            keep = s > 1e-9 * s[0]
+            reduced = (s[:, None] * vh)[keep]
+            stack = np.hstack([weights[a] * weights[b] * reduced @ full[a, b] @ _gram_root(sampled[b]) for b in count])
+            basis = _left(stack, tolerance)
+            self._mix.append((vh[keep].conj().T / s[keep]) @ basis)
+            into.append(basis.conj().T @ reduced)
+        self.core = {(a, b): into[a] @ full[a, b] @ into[b].T for a, b in full}
+
+    def _lens_terms(self, reach_x, tolerance):
+        if self.f is None:
+            return None, np.ones((1, 1))
+        x_max = reach_x / self.f
+        nodes = int(20 + 2 * self.k * self.f * x_max**4)
+        t, _ = gauss(nodes)
+        block = ell(reach_x * t[:, None], reach_x * t, self.f, self.k) / nodes
+        basis = _left(block, tolerance / 4)
+        return (reach_x, _series(t) @ (basis * np.sqrt(nodes))), basis.conj().T @ block @ basis.conj()
+
+    def _products(self, offset, u, x, a):
+        """All products of kappa's and the lens's functions of one axis: (len(u), len(x), lens terms x kappa terms)."""
+        d = (u[:, None] - x) / self.reach
+        values = legendre(d.ravel(), len(self._series[a]), 1) @ self._series[a]
+        values = values.reshape(len(u), len(x), 1, -1)
+        if self._lens is not None:
+            reach, series = self._lens
+            values = values * (legendre(x / reach, len(series), 1) @ series)[:, :, None]
+        return values.reshape(len(u), len(x), -1)
+
+    def functions(self, a, u, x):
+        """P_r of offset number a at sensor positions u and lenslet positions x (m, from their centres): (terms, len(u), len(x))."""
+        return np.ascontiguousarray((self._products(self.offsets[a], u, x, a) @ self._mix[a]).transpose(2, 0, 1))
+
+
+def _nodes(far, reach, z, k):
+    """Nodes that carry kappa over displacements within `reach` of an offset, all at most `far` (m)."""
+    side = np.sqrt(z * z + far * far)
+    slope = k * reach * far * abs(1 / np.sqrt(side * side + far * far) - 1 / side)
+    return int(np.ceil(slope + 5 * np.cbrt(slope) + 12))
+
+
+def _series(t):
+    """Legendre coefficients from values on the Gauss nodes t."""
+    w = gauss(len(t))[1]
+    degrees = np.arange(len(t))
+    return legendre(t, len(t), 1).T * w * ((2 * degrees + 1) / 2)[:, None]
+
+
+def _left(matrix, tolerance):
+    """Orthonormal columns that hold the matrix up to `tolerance` (root sum of squares)."""
+    u, s, _ = np.linalg.svd(matrix, full_matrices=False)
+    tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
+    return u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
+
+
+def _gram_root(columns):
+    """R^T with columns = Q R: what weighs coefficients as the functions themselves."""
+    return np.linalg.qr(columns, mode="r").T

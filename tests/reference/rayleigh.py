@@ -1,0 +1,166 @@
+"""Slow, explicit oracle of the exact model: Rayleigh and Sommerfeld's first integral summed point by point.
+
+It shares no code with plenocli.optics: the field on the array is integrated over the pupil in direction cosines (or, with
+`spheres`, over spherical waves from each point of the exit pupil), the lenslet's phase is written out, and every node of the
+lenslet sends z/(j lambda R^2) (1 + j/(k R)) exp(j k R) to every node of the sensor. Positions are (y, x) in metres from
+the optical axis.
+"""
+
+import numpy as np
+from scipy.special import roots_legendre
+
+from tests.reference.fresnel import sensor_nodes
+
+try:
+    from numba import njit
+except ImportError:
+    njit = None
+
+
+def panels(low, high, slope, count=None):
+    """Composite Gauss-Legendre nodes and weights for phases of at most `slope` rad/m: at most 36 rad in a panel of 20 nodes."""
+    pieces = max(1, int(np.ceil(slope * (high - low) / 36)))
+    t, w = roots_legendre(count or 20)
+    half = (high - low) / 2 / pieces
+    middle = low + half * (2 * np.arange(pieces) + 1)
+    return (middle[:, None] + half * t).ravel(), np.tile(half * w, pieces)
+
+
+def amplitude(name, s2):
+    """Amplitude in direction cosines: of an evenly lit plane pupil, of an aplanatic lens, of an even one."""
+    return {"uniform-pupil": 1 / (1 - s2), "aplanatic": (1 - s2) ** -0.25, "uniform-sine": np.ones_like(s2)}[name]
+
+
+def pupil_directions(camera, density=1.0, wavelength=None):
+    """Direction cosines and weights d^2 s a(s)/N of a round or square pupil: (sy, sx, complex weight), N so that the light is 1."""
+    lens, z = camera.main_lens, camera.lenslet_array.distance
+    k, radius, pitch = 2 * np.pi / (wavelength or camera.light.wavelengths[0]), lens.aperture_diameter / 2, camera.lenslet_array.pitch
+    rate = density * k / z * 3 * pitch
+    if lens.aperture_shape == "square":
+        p, w = panels(-radius, radius, rate)
+        y, x, weight = np.repeat(p, len(p)), np.tile(p, len(p)), np.outer(w, w).ravel()
+    else:
+        r, w = panels(radius * lens.obscuration, radius, rate)
+        turns = int(40 + 1.3 * rate * radius)
+        phi = 2 * np.pi * (np.arange(turns) + 0.5) / turns
+        y, x = np.outer(r, np.sin(phi)).ravel(), np.outer(r, np.cos(phi)).ravel()
+        weight = np.repeat(w * r, turns) * 2 * np.pi / turns
+    r2 = y * y + x * x
+    s2 = r2 / (z * z + r2)
+    weight = weight * (1 - s2) ** 2 / z**2 * amplitude(lens.apodisation, s2)
+    norm = np.sqrt((weight * amplitude(lens.apodisation, s2)).sum())
+    eps = 1 / camera.object.distance + 1 / z - 1 / camera.main_lens.focal_length
+    if eps:
+        image = 1 / (1 / z - eps)
+        weight = weight * np.exp(1j * k * ((np.sqrt(z * z + r2) - z) - np.sign(image) * (np.sqrt(image**2 + r2) - abs(image))))
+    side = np.sqrt(z * z + r2)
+    return y / side, x / side, weight / norm
+
+
+def field_on_array(camera, wavelength, image_point, y, x, directions):
+    """Field at the grid y, x (m, from the axis) of a point imaged at `image_point`: (len(y), len(x)), 1/m."""
+    k, z = 2 * np.pi / wavelength, camera.lenslet_array.distance
+    sy, sx, weight = directions
+    total = np.zeros((len(y), len(x)), complex)
+    for start in range(0, len(weight), 20000):
+        some = slice(start, start + 20000)
+        total += (np.exp(-1j * k * np.outer(y - image_point[0], sy[some])) * weight[some]) @ np.exp(-1j * k * np.outer(sx[some], x - image_point[1]))
+    return total / wavelength * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
+
+
+def field_of_spheres(camera, wavelength, image_point, y, x, radial=60, turns=240):
+    """The same for a round, evenly lit plane pupil by spherical waves with exact distances, pupil point by pupil point."""
+    k, z, radius = 2 * np.pi / wavelength, camera.lenslet_array.distance, camera.main_lens.aperture_diameter / 2
+    t, w = roots_legendre(radial)
+    r, w = radius * (t + 1) / 2, radius * w / 2
+    phi = 2 * np.pi * (np.arange(turns) + 0.5) / turns
+    total = np.zeros((len(y), len(x)), complex)
+    for ri, wi in zip(r, w):
+        for angle in phi:
+            py, px = ri * np.sin(angle), ri * np.cos(angle)
+            side = np.sqrt(z * z + (y[:, None] - py) ** 2 + (x - px) ** 2)
+            image = np.sqrt(z * z + (image_point[0] - py) ** 2 + (image_point[1] - px) ** 2)
+            total += wi * ri * 2 * np.pi / turns * z / side**2 * np.exp(1j * k * (side - image))
+    return total / (wavelength * np.sqrt(np.pi) * radius)
+
+
+def lens_phase(profile, f, y, x, k):
+    """The lenslet's phase factor at (y, x) from its centre."""
+    r2 = y[:, None] ** 2 + x**2
+    return np.exp(-1j * k * (r2 / (2 * f) if profile == "parabolic" else np.sqrt(f * f + r2) - f))
+
+
+def pixel_energies(camera, wavelength, image_point, lenslets, centre, *, rows=None, density=1.0, pixel_nodes=6, f2=None, spheres=False):
+    """Energy in each pixel (of `rows`, default all) of a superpixel at `centre` (m, on the sensor): (rows, columns).
+
+    lenslets: list of (row, column) whose fields add; density scales the nodes of pupil and lenslet.
+    """
+    k, z = 2 * np.pi / wavelength, camera.sensor.distance
+    array, sensor = camera.lenslet_array, camera.sensor
+    width, f2 = array.pitch * array.fill_factor, f2 or array.focal_length
+    (v, wv), (u, wu) = sensor_nodes(centre, sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch * np.sqrt(sensor.pixel_fill_factor), pixel_nodes)
+    if rows is not None:
+        chosen = (np.asarray(rows)[:, None] * pixel_nodes + np.arange(pixel_nodes)).ravel()
+        v, wv = v[chosen], wv[chosen]
+    directions = pupil_directions(camera, density, wavelength)
+    total = np.zeros((len(v), len(u)), complex)
+    for row, column in lenslets:
+        far = max(np.abs(v - row * array.pitch).max(), np.abs(u - column * array.pitch).max()) + width / 2
+        slope = density * k * (far / np.hypot(z, far) + camera.main_lens.aperture_diameter / (2 * array.distance) + width / (2 * f2))
+        y, wy = panels(-width / 2, width / 2, slope)
+        x, wx = panels(-width / 2, width / 2, slope)
+        if spheres:
+            field = field_of_spheres(camera, wavelength, image_point, y + row * array.pitch, x + column * array.pitch)
+        else:
+            field = field_on_array(camera, wavelength, image_point, y + row * array.pitch, x + column * array.pitch, directions)
+        field = field * lens_phase(array.profile, f2, y, x, k) * wy[:, None] * wx
+        total += rayleigh_sum(field, y + row * array.pitch, x + column * array.pitch, v, u, z, k)
+    energy = np.abs(total) ** 2 * wv[:, None] * wu
+    return energy.reshape(-1, pixel_nodes, sensor.pixels_per_lenslet[1], pixel_nodes).sum(axis=(1, 3))
+
+
+def rayleigh_sum(field, y, x, v, u, z, k):
+    """sum of field(y, x) K(v - y, u - x), exp(j k z) left out: (len(v), len(u))."""
+    if njit is None:
+        return _plain_sum(field, y, x, v, u, z, k)
+    return _fast_sum(np.ascontiguousarray(field.real), np.ascontiguousarray(field.imag), y, x, v, u, z, k) * k / (2j * np.pi)
+
+
+def _plain_sum(field, y, x, v, u, z, k):
+    total = np.zeros((len(v), len(u)), complex)
+    for i, at in enumerate(v):
+        for j, across in enumerate(u):
+            q = (at - y[:, None]) ** 2 + (across - x) ** 2
+            side = np.sqrt(z * z + q)
+            total[i, j] = (field * (z / side**2 * (1 + 1j / (k * side))) * np.exp(1j * k * q / (side + z))).sum()
+    return total * k / (2j * np.pi)
+
+
+def _fast(real, imag, y, x, v, u, z, k):
+    """The same sum in compiled code; sine and cosine from the Taylor series of a quarter of the angle."""
+    out = np.zeros((len(v), len(u)), np.complex128)
+    for i in range(len(v)):
+        for j in range(len(u)):
+            total_r, total_i = 0.0, 0.0
+            for a in range(len(y)):
+                dy2 = (v[i] - y[a]) ** 2
+                for b in range(len(x)):
+                    q = dy2 + (u[j] - x[b]) ** 2
+                    side = np.sqrt(z * z + q)
+                    turns = k / (2 * np.pi) * q / (side + z)
+                    t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
+                    t2 = t * t
+                    s = t * (1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210)))))))
+                    c = 1 - t2 / 2 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182 * (1 - t2 / 240)))))))
+                    s, c = 2 * s * c, 1 - 2 * s * s
+                    s, c = 2 * s * c, 1 - 2 * s * s
+                    size = z / (side * side)
+                    tilt = size / (k * side)
+                    kr, ki = size * c - tilt * s, size * s + tilt * c
+                    total_r += real[a, b] * kr - imag[a, b] * ki
+                    total_i += real[a, b] * ki + imag[a, b] * kr
+            out[i, j] = total_r + 1j * total_i
+    return out
+
+
+_fast_sum = njit(fastmath=True, error_model="numpy")(_fast) if njit else None

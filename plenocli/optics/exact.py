@@ -229,25 +229,27 @@ class ExactSquareLenslets:
         return np.einsum("iab,iab->i", gy[rows], gx[columns]).real
 
     def columns(self, rows, columns, out):
-        """As SquareLenslets.columns; mirrored points and superpixels are computed as their mirror images."""
-        ry, rx = (self._reach(axis) for axis in (0, 1))
-        shape = self.geometry.object_shape
-        for sy in range(-ry, ry + 1):
-            for sx in range(-rx, rx + 1):
-                a, b, turned = self._canonical(sy, sx)
-                table = self._tables[a, b]
-                if turned:
-                    table = Factors(table.wide, table.high, self.geometry.pixel_shape[::-1], self.band.pixel_nodes)
-                flip_y, flip_x = (self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))
-                                  for axis, s, index in ((0, sy, rows), (1, sx, columns)))
-                for fy in (False, True):
-                    for fx in (False, True):
-                        some = np.flatnonzero((flip_y == fy) & (flip_x == fx))
-                        if len(some):
-                            images = np.empty((len(some), 1, 1, *self.geometry.pixel_shape), out.dtype)
-                            table.columns(shape[0] - 1 - rows[some] if fy else rows[some],
-                                          shape[1] - 1 - columns[some] if fx else columns[some], images)
-                            out[some, sy + ry, sx + rx] = images[:, 0, 0, :: -1 if fy else 1, :: -1 if fx else 1]
+        """As Factors.columns."""
+        for sy in range(self.superpixels[0]):
+            for sx in range(self.superpixels[1]):
+                self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
+
+    def superpixel(self, sy, sx, rows, columns, out):
+        """As Factors.superpixel; mirrored points and superpixels are computed as their mirror images."""
+        sy, sx = sy - self._reach(0), sx - self._reach(1)
+        *table, turned = self._canonical(sy, sx)
+        table, shape = self._tables[*table], self.geometry.object_shape
+        if turned:
+            table = Factors(table.wide, table.high, self.geometry.pixel_shape, self.band.pixel_nodes)
+        # points whose own half of the lenslet has no table
+        far_y, far_x = (self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))
+                        for axis, s, index in ((0, sy, rows), (1, sx, columns)))
+        for fy, fx in ((False, False), (False, True), (True, False), (True, True)):
+            some = np.flatnonzero((far_y == fy) & (far_x == fx))
+            if len(some):
+                images = np.empty((len(some), *self.geometry.pixel_shape), out.dtype)
+                table.superpixel(0, 0, shape[0] - 1 - rows[some] if fy else rows[some], shape[1] - 1 - columns[some] if fx else columns[some], images)
+                out[some] = images[:, :: -1 if fy else 1, :: -1 if fx else 1]
 
 
 class LocalTerms:

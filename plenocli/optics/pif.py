@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from plenocli.errors import NumericsError
+from plenocli.optics.exact import ExactSquareLenslets
 from plenocli.optics.geometry import geometry
 from plenocli.optics.lens import at_wavelength
 from plenocli.optics.shaped import ShapedLenslets
@@ -229,6 +230,8 @@ class PifBuilder:
 def _maker(camera, plan):
     """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
     array = camera.lenslet_array
+    if plan.model == "exact":
+        return ExactSquareLenslets
     return SquareLenslets if (array.aperture_shape, array.lattice) == ("square", "square") else ShapedLenslets
 
 

@@ -5,8 +5,8 @@ import json
 import click
 
 
-@click.command("schema", short_help="Print the JSON Schema of a camera or scene description.")
-@click.argument("kind", type=click.Choice(["camera", "scene"]))
+@click.command("schema", short_help="Print the JSON Schema of a camera, scene or lens description.")
+@click.argument("kind", type=click.Choice(["camera", "scene", "lens"]))
 def command(kind):
     """Print the JSON Schema of a configuration file, for editors and for checking without plenocli.
 
@@ -14,7 +14,8 @@ def command(kind):
     Example:
       plenocli schema camera > camera.schema.json
     """
-    from plenocli.config.camera import camera_schema
+    from plenocli.config.camera import Camera
+    from plenocli.config.lens import LensFile
     from plenocli.config.scene import Scene
 
-    click.echo(json.dumps(camera_schema() if kind == "camera" else Scene.model_json_schema(), indent=2))
+    click.echo(json.dumps({"camera": Camera, "scene": Scene, "lens": LensFile}[kind].model_json_schema(), indent=2))

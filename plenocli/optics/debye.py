@@ -17,8 +17,9 @@ import math
 import numpy as np
 
 from plenocli.optics.psf import mirrored
-from plenocli.optics.pupil import pupil_rows
-from plenocli.optics.quadrature import gauss
+from plenocli.optics.pupil import pupil_rows, wavefront, wavefront_slope
+from plenocli.optics.quadrature import gauss, nodes_for
+from plenocli.optics.radial import hankel_series, is_radial, radial_field
 
 APODISATION = {
     "uniform-pupil": lambda cos2: 1 / cos2,
@@ -30,10 +31,13 @@ SLAB = 1 << 21
 
 
 def spherical_field(camera, geometry, dy, dx):
-    """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: complex (len(dy), len(dx)).
+    """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: (len(dy), len(dx)), real where a radial pupil
+    makes it so.
 
     By quadrature over any pupil that pupil_rows knows; source: see the module.
     """
+    if is_radial(camera):
+        return radial_field(camera, geometry, dy, dx, spherical_profile)
     g, lens = geometry, camera.main_lens
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max())
     total = 0
@@ -45,6 +49,21 @@ def spherical_field(camera, geometry, dy, dx):
         weight *= APODISATION[lens.apodisation](cos2) * cos2**2 / g.z2**2
         total = total + _transform(rows.y, rows.x, weight, np.sqrt(cos2) * g.k / g.z2, dy, dx)
     return total / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
+
+
+def spherical_profile(camera, geometry, reach):
+    """As radial.profile: Chebyshev coefficients of h in 2 |d|^2/reach^2 - 1, |d| <= reach (m)."""
+    g, lens = geometry, camera.main_lens
+    outer = lens.aperture_diameter / 2
+    inner = outer * (lens.obscuration or 0.0)
+    rate, half = g.k * reach, (outer - inner) / 2
+    t, w = gauss(nodes_for(half * (rate / g.z2 + g.k * (abs(g.eps) * outer + wavefront_slope(lens)))))
+    rho = inner + half * (t + 1)
+    cos2 = g.z2**2 / (g.z2**2 + rho * rho)
+    phase = g.k * (wavefront(lens, np.zeros_like(rho), rho) + defocus_path(g, rho * rho))
+    weight = half * w * rho * APODISATION[lens.apodisation](cos2) * cos2**2 / g.z2**2 * np.exp(1j * phase)
+    sines = rho * np.sqrt(cos2) / g.z2
+    return hankel_series(rate * sines, weight, rate * outer / math.hypot(outer, g.z2)) * (2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g))))
 
 
 def defocus_path(geometry, r2):
@@ -104,6 +123,11 @@ def _aperture_norm(lens, geometry):
     """Integral of a(s)^2 d^2 s over the open aperture P1, filters not counted."""
     radius, shade = lens.aperture_diameter / 2, APODISATION[lens.apodisation]
     t, w = gauss(64)
+    if lens.aperture_shape == "image":
+        image = lens.samples("aperture_image")
+        centres = ((np.arange(len(image)) + 0.5) / len(image) - 0.5) * 2 * radius
+        cos2 = geometry.z2**2 / (geometry.z2**2 + centres[:, None] ** 2 + centres**2)
+        return (image * (shade(cos2) * cos2) ** 2).mean() * (2 * radius / geometry.z2) ** 2
     if lens.aperture_shape == "square":
         cos2 = geometry.z2**2 / (geometry.z2**2 + radius**2 * (t[:, None] ** 2 + t**2))
         return ((shade(cos2) * cos2) ** 2 * w * w[:, None]).sum() * (radius / geometry.z2) ** 2

@@ -26,8 +26,6 @@ def is_radial(camera):
 
 def profile(camera, geometry, reach):
     """Chebyshev coefficients (terms,) of h (1/m) in 2 |d|^2/reach^2 - 1, |d| <= reach (m); real where h is."""
-    from scipy.special import j0
-
     g, lens = geometry, camera.main_lens
     outer = g.D1 / 2
     inner = outer * (lens.obscuration or 0.0)
@@ -36,19 +34,27 @@ def profile(camera, geometry, reach):
     t, w = gauss(nodes_for(half * (rate + g.k * (abs(g.eps) * unit_radius(lens) + wavefront_slope(lens)))))
     rho = inner + half * (t + 1)
     weight = half * w * rho * np.exp(1j * g.k * (wavefront(lens, np.zeros_like(rho), rho) + g.eps / 2 * rho * rho))
-    edge = rate * outer
+    return hankel_series(rate * rho, weight, rate * outer) * (2 * np.pi / (g.wavelength * g.z2 * math.sqrt(aperture_area(lens))))
+
+
+def hankel_series(rates, weight, edge):
+    """Chebyshev coefficients in 2 t^2 - 1, 0 <= t <= 1, of the sum of weight J0(rates t); rates at most `edge`; real where it is."""
+    from scipy.special import j0
+
     count = int(edge / 2 + 4 * np.cbrt(edge) + 12)
     theta = (np.arange(count) + 0.5) * np.pi / count
-    samples = j0(np.outer(rate * np.cos(theta / 2), rho)) @ np.stack([weight.real, weight.imag], -1)
+    samples = j0(np.outer(np.cos(theta / 2), rates)) @ np.stack([weight.real, weight.imag], -1)
     series = np.cos(np.outer(np.arange(count), theta)) @ samples * (2 / count)
     series[0] /= 2
-    series *= 2 * np.pi / (g.wavelength * g.z2 * math.sqrt(aperture_area(lens)))
     real = np.abs(series[:, 1]).max() <= 1e-14 * np.abs(series[:, 0]).max()
     return series[:, 0] if real else series[:, 0] + 1j * series[:, 1]
 
 
-def radial_field(camera, geometry, dy, dx):
-    """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is. The pupil must be radial (is_radial)."""
+def radial_field(camera, geometry, dy, dx, profile=profile):
+    """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is. The pupil must be radial (is_radial).
+
+    profile: what computes the series, this module's or debye.spherical_profile.
+    """
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max()) or geometry.D2
     series = profile(camera, geometry, reach)
     # every distance once: grids are even and usually the same along both axes

@@ -8,6 +8,7 @@ ORDER = {"affine": 1, "poly2": 2, "poly3": 3, "poly5": 5}
 FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20, "poly5": 42}  # parameters, simplest first
 
 MARGIN = 0.12  # of the residual
+ENOUGH = 2000  # sites for the first, rough part of a fit
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,15 @@ def fit_model(kind, index, position, weight=None, robust=True):
     index, position = np.asarray(index, float), np.asarray(position, float)
     prior = np.ones(len(index)) if weight is None else np.asarray(weight, float)
     model = _start(kind, index, position)
+    few = slice(None, None, -(-len(index) // ENOUGH)) if robust else slice(None)
     for _ in range(1 if kind in ORDER else 4):
-        model = _least_squares(model, index, position, prior)
+        model = _least_squares(model, index[few], position[few], prior[few])
     if not robust:
         return model
     for _ in range(8):
-        miss = _miss(model, index, position)
-        model = _least_squares(model, index, position, prior / np.maximum(miss, 0.05 * np.median(miss) + 1e-9))
-    for _ in range(5):
+        miss = _miss(model, index[few], position[few])
+        model = _least_squares(model, index[few], position[few], prior[few] / np.maximum(miss, 0.05 * np.median(miss) + 1e-9))
+    for _ in range(4):
         model = _least_squares(model, index, position, prior * _tukey(_miss(model, index, position)))
     return model
 
@@ -64,7 +66,7 @@ def choose_model(index, position, weight=None):
     """The simplest map whose leave-one-out residual is within a margin of the best one.
 
     All kinds are compared with one common set of weights, those of the richest (trimming each by its own residual
-    would flatter the stiff ones). Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
+    would flatter the stiff ones) and the weights squared: sites of little weight shall not choose. Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
     The margin is two standard errors of an rms over N sites, at least MARGIN: what sampling and the frame's edges do to
     exact lattices (a bend of half a site's own scatter passes unseen). index (N, 2), position (N, 2) px,
     weight (N,). Returns (GridModel fitted to all, {kind: leave-one-out rms in px}).
@@ -75,7 +77,7 @@ def choose_model(index, position, weight=None):
         return fit_model("affine", index, position, weight), {}
     index, position = np.asarray(index, float), np.asarray(position, float)
     fitted = {kind: fit_model(kind, index, position, weight) for kind in allowed}
-    common = _tukey(_miss(fitted[allowed[-1]], index, position)) * (1 if weight is None else weight)
+    common = _tukey(_miss(fitted[allowed[-1]], index, position)) * (1 if weight is None else np.asarray(weight) ** 2)
     error = {kind: _left_out(model, index, position, common) for kind, model in fitted.items()}
     margin = 1 + max(MARGIN, 2 / np.sqrt(2 * count))
     best = min(error.values())

@@ -1,8 +1,8 @@
 """The lenslet grid of a white image: square or hexagonal, any rotation, pitch of 5 to 300 px.
 
-Method: autocorrelation for the first guess, maxima of the smoothed picture, windowed centroids on the
-illumination-flattened image (vignetting left in biases the pitch), numbering by a walk over the lattice,
-then the simplest smooth map (affine, homography, low-order polynomial) that the residuals support.
+Method: autocorrelation for the first guess, maxima of the smoothed picture, windowed centroids, numbering by a walk over
+the lattice, then a robust fit of every superpixel's common look on the illumination-flattened image (vignetting left in
+biases the pitch) and the simplest smooth map that the places support. See docs/model.md, "Spectral response: calibration and demultiplexing".
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class Lattice:
     kind: "square" or "hexagonal" (rows of a hexagonal grid are offset by half a pitch).
     pitch: lengths of the two lattice vectors, (down, right), px. angle: of the right vector, degrees, positive
     towards larger rows. centres (R, C, 2): the fitted map at every site of the array; valid (R, C): the cell lies
-    in the frame and is lit; residual (R, C): measured centroid minus fit, px, NaN where not measured.
+    in the frame and is lit; residual (R, C): distance of the measured place from the fit, px, NaN where not measured.
     rms: of all residuals of valid sites. model: form of the map. basis (2, 2): mean lattice vectors [down, right] px.
     """
 
@@ -71,7 +71,8 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
             fix=FIX,
         )
     weight = np.where(lattice.surrounded(index[inside], kind), 1.0, BORDER_WEIGHT)
-    model, _ = distortion.choose_model(index[inside], position[inside], weight)
+    few = slice(None, None, -(-int(inside.sum()) // distortion.ENOUGH))
+    model, _ = distortion.choose_model(index[inside][few], position[inside][few], weight[few])
     miss = np.hypot(*(position - model.at(index)).T)
     if np.sqrt(np.mean(miss[inside] ** 2)) > 0.07 * pitch:
         raise NumericsError(

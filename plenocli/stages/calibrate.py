@@ -222,7 +222,9 @@ def _add_attrs(attrs, white, dark, noise, reference):
 
 
 def _report(grid, attrs, data, whites, noise):
+    worst = np.unravel_index(np.nanargmax(np.where(grid.valid, grid.residual, np.nan)), grid.valid.shape)
     report = dict(lattice=grid.kind, pitch_px=[float(p) for p in grid.pitch], angle_deg=grid.angle, rms_px=grid.rms, model=grid.model,
+                  residual_median_px=float(np.nanmedian(grid.residual[grid.valid])), residual_worst_px=float(grid.residual[worst]), residual_worst_lenslet=[int(n) for n in worst],
                   lenslets=int(data["grid/valid"].sum()), array=list(data["grid/valid"].shape), window=[int(n) for n in data["response/window"]],
                   noise=noise.source, gain_dn_per_e=noise.gain)
     if "response" in attrs:

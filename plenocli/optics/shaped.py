@@ -7,17 +7,20 @@ products: scan nodes x separable terms x sensor nodes, and sensor nodes x scan n
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.optics.plan import coherent_window, size_band
-from plenocli.optics.psf import psf_nodes, separable_field
+from plenocli.optics.psf import separable_field
 from plenocli.optics.quadrature import gauss, nodes_for, smooth_nodes
 from plenocli.optics.relay import lenslet_kernel, pixel_energy, sensor_nodes
 
 SLAB = 1 << 20
 """Complex numbers in the work arrays of a few points: about what the last-level cache holds."""
+KEPT_BYTES = 1 << 26
+"""Values of terms along chords that are kept for the guard, which needs them a second time."""
+PIECES = 6
+"""Groups of short panels with a node count of their own."""
 
 
 @dataclass(frozen=True)
@@ -25,22 +28,14 @@ class Chords:
     """Quadrature of a lenslet's opening, in metres from its centre.
 
     axis: the scan axis (0 rows, 1 columns); at, weight: (chord, mirror) scan nodes, at[h, i] = -at[h, -1-i], chords ascending
-    in length; core, core_weight: nodes over the shortest chord; panels, panel_weight: (chord - 1, nodes) over what each longer
-    chord adds at both ends.
+    in length; pieces: [(x, weight)], each (chord, node), in the chords' order: what a chord adds to the next shorter one, the
+    first its whole self.
     """
 
     axis: int
     at: np.ndarray
     weight: np.ndarray
-    core: np.ndarray
-    core_weight: np.ndarray
-    panels: np.ndarray
-    panel_weight: np.ndarray
-
-    @property
-    def pieces(self):
-        """(nodes, weights) of the core and, where chords differ, of the panels: each (chord, node)."""
-        return [piece for piece in ((self.core[None], self.core_weight[None]), (self.panels, self.panel_weight)) if len(piece[0])]
+    pieces: tuple
 
 
 def chords(shape, width, slope, error=1e-10):
@@ -66,10 +61,14 @@ def chords(shape, width, slope, error=1e-10):
 
 def _chords(axis, at, weight, ends, slope, error):
     t, w = gauss(2 * ((nodes_for(slope * ends[0]) + 1) // 2))
-    low, high = ends[:-1, None], ends[1:, None]
-    s, v = gauss(smooth_nodes(slope * float(np.max(np.diff(ends), initial=0.0)) / 2, error))
-    x, wx = (low + high) / 2 + (high - low) / 2 * s, (high - low) / 2 * v
-    return Chords(axis, at, weight, ends[0] * t, ends[0] * w, np.hstack([x, -x]), np.hstack([wx, wx]))
+    pieces = [(ends[0] * t[None], ends[0] * w[None])]
+    # panels differ in width and so in nodes
+    for part in np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1)) if len(ends) > 1 else ():
+        low, high = ends[part - 1][:, None], ends[part][:, None]
+        t, w = gauss(smooth_nodes(slope * float(np.max(high - low)) / 2, error))
+        x, wx = (low + high) / 2 + (high - low) / 2 * t, (high - low) / 2 * w
+        pieces.append((np.hstack([x, -x]), np.hstack([wx, wx])))
+    return Chords(axis, at, weight, tuple(pieces))
 
 
 class ShapedLenslets:
@@ -80,11 +79,12 @@ class ShapedLenslets:
         self.pixel_nodes, self.dtype = band.pixel_nodes, np.complex128 if plan.double else np.complex64
         self.field = separable_field(camera, geometry, band.half, plan.tolerance)
         self.symmetry, self.notes = self.field.symmetry, {"separable_terms": self.field.terms, "field_tail": self.field.tail}
-        self.cut = chords(geometry.lenslet_shape, geometry.lenslet_width, _slope(camera, geometry, plan.superpixels, band.window), plan.tolerance / 1e3)
+        self.cut = chords(geometry.lenslet_shape, geometry.lenslet_width, _slope(camera, geometry, plan.superpixels, band.window), plan.tolerance / 30)
         self._sites = geometry.places(plan.superpixels)
         self._products = {} if self.window is None else {None: geometry.neighbourhood(self.window)}
         if self.window is None:
             self._products = {site: [([site[0]], [site[1]])] for site in self._sites}
+        self._kept = {}
         self._heights = {key: [self._rows(product[self.cut.axis]) for product in products] for key, products in self._products.items()}
 
     # the two tables of one set of lenslets
@@ -97,21 +97,32 @@ class ShapedLenslets:
         return np.ascontiguousarray(_folded(values, 2)).astype(self.dtype)
 
     def _across(self, positions, place):
-        """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: [core, panels], (chord, sensor node, node)."""
+        """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by piece (chord, node, sensor node)."""
         axis = 1 - self.cut.axis
         u, wu = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place))
         parts = []
         for x, w in self.cut.pieces:
             kernels = [(lenslet_kernel(self.geometry, n - place, u, wu, x.ravel()) * w.ravel()).reshape(len(u), *x.shape) for n in positions]
-            parts.append(np.ascontiguousarray(np.concatenate(kernels, axis=2).transpose(1, 0, 2)).astype(self.dtype))
+            parts.append(np.ascontiguousarray(np.concatenate(kernels, axis=2).transpose(1, 2, 0)).astype(self.dtype))
         return parts
 
     def _along(self, positions, index):
-        """Terms at the chords' nodes of lenslets at `positions` for point `index` of the chord axis: [core, panels], (chord, node, term)."""
-        g, axis = self.geometry, 1 - self.cut.axis
-        shift = np.asarray(positions) * g.D2
-        return [self.field.evaluate(x[:, None, :] + shift[:, None] - g.points(axis)[index], axis).reshape(len(x), -1, self.field.terms).astype(self.dtype)
-                for x, _ in self.cut.pieces]
+        """Terms at the chords' nodes of lenslets at `positions` for point `index` of the chord axis: by piece (chord, term, node)."""
+        key = tuple(positions), int(index)
+        if key not in self._kept:
+            g, axis = self.geometry, 1 - self.cut.axis
+            shift = np.asarray(positions) * g.D2 - g.points(axis)[index]
+            nodes = np.concatenate([(x[:, None, :] + shift[:, None]).ravel() for x, _ in self.cut.pieces])
+            values = np.ascontiguousarray(self.field.evaluate(nodes, axis).astype(self.dtype).T)
+            parts, start = [], 0
+            for x, _ in self.cut.pieces:
+                stop = start + x.size * len(shift)
+                parts.append(values[:, start:stop].reshape(len(values), len(x), -1).transpose(1, 0, 2))
+                start = stop
+            if sum(kept[0].base.nbytes for kept in self._kept.values()) > KEPT_BYTES:
+                self._kept.clear()
+            self._kept[key] = parts
+        return self._kept[key]
 
     def _kernel(self, products, place):
         """Kernel from the scan nodes of all products to the superpixel at `place`: (sensor node, sums of all, differences of all)."""
@@ -163,9 +174,12 @@ class ShapedLenslets:
 
     def _spread(self, product, across, index):
         """Terms carried along every chord to the sensor, for one point of the chord axis: (chord, term, sensor node)."""
-        out = np.concatenate([values.transpose(0, 2, 1) @ kernel.transpose(0, 2, 1)
-                              for values, kernel in zip(self._along(product[1 - self.cut.axis], index), across)])
-        return np.cumsum(out, axis=0, out=out)
+        out = np.empty((len(self.cut.at), self.field.terms, across[0].shape[2]), self.dtype)
+        start = 0
+        for values, kernel in zip(self._along(product[1 - self.cut.axis], index), across):
+            np.matmul(values, kernel, out=out[start:start + len(kernel)])
+            start += len(kernel)
+        return _accumulated(out)
 
     def _lines(self, key, scan, spread):
         """Fields of points `scan` at the scan nodes, before the hop along the scan axis: (point, sums then differences, sensor node)."""
@@ -200,9 +214,11 @@ class ShapedLenslets:
                 weight = np.concatenate([weight, weight], axis=1) / 2
                 for index in np.unique(chord):
                     here = np.flatnonzero(chord == index)
-                    heights = self._heights[key][number][scan[here]]
-                    gram = self._gram(product, index)
-                    share[here] += np.einsum("ihra,ihra,hr->i", heights @ gram, heights.conj(), weight, optimize=True).real
+                    heights = self._heights[key][number][scan[here]].transpose(1, 0, 2, 3)
+                    lines = heights.reshape(len(heights), -1, self.field.terms)
+                    entered = (lines @ self._gram(product, index)).view(lines.real.dtype)
+                    entered *= lines.view(lines.real.dtype)
+                    share[here] += np.einsum("hir,hr->i", entered.sum(axis=2).reshape(heights.shape[:3]), weight)
         return share
 
     def _gram(self, product, index):
@@ -210,8 +226,15 @@ class ShapedLenslets:
         positions, parts = product[1 - self.cut.axis], []
         for values, (_, w) in zip(self._along(positions, index), self.cut.pieces):
             weight = np.tile(w, len(positions)).astype(values.real.dtype)
-            parts.append((values * weight[:, :, None]).transpose(0, 2, 1) @ values.conj())
-        return np.cumsum(np.concatenate(parts), axis=0)
+            parts.append((values * weight[:, None]) @ values.conj().transpose(0, 2, 1))
+        return _accumulated(np.concatenate(parts))
+
+
+def _accumulated(panels):
+    """Running sums over the first axis, in place: plane by plane, which is many times faster than cumsum."""
+    for shorter, longer in zip(panels, panels[1:]):
+        longer += shorter
+    return panels
 
 
 def _folded(values, axis):
@@ -241,3 +264,39 @@ def _slope(camera, geometry, grid, window):
     rim = g.D1 / 2 * (1 if camera.main_lens.aperture_shape in ("circle", "annulus") else math.sqrt(2))
     corner = math.hypot(*g.lenslet_extent) if g.lenslet_shape == "square" else max(g.lenslet_extent)
     return g.k * (reach / g.z3 + rim / g.z2 + abs(g.kappa) * corner)
+
+
+def valid_for(camera, view):
+    """None: every lenslet shape and lattice of a camera description, and every pupil, can be cut into chords."""
+    return None
+
+
+def cost(camera, view, band, shape, double):
+    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
+    seconds (what does not scale with them, one core) and bytes (beyond the result).
+
+    Counted from the node rules; the seconds were fitted to process times of isolated and joined circles and hexagons.
+    """
+    grid = _grid_of(shape[1])
+    cut = chords(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), 1e-7)
+    products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
+    points, nodes = shape[3], [n * band.pixel_nodes for n in view.pixel_shape]
+    across, along = nodes[1 - cut.axis], nodes[cut.axis]
+    lanes = min(points, view.object_shape[1 - cut.axis])
+    scan = sum(cut.at.size * len(p[cut.axis]) for p in products)
+    chord = sum(sum(x.size for x, _ in cut.pieces) * len(p[1 - cut.axis]) for p in products)
+    places = len({place[1 - cut.axis] for place in view.places(grid)}) if band.window is not None else shape[1]
+    hop = scan * across * along * shape[1] * (0.5 if shape[1] == 1 else 1.0)
+    operations = 8.0 * (points * (places * scan * band.terms * across + hop) + lanes * places * chord * band.terms * across)
+    squares = points * shape[1] * along * across * (6e-9 if double else 3e-9)
+    guard = 2e-8 * points * scan * band.terms
+    size_ = 16 if double else 8
+    heights = size_ * view.object_shape[cut.axis] * scan * band.terms * (1 if band.window is not None else shape[1])
+    spread = size_ * len(cut.at) * len(products) * band.terms * across
+    return {"operations": operations, "seconds": squares + guard + band.psf_nodes**3 * 8e-9 + 0.05, "bytes": int(heights + 2 * spread) + (1 << 27)}
+
+
+def _grid_of(count):
+    """(rows, columns) of so many superpixels: a square block, else one row."""
+    side = math.isqrt(count)
+    return (side, side) if side * side == count else (1, count)

@@ -147,15 +147,18 @@ def _consider(request, rung):
         return Candidate(rung.name, rung.model, reason)
     fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
              "spectrum": 0.0, "storage": 3e-8 if request.dtype == np.float32 else 0.0}
-    best = None
-    for ring in request.rings:
-        outside = max(window_error(v, request.grid, ring) for v in request.depths)
+    tried = []
+    # rays end where the blur ends
+    for ring in request.rings if rung.model != "ray" else request.rings[:1]:
+        outside = 0.0 if rung.model == "ray" else max(window_error(v, request.grid, ring) for v in request.depths)
         # the rings that a user asks for are the user's model
         split = fixed | {"neighbourhood": outside if len(request.rings) > 1 else 0.0}
-        best = _sized(request, rung, ring, split)
-        if best.why is None:
-            break
-    return best
+        tried.append(_sized(request, rung, ring, split))
+        if tried[-1].why is None:
+            return tried[-1]
+    # none serves: the fewest rings that come as near as any
+    least = min(c.error for c in tried)
+    return next(c for c in tried if c.error <= 1.1 * least)
 
 
 def _sized(request, rung, ring, split):
@@ -213,7 +216,7 @@ def _plan(request, found, best):
     table = tuple(replace(c, why=c.why or f"serves, at {c.seconds() / max(best.seconds(), 1e-9):.2g} times the cost") if c is not best else c for c in found)
     warnings = [*request.warnings, *_warnings(request, best)]
     view_error = max(window_error(v, request.grid, best.ring) for v in request.depths)
-    if best.ring:
+    if best.ring and best.model != "ray":
         request.left_out.append(f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {view_error:.1g}")
         if len(request.rings) == 1 and view_error > request.accuracy:
             warnings.append(f"lenslets beyond the coherent window change columns by about {view_error:.1g}, more than the accuracy {request.accuracy:g}")

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from plenocli.optics import exact, rays, shaped
 from plenocli.optics.plan import size_band
 
 
@@ -32,14 +33,18 @@ def _square_only(camera, view):
     return None
 
 
-def _always(camera, view):
-    return None
+def _ray_error(camera, view):
+    return min(2.0, math.hypot(rays.error_bound(camera, view), _paraxial_error(camera, view)))
 
 
 def _paraxial_error(camera, view):
     """Fresnel against exact: the phase dropped at a lenslet's corner, the obliquity, and sine against tangent at the main lens."""
     aperture = math.hypot(view.D1 / 2 / view.z2, view.lenslet_width / 2 / view.z3)
     return min(1.0, 0.4 * view.quartic_phase + 1.5 * aperture**2)
+
+
+def _no_error(camera, view):
+    return 0.0
 
 
 def _square_cost(camera, view, band, shape, double):
@@ -49,16 +54,17 @@ def _square_cost(camera, view, band, shape, double):
             "bytes": 1 << 27}
 
 
-def _shaped_cost(camera, view, band, shape, double):
-    lenslets = 1 if band.window is None else 2 * band.window + 1
-    fine = view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
-    columns = shape[1] * shape[3]
-    return {"operations": 8.0 * fine * lenslets * band.lenslet_nodes * columns, "seconds": fine * columns * (3e-9 if double else 1.5e-9) + band.psf_nodes**3 * 8e-9 + 0.05,
-            "bytes": 1 << 27}
+def _exact_cost(camera, view, band, shape, double):
+    found = _square_cost(camera, view, band, shape, double)
+    # terms beyond the paraxial ones carry the corner's phase, and the set-up finds them
+    more = 2 + 0.5 * view.quartic_phase * 16
+    return {"operations": more * found["operations"], "seconds": found["seconds"] + 0.3 * more, "bytes": 1 << 29}
 
 
 RUNGS = (
+    Rung("rays", "ray", rays.valid_for, _ray_error, rays.size_band, rays.cost),
     Rung("fresnel, low rank", "fresnel", _square_only, _paraxial_error, size_band, _square_cost),
-    Rung("fresnel, triple product", "fresnel", _always, _paraxial_error, size_band, _shaped_cost),
+    Rung("fresnel, triple product", "fresnel", shaped.valid_for, _paraxial_error, size_band, shaped.cost),
+    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, _exact_cost),
 )
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""

@@ -12,6 +12,7 @@ from plenocli.errors import NumericsError
 from plenocli.optics.exact import ExactSquareLenslets
 from plenocli.optics.geometry import geometry
 from plenocli.optics.lens import at_wavelength
+from plenocli.optics.rays import RayLenslets
 from plenocli.optics.shaped import ShapedLenslets
 from plenocli.optics.square import SquareLenslets
 
@@ -229,10 +230,9 @@ class PifBuilder:
 
 def _maker(camera, plan):
     """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
-    array = camera.lenslet_array
-    if plan.model == "exact":
-        return ExactSquareLenslets
-    return SquareLenslets if (array.aperture_shape, array.lattice) == ("square", "square") else ShapedLenslets
+    if plan.model != "fresnel":
+        return {"ray": RayLenslets, "exact": ExactSquareLenslets}[plan.model]
+    return SquareLenslets if plan.rung == "fresnel, low rank" else ShapedLenslets
 
 
 def _mapped(planes, how):

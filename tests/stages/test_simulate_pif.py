@@ -1,6 +1,8 @@
 """simulate-pif from a camera file to an artefact, through the command line."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +50,7 @@ def test_warns_where_half_of_the_object_is_invisible(tmp_path, capsys):
     camera = tmp_path / "conjugate.toml"
     # f2 z2/(z2 - f2): the lenslets image the pupil onto the sensor
     camera.write_text(TINY.read_text().replace('[sensor]\ndistance = "208 um"', '[sensor]\ndistance = "208.789605430890 um"'))
-    assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--superpixels", "1x1", "--coherent-ring", "0"]) == 0
+    assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--model", "fresnel", "--superpixels", "1x1", "--coherent-ring", "0"]) == 0
     assert "half of the object is invisible" in capsys.readouterr().err
 
 
@@ -99,3 +101,58 @@ def test_an_off_axis_lenslet_on_the_sensors_raster(tmp_path, capsys):
     assert centroid(image) - centroid(plain) == pytest.approx(-shift, abs=0.08) and np.abs(shift).max() > 0.25
     assert run(["simulate-pif", str(TINY), "--explain", "--lenslet", "9,9"]) == 2
     assert "is not on the array" in capsys.readouterr().err
+
+
+def test_pieces_and_shards_hold_what_the_whole_does(tmp_path, monkeypatch, capsys):
+    """The same bytes whether A is held or streamed and for any number of threads; shards together are the whole."""
+    from plenocli.artefacts import read_pif
+    from plenocli.stages import pif_pieces
+
+    def matrix(name, *options):
+        assert run(["simulate-pif", str(TINY), "-o", str(tmp_path / name), "--superpixels", "3x3", "--model", "fresnel", "--accuracy", "1e-4", *options]) == 0
+        return tmp_path / name
+
+    whole = matrix("whole.h5")
+    assert matrix("threads.h5", "--workers", "3").read_bytes() == whole.read_bytes()
+    monkeypatch.setattr(pif_pieces, "layout", lambda *a: pif_pieces.Layout(True))
+    assert abs(matrix("pieces.h5").stat().st_size - whole.stat().st_size) < 4096
+    streamed, held = read_artefact(tmp_path / "pieces.h5", "pif"), read_artefact(whole, "pif")
+    assert np.array_equal(streamed.data["pif/A"], held.data["pif/A"])
+    # few points: the whole goes through LAPACK, pieces through A^T A
+    assert streamed.data["pif/singular_values"][0, :40] == pytest.approx(held.data["pif/singular_values"][0, :40], rel=1e-6)
+    monkeypatch.setattr(pif_pieces, "layout", lambda *a: pif_pieces.Layout(True, ((0, 1, 2, 3), (4, 5, 6, 7), (8,))))
+    sharded = read_pif(matrix("shards.h5"))
+    assert len(list(tmp_path.glob("shards.00?.h5"))) == 3
+    assert np.array_equal(sharded.data["pif/A"], held.data["pif/A"]) and np.array_equal(sharded.data["pif/lenslet_offset"], held.data["pif/lenslet_offset"])
+    assert sharded.data["pif/column_energy"] == pytest.approx(held.data["pif/column_energy"], rel=1e-12)
+    capsys.readouterr()
+
+
+def test_layouts_follow_the_memory_limit():
+    from types import SimpleNamespace
+
+    from plenocli.stages.pif_pieces import Layout, layout
+
+    def plan(superpixels, bands=1):
+        size = bands * superpixels * 2704 * 1600 * 4
+        return SimpleNamespace(shape=(bands, superpixels, 2704, 1600), bytes=size, memory=size + (64 << 20))
+
+    MiB = 1 << 20
+    assert layout(plan(1), 512 * MiB, "x") == Layout(False)
+    assert layout(plan(9), 512 * MiB, "x") == Layout(True)
+    sharded = layout(plan(25), 512 * MiB, "x").groups
+    assert [n for group in sharded for n in group] == list(range(25)) and max(map(len, sharded)) * 17 < 64
+    assert layout(plan(25), 8192 * MiB, "x") == Layout(True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("superpixels", ["3x3", "5x5"])
+def test_memory_limit_is_kept(tmp_path, superpixels):
+    """Peak of the whole command, measured in a child: below the limit, libraries included."""
+    camera = ROOT / "sample_configs" / "seed_spatial_250um.toml"
+    code = ("import sys, resource; from plenocli.cli.main import run; assert run(sys.argv[1:]) == 0\n"
+            "print('PEAK', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)")
+    done = subprocess.run([sys.executable, "-c", code, "simulate-pif", str(camera), "--superpixels", superpixels, "--coherent-ring", "1", "--model", "fresnel",
+                           "--accuracy", "1e-2", "--mem-limit", "512MiB", "-o", str(tmp_path / "pif.h5")], capture_output=True, text=True, check=True)
+    assert int(done.stdout.split("PEAK")[1]) < 512 * 1024
+    assert (len(list(tmp_path.glob("pif.*.h5"))) > 1) == (superpixels == "5x5")

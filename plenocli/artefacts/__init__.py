@@ -3,7 +3,8 @@
 from importlib import import_module
 
 _HOMES = {
-    "Artefact": "container", "write_artefact": "container", "read_artefact": "container", "cfa_text": "container",
+    "Artefact": "container", "write_artefact": "container", "read_artefact": "container", "cfa_text": "container", "streamed_artefact": "stream",
+    "writing_pif": "shards", "read_pif": "shards", "pif_parts": "shards", "shard_path": "shards",
     "default_mem_limit": "limits", "SCHEMAS": "kinds",
     "Provenance": "provenance", "describe_inputs": "provenance", "file_digest": "provenance", "provenance_texts": "provenance", "read_provenance_texts": "provenance",
     "require_file": "provenance",

@@ -1,6 +1,7 @@
 """Results appear whole or not at all: temporary file beside the target, fsync, rename, fsync of the folder."""
 
 import contextlib
+import errno
 import fcntl
 import os
 from pathlib import Path
@@ -126,6 +127,25 @@ def _is_same_file(descriptor, path):
 def _write_all(descriptor, view):
     while view:
         view = view[os.write(descriptor, view[: 1 << 24]):]
+
+
+def write_at(descriptor, offset, data):
+    """Write all of `data` (bytes-like or a C-ordered array) at `offset` of an open file; short writes are continued."""
+    view = memoryview(data)
+    view = view.cast("B") if view.nbytes else view[:0]
+    while view:
+        done = os.pwrite(descriptor, view[: 1 << 24], offset)
+        view, offset = view[done:], offset + done
+
+
+def reserve(descriptor, size):
+    """Make an open file `size` bytes long, with room for them on the disk where the file system can promise it."""
+    os.ftruncate(descriptor, size)
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS, errno.EBADF, errno.ENODEV):
+            raise
 
 
 def _sync_folder(folder):

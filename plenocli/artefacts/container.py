@@ -1,13 +1,15 @@
 """The one writer and the one verified reader of artefacts.
 
 A file is a 512-byte user block (magic, SHA-256 and length of the rest), then an ordinary HDF5 file that any viewer opens.
-The HDF5 part is built in memory and written by `publish`, because HDF5 itself may crash the process when a disk is full.
+HDF5 never touches the disk, because it may crash the process when one is full: its frame is built in memory, with room for
+the large datasets, and frame and values are written by us (`stream` writes them as they come).
 Reading goes the other way: all bytes once, digest, structure, declared sizes, and only then values, parsed from those bytes.
 """
 
+import errno
 import hashlib
-import io
 import json
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,15 +22,17 @@ from plenocli.artefacts import schema as tables
 from plenocli.artefacts.kinds import SCHEMAS
 from plenocli.artefacts.limits import default_mem_limit
 from plenocli.artefacts.provenance import Provenance, require_file
-from plenocli.artefacts.atomic import publish
+from plenocli.artefacts.atomic import replacement, reserve, write_at
+from plenocli.artefacts.sparse import SparseFile
 from plenocli.artefacts.structure import attribute_names, read_attribute, survey
-from plenocli.errors import InputError, OutputError, PlenoError
+from plenocli.errors import InputError, PlenoError
 
 MAGIC = b"plenocli artefact 1\n"
 HEADER_BYTES = 512
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
 _CHUNK_BYTES = 1 << 20
+_READ_BYTES = 1 << 22
 _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 
@@ -56,9 +60,12 @@ def write_artefact(path, artefact, *, overwrite=False):
 
     Raises ValueError listing every broken rule of the table (a bug of the caller), UsageError, OutputError.
     """
-    image = build_image(artefact)
-    header = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
-    publish(path, [header.ljust(HEADER_BYTES, b"\0"), image], overwrite=overwrite)
+    frame = Frame(artefact)
+    with replacement(path, overwrite=overwrite) as (_, descriptor):
+        frame.write(descriptor)
+        for name, values in frame.raw.items():
+            write_at(descriptor, frame.offset(name), values)
+        seal(descriptor, frame.size)
 
 
 def read_artefact(path, kind=None, *, mem_limit=None):
@@ -81,28 +88,92 @@ def read_artefact(path, kind=None, *, mem_limit=None):
 
 # --- writing -----------------------------------------------------------------------------------------------------------
 
+class Frame:
+    """The HDF5 file of an artefact without the values of its raw datasets (those that the table does not compress).
+
+    raw: dataset path -> values to write; size: bytes of the HDF5 file. `streamed`: dataset path -> (shape, dtype) of raw datasets
+    that come by themselves. ValueError listing every broken rule of the table.
+    """
+
+    def __init__(self, artefact, streamed=None):
+        schema, data, declared, attrs = _checked(artefact, streamed or {})
+        stored = _stored_attributes(schema, artefact, declared, attrs)
+        apart = [path for path, (shape, dtype) in declared.items() if is_raw(schema, path, shape)]
+        self.raw = {path: data.pop(path) for path in apart if path in data}
+        self._file, self._offsets = _frame(schema, data, {path: declared[path] for path in sorted(apart)}, stored)
+        self._taken = {path: (start, int(np.prod(declared[path][0])) * np.dtype(declared[path][1]).itemsize) for path, start in self._offsets.items()}
+        self.size = self._file.size
+
+    def offset(self, name):
+        """Where the values of a raw dataset begin in the finished file, bytes."""
+        return HEADER_BYTES + self._offsets[name]
+
+    def write(self, descriptor):
+        """Put the frame into an open file, around the values of the raw datasets, which may be there already."""
+        reserve(descriptor, HEADER_BYTES + self.size)
+        for offset, content in self._file.extents():
+            for first, last in self._around(offset, offset + len(content)):
+                write_at(descriptor, HEADER_BYTES + first, content[first - offset:last - offset])
+
+    def _around(self, first, last):
+        """The parts of a range that no raw dataset takes."""
+        for start, size in sorted(self._taken.values()):
+            if start < last and start + size > first:
+                if start > first:
+                    yield first, start
+                first = start + size
+        if first < last:
+            yield first, last
+
+
 def build_image(artefact):
     """The HDF5 file as bytes. Raises ValueError listing every broken rule of the table."""
+    frame = Frame(artefact)
+    image = bytearray(frame.size)
+    for offset, content in frame._file.extents():
+        image[offset:offset + len(content)] = content
+    for name, values in frame.raw.items():
+        start = frame.offset(name) - HEADER_BYTES
+        image[start:start + values.nbytes] = values.tobytes()
+    return bytes(image)
+
+
+def is_raw(schema, path, shape):
+    """Whether a dataset is stored as one run of numbers: what the table does not compress, and is not empty."""
+    entry = schema.field_for(path)
+    return entry is not None and not entry.compress and len(shape) > 0 and 0 not in shape
+
+
+def seal(descriptor, size):
+    """Write the digest block of the HDF5 file of `size` bytes that follows it in the open file."""
+    digest = hashlib.sha256()
+    for start in range(0, size, _READ_BYTES):
+        wanted = min(_READ_BYTES, size - start)
+        while wanted:
+            part = os.pread(descriptor, wanted, HEADER_BYTES + start)
+            if not part:
+                raise OSError(errno.EIO, "the file was cut short while it was written")
+            digest.update(part)
+            start, wanted = start + len(part), wanted - len(part)
+    header = MAGIC + f"sha256 {digest.hexdigest()}\nbytes {size}\n".encode()
+    write_at(descriptor, 0, header.ljust(HEADER_BYTES, b"\0"))
+
+
+def _checked(artefact, streamed):
+    """(schema, arrays, declared shapes, attributes) of an artefact; ValueError listing every broken rule of its table."""
     if artefact.kind not in SCHEMAS:
         raise ValueError(f"no artefact kind '{artefact.kind}' (kinds: {', '.join(SCHEMAS)})")
     schema = SCHEMAS[artefact.kind]
     data = {path: _plain_array(path, value) for path, value in artefact.data.items() if value is not None}
     attrs = {where: {n: v for n, v in named.items() if v is not None} for where, named in artefact.attrs.items()}
-    declared = {path: (values.shape, values.dtype) for path, values in data.items()}
+    declared = {path: (values.shape, values.dtype) for path, values in data.items()} | dict(streamed)
     problems = tables.declared_problems(schema, declared) + tables.attribute_problems(schema, attrs)
     problems += tables.value_problems(schema, data)
-    groups = {path.rsplit("/", depth)[0] for path in data for depth in range(1, path.count("/") + 1)}
-    problems += [f"attributes for '{where}', which has no dataset" for where in attrs if attrs[where] and where not in groups | set(data)]
+    groups = {path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)}
+    problems += [f"attributes for '{where}', which has no dataset" for where in attrs if attrs[where] and where not in groups | set(declared)]
     if problems:
         raise ValueError(f"{artefact.kind} artefact breaks its table: " + "; ".join(problems))
-    stored = _stored_attributes(schema, artefact, declared, attrs)
-    longest = max(len(v) for named in stored.values() for v in named.values() if isinstance(v, bytes))
-    layout = "earliest" if longest < _LONG_TEXT else "v108"
-    try:
-        return _image(schema, data, stored, layout)
-    except MemoryError as error:
-        size = sum(values.nbytes for values in data.values())
-        raise OutputError(f"{size / 1e9:.1f} GB of results do not fit into memory twice", None, "ask for fewer points or bands") from error
+    return schema, data, declared, attrs
 
 
 def _plain_array(path, value):
@@ -142,16 +213,34 @@ def _storable(value):
     return values.astype({"i": "i8", "u": "u8", "f": "f8", "b": "?"}[values.dtype.kind])
 
 
-def _image(schema, data, stored, layout):
-    memory = io.BytesIO()
+def _frame(schema, data, apart, stored):
+    """(SparseFile, raw dataset path -> offset in it). Raw datasets come first, so that their place depends on their sizes only."""
+    longest = max((len(v) for named in stored.values() for v in named.values() if isinstance(v, bytes)), default=0)
+    layout = "v108" if apart or longest >= _LONG_TEXT else "earliest"
+    memory, offsets = SparseFile(), {}
     with h5py.File(memory, "w", libver=(layout, "v110"), track_times=False) as file:
+        for path, (shape, dtype) in apart.items():
+            offsets[path] = _reserve_dataset(file, path, shape, dtype)
         for path in sorted(data):
-            file.create_dataset(path, data=data[path], **_storage(schema.field_for(path), data[path]))
+            file.create_dataset(path, data=data[path], **_storage(data[path]))
         for where in sorted(stored):
             target = file[where or "/"]
             for name, value in stored[where].items():
                 _put_attribute(target, name, value)
-    return memory.getbuffer()
+    return memory, offsets
+
+
+def _reserve_dataset(file, path, shape, dtype):
+    """Make a dataset in one run, its room allocated and never filled; returns its offset."""
+    group, _, name = path.rpartition("/")
+    options = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    options.set_layout(h5py.h5d.CONTIGUOUS)
+    options.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    options.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    options.set_obj_track_times(False)
+    parent = file.require_group(group) if group else file
+    made = h5py.h5d.create(parent.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype), logical=True), h5py.h5s.create_simple(tuple(shape)), options)
+    return made.get_offset()
 
 
 def _put_attribute(target, name, value):
@@ -163,18 +252,15 @@ def _put_attribute(target, name, value):
         target.attrs.create(name, value)
 
 
-def _storage(entry, values):
-    """Storage options: 1 MiB chunks with a checksum each; gzip unless the table says that it does not pay."""
+def _storage(values):
+    """Storage options: 1 MiB chunks with a checksum each, gzip."""
     if values.ndim == 0 or values.size == 0:
         return {"track_times": False}
     chunks, budget = [], max(_CHUNK_BYTES // values.itemsize, 1)
     for size in reversed(values.shape):
         chunks.insert(0, max(min(size, budget), 1))
         budget //= chunks[0]
-    options = {"chunks": tuple(chunks), "fletcher32": True, "track_times": False}
-    if entry.compress:
-        options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    return options
+    return {"chunks": tuple(chunks), "fletcher32": True, "track_times": False, "compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 # --- reading -----------------------------------------------------------------------------------------------------------

@@ -7,16 +7,15 @@ from plenocli.artefacts.schema import Attr, Field, Schema
 
 _NOTES = Attr("notes", "json", "", "anything else worth keeping")
 
-PIF = Schema("pif", 1, "Pupil image functions: the system matrix A of a camera, one matrix a band and superpixel.", (
-    Field("pif/A", "band lenslet pixel point", "f", "1", minimum=0, compress=False,
-          doc="fraction of the light through the main pupil from an object point that lands in a pixel of a superpixel"),
+_PIF_FIELDS = (
     Field("pif/wavelength", "band", "f", "m", "centre wavelength", minimum=0, ascending=True),
     Field("pif/lenslet_offset", "lenslet 2", "i", "1", "superpixel (row, column) relative to the object's own lenslet"),
     Field("pif/pixel_shape", "2", "i", "1", "pixels of a superpixel (rows, columns)", minimum=1),
     Field("pif/object_shape", "2", "i", "1", "object points over one lenslet's field (rows, columns)", minimum=1),
     Field("pif/column_energy", "band point", "f", "1", "share of a point's light that lands on the superpixels kept", minimum=0),
     Field("pif/singular_values", "band value | value", "f", "1", "singular values of A, largest first", optional=True, minimum=0),
-), attrs={"pif": (
+)
+_PIF_ATTRS = (
     Attr("rank", "number", "1", "numerical rank, one a band"),
     Attr("condition", "number", "1", "largest over smallest singular value, one a band", finite=False),
     Attr("symmetry_defect", "number", "1", "relative difference of A and A with the object turned by 180 degrees; 0: half of it is invisible"),
@@ -25,8 +24,16 @@ PIF = Schema("pif", 1, "Pupil image functions: the system matrix A of a camera, 
     Attr("eps", "number", "1/m", "defocus of the main lens"),
     Attr("superpixel_pitch", "number", "m", "spacing of superpixel centres on the sensor"),
     Attr("model", "text", "", "propagation model"),
-    _NOTES)},
-    plots={"pif": ("A", ())}, default=("pif",))
+    _NOTES)
+
+PIF = Schema("pif", 1, "Pupil image functions: the system matrix A of a camera, one matrix a band and superpixel.", (
+    Field("pif/A", "band lenslet pixel point", "f", "1", minimum=0, compress=False,
+          doc="fraction of the light through the main pupil from an object point that lands in a pixel of a superpixel"),
+    *_PIF_FIELDS), attrs={"pif": _PIF_ATTRS}, plots={"pif": ("A", ())}, default=("pif",))
+
+PIF_INDEX = Schema("pif-index", 1, "A system matrix too large for one file: what `pif` holds but for A, which is in numbered files of kind pif beside it.", (
+    *_PIF_FIELDS, Field("pif/shard", "lenslet", "i", "1", "which of the files holds the superpixel, counted from 0; there it has the same offset", minimum=0),
+), attrs={"pif": (*_PIF_ATTRS, Attr("shards", "json", "", "name and SHA-256 of each file"))}, plots={"pif": ("column_energy", ())}, default=("pif",))
 
 CAPTURE = Schema("capture", 1, "One exposure of a plenoptic camera, simulated or measured.", (
     Field("capture/mosaic", "row column", "i f", "see units", "sensor values as read out", maskable=False),
@@ -132,4 +139,4 @@ IMAGE = Schema("image", 1, "Reconstructed picture, linear.", (
     Attr("clipped", "number", "1", "share of points set to zero because they came out negative"), _NOTES)},
     plots={"image": ("value", ("sigma",))}, default=("image",))
 
-SCHEMAS = {schema.kind: schema for schema in (PIF, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE)}
+SCHEMAS = {schema.kind: schema for schema in (PIF, PIF_INDEX, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE)}

@@ -123,7 +123,7 @@ output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT",
 overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
-workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes to use.")
+workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
 mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
 
 

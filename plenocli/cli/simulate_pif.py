@@ -53,5 +53,5 @@ def command(ctx, camera, output, explain, workers, overwrite, as_json, **setting
     """
     from plenocli.stages.simulate_pif import Settings, line, run_simulate_pif
 
-    report = run_simulate_pif(camera, output, Settings(**settings), explain=explain, overwrite=overwrite, command=options.command_line(ctx))
+    report = run_simulate_pif(camera, output, Settings(**settings), explain=explain, overwrite=overwrite, workers=workers, command=options.command_line(ctx))
     options.summary(report, as_json, line(report))

@@ -126,11 +126,11 @@ class _Stored:
 
 def _read_pif(path, camera, settings, wavelengths, camera_path):
     """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it belongs to another camera or lacks a wavelength."""
-    from plenocli.artefacts import read_artefact
+    from plenocli.artefacts import read_pif
     from plenocli.config import parse_camera
     from plenocli.stages.cameras import require_same_files
 
-    artefact = read_artefact(path, "pif", mem_limit=settings.mem_limit)
+    artefact = read_pif(path, settings.mem_limit)
     if settings.refine != 1:
         raise UsageError("--refine computes its own finer system matrix and cannot take --pif", fix="leave one of them out")
     made_for = parse_camera(artefact.provenance.config, path)

@@ -41,7 +41,7 @@ def run_score(
     block: object samples per lenslet (h, w), else from the files. light: for colour differences. One bad result does not
     stop the others: its message stands in its place and is raised at the end.
     """
-    from plenocli.artefacts import check_output, describe_inputs, publish, read_artefact
+    from plenocli.artefacts import check_output, describe_inputs, publish, read_pif
 
     inputs = [*results, truth, *whites, patches, pif, capture]
     files = [path for path in inputs if path is not None and Path(path).is_file()]
@@ -50,7 +50,7 @@ def run_score(
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
     if report is not None and Path(report) == Path(output):
         raise UsageError("--output and --report name the same file", output, "give the report another name, such as report.html")
-    system = read_artefact(pif, "pif", mem_limit=mem_limit) if pif else None
+    system = read_pif(pif, mem_limit) if pif else None
     context = _Context(truth, whites, patches, system, capture, block, sampling, light, mem_limit)
     scored, pictures, errors = [], [], []
     for path in results:

@@ -25,7 +25,7 @@ class Settings:
     mem_limit: int = 8 << 30
 
 
-def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=False, command=""):
+def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=False, workers=1, command=""):
     """Compute A and write it as a pif artefact; returns a summary dict. With `explain` only the plan is made.
 
     Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where memory or accuracy do not
@@ -36,6 +36,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.optics.diagnose import describe
     from plenocli.optics.pif import build_pif
+    from plenocli.stages import pif_pieces
     from plenocli.stages.needs import read_needs
 
     if not explain:
@@ -48,33 +49,30 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
                     accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs, lenslet=settings.lenslet)
     if explain:
         return _explained(plan)
-    # the matrix, its copy while columns are gathered, and the file's image in memory
-    needed = 3 * plan.bytes + (1 << 27)
-    if needed > settings.mem_limit:
-        raise NumericsError(f"the matrix needs about {needed / 2**30:.2g} GiB, more than the limit of {settings.mem_limit / 2**30:.2g} GiB",
-                            camera_path, "take fewer superpixels, points or wavelengths, or raise --mem-limit")
+    chosen = pif_pieces.layout(plan, settings.mem_limit, camera_path)
     for warning in plan.warnings:
         note(warning)
-    with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
-        pif = build_pif(camera, plan, progress=lambda done, total: progress.update(done - progress.n))
-    found = describe(pif)
-    for warning in found["warnings"]:
-        note(warning)
-    data, attrs = _contents(pif, found)
-    if settings.lenslet is not None:
-        attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
     provenance = Provenance(command, describe_inputs(camera_files(camera_path, camera) | {"scene": scene}), None, camera.text, accuracy_record(plan))
-    write_artefact(output, Artefact("pif", data, attrs, provenance), overwrite=overwrite)
+
+    def finish(pif, found):
+        data, attrs = _contents(pif, found)
+        if settings.lenslet is not None:
+            attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
+        return Artefact("pif", data, attrs, provenance)
+
+    with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
+        options = dict(progress=lambda done, total: progress.update(done - progress.n), workers=workers)
+        if chosen.streamed:
+            pif, found = pif_pieces.stream_pif(camera, plan, output, chosen, finish, overwrite=overwrite, **options)
+        else:
+            pif = build_pif(camera, plan, **options)
+            found = describe(pif)
+    for warning in found["warnings"]:
+        note(warning)
+    if not chosen.streamed:
+        write_artefact(output, finish(pif, found), overwrite=overwrite)
     return _summary(output, pif, found, plan)
-
-
-def _window(camera, lenslet):
-    """Where the pixels of an off-axis lenslet's own superpixel lie on the sensor."""
-    from plenocli.optics.geometry import lenslet_shift
-
-    row, column, shift = lenslet_shift(camera, *lenslet)
-    return {"lenslet": list(lenslet), "first_pixel": [row, column], "pixel_shift": list(shift)}
 
 
 def accuracy_record(plan):
@@ -106,6 +104,14 @@ def _wavelengths(camera, settings):
     return tuple(float(w) for w in broadband(camera, lambda w: illuminant(camera.light.illuminant, w), step).wavelengths)
 
 
+def _window(camera, lenslet):
+    """Where the pixels of an off-axis lenslet's own superpixel lie on the sensor."""
+    from plenocli.optics.geometry import lenslet_shift
+
+    row, column, shift = lenslet_shift(camera, *lenslet)
+    return {"lenslet": list(lenslet), "first_pixel": [row, column], "pixel_shift": list(shift)}
+
+
 def _contents(pif, found):
     data = {
         "pif/A": pif.A,
@@ -126,7 +132,7 @@ def _contents(pif, found):
 
 def _summary(output, pif, found, plan):
     keep = {key: found[key] for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max") if key in found}
-    bands, _, pixels, points = pif.A.shape
+    bands, _, pixels, points = plan.shape
     return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
             "wavelengths": pif.wavelength.tolist(), "model": plan.model, "rung": plan.rung, "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
             "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],

@@ -28,9 +28,9 @@ class System:
 
 def read_system(path, mem_limit=None):
     """System of a pif artefact; several bands are averaged, as equal shares of the light. InputError where it lacks (0, 0)."""
-    from plenocli.artefacts import read_artefact
+    from plenocli.artefacts import read_pif
 
-    artefact = read_artefact(path, "pif", mem_limit=mem_limit)
+    artefact = read_pif(path, mem_limit)
     matrices = artefact.data["pif/A"]
     if len(matrices) > 1:
         note(f"{Path(path).name} holds {len(matrices)} bands; they are averaged, as equal shares of the light")

@@ -86,15 +86,8 @@ class PifBuilder:
                 done = np.union1d(done, points)
 
     def orbits(self):
-        """Superpixels that the symmetry maps onto each other: [(index of the first, [(index, (turned, flipped rows, flipped columns))])]."""
-        (cy, cx), found = ((n - 1) // 2 for n in self.plan.superpixels), {}
-        place = {tuple(o): i for i, o in enumerate(self.offsets.tolist())}
-        for (r, c), index in place.items():
-            flips = r < 0 and self.symmetry[0], c < 0 and self.symmetry[1]
-            a, b = (-n if flip else n for n, flip in zip((r, c), flips))
-            turned = self._turns and a > b
-            found.setdefault(place[(b, a) if turned else (a, b)], []).append((index, (turned, *flips)))
-        return list(found.items())
+        """As superpixel_orbits, of this matrix."""
+        return superpixel_orbits(self.offsets, self.symmetry)
 
     @property
     def _turns(self):
@@ -235,6 +228,21 @@ def _maker(camera, plan):
     return SquareLenslets if plan.rung == "fresnel, low rank" else ShapedLenslets
 
 
+def superpixel_orbits(offsets, symmetry):
+    """Superpixels (offsets (superpixel, 2)) that the symmetry (flip rows, flip columns, transpose) of A maps onto each other.
+
+    [(first, [(superpixel, (turned, flipped rows, flipped columns) that leads there from the first)])], numbers of superpixels.
+    """
+    place, found = {tuple(o): i for i, o in enumerate(np.asarray(offsets).tolist())}, {}
+    turns = symmetry[2] and symmetry[0] == symmetry[1]
+    for (r, c), index in place.items():
+        flips = bool(r < 0 and symmetry[0]), bool(c < 0 and symmetry[1])
+        a, b = (-n if flip else n for n, flip in zip((r, c), flips))
+        turned = bool(turns and a > b)
+        found.setdefault(place[(b, a) if turned else (a, b)], []).append((index, (turned, *flips)))
+    return list(found.items())
+
+
 def _mapped(planes, how):
     """(pixel row, pixel column, point row, point column) of the superpixel that (turned, flipped rows, flipped columns) leads to: a view."""
     turned, rows, columns = how
@@ -276,7 +284,7 @@ def build_pif(camera, plan, *, points=None, progress=None, workers=1):
     dtype = np.dtype(plan.dtype)
     A = np.empty(plan.shape, dtype)
     count = _Count(plan, progress)
-    builders = []
+    tails, builder = [], None
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=dtype)
         if points is None:
@@ -285,8 +293,8 @@ def build_pif(camera, plan, *, points=None, progress=None, workers=1):
             for where, block in _chunks(builder, np.arange(builder.points)[points]):
                 A[b][:, :, where] = block
                 count(len(where) * len(builder.offsets))
-        builders.append(builder)
-    return Pif(A, *described(plan, builders, A.sum(axis=(1, 2), dtype=float)))
+        tails.append(builder.notes["field_tail"])
+    return Pif(A, *described(plan, builder, tails, A.sum(axis=(1, 2), dtype=float)))
 
 
 def pif_pieces(camera, plan, *, progress=None, workers=1):
@@ -314,12 +322,10 @@ class _Count:
             self._report(self._done // self._superpixels, self._total)
 
 
-def described(plan, builders, energy):
-    """What a Pif holds beside A, in its order, from the PifBuilders of all bands and the energy (band, point) of all columns."""
-    last = builders[-1]
-    tails = [builder.notes["field_tail"] for builder in builders]
-    return (np.array([band.wavelength for band in plan.bands]), last.offsets, last.pixel_shape, last.object_shape, energy,
-            _notes(plan, last, tails, energy))
+def described(plan, builder, tails, energy):
+    """What a Pif holds beside A, in its order: `builder` of any band, the field tails of all bands and the energy (band, point) of all columns."""
+    return (np.array([band.wavelength for band in plan.bands]), builder.offsets, builder.pixel_shape, builder.object_shape, energy,
+            _notes(plan, builder, tails, energy))
 
 
 def _chunks(builder, points):

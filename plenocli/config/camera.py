@@ -210,7 +210,8 @@ class Sensor(Section):
 
 
 class Band(Section):
-    """A band of light around `center`, `fwhm` wide: photons per wavelength fall off as a Gaussian or are constant (box)."""
+    """A band of light around `center`, `fwhm` wide: photons per wavelength fall off as a Gaussian, cut
+    off at 1.5 fwhm on either side, or are constant (box)."""
 
     center: Wavelength
     fwhm: Length
@@ -218,8 +219,8 @@ class Band(Section):
 
     @model_validator(mode="after")
     def _narrow(self):
-        if self.fwhm > self.center / 2:
-            raise ValueError(f"fwhm {format_length(self.fwhm)} is more than half of the centre, {format_length(self.center)}: give several bands' wavelengths instead")
+        if self.fwhm > self.center / 3:
+            raise ValueError(f"fwhm {format_length(self.fwhm)} is more than a third of the centre, {format_length(self.center)}: give several bands' wavelengths instead")
         return self
 
 

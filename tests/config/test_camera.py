@@ -102,7 +102,7 @@ def test_a_band_of_light_instead_of_lines(shape):
 @pytest.mark.parametrize("light, words", [
     ('wavelengths = ["540 nm"]\nband = { center = "550 nm", fwhm = "10 nm" }', "exactly one of wavelengths and band"),
     ('illuminant = "D65"', "exactly one of wavelengths and band"),
-    ('band = { center = "550 nm", fwhm = "300 nm" }', "more than half of the centre"),
+    ('band = { center = "550 nm", fwhm = "300 nm" }', "more than a third of the centre"),
 ])
 def test_bands_that_cannot_be(light, words):
     with pytest.raises(ConfigError, match=words):

@@ -40,7 +40,7 @@ $(RUN)/paper/capture.h5: $(CONFIG) $(RUN)/pif.h5 | $(RUN)/paper/
 	$(P) capture-sim $< --pif $(RUN)/pif.h5 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 1 -o $@ --overwrite
 
 $(RUN)/stray/capture.h5: $(CONFIG) | $(RUN)/stray/
-	$(P) capture-sim $< --refine $(REFINE) --bandwidth 10nm --superpixels 3x3 --coherent-ring 1 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 2 -o $@ --overwrite
+	$(P) capture-sim $< --model fresnel --accuracy 1e-3 --refine $(REFINE) --bandwidth 10nm --superpixels 3x3 --coherent-ring 1 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 2 -o $@ --overwrite
 
 $(RUN)/dictionary.h5: $(RUN)/pif.h5
 	$(P) learn-dict $(TRAINING) --pif $< $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 -o $@ --overwrite

@@ -28,7 +28,7 @@ $(RAW)/white.dng: $(RUN)/pif.h5 | $(RAW)/
 $(RAW)/dark.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target dark --exposure $(LONG) --seed 2 -o $@
 $(RAW)/band-%.dng: $(CONFIG) | $(RAW)/
-	$(P) capture-sim $(CONFIG) --target mono:$* --superpixels $(SUPERPIXELS) --exposure $(LONG) --seed 3 -o $@ --overwrite
+	$(P) capture-sim $(CONFIG) --model fresnel --accuracy 1e-3 --target mono:$* --superpixels $(SUPERPIXELS) --exposure $(LONG) --seed 3 -o $@ --overwrite
 $(RAW)/chart-long.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target colorchecker --exposure $(LONG) --seed 4 -o $@
 $(RAW)/chart-short.dng: $(RUN)/pif.h5 | $(RAW)/

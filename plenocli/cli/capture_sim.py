@@ -20,8 +20,8 @@ from plenocli.cli import options
 @click.option("--spectral-step", type=options.LENGTH, default=None, help="Spacing of wavelengths for cameras with colour; default half of the narrowest filter.")
 @options.superpixels("Superpixels that one lenslet's light may reach")
 @options.coherent_ring
-@click.option("--accuracy", type=options.POSITIVE, default=1e-3, show_default=True, help="Relative error of the light on the sensor.")
-@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="fresnel", show_default=True, help="Propagation model, as in simulate-pif.")
+@click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of the light on the sensor; default: what its noise lets be seen.")
+@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Propagation model, as in simulate-pif.")
 @click.option("--scene-out", type=options.FILE, help="Also write the object as sampled (.h5 or .exr): the truth that score compares with.")
 @options.seed
 @options.mem_limit

@@ -25,8 +25,8 @@ class Settings:
     spectral_step: float | None = None
     superpixels: object = "auto"
     coherent_ring: object = "auto"
-    accuracy: float = 1e-3
-    model: str = "fresnel"
+    accuracy: float | None = None
+    model: str = "auto"
     snr_db: float | None = None
     noise: str = "sensor"
     exposure: float | None = None
@@ -180,8 +180,15 @@ def _carry(camera, source, scene, settings, matrix):
 def _build(camera, wavelength, settings):
     from plenocli.accuracy import pif_builder
 
-    return pif_builder(camera, wavelength, superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy,
-                       model=settings.model)
+    return pif_builder(camera, wavelength, **_request(settings))
+
+
+def _request(settings):
+    """What the dial is asked: with --snr its noise stands in for the sensor's where no accuracy is named."""
+    from plenocli.accuracy.needs import Needs
+
+    needs = None if settings.snr_db is None or settings.accuracy is not None else Needs(noise=10 ** (-settings.snr_db / 20), source="--snr")
+    return dict(superpixels=settings.superpixels, coherent_ring=settings.coherent_ring, accuracy=settings.accuracy, model=settings.model, needs=needs)
 
 
 def _accuracy(camera, settings, wavelengths):
@@ -189,8 +196,7 @@ def _accuracy(camera, settings, wavelengths):
     from plenocli.accuracy import plan_pif
     from plenocli.stages.simulate_pif import accuracy_record
 
-    return accuracy_record(plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), superpixels=settings.superpixels,
-                                    coherent_ring=settings.coherent_ring, accuracy=settings.accuracy, model=settings.model))
+    return accuracy_record(plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(settings)))
 
 
 def _truth(camera, scene, grid, refine):

@@ -107,14 +107,14 @@ def coherent_window(view, grid, ring):
 
 def size_band(view, grid, ring, accuracy, tolerance):
     """Node counts at one wavelength; the phase across a lenslet counts the far edge of the outermost superpixel it lights."""
-    half_width, window = view.lenslet_width / 2, coherent_window(view, grid, ring)
+    half_width, window = max(view.lenslet_extent), coherent_window(view, grid, ring)
     lit = max(view.reach(grid, window))
     far = 0 if window is None else max(view.reach(grid)) + lit
     raster = 0 if view.pixel_shift is None else 1
     reach = (max(view.pixel_shape) + raster) * view.pixel_pitch / 2 + far * view.superpixel_pitch
     slope = half_width * view.k * (reach / view.z3 + view.D1 / 2 / view.z2 + abs(view.kappa) * half_width)
     active = view.pixel_active / (view.wavelength * view.z3)
-    own, joint = view.lenslet_width * active, (1 if window is None else 2 * lit + 1) * view.D2 * active
+    own, joint = 2 * half_width * active, (1 if window is None else 2 * lit + 1) * view.D2 * active
     half = view.field_half(grid, window)
     count = psf_nodes(view, half)
     phase = view.k * view.D1 / 2 * half / view.z2

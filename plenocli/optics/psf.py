@@ -110,6 +110,8 @@ def mirrored(y, x, weight, axis):
 
 def _row_transforms(rows, frequency):
     """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows and frequencies cost a quarter."""
+    if rows.x.strides[0] == 0:  # a grid of nodes: one matrix product
+        return rows.weight @ np.exp(-1j * np.outer(rows.x[0], frequency))
     count, nodes = len(frequency), rows.x.shape[1]
     paired = count % 2 == 0 and np.allclose(frequency, -frequency[::-1], rtol=1e-14, atol=0)
     f = frequency[count // 2:] if paired else frequency

@@ -121,7 +121,7 @@ def _sampled_slopes(lens):
     if lens.wavefront is not None:
         count = min(2 * len(lens.samples("wavefront")) + 1, 513)
     axis = np.linspace(-half, half, max(count, 129))
-    slopes = np.gradient(wavefront(lens, axis[:, None], axis[None, :]), axis[1] - axis[0])
+    slopes = np.gradient(wavefront(lens, axis[:, None], axis[None, :]), axis[1] - axis[0], edge_order=2)
     y, x = np.broadcast_arrays(axis[:, None], axis[None, :])
     if lens.aperture_shape == "image":
         image = lens.samples("aperture_image")

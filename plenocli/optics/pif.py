@@ -26,7 +26,8 @@ class Pif:
 
     A: (band, lenslet, pixel, point), share of the light through the main-lens aperture (filters not counted) from a point
     that lands in a pixel; wavelength: (band,) m; lenslet_offset: (lenslet, 2) superpixel row and column relative to the
-    object's own; pixel_shape, object_shape: rows, columns; column_energy: (band, point); notes: how it was made.
+    object's own, axial numbers on a hexagonal lattice; pixel_shape, object_shape: rows, columns; column_energy: (band, point);
+    notes: how it was made.
     """
 
     A: np.ndarray

@@ -145,3 +145,19 @@ def test_provenance_names_the_files_and_a_capture_refuses_a_matrix_of_others(tmp
     write_h5(tmp_path / "w.h5", np.zeros((6, 6)))
     assert run([*capture, str(tmp_path / "two.h5")]) == 3
     assert not (tmp_path / "two.h5").exists()
+
+
+def test_a_hexagonal_camera_has_a_matrix_but_no_captures_or_pictures_yet(tmp_path, capsys):
+    text = TINY.replace("count = [5, 5]", 'count = [5, 5]\nlattice = "hexagonal"').replace("pixels_per_lenslet = [13, 13]", "pixels_per_lenslet = [11, 13]")
+    (tmp_path / "camera.toml").write_text(text)
+    request = ["--superpixels", "3x3", "--coherent-ring", "0", "--accuracy", "1e-2", "--model", "fresnel"]
+    assert run(["simulate-pif", str(tmp_path / "camera.toml"), "-o", str(tmp_path / "pif.h5"), *request]) == 0
+    pif = read_artefact(tmp_path / "pif.h5", "pif")
+    assert pif.data["pif/lenslet_offset"].tolist() == [[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)]
+    assert 'aperture_shape = "hexagon"' in pif.provenance.config
+    assert 0 < pif.data["pif/column_energy"].min() and pif.data["pif/column_energy"].max() < 1
+    capsys.readouterr()
+    assert run(["capture-sim", str(tmp_path / "camera.toml"), "--target", "white", "-o", str(tmp_path / "c.h5")]) == 2
+    assert "hexagonal" in capsys.readouterr().err
+    assert run(["learn-dict", "skimage:camera", "--pif", str(tmp_path / "pif.h5"), "-o", str(tmp_path / "d.h5")]) == 3
+    assert "hexagonal lattice, whose object blocks do not tile" in capsys.readouterr().err

@@ -9,7 +9,7 @@ _NOTES = Attr("notes", "json", "", "anything else worth keeping")
 
 _PIF_FIELDS = (
     Field("pif/wavelength", "band", "f", "m", "centre wavelength", minimum=0, ascending=True),
-    Field("pif/lenslet_offset", "lenslet 2", "i", "1", "superpixel (row, column) relative to the object's own lenslet"),
+    Field("pif/lenslet_offset", "lenslet 2", "i", "1", "superpixel (row, column) relative to the object's own lenslet; axial numbers on a hexagonal lattice"),
     Field("pif/pixel_shape", "2", "i", "1", "pixels of a superpixel (rows, columns)", minimum=1),
     Field("pif/object_shape", "2", "i", "1", "object points over one lenslet's field (rows, columns)", minimum=1),
     Field("pif/column_energy", "band point", "f", "1", "share of a point's light that lands on the superpixels kept", minimum=0),
@@ -107,6 +107,7 @@ CALIBRATION = Schema("calibration", 1, "Lenslet grid, white and dark levels and 
 SPECTRA = Schema("spectra", 1, "Spectrum behind each lenslet.", (
     Field("spectra/value", "band lenslet_row lenslet_column", "f", "1", "recovered radiance or reflectance", maskable=True),
     Field("spectra/sigma", "band lenslet_row lenslet_column", "f", "1", "predicted standard deviation", optional=True, maskable=True, minimum=0),
+    Field("spectra/residual", "lenslet_row lenslet_column", "f", "1", "mean square of what F b leaves of a superpixel over its noise; 1 is noise alone", optional=True, maskable=True, minimum=0),
     Field("spectra/wavelength", "band", "f", "m", "band centres", minimum=0, ascending=True),
 ), attrs={"spectra": (
     Attr("quantity", "text", "", "radiance or reflectance"), Attr("method", "text", "", "how it was computed"),

@@ -13,6 +13,8 @@ from plenocli.config import REFERENCE_REFLECTANCE
               help="auto takes the one with the least predicted error and says so.")
 @click.option("--reference", type=options.FILE, help="Capture of a white reference: the result is reflectance instead of radiance.")
 @click.option("--reference-reflectance", type=options.FRACTION, default=REFERENCE_REFLECTANCE, show_default=True, help="Reflectance of that white reference.")
+@click.option("--register", type=click.Choice(["auto", "on", "off"]), default="auto", show_default=True,
+              help="Bring captures into line with the calibration (moved lenslets, offset, stray light); auto: where they show it by more than chance.")
 @options.file_type("exr", "h5")
 @options.output
 @options.workers
@@ -38,6 +40,8 @@ def command(ctx, captures, output, calibration, suffix, workers, overwrite, as_j
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
         line = f"{one['output']}: {one['quantity']} in {len(one['bands_nm'])} bands behind {one['lenslets']} lenslets, {one['method']} ({one['reason']})"
+        if (one["registration"] or {}).get("corrected"):
+            line += f"; corrected: {', '.join(one['registration']['corrected'])} (lenslets moved by up to {one['registration']['largest_px']:.3g} px)"
     else:
         line = f"{output}: {report['done']} demultiplexed, {report['skipped']} were finished before"
     options.summary(report, as_json, line)

@@ -27,12 +27,17 @@ def _colour():
 def collect():
     """dict of arrays: wavelengths in nm (float64), tables as colour-science holds them (float64)."""
     colour = _colour()
+    from colour.quality.cfi2017 import load_TCS_CIE2017
+
+    surfaces = load_TCS_CIE2017(colour.SpectralShape(380, 780, 5))
     chart = colour.SDS_COLOURCHECKERS[CHART]
     observer = colour.MSDS_CMFS[OBSERVER]
     tables = {
         "chart/names": np.array(list(chart)),
         "chart/wavelength_nm": next(iter(chart.values())).wavelengths,
         "chart/reflectance": np.array([spectrum.values for spectrum in chart.values()]),
+        "surfaces/wavelength_nm": surfaces.wavelengths,
+        "surfaces/reflectance": np.ascontiguousarray(surfaces.values.T),
         "observer/wavelength_nm": observer.wavelengths,
         "observer/xyz": observer.values.T,
     }

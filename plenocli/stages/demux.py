@@ -1,6 +1,6 @@
 """demux: band radiances or reflectances behind every lenslet of captures, with predicted standard deviations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,13 @@ WORTHWHILE = 1.05  # `auto` takes a method that assumes more only where it predi
 
 @dataclass(frozen=True)
 class Settings:
-    """method: pinv, single-pixel, wls, lmmse, nnls or auto; reference_reflectance: of the white reference."""
+    """method: pinv, single-pixel, wls, lmmse, nnls or auto; reference_reflectance: of the white reference; register: auto, on
+    or off, whether captures are brought into line with the calibration (plenocli.stages.alignment)."""
 
     method: str = "auto"
     reference: Path | None = None
     reference_reflectance: float = REFERENCE_REFLECTANCE
+    register: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Response:
     wavelengths: np.ndarray
     origin: np.ndarray
     window: tuple
+    centres: np.ndarray
     valid: np.ndarray
     white: np.ndarray
     dark: object
@@ -89,7 +92,7 @@ class _Worker:
         self.reference = None
         self.prior = _prior(self.calibration)
         if settings.reference is not None:
-            self.reference = self._radiance(settings.reference, self._plain_method())[:2]
+            self.reference = self._radiance(settings.reference, self._plain_method())
 
     def _plain_method(self):
         """The white reference is demultiplexed without a prior: a prior's pull would not divide out."""
@@ -97,19 +100,28 @@ class _Worker:
         return {"auto": "pinv", "lmmse": "wls"}.get(method, method)
 
     def _radiance(self, path, method):
-        exposure = read_exposure(path, cfa=self.calibration.cfa)
-        values, noise = _values(exposure, self.calibration, path)
-        return estimate(self.calibration, values, noise, method, self.prior, ratio=self.settings.reference is not None)
+        """Estimate of one capture, registered to the calibration first."""
+        from plenocli.sensor.superpixel import extract
+        from plenocli.stages.alignment import align, judge, residuals
+
+        signal, noise = _signal(read_exposure(path, cfa=self.calibration.cfa), self.calibration, path)
+        c, signal, stray, record = align(self.calibration, signal, noise, self.settings.register, path)
+        values = extract(signal, c.origin, c.window)
+        values[~c.valid] = np.nan
+        found = estimate(c, values, noise, method, self.prior, ratio=self.settings.reference is not None, stray=stray)
+        residual = residuals(c, values, found.plain, noise, stray)
+        return replace(found, residual=residual, record=record, warning=judge(residual, record, path))
 
     def demux(self, capture, target):
         """Demultiplex one capture and write it to `target`; returns its report."""
         from plenocli.artefacts import describe_inputs
 
         c = self.calibration
-        value, sigma, method, why = self._radiance(capture, self.settings.method)
+        found = self._radiance(capture, self.settings.method)
+        value, sigma, method, why = found.value, found.sigma, found.method, found.why
         quantity = "radiance"
         if self.reference is not None:
-            value, sigma = _reflectance(value, sigma, *self.reference, self.settings.reference_reflectance)
+            value, sigma = _reflectance(value, sigma, self.reference.value, self.reference.sigma, self.settings.reference_reflectance)
             quantity = "reflectance"
         if not np.isfinite(value).any():
             raise NumericsError("no lenslet could be demultiplexed", capture, "check exposure and calibration")
@@ -117,10 +129,10 @@ class _Worker:
         attrs = dict(quantity=quantity, method=method)
         if self.settings.reference is not None:
             attrs["reference"] = Path(self.settings.reference).name
-        parameters = {"asked": self.settings.method, "reason": why, "reference_reflectance": self.settings.reference_reflectance if self.reference is not None else None}
-        _write(target, c.wavelengths, np.moveaxis(value, -1, 0), np.moveaxis(sigma, -1, 0), attrs, parameters, inputs, self.overwrite, self.command)
+        parameters = {"registration": found.record, "warning": found.warning, "asked": self.settings.method, "reason": why, "reference_reflectance": self.settings.reference_reflectance if self.reference is not None else None}
+        _write(target, c.wavelengths, np.moveaxis(value, -1, 0), np.moveaxis(sigma, -1, 0), found.residual, attrs, parameters, inputs, self.overwrite, self.command)
         seen = np.isfinite(value).all(axis=-1)
-        return dict(capture=Path(capture).name, output=str(target), method=method, reason=why, quantity=quantity, lenslets=int(seen.sum()),
+        return dict(capture=Path(capture).name, output=str(target), method=method, reason=why, registration=found.record, warning=found.warning, quantity=quantity, lenslets=int(seen.sum()),
                     array=list(value.shape[:2]), bands_nm=[float(w * 1e9) for w in c.wavelengths],
                     mean=[float(v) for v in value[seen].mean(axis=0)], sigma=[float(v) for v in np.nanmean(sigma[seen], axis=0)] if np.isfinite(sigma[seen]).any() else None)
 
@@ -141,15 +153,14 @@ def read_response(path):
     dark = Dark(data["dark/mean"], black, dark_attrs.get("exposure"), dark_attrs.get("sigma"))
     gain = response.get("gain_e_per_dn")
     return Response(data["response/F"], data.get("response/covariance"), data["response/wavelength"], data["response/origin"],
-                    tuple(int(n) for n in data["response/window"]), data["grid/valid"].astype(bool), data["response/white"], dark, str(response.get("cfa", "mono")),
+                    tuple(int(n) for n in data["response/window"]), data["grid/centre"], data["grid/valid"].astype(bool), data["response/white"], dark, str(response.get("cfa", "mono")),
                     str(response.get("units", "DN")), float(levels.get("white", np.inf)), response.get("exposure_s"), None if gain is None else 1 / gain,
                     float(response.get("read_noise", 0.0)) ** 2)
 
 
-def _values(exposure, c, path):
-    """Superpixel values (R, C, pixel) at the calibration's exposure and (gain, read variance) that hold there (None: unknown)."""
+def _signal(exposure, c, path):
+    """Signal (rows, columns), dark removed, NaN where saturated, at the calibration's exposure; (gain, read variance) that hold there (None: unknown)."""
     from plenocli.sensor.frames import saturated
-    from plenocli.sensor.superpixel import extract
 
     if exposure.values.shape != c.dark.mean.shape:
         raise InputError(f"is {exposure.values.shape[0]} x {exposure.values.shape[1]} px, the calibration {c.dark.mean.shape[0]} x {c.dark.mean.shape[1]}", path, "use captures of the calibrated camera")
@@ -163,44 +174,98 @@ def _values(exposure, c, path):
     signal = (np.asarray(exposure.values, np.float32) - c.dark.at(exposure.seconds)) * np.float32(scale)
     top = exposure.white if np.isfinite(exposure.white) else c.white_level
     signal[saturated(exposure.values, exposure.black, top)] = np.nan
-    values = extract(signal, c.origin, c.window)
-    values[~c.valid] = np.nan
     if exposure.sigma is not None:
-        return values, (0.0, (exposure.sigma * scale) ** 2)
+        return signal, (0.0, (exposure.sigma * scale) ** 2)
     gain = c.gain if c.gain is not None else exposure.gain
-    return values, None if gain is None else (gain * scale, c.read_variance * scale**2)
+    return signal, None if gain is None else (gain * scale, c.read_variance * scale**2)
 
 
-def estimate(c, values, noise, method, prior=None, ratio=False):
-    """Radiances and sigmas (R, C, band) of superpixel values (R, C, pixel), with the method used and why.
+@dataclass(frozen=True)
+class Estimate:
+    """value, sigma (R, C, band) of the method used, and why that one; plain: least squares radiances (R, C, unknown), stray
+    light last where it is one. residual (R, C), record and warning as plenocli.stages.alignment gives them."""
 
-    Least squares first gives the expected radiance from which the noise of each pixel follows; `auto` compares the mean
-    square errors that the methods predict. ratio: the radiance will be divided by another one from the same F, so that
-    the error of F divides out (to first order, and but for crosstalk) and does not count.
+    value: np.ndarray
+    sigma: np.ndarray
+    method: str
+    why: str
+    plain: np.ndarray
+    residual: np.ndarray | None = None
+    record: dict | None = None
+    warning: str | None = None
+
+
+def estimate(c, values, noise, method, prior=None, ratio=False, stray=None):
+    """The Estimate of superpixel values (R, C, pixel).
+
+    Least squares first gives the expected radiance from which the noise of each pixel follows (where a lenslet has too little
+    light for that, LMMSE); `auto` compares the mean square errors that the methods predict. ratio: the radiance will be
+    divided by another one from the same F, so that the error of F divides out (to first order, and but for crosstalk) and
+    does not count. stray (R, C, pixel, n): patterns of light that is no band's, unknowns of their own for all methods but
+    single pixel.
     """
     from plenocli.solvers.spectral import choose_pixels, demultiplex
 
-    pixels = choose_pixels(c.response)
+    bands = len(c.wavelengths)
+    whole, prior = _with_stray(c, stray, prior, values)
+
+    def solve(m, variance=None):
+        return tuple(part[..., :bands] for part in demultiplex((c if m == "single-pixel" else whole).response, values, m, variance=variance, pixels=pixels, prior=prior))
+
+    pixels = choose_pixels(c.response) if method in ("auto", "single-pixel") else None
+    start, spread = demultiplex(whole.response, values, "pinv")
     if noise is None:
         used = "pinv" if method == "auto" else method
-        value, sigma = demultiplex(c.response, values, used, pixels=pixels)
-        return value, sigma, used, "the sensor's noise is not known" if method == "auto" else "asked for"
-    start, _ = demultiplex(c.response, values, "pinv")
-    variance = _variance(c, start, noise, None if ratio else c.variance)
+        value, sigma = (start[..., :bands], spread[..., :bands]) if used == "pinv" else solve(used)
+        return Estimate(value, sigma, used, "the sensor's noise is not known" if method == "auto" else "asked for", start)
+    response_variance = None if ratio else whole.variance
+    variance = _variance(whole, start, noise, response_variance)
+    if prior is not None and _starved(whole, values, variance, prior):
+        variance = _variance(whole, np.broadcast_to(prior[0], start.shape), noise, response_variance)
+        variance = _variance(whole, demultiplex(whole.response, values, "lmmse", variance=variance, prior=prior)[0], noise, response_variance)
     if method != "auto":
-        value, sigma = demultiplex(c.response, values, method, variance=variance, pixels=pixels, prior=prior)
-        return value, sigma, method, "asked for"
+        return Estimate(*solve(method, variance), method, "asked for", start)
     if not np.isfinite(start).any():
         raise NumericsError("no lenslet could be demultiplexed", fix="check that the capture is not saturated and that the bands of the calibration differ")
-    tried = {m: demultiplex(c.response, values, m, variance=variance, prior=prior) for m in ("pinv", "wls", *(["lmmse"] if prior else []))}
+    tried = {m: solve(m, variance) for m in ("pinv", "wls", *(["lmmse"] if prior else []))}
     error = {m: float(np.nanmean(sigma**2)) for m, (_, sigma) in tried.items()}
-    error["single-pixel"] = _single_pixel_error(c, pixels, start, noise)
+    error["single-pixel"] = _single_pixel_error(c, pixels, start[..., :bands], noise)
     least = min(error.values())
     used = next(m for m in error if error[m] <= WORTHWHILE * least)
     if used == "single-pixel":
-        tried[used] = demultiplex(c.response, values, used, variance=variance, pixels=pixels)
+        tried[used] = solve(used, variance)
     why = "predicted rms error " + ", ".join(f"{m} {np.sqrt(e):.3g}" for m, e in error.items())
-    return *tried[used], used, why
+    return Estimate(*tried[used], used, why, start)
+
+
+def _with_stray(c, stray, prior, values):
+    """Calibration and prior with the patterns of stray light as further bands, scaled to the light of the others."""
+    if stray is None:
+        return c, prior
+    level = np.float32(max(float(np.nanmax(c.response)), 1e-30))
+    own = c.response if c.response.ndim > 2 else np.broadcast_to(c.response, (*c.valid.shape, *c.response.shape))
+    count = stray.shape[-1]
+    variance = None if c.variance is None else np.concatenate([c.variance, np.zeros((len(c.variance), count))], axis=1)
+    if prior is not None:
+        free = float(np.nanmax(values) / level) ** 2  # nothing is known of it beforehand
+        mean, covariance = prior
+        wide = np.diag(np.concatenate([np.zeros(len(mean)), np.full(count, free)]))
+        wide[: len(mean), : len(mean)] = covariance
+        prior = np.concatenate([mean, np.zeros(count)]), wide
+    return replace(c, response=np.concatenate([own, stray * level], axis=-1), variance=variance), prior
+
+
+def _starved(c, values, variance, prior):
+    """Whether noise leaves less than ten levels of the prior's spread: then weights from least squares follow the noise."""
+    from plenocli.solvers.spectral import demultiplex
+
+    some = np.isfinite(values).any(axis=-1)
+    picked = tuple(part[:: max(1, len(part) // 64)] for part in np.nonzero(some))
+    response = c.response if c.response.ndim == 2 else c.response[picked]
+    _, sigma = demultiplex(response, values[picked], "pinv", variance=variance[picked])
+    sigma = sigma[np.isfinite(sigma).all(axis=-1)]
+    bands = len(c.wavelengths)
+    return not len(sigma) or bool((np.median(sigma[:, :bands], axis=0) > 0.1 * np.sqrt(np.diag(prior[1])[:bands])).any())
 
 
 def _variance(c, radiance, noise, response_variance):
@@ -229,12 +294,13 @@ def _single_pixel_error(c, pixels, radiance, noise):
 
 
 def _prior(c):
-    """Mean and covariance of radiance for lmmse: the chart's 24 reflectances under the light of the calibration's white.
+    """Mean and covariance of radiance for lmmse: reflectances of natural and man-made surfaces under the light of the
+    calibration's white.
 
     None where the white image cannot tell the light in every band.
     """
     from plenocli.scene.statistics import radiance_statistics, reflectance_statistics
-    from plenocli.scene.tables import colorchecker
+    from plenocli.scene.tables import surfaces
     from plenocli.solvers.spectral import demultiplex
 
     light, _ = demultiplex(c.response, c.white, "pinv")
@@ -243,8 +309,8 @@ def _prior(c):
     light = np.median(light, axis=0) if len(light) else np.zeros(1)
     if not (light > 0).all():
         return None
-    mean, covariance = reflectance_statistics(colorchecker(c.wavelengths)[2])
-    covariance = covariance + 1e-4 * np.eye(len(mean))  # narrow neighbouring bands are nearly the same number on a chart
+    mean, covariance = reflectance_statistics(surfaces(c.wavelengths))
+    covariance = covariance + 1e-4 * np.eye(len(mean))  # narrow neighbouring bands are nearly the same number on most surfaces
     return radiance_statistics(mean, covariance, light)
 
 
@@ -257,12 +323,14 @@ def _reflectance(value, sigma, white, white_sigma, level):
     return ratio, spread
 
 
-def _write(target, wavelengths, value, sigma, attrs, parameters, inputs, overwrite, command):
+def _write(target, wavelengths, value, sigma, residual, attrs, parameters, inputs, overwrite, command):
     from plenocli.artefacts import Artefact, Provenance, provenance_texts, write_artefact, write_spectral_exr
 
     value, sigma, provenance = value.astype(np.float32), sigma.astype(np.float32), Provenance(command, inputs)
     if Path(target).suffix == ".h5":
         data = {"spectra/value": value, "spectra/sigma": sigma, "spectra/wavelength": wavelengths}
+        if residual is not None:
+            data["spectra/residual"] = residual
         write_artefact(target, Artefact("spectra", data, {"spectra": attrs | {"parameters": parameters}}, provenance), overwrite=overwrite)
         return
     import json

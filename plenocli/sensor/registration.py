@@ -1,0 +1,386 @@
+"""Where the lenslets of a capture are, relative to their calibration, from the capture itself.
+
+Between calibration and capture a lenslet array moves by parts of a pixel. A superpixel then shows F(p - d) b + o instead
+of F(p) b: d (rows, columns) px is the displacement, b the radiances of the bands, o an offset that both share. All three
+are fitted to the pixels of a lenslet; displacements of many lenslets make a rigid motion with stretch, d = m + M (c - c0).
+A gain of the whole capture cannot be told from brighter radiances, and a mixture of bands that every cell shares looks like
+other radiances: neither is visible here. docs/model.md, "Registration".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+ITERATIONS = 8
+REACH = 4  # px: how far the search for a whole-pixel displacement goes
+DEGREE = 5
+SAMPLE = 48  # lenslets that tell the motion; the answer is far better known than it needs to be
+WEAK = 0.02  # of a band's best colour: a colour with less response is filled in from its neighbours before interpolation
+UNSURE = 0.02  # of a band's peak: pixels whose interpolated response may be off by more take no part
+SIGNIFICANT = 4.0  # standard deviations
+LEAST_SHIFT = 0.01  # px: what less than this costs is below the noise of one lenslet
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacement of superpixels at c (rows, columns) px: shift + matrix (c - middle). offset: in the values' unit.
+
+    sigma: standard deviations of (row shift, column shift, offset); offset NaN where no pixel of a superpixel tells it
+    from light. stray: light that the calibration does not know, spread over superpixels, in shares of their mean light, and
+    its standard deviation (NaN where all lenslets are alike). before, after: mean square of the residual over the expected
+    one, median over the lenslets used, without and with the motion. lenslets: how many were used; reach: of the largest
+    displacement over the array, px.
+    """
+
+    shift: np.ndarray
+    matrix: np.ndarray
+    middle: np.ndarray
+    offset: float
+    stray: float
+    sigma: np.ndarray
+    stray_sigma: float
+    before: float
+    after: float
+    lenslets: int
+    reach: float
+
+    def at(self, centres):
+        """Displacements (..., 2) px at centres (..., 2) px."""
+        return self.shift + (np.asarray(centres, float) - self.middle) @ self.matrix.T
+
+    @property
+    def rotation(self):
+        """Radians, positive where columns to the right move up (counter-clockwise in a picture whose rows go down)."""
+        return float(self.matrix[1, 0] - self.matrix[0, 1]) / 2
+
+    @property
+    def moved(self):
+        """Whether the lenslets moved by more than chance and enough to matter."""
+        return bool(self.reach > max(LEAST_SHIFT, SIGNIFICANT * np.hypot(*self.sigma[:2])))
+
+    @property
+    def lifted(self):
+        """Whether there is an offset by more than chance."""
+        return bool(abs(self.offset) > SIGNIFICANT * self.sigma[2])
+
+    @property
+    def strayed(self):
+        """Whether there is light that the calibration does not know."""
+        return bool(abs(self.stray) > max(0.002, SIGNIFICANT * self.stray_sigma))
+
+
+def spline_matrix(count, shift, degree=DEGREE, derivative=False):
+    """Matrices (..., count, count): samples f(0..count-1) to samples of f(x - shift), or to its derivative by shift.
+
+    f is the interpolating spline of `degree` 3 or 5 with mirrored ends. shift (...), in px.
+    """
+    from scipy.interpolate import BSpline
+
+    half = (degree + 1) // 2
+    kernel = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
+
+    def weights(position, order):
+        first = np.floor(position).astype(int) - half + 1
+        taps = first[..., None] + np.arange(2 * half)
+        value = np.nan_to_num((kernel.derivative() if order else kernel)(position[..., None] - taps))
+        folded = np.abs(taps) % (2 * (count - 1))
+        folded = np.where(folded > count - 1, 2 * (count - 1) - folded, folded)
+        out = np.zeros((*position.shape, count))
+        for k in range(2 * half):
+            at = folded[..., k:k + 1]
+            np.put_along_axis(out, at, np.take_along_axis(out, at, -1) + value[..., k:k + 1], -1)
+        return out
+
+    index = np.arange(count, dtype=float)
+    fit = np.linalg.inv(weights(index, 0))
+    position = index - np.asarray(shift, float)[..., None]
+    return (-1 if derivative else 1) * (weights(position, int(derivative)) @ fit)
+
+
+class Smooth:
+    """Responses without the colours of the mosaic: F = gain(colour of the pixel, band) * smooth, and smooth can be moved.
+
+    response (lenslet, pixel, band) with NaN at pixels that are not known; origin (lenslet, 2) first pixels; window (h, w);
+    cfa "mono" or four letters. Under narrow-band light the mosaic's filters multiply the picture of the pupil by one number
+    each, which is why a motion by an odd number of pixels can be followed at all. gains (letter, band): None measures them.
+    """
+
+    def __init__(self, response, origin, window, cfa, gains=None):
+        self.window, self.cfa = tuple(window), cfa
+        response = np.asarray(response, np.float32).reshape(len(response), *self.window, -1)
+        self.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
+        self.gains = gains
+        if gains is None:
+            self.gains = self._measure(response, origin) if len(self.letters) > 1 else np.ones((1, response.shape[-1]), np.float32)
+        gain = self.gain(origin)
+        good = np.isfinite(response).all(axis=-1, keepdims=True) & (gain > WEAK)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            smooth = np.where(good, response / gain, 0)
+        if not good.all():
+            smooth = _filled(smooth, good.astype(np.float32))
+        self.smooth = smooth
+
+    def _measure(self, response, origin):
+        where = self._colours(origin)
+        known = np.isfinite(response).all(axis=-1)
+        sites = [known & (where == k) for k in range(len(self.letters))]
+        mean = np.stack([response[one].mean(axis=0, dtype=float) for one in sites])
+        gains = mean / np.maximum(mean.max(axis=0), 1e-30)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            smooth = np.where(known[..., None], response / gains.astype(np.float32)[where], 0)
+        return (gains * _flat_ratios(_filled(np.nan_to_num(smooth), known[..., None].astype(np.float32)), sites)).astype(np.float32)
+
+    def _colours(self, origin):
+        """Index (lenslet, h, w) into letters."""
+        tile = np.array([self.letters.index(c) for c in self.cfa]).reshape(2, 2) if len(self.letters) > 1 else np.zeros((2, 2), int)
+        rows = (origin[:, 0, None] + np.arange(self.window[0])) % 2
+        columns = (origin[:, 1, None] + np.arange(self.window[1])) % 2
+        return tile[rows[:, :, None], columns[:, None, :]]
+
+    def gain(self, origin):
+        """Gains (lenslet, h, w, band) of the colours under windows at `origin` (lenslet, 2); the number 1 without a mosaic."""
+        return self.gains[self._colours(origin)] if len(self.letters) > 1 else np.float32(1)
+
+    def _sure(self, shift):
+        """Mask (lenslet, h, w) of pixels whose spline is good: a sixth difference shows what a spline cannot know.
+
+        It passes the frequencies near Nyquist's, which alias; a shift by half a pixel errs by about all of them. Where a
+        band would lose more than half of its light (cells of a few pixels), nothing is masked.
+        """
+        from scipy.ndimage import convolve1d, maximum_filter1d
+
+        peak = np.maximum(np.abs(self.smooth).max(axis=(1, 2), keepdims=True), 1e-30)
+        error = 0
+        for axis in (1, 2):
+            rough = np.abs(convolve1d(self.smooth, np.array([1, -6, 15, -20, 15, -6, 1], np.float32) / 64, axis, mode="nearest"))
+            error = error + np.abs(np.sin(np.pi * shift[:, axis - 1]))[:, None, None, None] * maximum_filter1d(rough, 3, axis)
+        good = (error < UNSURE * peak).all(axis=-1)
+        light = np.maximum(self.smooth, 0)
+        kept = (light * good[..., None]).sum(axis=(1, 2)) / np.maximum(light.sum(axis=(1, 2)), 1e-30)
+        return good | (kept < 0.5).any(axis=-1)[:, None, None]
+
+    def at(self, origin, shift, derivatives=False, sharp=True):
+        """Responses (lenslet, pixel, band) of windows at `origin` (lenslet, 2) whose light is displaced by `shift` (lenslet or 1, 2)
+        px within them; with derivatives also those by row and by column shift. Rows and columns that the shift brings in
+        from outside are NaN, and so are pixels that the spline cannot be trusted at unless sharp is False."""
+        h, w = self.window
+        rows, columns = spline_matrix(h, shift[:, 0]).astype(np.float32), spline_matrix(w, shift[:, 1]).astype(np.float32)
+        gain = self.gain(origin)
+        across = _columns(self.smooth, columns)
+        out = [gain * _rows(across, rows)]
+        if derivatives:
+            out.append(gain * _rows(across, spline_matrix(h, shift[:, 0], derivative=True).astype(np.float32)))
+            out.append(gain * _rows(_columns(self.smooth, spline_matrix(w, shift[:, 1], derivative=True).astype(np.float32)), rows))
+        row, column = np.arange(h), np.arange(w)
+        seen = _seen(row, shift[:, 0], h)[:, :, None] & _seen(column, shift[:, 1], w)[:, None, :]
+        if sharp:
+            seen = seen & self._sure(shift)
+        out[0] = np.where(seen[..., None], out[0], np.float32(np.nan))
+        flat = [part.reshape(len(part), h * w, -1) for part in out]
+        return flat if derivatives else flat[0]
+
+
+def _flat_ratios(pictures, sites):
+    """Median (site class, band) of pictures (lenslet, h, w, band) over their local means, where there is light.
+
+    The local mean weighs the four positions of a 2x2 mosaic alike and slopes cancel in it. Three pixels from any edge are
+    left out: there colours sample the picture at different places.
+    """
+    from scipy.ndimage import convolve1d, minimum_filter
+
+    local = pictures
+    for axis in (1, 2):
+        local = convolve1d(local, np.array([1, 2, 1], np.float32) / 4, axis, mode="nearest")
+    bright = local > 0.5 * np.percentile(local, 99.5, axis=(1, 2), keepdims=True)
+    bright = minimum_filter(bright, (0, 7, 7, 0), mode="constant")
+    out = np.ones((len(sites), pictures.shape[-1]))
+    for k, site in enumerate(sites):
+        for band in range(pictures.shape[-1]):
+            where = site & bright[..., band]
+            if where.sum() > 30:
+                out[k, band] = np.median(pictures[..., band][where] / local[..., band][where])
+    return out
+
+
+def _seen(index, shift, count):
+    """Which samples (lenslet, count) come from inside, a pixel's margin kept where there is a shift at all."""
+    position = index - shift[:, None]
+    margin = np.where(np.abs(shift) > LEAST_SHIFT / 2, 0.5, -1e-6)[:, None]
+    return (position >= margin) & (position <= count - 1 - margin)
+
+
+def _rows(pictures, matrices):
+    lead, (h, w, bands) = len(pictures), pictures.shape[1:]
+    return (matrices @ pictures.reshape(lead, h, w * bands)).reshape(max(lead, len(matrices)), h, w, bands)
+
+
+def _columns(pictures, matrices):
+    return matrices[:, None] @ pictures
+
+
+def _filled(values, weight):
+    """Values (lenslet, h, w, band), those of weight 0 replaced by means of their neighbours, farther ones where it takes that."""
+    from scipy.ndimage import uniform_filter
+
+    out = np.where(weight > 0, values, 0)
+    todo = weight == 0
+    for size in (3, 5, 9):
+        total, share = (uniform_filter(v, (0, size, size, 0), mode="constant") for v in (values * weight, weight + np.zeros_like(values)))
+        ready = todo & (share > 1e-3)
+        out = np.where(ready, total / np.where(share > 1e-3, share, 1), out)
+        todo = todo & ~ready
+    return out.astype(np.float32)
+
+
+def find_motion(signal, response, origin, window, centres, cfa="mono", noise=None, response_variance=None, sample=SAMPLE):
+    """Motion of the lenslets of a capture since their calibration; None where fewer than three lenslets show it.
+
+    signal (rows, columns): dark removed, NaN where saturated. response (R, C, pixel, band), or (pixel, band) for all; origin
+    (R, C, 2) first pixels of the windows, those of lenslets without response far outside; centres (R, C, 2) px. noise: (gain,
+    read variance) of the signal, None: unknown, all pixels weigh the same. response_variance (pixel, band): of the response
+    itself, None: taken as exact. Displacements beyond REACH px are not found.
+    """
+    data = _Sample(signal, response, origin, window, centres, cfa, noise, response_variance, sample)
+    if data.count < 3:
+        return None
+    best = data.fit(np.zeros(2))
+    if best.after > 1.5 or best.reach > 0.7:
+        start = data.search()
+        if start.any():
+            best = min((best, data.fit(start)), key=lambda motion: motion.after)
+    return best
+
+
+class _Sample:
+    """The lenslets that tell the motion: bright, whole and spread over the array."""
+
+    def __init__(self, signal, response, origin, window, centres, cfa, noise, response_variance, sample):
+        from plenocli.sensor.superpixel import extract, inside
+
+        margin = np.asarray(window) + 2 * REACH
+        whole = inside(origin - REACH, margin, signal.shape)
+        if response.ndim > 2:
+            whole &= np.isfinite(response).all(axis=-1).mean(axis=-1) > 0.5
+        place = np.argwhere(whole)
+        if len(place):
+            place = place[np.unique(np.linspace(0, len(place) - 1, min(len(place), 4 * sample)).astype(int))]
+        values = extract(signal, origin[tuple(place.T)][:, None], window)[:, 0]
+        level = np.nan_to_num(np.where(np.isfinite(values).mean(axis=-1) > 0.5, np.nansum(values, axis=-1), 0))
+        bright = np.flatnonzero(level > 0.25 * np.percentile(level, 90)) if len(level) else np.zeros(0, int)
+        chosen = bright[np.unique(np.linspace(0, len(bright) - 1, min(len(bright), sample)).astype(int))] if len(bright) else bright
+        place = tuple(place[chosen].T)
+        self.count, self.signal, self.window, self.noise = len(chosen), signal, tuple(window), noise
+        self.spread = None if response_variance is None else np.nan_to_num(response_variance)
+        self.origin, self.centres = origin[place], centres[place]
+        corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)
+        self.middle, self.extremes = corners.mean(axis=0), np.array([[f(corners[:, 0]), g(corners[:, 1])] for f in (np.min, np.max) for g in (np.min, np.max)])
+        if self.count:
+            self.response = np.asarray(response[place] if response.ndim > 2 else np.broadcast_to(response, (self.count, *response.shape)), np.float32)
+            self.smooth = Smooth(self.response, self.origin, window, cfa)
+
+    def values(self, whole):
+        from plenocli.sensor.superpixel import extract
+
+        return extract(self.signal, (self.origin + whole)[:, None], self.window)[:, 0].astype(float)
+
+    def search(self):
+        """Displacement (2,) in whole pixels (an even number where there is a colour mosaic) that leaves the least residual."""
+        step = 1 if self.smooth.cfa == "mono" else 2
+        some = slice(None, None, max(1, self.count // 24))
+        known = np.isfinite(self.response[some]).all(axis=-1)
+        q = np.linalg.qr(np.where(known[..., None], self.response[some], 0))[0]
+        best, where = np.inf, np.zeros(2)
+        for row in range(-REACH, REACH + 1, step):
+            for column in range(-REACH, REACH + 1, step):
+                x = self.values(np.array([row, column]))[some]
+                x = np.where(known & np.isfinite(x), x, 0)
+                part = 1 - ((np.swapaxes(q, -1, -2) @ x[..., None]) ** 2).sum(axis=(1, 2)) / np.maximum((x**2).sum(axis=1), 1e-30)
+                if np.median(part) < best:
+                    best, where = np.median(part), np.array([row, column], float)
+        return where
+
+    def fit(self, start):
+        """Gauss-Newton from displacement `start`: the common motion that leaves the least weighted residual."""
+        affine = self.count >= 12 and np.linalg.matrix_rank(self.centres - self.middle, tol=1e-3 * np.ptp(self.centres)) == 2
+        arms = (self.centres - self.middle) / np.abs(self.extremes - self.middle).max(axis=0)
+        arms = np.concatenate([np.ones((self.count, 1)), arms], axis=1) if affine else np.ones((self.count, 1))
+        q = np.zeros((2, arms.shape[1]))
+        q[:, 0] = start
+        before = after = None
+        for _ in range(ITERATIONS):
+            shifts = arms @ q.T
+            normal, right, chi = self._equations(shifts, arms)
+            before = chi if before is None else before
+            solved, spread = _solve(normal, right)
+            step = solved[: q.size].reshape(q.shape)
+            length = np.abs(arms @ step.T).max()
+            q = q + step / max(1.0, length)
+            if np.abs(q[:, 0]).max() > REACH + 1:
+                break
+            if length < 1e-4:
+                break
+        after = self._equations(arms @ q.T, arms)[2]
+        scale = np.sqrt(max(np.median(after), 1.0)) if self.noise is not None else 1.0
+        size = np.abs(self.extremes - self.middle).max(axis=0)
+        matrix = q[:, 1:] / size if affine else np.zeros((2, 2))
+        reach = np.linalg.norm(q[:, 0] + (self.extremes - self.middle) @ matrix.T, axis=1).max()
+        sigma = np.array([spread[0], spread[arms.shape[1]], spread[-2]]) * scale
+        return Motion(q[:, 0].copy(), matrix, self.middle, float(solved[-2]), float(solved[-1]), sigma, float(spread[-1] * scale),
+                      float(np.median(before)), float(np.median(after)), self.count, float(reach))
+
+    def _equations(self, shifts, arms):
+        """Normal equations of (displacement coefficients, offset, stray) with radiances eliminated, and chi^2 a lenslet.
+
+        The offset is that of the capture; stray is in shares of each lenslet's mean light. Lenslets that fit worse than the
+        median weigh less.
+        """
+        whole = np.rint(shifts).astype(int)
+        if self.smooth.cfa == "mono":
+            whole = np.broadcast_to(np.rint(shifts.mean(axis=0)).astype(int), whole.shape)
+        f, by_row, by_column = self.smooth.at(self.origin + whole, shifts - whole, derivatives=True, sharp=False)
+        x = self.values(whole)
+        f, by_row, by_column = (np.asarray(part, float) for part in (f, by_row, by_column))
+        good = np.isfinite(x) & np.isfinite(f).all(axis=-1)
+        f, x = np.where(good[..., None], f, 0), np.where(good, x, 0)
+        root = np.sqrt(good.astype(float))
+        b = np.linalg.pinv(f) @ x[..., None]
+        if self.noise is not None:
+            expected = self.noise[0] * np.clip((f @ b)[..., 0], 0, None) + self.noise[1]
+            if self.spread is not None:
+                expected = expected + (self.spread @ b**2)[..., 0]
+            root = root / np.sqrt(np.maximum(expected, 1e-12))
+        orthogonal = np.linalg.qr(f * root[..., None])[0]
+        b = np.linalg.pinv(f * root[..., None]) @ (x * root)[..., None]
+        light = np.maximum((f @ b)[..., 0].sum(axis=-1) / np.maximum(good.sum(axis=-1), 1), 0)
+        design = np.stack([(by_row @ b)[..., 0], (by_column @ b)[..., 0], np.ones_like(x), np.broadcast_to(light[:, None], x.shape)], axis=-1)
+        design = np.concatenate([design, (x - (f @ b)[..., 0])[..., None]], axis=-1) * root[..., None]
+        design = design - orthogonal @ (np.swapaxes(orthogonal, -1, -2) @ design)
+        product = np.swapaxes(design, -1, -2) @ design
+        chi = product[:, -1, -1] / np.maximum(good.sum(axis=-1) - f.shape[-1], 1)
+        unit = 1.0 if self.noise is not None else max(float(np.median(chi)), 1e-30)
+        weight = 1 / unit / np.maximum(1, chi / max(np.median(chi), 1e-30)) ** 2
+        terms = arms.shape[1]
+        carry = np.zeros((len(arms), 4, 2 * terms + 2))
+        carry[:, 0, :terms], carry[:, 1, terms:2 * terms] = arms, arms
+        carry[:, 2, -2] = carry[:, 3, -1] = 1
+        turned = np.swapaxes(carry, -1, -2) * weight[:, None, None]
+        normal = (turned @ product[:, :4, :4] @ carry).sum(axis=0)
+        right = (turned @ product[:, :4, 4:]).sum(axis=0)[:, 0]
+        return normal, right, chi
+
+
+def _solve(normal, right):
+    """Solution and standard deviations; what the data do not tell is 0 with deviation NaN: stray before offset."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    spread, solved = np.full(len(right), np.nan), np.zeros(len(right))
+    keep = list(range(len(right)))
+    for drop in (None, len(right) - 1, len(right) - 2):
+        if drop is not None:
+            keep.remove(drop)
+        unit = normal[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
+        if np.linalg.cond(unit) < 1e4:
+            break
+    inverse = np.linalg.pinv(unit)
+    solved[keep] = inverse @ (right[keep] / scale[keep]) / scale[keep]
+    spread[keep] = np.sqrt(np.maximum(np.diag(inverse), 0)) / scale[keep]
+    return solved, spread

@@ -1,0 +1,145 @@
+"""What stands between a capture and its calibration: moved lenslets, an offset, light that the calibration does not know."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from plenocli.errors import NumericsError
+from plenocli.stages.progress import note
+
+MODES = ("auto", "on", "off")
+POOR_FIT = 1.5  # residual over noise, mean squares, above which the calibration does not describe the capture
+LEAST_OFFSET = 0.1  # standard deviations of one pixel in the dark: less costs less than the noise of one lenslet
+
+
+def align(calibration, signal, noise, mode, path):
+    """(calibration, signal, stray, record) with the response moved to where the capture's lenslets are.
+
+    calibration: plenocli.stages.demux.Response; signal (rows, columns), dark removed; noise: (gain, read variance) or None.
+    mode: auto corrects what is more than chance, on corrects whatever is found and fails where nothing can be, off looks at
+    nothing. stray (R, C, pixel, colour): patterns of stray light, even over a superpixel, that deserve unknowns of their own where
+    there is more of it than chance (None: there is not). record: what was found, for
+    the file and the report (None: off).
+    """
+    from plenocli.sensor.registration import find_motion
+
+    c = calibration
+    if mode == "off":
+        return c, signal, None, None
+    motion = find_motion(signal, c.response, np.where(c.valid[..., None], c.origin, -(2**20)), c.window, c.centres, c.cfa, noise, c.variance)
+    if motion is None:
+        if mode == "on":
+            raise NumericsError("cannot be registered: fewer than three lenslets hold light", path, "expose longer, or use --register off")
+        return c, signal, None, {"corrected": [], "reason": "fewer than three lenslets hold light"}
+    better = motion.after < motion.before
+    dark = np.sqrt(noise[1]) if noise is not None else 0.0
+    corrected = []
+    if better and (mode == "on" or motion.moved):
+        corrected.append("motion")
+    if motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
+        corrected.append("offset")
+    if motion.strayed and better:
+        corrected.append("stray light")
+    if "motion" in corrected:
+        c = _moved(c, motion)
+    if "offset" in corrected:
+        signal = signal - np.float32(motion.offset)
+    return c, signal, _even_light(c, signal.shape) if "stray light" in corrected else None, _record(motion, corrected)
+
+
+def _even_light(c, shape):
+    """Patterns (R, C, pixel, colour): 1 where a pixel has that colour."""
+    from plenocli.sensor.cfa import cfa_map
+    from plenocli.sensor.superpixel import extract
+
+    where = cfa_map(shape, c.cfa)
+    patterns = [extract((where == letter).astype(np.float32), c.origin, c.window) for letter in dict.fromkeys(c.cfa if c.cfa != "mono" else where[0, 0])]
+    return np.nan_to_num(np.stack(patterns, axis=-1))
+
+
+def _moved(c, motion):
+    """The calibration with windows moved by whole pixels and responses by what is left."""
+    from plenocli.sensor.registration import Smooth
+
+    valid = np.argwhere(c.valid)
+    at = tuple(valid.T)
+    shifts = motion.at(c.centres[at])
+    whole = np.rint(shifts).astype(int)
+    if c.cfa == "mono":
+        whole[:] = np.rint(motion.at(motion.middle))
+    origin = c.origin.copy()
+    origin[at] += whole
+    rest = shifts - whole
+    window = c.window
+    if c.response.ndim == 2 and c.cfa == "mono" and np.ptp(rest, axis=0).max() < 0.02:
+        smooth = Smooth(c.response[None], origin[at][:1], window, c.cfa)
+        return replace(c, response=smooth.at(origin[at][:1], rest.mean(axis=0, keepdims=True))[0], origin=origin)
+    response = np.full((*c.valid.shape, window[0] * window[1], c.response.shape[-1]), np.nan, np.float32)
+    step = max(1, 2_000_000 // (window[0] * window[1] * c.response.shape[-1]))
+    own = c.response if c.response.ndim > 2 else np.broadcast_to(c.response, response.shape)
+    gains = None
+    for start in range(0, len(valid), step):
+        part = tuple(valid[start:start + step].T)
+        smooth = Smooth(own[part], c.origin[part], window, c.cfa, gains)
+        gains = smooth.gains
+        response[part] = smooth.at(origin[part], rest[start:start + step])
+    return replace(c, response=response, origin=origin, variance=_carried(c, smooth, origin, part))
+
+
+def _carried(c, smooth, origin, part):
+    """Variance of the moved response (pixel, band): a pixel that takes its value from a weak colour takes its noise too."""
+    if c.variance is None or c.cfa == "mono":
+        return c.variance
+    before, after = (np.mean([smooth.gain(o[None]) ** 2 for o in one[part]], axis=0).reshape(c.variance.shape) for one in (c.origin, origin))
+    return np.where(before > 0, c.variance * after / np.maximum(before, 1e-6), c.variance)
+
+
+def _record(motion, corrected):
+    return {
+        "corrected": corrected,
+        "shift_px": [float(v) for v in motion.shift], "shift_sigma_px": [float(v) for v in motion.sigma[:2]],
+        "rotation_deg": float(np.degrees(motion.rotation)), "stretch": (motion.matrix + motion.matrix.T).tolist(),
+        "largest_px": motion.reach, "offset": motion.offset, "offset_sigma": _or_none(motion.sigma[2]),
+        "stray": motion.stray, "stray_sigma": _or_none(motion.stray_sigma),
+        "residual_before": motion.before, "residual_after": motion.after, "lenslets": motion.lenslets,
+    }
+
+
+def _or_none(value):
+    return float(value) if np.isfinite(value) else None
+
+
+def residuals(c, values, radiance, noise, stray=None):
+    """Mean square of x - F b over its expected one (R, C): 1 is noise alone. None where the noise is not known."""
+    if noise is None:
+        return None
+    out = np.full(c.valid.shape, np.nan, np.float32)
+    spread = None if c.variance is None else np.nan_to_num(c.variance).astype(np.float32)
+    bands, unknowns = len(c.wavelengths), radiance.shape[-1]
+    level = np.float32(max(float(np.nanmax(c.response)), 1e-30))
+    for row in range(len(out)):
+        f = c.response if c.response.ndim == 2 else c.response[row]
+        b = radiance[row, :, :bands].astype(np.float32)
+        mean = np.matmul(f, b[..., None])[..., 0]
+        if stray is not None:
+            mean = mean + level * np.matmul(stray[row], radiance[row, :, bands:, None].astype(np.float32))[..., 0]
+        expected = np.float32(noise[0]) * np.maximum(mean, 0) + np.float32(noise[1])
+        if spread is not None:
+            expected = expected + (b**2 @ spread.T)
+        part = (values[row] - mean) ** 2 / np.maximum(expected, np.float32(1e-12))
+        good = np.isfinite(part)
+        freedom = good.sum(axis=-1) - unknowns
+        out[row] = np.where(freedom > 0, np.where(good, part, 0).sum(axis=-1) / np.maximum(freedom, 1), np.nan)
+    return out
+
+
+def judge(residual, record, path):
+    """Warn where the calibration does not describe the capture; returns the sentence, or None."""
+    middle = float(np.nanmedian(residual)) if residual is not None and np.isfinite(residual).any() else 0.0
+    if middle <= POOR_FIT:
+        return None
+    tried = "it was not registered" if record is None else "after registration" if record["corrected"] else "and no motion explains it"
+    text = (f"the calibration does not describe this capture: residuals have {middle:.3g} times the power of the noise ({tried}). Predicted errors are too small; "
+            "filters, leak between bands, focus or the scene within a lenslet's field may differ: calibrate again")
+    note(f"warning: {path}: {text}")
+    return text

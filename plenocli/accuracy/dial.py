@@ -261,9 +261,10 @@ def _warnings(request, best):
     view, grid, found = request.views[0], request.grid, []
     for axis, name in ((0, "rows"), (1, "columns")):
         size = view.pixel_shape[axis] * view.pixel_pitch
-        if request.pixel_shift is None and abs(size / view.superpixel_pitch - 1) > 1e-4:
+        spacing = view.superpixel_pitch * (1.0 if axis else view.row_spacing)
+        if request.pixel_shift is None and abs(size / spacing - 1) > 1e-4:
             found.append(
-                f"superpixels are {view.superpixel_pitch / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
+                f"superpixels are {spacing / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
                 "grid centred on each superpixel, not for one sensor raster (--lenslet)")
     if request.model != "auto" and best.model != "exact":
         error = _model_error(request, best)

@@ -25,6 +25,11 @@ from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
 from plenocli.optics.residual import Residuals, path
 
+MIXERS = 2
+FILL = 0.82
+"""Largest part of a sketch that the terms kept may fill."""
+CUT, CUT_EFFECT = 0.4, 1.3
+"""Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.5 to 1.8)."""
 MAX_SKETCH = 2500
 """Columns of the largest sketch: beyond it the set-up takes minutes and the model is refused."""
 
@@ -44,7 +49,8 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
     count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4))
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
-    return ExactBand(**vars(base), cut=accuracy / 10, sensor_count=count)
+    cut = CUT * accuracy
+    return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * cut)}, cut=cut, sensor_count=count)
 
 
 def valid_for(camera, view):
@@ -55,6 +61,19 @@ def valid_for(camera, view):
     if view.z3 < 10 * view.wavelength:
         return "the sensor lies within ten wavelengths of the lenslets, where evanescent waves reach it"
     return None
+
+
+def corner_phase(view):
+    """Phase (rad) of the kernel that does not separate, at the largest displacements along both axes within one superpixel."""
+    far = view.lenslet_width / 2 + max(view.pixel_shape) * view.pixel_pitch / 2
+    return view.k * far**4 / (4 * view.z3**3)
+
+
+def expected_terms(view, terms, cut, parabolic):
+    """Terms of an isolated lenslet's field, of whose spread function there are `terms` (fitted to f/8 and f/4.4, both profiles)."""
+    phase, decades = corner_phase(view), math.log10(1e-3 / cut)
+    first = (1 if parabolic else 1.1) * (1 + 0.22 * phase**0.62)
+    return terms * (first + decades * (1 if parabolic else 1.47) * (0.45 + 0.12 * phase**0.57))
 
 
 class ExactSquareLenslets:
@@ -127,10 +146,18 @@ class ExactSquareLenslets:
     def _gram(self, axis):
         """(point, term, term): overlaps of the terms of h over the lenslets."""
         g, total = self.geometry, 0
+        points = self._points(0, axis)
         for m in lit_lenslets(self._reach(axis), self.band.window):
-            values = self._field.evaluate(self._x + m * g.D2 - g.points(axis)[:, None], axis).transpose(0, 2, 1)
+            values = self._field.evaluate(self._x + m * g.D2 - points[:, None], axis).transpose(0, 2, 1)
             total = total + (values * self._w) @ values.conj().transpose(0, 2, 1)
-        return total
+        return np.concatenate([total, total[:len(g.points(axis)) - len(points)][::-1]])
+
+    def _emphasis(self, s, axis):
+        """Weights of the points in the compression: those at the lenslet's edge lose light and split it, so that the same error
+        would be a larger share of their columns."""
+        g = self.geometry
+        edge = (g.D2 / 2 - np.abs(self._points(s, axis))) * g.D1 / (g.wavelength * g.z2)
+        return 1 + 0.8 * np.exp(-edge)
 
     def _points(self, s, axis):
         """Object points (m, on the array) along one axis that are computed for superpixel s; the others mirror them."""
@@ -163,11 +190,11 @@ class ExactSquareLenslets:
             wave = (root[:, None] * self._w / math.sqrt(g.wavelength * g.z3)) * np.exp(1j * k * phase)
             terms = self._residuals.functions(self._number[s, m], u, x)
             local = self._local_terms(s, m, axis)
-            values = local.evaluate(place[:, None] - points)
-            flat = values.reshape(len(x), -1).astype(self.dtype)
+            values = local.evaluate(place[:, None] - points, axis) * self._emphasis(s, axis)[:, None]
+            flat = values.reshape(len(x), -1).astype(self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype)
             sheet = np.empty((len(u), len(points), len(terms), values.shape[2]), self.dtype)
             for r, term in enumerate(terms):
-                sheet[:, :, r] = ((wave * term).astype(self.dtype) @ flat).reshape(len(u), len(points), -1)
+                sheet[:, :, r] = _times((wave * term).astype(self.dtype), flat).reshape(len(u), len(points), -1)
             sheets.append((m, sheet.reshape(len(u) * len(points), len(terms), -1), local))
         self._sheets[s, axis] = sheets
         return sheets
@@ -176,6 +203,8 @@ class ExactSquareLenslets:
         key = (s, m, axis)
         if key not in self._local:
             g, share = self.geometry, self._offsets[s, m][1]
+            if self.band.window is None and (not self._turn or self._field.signs is not None):
+                return AllTerms(self._field, self._turn)
             reach = self._x[-1] + np.abs(g.points(axis)).max()
             low, high = max(m * g.D2 - reach, -self.band.half), min(m * g.D2 + reach, self.band.half)
             self._local[key] = LocalTerms(self._field, axis, low, high, self.band.cut / 3 / share)
@@ -202,9 +231,8 @@ class ExactSquareLenslets:
         return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes)
 
     def _first_guess(self):
-        g = self.geometry
-        corner = g.k * (g.D2 / 2 + max(g.pixel_shape) * g.pixel_pitch / 2) ** 4 / (4 * g.z3**3)
-        return int(1.8 * self._field.terms * (1.6 + 0.5 * corner**0.57) * (1 if self._parabolic else 1.2)) + 16
+        """Columns of the first sketch, from the rank expected."""
+        return int(1.05 / FILL * expected_terms(self.geometry, self._field.terms, self.band.cut, self._parabolic)) + 8
 
     def _to_pixels(self, factor, s, axis):
         """(sensor nodes x points, terms) to (points, pixel nodes, terms)."""
@@ -219,7 +247,8 @@ class ExactSquareLenslets:
             matrix = np.sqrt(w.ravel())[:, None] * (legendre(v.ravel() / self._extent[axis], len(u), 1) @ back) / root
             real = factor.real.dtype
             factor = (matrix.astype(real) @ factor.view(real)).view(factor.dtype)
-        return np.ascontiguousarray(factor.reshape(len(factor), points, -1).transpose(1, 0, 2))
+        factor = factor.reshape(len(factor), points, -1).transpose(1, 0, 2)
+        return factor / self._emphasis(s, axis).astype(factor.real.dtype)[:, None, None]
 
     # what the builder asks for
 
@@ -252,6 +281,19 @@ class ExactSquareLenslets:
                 out[some] = images[:, :: -1 if fy else 1, :: -1 if fx else 1]
 
 
+class AllTerms:
+    """The terms of h as they are, with the methods of LocalTerms; for `turn` those of the rows serve the columns too."""
+
+    def __init__(self, field, turn):
+        self._field, self._turn = field, turn
+
+    def coefficients(self, axis):
+        return np.diag(self._field.signs) if axis and self._turn else np.eye(self._field.terms)
+
+    def evaluate(self, d, axis):
+        return self._field.evaluate(d, axis)
+
+
 class LocalTerms:
     """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at `tolerance` of the whole field."""
 
@@ -267,7 +309,7 @@ class LocalTerms:
         basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
-        self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root)).astype(complex)
+        self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))
 
     def coefficients(self, axis):
         """(i, term): the terms of h along `axis` in this basis."""
@@ -309,14 +351,28 @@ class Product:
             out.append(total.reshape(-1, total.shape[-1]))
         return out
 
-    def _range(self, side, count):
-        """Orthonormal basis of the range of M (side 0) or M^T (1) from `count` of its columns."""
+    def _sketch(self, side, count):
+        """`count` random combinations of the columns of M (side 0) or of M^T (1), of which each goes into two."""
         mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
-        rows = len(other[0])
-        chosen = _jittered(rows, min(count, rows), self.rng)
-        core = self._through(side, [x[chosen].transpose(1, 2, 0) for x in other])
-        sketch = sum(x.reshape(len(x), -1) @ c for x, c in zip(mine, core))
-        return _orthonormal(sketch)
+        mixers = [_mixer(len(other[0]), count, self.rng) for _ in range(MIXERS)]
+        mixed = [sum(mixer(x.reshape(len(x), -1)) for mixer in mixers).reshape(count, *x.shape[1:]).transpose(1, 2, 0) for x in other]
+        return sum(x.reshape(len(x), -1) @ c for x, c in zip(mine, self._through(side, mixed)))
+
+    def _extend(self, side, count, basis, inner):
+        """A basis of the range of M (side 0) or M^T (1) with `count` more columns, and the sheets seen through it, (r, i, basis)."""
+        sheets = self.left if side == 0 else self.right
+        columns = self._sketch(side, count)
+        if basis is not None:
+            for _ in range(2):
+                columns -= basis @ (basis.conj().T @ columns)
+        new = _orthonormal(columns)
+        if basis is not None:
+            # what was numerically nothing is no direction of its own
+            new = _orthonormal(new - basis @ (basis.conj().T @ new))
+        seen = [(new.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in sheets]
+        if basis is None:
+            return new, seen
+        return np.hstack([basis, new]), [np.concatenate(pair, axis=2) for pair in zip(inner, seen)]
 
     def factors(self, cut, count):
         """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
@@ -324,26 +380,25 @@ class Product:
         NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
         limit = min(len(self.left[0]), len(self.right[0]))
+        add, q, p, outer, inner = min(count, limit), None, None, None, None
         while True:
-            count = min(count, limit)
-            q = self._range(0, count)
-            p = q if self.symmetric else self._range(1, count)
-            inner = [(p.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in self.right]
-            outer = inner if self.symmetric else [(q.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in self.left]
-            core = sum(o.reshape(-1, o.shape[-1]).T @ c for o, c in zip(outer, self._through(0, inner)))
+            q, outer = self._extend(0, add, q, outer)
+            p, inner = (q, outer) if self.symmetric else self._extend(1, add, p, inner)
+            size = q.shape[1]
+            core = sum(o.reshape(-1, size).T @ c for o, c in zip(outer, self._through(0, inner)))
             u, s, vh = np.linalg.svd(core)
             tails = np.sqrt(np.cumsum(s.astype(float)[::-1] ** 2)[::-1])
             terms = max(1, int(np.count_nonzero(tails > cut)))
             root = np.sqrt(s[:terms])
             high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
-            self.error = self._missed(high, wide)
-            if count == limit or (terms <= 0.7 * count and self.error <= 3 * cut):
+            missed = self._missed(high, wide)
+            if size >= limit or (terms <= FILL * size and missed <= 2 * cut):
                 return high, wide
-            if count >= MAX_SKETCH:
+            if size >= MAX_SKETCH:
                 raise NumericsError(
-                    f"the exact field has more than {terms} separable terms (error {self.error / cut:.1g} of what is allowed)",
+                    f"the exact field has more than {terms} separable terms (error {missed / cut:.1g} of what is allowed)",
                     "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
-            count = min(MAX_SKETCH, int(1.7 * max(count, terms)))
+            add = min(MAX_SKETCH, limit, max(size // 4, int(terms / FILL) - size + 8) + size) - size
 
     def _missed(self, high, wide):
         """Root sum of squares of M - H B^T, estimated on random entries."""
@@ -354,19 +409,30 @@ class Product:
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
 
 
-def _jittered(n, count, rng):
-    """`count` of 0..n-1, one at random from each of as many equal pieces."""
-    edges = np.linspace(0, n, count + 1)
-    return np.minimum((edges[:-1] + rng.random(count) * np.diff(edges)).astype(int), n - 1)
+def _times(kernel, values):
+    """kernel @ values for a complex kernel and real or complex values of the same precision."""
+    if np.iscomplexobj(values):
+        return kernel @ values
+    out = np.empty((len(kernel), values.shape[1]), kernel.dtype)
+    out.real, out.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ values, 2)
+    return out
+
+
+def _mixer(n, count, rng):
+    """A function that adds up n rows, in random order and with random signs, into `count` rows."""
+    order, signs = rng.permutation(n), rng.choice([-1, 1], n)
+    starts = np.linspace(0, n, count, endpoint=False).astype(int)
+
+    def mix(rows):
+        chosen = rows[order]
+        chosen *= signs.astype(rows.real.dtype)[:, None]
+        return np.add.reduceat(chosen, starts, axis=0)
+
+    return mix
 
 
 def _orthonormal(columns):
-    """An orthonormal basis of the columns; single precision by the eigenvectors of their Gram matrix in double."""
-    if columns.dtype == np.complex128:
-        return np.linalg.qr(columns)[0]
-    double = columns.astype(np.complex128)
-    gram = double.conj().T @ double
-    values, vectors = np.linalg.eigh(gram)
-    keep = values > 1e-13 * values[-1]
-    # in double as well: the weakest directions are differences of nearly equal columns
-    return (double @ (vectors[:, keep] / np.sqrt(values[keep]))).astype(columns.dtype)
+    """An orthonormal basis of the columns."""
+    from scipy.linalg import qr
+
+    return qr(columns, mode="economic", check_finite=False)[0]

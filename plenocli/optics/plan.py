@@ -119,8 +119,10 @@ def size_band(view, grid, ring, accuracy, tolerance):
     count = psf_nodes(view, half)
     phase = view.k * view.D1 / 2 * half / view.z2
     terms = int(0.27 * phase + 3 + 0.6 * math.log10(1 / tolerance)) if view.blur < view.D2 else int(0.4 * phase + 10)
-    nodes = pixel_nodes(own, joint, view.diffraction_cells, accuracy)
-    sampling = math.hypot(pixel_error(nodes, own, joint, view.diffraction_cells), CUT * tolerance)
+    # a point between lenslets that do not touch is dim, and what is missed weighs more in its column
+    dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
+    nodes = pixel_nodes(own, joint, view.diffraction_cells, accuracy / dim)
+    sampling = math.hypot(dim * pixel_error(nodes, own, joint, view.diffraction_cells), CUT * tolerance)
     return BandPlan(view.wavelength, window, nodes_for(slope), nodes, count, terms, half, sampling)
 
 

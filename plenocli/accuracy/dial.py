@@ -9,8 +9,9 @@ from plenocli.accuracy.needs import seen_wavelengths, sensor_noise, visible_accu
 from plenocli.accuracy.rates import NOMINAL, product_rate
 from plenocli.accuracy.rungs import RUNGS
 from plenocli.errors import NumericsError, UsageError
+from plenocli.optics.bands import MAX_NODES, spectral_error, spectral_nodes
 from plenocli.optics.geometry import geometry, lenslet_shift
-from plenocli.optics.plan import PifPlan, blur_ring, predicted_outside, window_error
+from plenocli.optics.plan import PifPlan, blur_ring, coherent_window, predicted_outside, window_error
 
 BEST_ACCURACY = 1e-8
 """Finest sampling on offer: double precision."""
@@ -21,6 +22,8 @@ SINGLE_LIMIT = 1e-5
 """Single precision serves sampling errors down to this."""
 ROUNDING = {False: 3e-7, True: 3e-10}
 """Error of a column from rounding in single and double precision (measured)."""
+BAND_SHARE = 0.5
+"""Share of the accuracy that the wavelengths of a band may use up."""
 SHARE = 0.2
 """Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
 
@@ -42,6 +45,7 @@ class Candidate:
     operations: float = 0.0
     fixed_seconds: float = 0.0
     bytes: int = 0
+    band_nodes: int = 0
 
     def seconds(self, rate=None):
         """Seconds of one core, at the nominal rate or at `rate` (a function of `double`)."""
@@ -83,6 +87,8 @@ class _Request:
             self.left_out.append(f"{len(dropped)} wavelength(s) without light in the scene: no error")
         self.pixel_shift, self.off_axis = _place(camera, lenslet)
         self.views = [geometry(camera, w, self.pixel_shift) for w in kept]
+        # a band goes by its centre
+        self.band = camera.light.band if camera.light.band is not None and kept == (camera.light.band.center,) else None
         self.explicit = accuracy is not None
         self.accuracy, self.asked_by = self._accuracy(accuracy)
         self.dtype = np.dtype((np.float32 if self.accuracy >= 1e-6 else np.float64) if isinstance(dtype, str) and dtype == "auto" else dtype)
@@ -146,14 +152,15 @@ def _consider(request, rung):
     if reason:
         return Candidate(rung.name, rung.model, reason)
     fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
-             "spectrum": 0.0, "storage": 3e-8 if request.dtype == np.float32 else 0.0}
+             "storage": 3e-8 if request.dtype == np.float32 else 0.0}
     tried = []
     # rays end where the blur ends
     for ring in request.rings if rung.model != "ray" else request.rings[:1]:
         outside = 0.0 if rung.model == "ray" else max(window_error(v, request.grid, ring) for v in request.depths)
         # the rings that a user asks for are the user's model
-        split = fixed | {"neighbourhood": outside if len(request.rings) > 1 else 0.0}
-        tried.append(_sized(request, rung, ring, split))
+        nodes, spectrum = _band_nodes(request, rung, ring)
+        split = fixed | {"spectrum": spectrum, "neighbourhood": outside if len(request.rings) > 1 else 0.0}
+        tried.append(_sized(request, rung, ring, split, nodes))
         if tried[-1].why is None:
             return tried[-1]
     # none serves: the fewest rings that come as near as any
@@ -161,7 +168,20 @@ def _consider(request, rung):
     return next(c for c in tried if c.error <= 1.1 * least)
 
 
-def _sized(request, rung, ring, split):
+def _band_nodes(request, rung, ring):
+    """(wavelengths that stand for the camera's band of light, error that leaves); (0, 0.0) for lines."""
+    if request.band is None:
+        return 0, 0.0
+    view = request.views[0]
+    window = None if ring == 0 else coherent_window(view, request.grid, ring)
+    for count in range(1, MAX_NODES + 1):
+        error = spectral_error(view, request.band, count, window)
+        if error <= BAND_SHARE * request.accuracy:
+            break
+    return count, error
+
+
+def _sized(request, rung, ring, split, nodes):
     """Node counts for the accuracy that the other errors leave to sampling."""
     rest = math.hypot(*split.values())
     room = math.sqrt(max(request.accuracy**2 - rest**2, 0))
@@ -173,14 +193,24 @@ def _sized(request, rung, ring, split):
     sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
     double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
-        bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in request.views)
+        bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in _finest(request, nodes))
     except NumericsError as error:
         return Candidate(rung.name, rung.model, str(error))
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
+    if nodes:
+        bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(rung.name, rung.model, why, math.hypot(*split.values()), split, ring, sampling, double, bands,
-                     sum(c["operations"] for c in costs), sum(c["seconds"] for c in costs), size + max(c["bytes"] for c in costs))
+                     max(nodes, 1) * sum(c["operations"] for c in costs), max(nodes, 1) * sum(c["seconds"] for c in costs),
+                     size + max(nodes, 1) * max(c["bytes"] for c in costs), nodes)
+
+
+def _finest(request, nodes):
+    """The geometries that node counts must serve: of a band, that of its shortest wavelength."""
+    if not nodes:
+        return request.views
+    return [geometry(request.camera, float(spectral_nodes(request.band, nodes)[0].min()), request.pixel_shift)]
 
 
 def _cheapest(found):
@@ -223,7 +253,7 @@ def _plan(request, found, best):
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(best.model, best.name, request.grid, best.ring, request.accuracy, request.asked_by, best.sampling / 2, best.double, best.bands,
                    request.shape, size, best.bytes, best.error, best.split, _model_error(request, best), request.dtype.name, tuple(request.reasons), tuple(request.left_out),
-                   tuple(warnings), table, request.pixel_shift)
+                   tuple(warnings), table, request.pixel_shift, best.band_nodes)
 
 
 def _model_error(request, best):

@@ -20,6 +20,8 @@ def explain(plan):
         f"{b.psf_nodes} across the spread function, about {b.terms} terms"
         for b in plan.bands
     ]
+    if plan.band_nodes:
+        nodes.append(f"the band is the sum of {plan.band_nodes} wavelength(s)")
     return "\n".join([*head, *(f"- {r}" for r in plan.reasons), *(f"- left out: {t}" for t in plan.left_out), *(f"- {n}" for n in nodes),
                       *(f"! {w}" for w in plan.warnings)])
 

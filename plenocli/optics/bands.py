@@ -130,7 +130,7 @@ def combined(maker, nodes):
 
     def make(camera, view, plan, band):
         wavelengths, weights = spectral_nodes(camera.light.band, nodes)
-        views = [replace(geometry(camera, w), pixel_shift=view.pixel_shift) for w in wavelengths]
+        views = [geometry(camera, w, view.pixel_shift) for w in wavelengths]
         return CombinedBands([maker(camera, v, plan, replace(band, wavelength=v.wavelength)) for v in views], weights)
 
     return make
@@ -145,7 +145,7 @@ def band_matrix(camera, plan, nodes, *, workers=1):
 
     total, work = None, None
     for wavelength, weight in zip(*spectral_nodes(camera.light.band, nodes)):
-        here = replace(plan, bands=(replace(plan.bands[0], wavelength=float(wavelength)),))
+        here = replace(plan, band_nodes=0, bands=(replace(plan.bands[0], wavelength=float(wavelength)),))
         builder = PifBuilder(camera, float(wavelength), here, dtype=plan.dtype)
         if total is None:
             total = np.zeros((*builder.shape, builder.points), plan.dtype)

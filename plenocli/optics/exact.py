@@ -315,8 +315,8 @@ class LocalTerms:
         """(i, term): the terms of h along `axis` in this basis."""
         return self._mixing[axis]
 
-    def evaluate(self, d):
-        """e_i at d (m): d.shape + (i,)."""
+    def evaluate(self, d, axis):
+        """e_i at d (m): d.shape + (i,), the same for both axes."""
         t = (np.asarray(d, float).ravel() - self.middle) / self.half
         return (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
 

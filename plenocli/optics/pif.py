@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from plenocli.errors import NumericsError
+from plenocli.optics.bands import combined
 from plenocli.optics.exact import ExactSquareLenslets
 from plenocli.optics.geometry import geometry
 from plenocli.optics.lens import at_wavelength
@@ -225,8 +226,10 @@ class PifBuilder:
 def _maker(camera, plan):
     """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
     if plan.model != "fresnel":
-        return {"ray": RayLenslets, "exact": ExactSquareLenslets}[plan.model]
-    return SquareLenslets if plan.rung == "fresnel, low rank" else ShapedLenslets
+        maker = {"ray": RayLenslets, "exact": ExactSquareLenslets}[plan.model]
+    else:
+        maker = SquareLenslets if plan.rung == "fresnel, low rank" else ShapedLenslets
+    return combined(maker, plan.band_nodes) if plan.band_nodes else maker
 
 
 def superpixel_orbits(offsets, symmetry):

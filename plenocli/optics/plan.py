@@ -40,7 +40,8 @@ class PifPlan:
     bytes: of the result; memory: with the work; estimated: relative error of the worst column; split: that error by source; model_error: of the
     model itself against the finest one, whether asked for by name or not;
     dtype: of the stored matrix; reasons, left_out, warnings: a sentence each; candidates: the rungs considered; pixel_shift: of
-    an off-axis lenslet on the sensor's own raster (plenocli.optics.geometry.lenslet_shift), None where windows are centred.
+    an off-axis lenslet on the sensor's own raster (plenocli.optics.geometry.lenslet_shift), None where windows are centred; band_nodes: wavelengths that stand for the
+    camera's band of light, 0 for lines.
     """
 
     model: str
@@ -64,6 +65,7 @@ class PifPlan:
     warnings: tuple = ()
     candidates: tuple = ()
     pixel_shift: tuple | None = None
+    band_nodes: int = 0
 
 
 def window_error(view, grid, ring):

@@ -24,6 +24,7 @@ _PIF_ATTRS = (
     Attr("eps", "number", "1/m", "defocus of the main lens"),
     Attr("superpixel_pitch", "number", "m", "spacing of superpixel centres on the sensor"),
     Attr("model", "text", "", "propagation model"),
+    Attr("lattice", "text", "", "of the lenslets: square (if left out) or hexagonal"),
     _NOTES)
 
 PIF = Schema("pif", 1, "Pupil image functions: the system matrix A of a camera, one matrix a band and superpixel.", (
@@ -98,6 +99,8 @@ CALIBRATION = Schema("calibration", 1, "Lenslet grid, white and dark levels and 
     "response": (
         Attr("single_pixel", "number", "1", "pixel of the window chosen for each band"),
         Attr("condition", "number", "1", "median condition number of F", finite=False),
+        Attr("angles", "json", "deg", "median angles between the columns of F, (band, band); 90 is perfect separation"),
+        Attr("bias", "number", "1", "share by which the noise of F itself changes least-squares radiances, by band (errors in variables)"),
         Attr("read_noise", "number", "DN", "noise of a dark pixel"), Attr("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
         Attr("cfa", "text", "", "mono or four letters"), Attr("units", "text", "", "DN or electron"),
         Attr("exposure_s", "number", "s", "exposure to which F refers"), _NOTES),

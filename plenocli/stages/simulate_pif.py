@@ -57,6 +57,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
 
     def finish(pif, found):
         data, attrs = _contents(pif, found)
+        attrs["pif"]["lattice"] = camera.lenslet_array.lattice
         if settings.lenslet is not None:
             attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
         return Artefact("pif", data, attrs, provenance)

@@ -30,10 +30,9 @@ def read_system(path, mem_limit=None):
     """System of a pif artefact; several bands are averaged, as equal shares of the light. InputError where it lacks (0, 0) or
     belongs to a hexagonal lattice."""
     from plenocli.artefacts import read_pif
-    from plenocli.config import parse_camera
 
     artefact = read_pif(path, mem_limit)
-    if parse_camera(artefact.provenance.config, path).lenslet_array.lattice != "square":
+    if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError("belongs to a hexagonal lattice, whose object blocks do not tile a picture in rows and columns", path,
                          "use the pif of a camera with a square lattice")
     matrices = artefact.data["pif/A"]

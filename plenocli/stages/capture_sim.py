@@ -97,6 +97,8 @@ def _source(camera, settings, scene):
     target = settings.target
     if (target is None) == (scene is None):
         raise UsageError("give exactly one of --scene and --target", fix="for example --target white or --scene skimage:astronaut")
+    if camera.light.band is not None and settings.bandwidth:
+        raise UsageError("the camera's light is a band already, given in its [light] section", "--bandwidth", "leave one of the two out")
     white = broadband(camera, lambda wavelengths: illuminant(camera.light.illuminant, wavelengths), settings.spectral_step)
     if not has_colour(camera) and settings.bandwidth:
         white = broadened(camera.light.wavelengths, settings.bandwidth)

@@ -161,6 +161,7 @@ def test_a_matrix_from_disk_gives_the_same_and_another_cameras_is_refused(camera
         (None, ["--scene", "absent.png"], 3, "absent.png"),
         (None, ["--scene", "skimage:nobody"], 2, "astronaut"),
         (("[3, 4]", '[3, 4]\nlattice = "hexagonal"'), ["--target", "white"], 2, "hexagonal"),
+        (('wavelengths = ["550 nm"]', 'band = { center = "550 nm", fwhm = "20 nm" }'), ["--target", "white", "--bandwidth", "10nm"], 2, "a band already"),
         (('superpixel_pitch = "18 um"', 'pitch = "18 um"'), ["--target", "white"], None, "pixels off"),
     ],
 )

@@ -52,6 +52,7 @@ class PifBuilder:
         self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength, plan.pixel_shift), np.dtype(dtype)
         camera = at_wavelength(camera, wavelength)
         self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
+        self._sampling = band.sampling
         self.notes = self._lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
         self.points = self.object_shape[0] * self.object_shape[1]
@@ -214,7 +215,7 @@ class PifBuilder:
         """NumericsError where points (rows, columns) put more light on the `sensor` than `entered` the lenslets."""
         sensor, entered, rows, columns = (np.ravel(a) for a in (sensor, entered, rows, columns))
         excess = sensor - entered
-        slack = 1e-6 if self.plan.double else 1e-5
+        slack = max(1e-6 if self.plan.double else 1e-5, 0.5 * self._sampling)
         worst = int(np.argmax(excess))
         if not np.isfinite(sensor).all() or excess[worst] > slack:
             raise NumericsError(

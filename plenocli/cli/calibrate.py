@@ -42,4 +42,6 @@ def command(ctx, output, as_json, radiances, **settings):
             f"{report['lenslets']} lenslets, residual {report['rms_px']:.3f} px rms ({report['model']})")
     if "condition" in report:
         line += f"; F: {len(report['bands_nm'])} bands, condition {report['condition']:.3g}, {report['columns']}"
+        if report["bias"]:
+            line += f", bias by its noise up to {max(map(abs, report['bias'])):.1g}"
     options.summary(report, as_json, line)

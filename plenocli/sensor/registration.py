@@ -7,7 +7,7 @@ A gain of the whole capture cannot be told from brighter radiances, and a mixtur
 other radiances: neither is visible here. docs/model.md, "Registration".
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,8 +55,8 @@ class Motion:
 
     @property
     def moved(self):
-        """Whether the lenslets moved by more than chance and enough to matter."""
-        return bool(self.reach > max(LEAST_SHIFT, SIGNIFICANT * np.hypot(*self.sigma[:2])))
+        """Whether the lenslets moved by more than chance, enough to matter and not further than can be followed."""
+        return bool(self.reach < REACH + 2 and self.reach > max(LEAST_SHIFT, SIGNIFICANT * np.hypot(*self.sigma[:2])))
 
     @property
     def lifted(self):
@@ -232,6 +232,16 @@ def _filled(values, weight):
     return out.astype(np.float32)
 
 
+def own_pixels(window):
+    """Mask (pixel,) without the outermost pixels of a window, where the neighbours' light, which follows another radiance,
+    would pass for an offset or stray light: none below 16 px, one below 32, two above."""
+    keep = np.ones(tuple(window), bool)
+    for axis, count in enumerate(window):
+        edge = min(2, count // 16)
+        keep &= np.expand_dims((np.arange(count) >= edge) & (np.arange(count) < count - edge), 1 - axis)
+    return keep.ravel()
+
+
 def find_motion(signal, response, origin, window, centres, cfa="mono", noise=None, response_variance=None, sample=SAMPLE):
     """Motion of the lenslets of a capture since their calibration; None where fewer than three lenslets show it.
 
@@ -243,12 +253,13 @@ def find_motion(signal, response, origin, window, centres, cfa="mono", noise=Non
     data = _Sample(signal, response, origin, window, centres, cfa, noise, response_variance, sample)
     if data.count < 3:
         return None
-    best = data.fit(np.zeros(2))
-    if best.after > 1.5 or best.reach > 0.7:
-        start = data.search()
-        if start.any():
-            best = min((best, data.fit(start)), key=lambda motion: motion.after)
-    return best
+    first = data.fit(np.zeros(2))
+    if first.after <= 1.5 and first.reach <= 0.7:
+        return first
+    start = data.search()
+    if not start.any():
+        return first
+    return replace(min((first, data.fit(start)), key=lambda motion: motion.after), before=first.before)
 
 
 class _Sample:
@@ -265,7 +276,10 @@ class _Sample:
         if len(place):
             place = place[np.unique(np.linspace(0, len(place) - 1, min(len(place), 4 * sample)).astype(int))]
         values = extract(signal, origin[tuple(place.T)][:, None], window)[:, 0]
-        level = np.nan_to_num(np.where(np.isfinite(values).mean(axis=-1) > 0.5, np.nansum(values, axis=-1), 0))
+        known = np.isfinite(values)
+        level, power = (np.where(known, one, 0).sum(axis=-1, dtype=float) for one in (values, np.square(values, dtype=float)))
+        spread = power - level**2 / np.maximum(known.sum(axis=-1), 1)  # of a sum of pixels that are noise alone
+        level[(known.mean(axis=-1) <= 0.5) | (level < 6 * np.sqrt(np.maximum(spread, 0)))] = 0
         bright = np.flatnonzero(level > 0.25 * np.percentile(level, 90)) if len(level) else np.zeros(0, int)
         chosen = bright[np.unique(np.linspace(0, len(bright) - 1, min(len(bright), sample)).astype(int))] if len(bright) else bright
         place = tuple(place[chosen].T)
@@ -281,7 +295,7 @@ class _Sample:
     def values(self, whole):
         from plenocli.sensor.superpixel import extract
 
-        return extract(self.signal, (self.origin + whole)[:, None], self.window)[:, 0].astype(float)
+        return np.where(own_pixels(self.window), extract(self.signal, (self.origin + whole)[:, None], self.window)[:, 0].astype(float), np.nan)
 
     def search(self):
         """Displacement (2,) in whole pixels (an even number where there is a colour mosaic) that leaves the least residual."""

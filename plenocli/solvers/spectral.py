@@ -36,6 +36,22 @@ def column_angles(response):
     return np.degrees(np.arccos(np.clip(np.swapaxes(unit, -1, -2) @ unit, -1, 1)))
 
 
+def calibration_bias(response, variance):
+    """Errors-in-variables bias B (..., band, band) of least squares with a measured F-hat: its mean answer is (I + B) b.
+
+    response (..., pixel, band); variance (pixel, band) of its entries, independent of each other. To second order,
+    B = E[F+ dF F+ dF] - (F^T F)^-1 E[dF^T (I - F F+) dF]: the second term, which dominates with many pixels, attenuates;
+    the first can amplify where pixels are few. Expansion of the pseudo-inverse (G. H. Golub, V. Pereyra 1973).
+    """
+    f = _masked(response)
+    pseudo = np.linalg.pinv(f)
+    variance = np.where((f != 0).any(axis=-1, keepdims=True), np.nan_to_num(variance), 0.0)
+    leverage = np.einsum("...pk,...kp->...p", f, pseudo)
+    back = np.einsum("...ip,...jp,...pj->...ij", pseudo, pseudo, variance, optimize=True)
+    lost = (variance * (1 - leverage)[..., None]).sum(axis=-2)
+    return back - (pseudo @ np.swapaxes(pseudo, -1, -2)) * lost[..., None, :]
+
+
 def noise_variance(response, radiance, gain, read_variance, response_variance=None):
     """Variance (..., pixel) of the pixel values, DN^2: gain * E[F b] + read_variance [+ b^2 var(F)].
 

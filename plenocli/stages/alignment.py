@@ -9,19 +9,20 @@ from plenocli.stages.progress import note
 
 MODES = ("auto", "on", "off")
 POOR_FIT = 1.5  # residual over noise, mean squares, above which the calibration does not describe the capture
+BELIEVED = 0.1  # share of the residual that may be left where an offset or stray light is taken off a capture that stays poorly described
 LEAST_OFFSET = 0.1  # standard deviations of one pixel in the dark: less costs less than the noise of one lenslet
 
 
-def align(calibration, signal, noise, mode, path):
+def align(calibration, signal, noise, mode, path, levels=True):
     """(calibration, signal, stray, record) with the response moved to where the capture's lenslets are.
 
     calibration: plenocli.stages.demux.Response; signal (rows, columns), dark removed; noise: (gain, read variance) or None.
     mode: auto corrects what is more than chance, on corrects whatever is found and fails where nothing can be, off looks at
     nothing. stray (R, C, pixel, colour): patterns of stray light, even over a superpixel, that deserve unknowns of their own where
-    there is more of it than chance (None: there is not). record: what was found, for
-    the file and the report (None: off).
+    there is more of it than chance (None: there is not). record: what was found, for the file and the report (None: off).
+    levels: whether offset and stray light are corrected, which mean nothing where the motion cannot be followed.
     """
-    from plenocli.sensor.registration import find_motion
+    from plenocli.sensor.registration import REACH, find_motion
 
     c = calibration
     if mode == "off":
@@ -34,11 +35,15 @@ def align(calibration, signal, noise, mode, path):
     better = motion.after < motion.before
     dark = np.sqrt(noise[1]) if noise is not None else 0.0
     corrected = []
+    lost = motion.reach > REACH + 2
+    if mode == "on" and lost:
+        raise NumericsError(f"cannot be registered: the best motion is {motion.reach:.3g} px, further than it can be followed", path, "calibrate again, or use --register off")
     if better and (mode == "on" or motion.moved):
         corrected.append("motion")
-    if motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
+    levels = levels and not lost
+    if levels and motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
         corrected.append("offset")
-    if motion.strayed and better:
+    if levels and motion.strayed:
         corrected.append("stray light")
     if "motion" in corrected:
         c = _moved(c, motion)
@@ -48,13 +53,15 @@ def align(calibration, signal, noise, mode, path):
 
 
 def _even_light(c, shape):
-    """Patterns (R, C, pixel, colour): 1 where a pixel has that colour."""
+    """Patterns (R, C, pixel, colour): 1 where a pixel has that colour, NaN at the window's border, where the neighbours' light
+    cannot be told from stray light."""
     from plenocli.sensor.cfa import cfa_map
+    from plenocli.sensor.registration import own_pixels
     from plenocli.sensor.superpixel import extract
 
     where = cfa_map(shape, c.cfa)
     patterns = [extract((where == letter).astype(np.float32), c.origin, c.window) for letter in dict.fromkeys(c.cfa if c.cfa != "mono" else where[0, 0])]
-    return np.nan_to_num(np.stack(patterns, axis=-1))
+    return np.where(own_pixels(c.window)[:, None], np.nan_to_num(np.stack(patterns, axis=-1)), np.float32(np.nan))
 
 
 def _moved(c, motion):
@@ -133,9 +140,20 @@ def residuals(c, values, radiance, noise, stray=None):
     return out
 
 
+def misfit(residual):
+    """Median over lenslets of the residual's mean square over the expected one; 0 where the noise is not known."""
+    return float(np.nanmedian(residual)) if residual is not None and np.isfinite(residual).any() else 0.0
+
+
+def doubtful(residual, record):
+    """Whether an offset or stray light was taken off although the calibration does not describe the capture: another shape of
+    the superpixels (focus, filters) passes for both."""
+    return misfit(residual) > POOR_FIT and record is not None and bool({"offset", "stray light"} & set(record["corrected"]))
+
+
 def judge(residual, record, path):
     """Warn where the calibration does not describe the capture; returns the sentence, or None."""
-    middle = float(np.nanmedian(residual)) if residual is not None and np.isfinite(residual).any() else 0.0
+    middle = misfit(residual)
     if middle <= POOR_FIT:
         return None
     tried = "it was not registered" if record is None else "after registration" if record["corrected"] else "and no motion explains it"

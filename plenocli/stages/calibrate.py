@@ -153,7 +153,7 @@ def _mean(cells):
 def _response(data, attrs, merged, radiances, bad, noise, dark_variance, shared, grid, cfa):
     """F-hat: each band's signal over the radiance of its source, with its variance (pixel, band), mean over lenslets."""
     from plenocli.sensor.superpixel import extract
-    from plenocli.solvers.spectral import choose_pixels, column_angles, condition_number
+    from plenocli.solvers.spectral import calibration_bias, choose_pixels, column_angles, condition_number
 
     origin, window, valid = data["response/origin"], tuple(data["response/window"]), data["grid/valid"]
     unknown = [w for w in radiances if not any(abs(w - band) < 1e-12 for band in merged)]
@@ -185,10 +185,13 @@ def _response(data, attrs, merged, radiances, bad, noise, dark_variance, shared,
     between = angles[(slice(None), *np.triu_indices(len(merged), 1))]
     middle = sample if shared else _mean(sample)
     data |= {"response/F": response, "response/wavelength": np.array(list(merged)), "response/energy": energy}
+    attrs["response"] = dict(condition=float(np.median(condition)), angles=[[float(a) for a in row] for row in np.median(angles, axis=0)], single_pixel=[int(p) for p in choose_pixels(middle)],
+                             notes=f"smallest angle between two columns of F {between.min():.2f} deg" if between.size else "one band")
     if noise.gain is not None:
         data["response/covariance"] = variance
-    attrs["response"] = dict(condition=float(np.median(condition)), single_pixel=[int(p) for p in choose_pixels(middle)],
-                             notes=f"smallest angle between two columns of F {between.min():.2f} deg" if between.size else "one band")
+        some = sample if shared else sample[:: max(1, len(sample) // 32)]
+        bias = np.atleast_3d(calibration_bias(some, variance)).reshape(-1, len(merged), len(merged))
+        attrs["response"]["bias"] = [float(v) for v in np.median(np.diagonal(bias, axis1=-2, axis2=-1), axis=0)]
 
 
 def _check_shared(grid, origin, valid, cfa):
@@ -228,7 +231,8 @@ def _report(grid, attrs, data, whites, noise):
                   lenslets=int(data["grid/valid"].sum()), array=list(data["grid/valid"].shape), window=[int(n) for n in data["response/window"]],
                   noise=noise.source, gain_dn_per_e=noise.gain)
     if "response" in attrs:
-        report |= dict(bands_nm=[float(w * 1e9) for w in data["response/wavelength"]], condition=attrs["response"]["condition"], columns=attrs["response"]["notes"])
+        report |= dict(bands_nm=[float(w * 1e9) for w in data["response/wavelength"]], condition=attrs["response"]["condition"], columns=attrs["response"]["notes"],
+                       angles_deg=attrs["response"]["angles"], bias=attrs["response"].get("bias"))
     truth = true_centres(whites[0])
     if truth is not None:
         from scipy.spatial import cKDTree

@@ -101,16 +101,25 @@ class _Worker:
 
     def _radiance(self, path, method):
         """Estimate of one capture, registered to the calibration first."""
-        from plenocli.sensor.superpixel import extract
-        from plenocli.stages.alignment import align, judge, residuals
+        from plenocli.stages.alignment import BELIEVED, doubtful, judge, misfit
 
         signal, noise = _signal(read_exposure(path, cfa=self.calibration.cfa), self.calibration, path)
-        c, signal, stray, record = align(self.calibration, signal, noise, self.settings.register, path)
+        found = self._aligned(signal, noise, method, path)
+        if doubtful(found.residual, found.record):
+            plain = self._aligned(signal, noise, method, path, levels=False)
+            if misfit(found.residual) > BELIEVED * misfit(plain.residual):
+                found = plain
+        return replace(found, warning=judge(found.residual, found.record, path))
+
+    def _aligned(self, signal, noise, method, path, levels=True):
+        from plenocli.sensor.superpixel import extract
+        from plenocli.stages.alignment import align, residuals
+
+        c, signal, stray, record = align(self.calibration, signal, noise, self.settings.register, path, levels)
         values = extract(signal, c.origin, c.window)
         values[~c.valid] = np.nan
         found = estimate(c, values, noise, method, self.prior, ratio=self.settings.reference is not None, stray=stray)
-        residual = residuals(c, values, found.plain, noise, stray)
-        return replace(found, residual=residual, record=record, warning=judge(residual, record, path))
+        return replace(found, residual=residuals(c, values, found.plain, noise, stray), record=record)
 
     def demux(self, capture, target):
         """Demultiplex one capture and write it to `target`; returns its report."""
@@ -210,7 +219,7 @@ def estimate(c, values, noise, method, prior=None, ratio=False, stray=None):
     whole, prior = _with_stray(c, stray, prior, values)
 
     def solve(m, variance=None):
-        return tuple(part[..., :bands] for part in demultiplex((c if m == "single-pixel" else whole).response, values, m, variance=variance, pixels=pixels, prior=prior))
+        return tuple(part[..., :bands] for part in demultiplex((c if m == "single-pixel" else whole).response, values, m, variance=variance, pixels=pixels if m == "single-pixel" else None, prior=prior))
 
     pixels = choose_pixels(c.response) if method in ("auto", "single-pixel") else None
     start, spread = demultiplex(whole.response, values, "pinv")

@@ -159,3 +159,19 @@ def test_band_that_no_pixel_sees_is_not_invented():
     estimate, sigma = spectral.demultiplex(response, np.ones((4, 9)))
     assert np.isnan(estimate).all() and np.isnan(sigma).all()
     assert np.isinf(spectral.condition_number(response))
+
+
+def test_bias_of_a_noisy_calibration_is_the_one_of_repeated_calibrations(system):
+    response = system[0]
+    rng = np.random.default_rng(12)
+    variance = (0.12 * response.max()) ** 2 * rng.uniform(0.3, 1, response.shape)
+    truth = np.array([0.8, 0.2, 0.6, 0.4])
+    noisy = response + rng.normal(size=(60000, *response.shape)) * np.sqrt(variance)
+    found, _ = spectral.demultiplex(noisy, np.broadcast_to(response @ truth, (len(noisy), SIZE)))
+    bias = spectral.calibration_bias(response, variance) @ truth
+    measured = found.mean(axis=0) - truth
+    error = found.std(axis=0) / np.sqrt(len(found))
+    assert (np.abs(bias) > 30 * error).sum() >= 2  # far from nothing
+    np.testing.assert_allclose(measured, bias, atol=0.2 * np.abs(bias).max())  # second order: the next one is 15 % here
+    few = response[[0, 5, 20, 35]]  # as many pixels as bands: no attenuation, amplification is left
+    assert (np.diag(spectral.calibration_bias(few, variance[:4])) > 0).all()

@@ -20,6 +20,7 @@ COMMANDS = (
     "reconstruct",
     "score",
     "report",
+    "show",
     "inspect",
     "lens",
     "schema",

@@ -69,6 +69,22 @@ class Grid(click.ParamType):
         self.fail(f"{value!r} is not a grid; write for example {'|'.join((*self._words, '3x3'))}", param, ctx)
 
 
+class Place(click.ParamType):
+    """A row and a column, counted from 0, such as 5,0."""
+
+    name = "ROW,COLUMN"
+
+    def convert(self, value, param, ctx):
+        """(row, column)."""
+        parts = value.split(",") if isinstance(value, str) else value
+        if len(parts) == 2 and all(str(p).strip().isdigit() and int(p) < 100000 for p in parts):
+            return tuple(int(p) for p in parts)
+        self.fail(f"{value!r} is no row and column; write for example 5,0", param, ctx)
+
+
+PLACE = Place()
+
+
 class Pair(click.ParamType):
     """KEY=VALUE with a length as the key, such as 450nm=capture.h5 or 450nm=0.8."""
 

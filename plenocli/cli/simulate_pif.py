@@ -12,16 +12,6 @@ class _Step(click.ParamType):
         return value if value == "auto" else options.LENGTH.convert(value, param, ctx)
 
 
-class _Index(click.ParamType):
-    name = "ROW,COLUMN"
-
-    def convert(self, value, param, ctx):
-        parts = value.split(",") if isinstance(value, str) else value
-        if len(parts) == 2 and all(str(p).strip().isdigit() and int(p) < 100000 for p in parts):
-            return tuple(int(p) for p in parts)
-        self.fail(f"{value!r} is no lenslet; write for example 5,0", param, ctx)
-
-
 @click.command("simulate-pif", short_help="Compute the system matrix A of a camera by wave optics.")
 @options.input_path("camera")
 @click.option("-o", "--output", type=options.FILE, metavar="OUT", help="File to write, .h5; not needed with --explain.")
@@ -29,7 +19,7 @@ class _Index(click.ParamType):
 @click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
 @options.superpixels("Superpixels whose pixels are kept, odd")
 @options.coherent_ring
-@click.option("--lenslet", type=_Index(), default=None, help="Lenslet of the array, counted from 0, with its pixels where the sensor's raster has them; default the one on the axis.")
+@click.option("--lenslet", type=options.PLACE, default=None, help="Lenslet of the array, counted from 0, with its pixels where the sensor's raster has them; default the one on the axis.")
 @click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Propagation model; auto takes the cheapest that meets the accuracy, a named one is accurate within itself.")
 @click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of the worst column, against the finest model; default: what the sensor's noise lets be seen.")
 @click.option("--scene", type=options.FILE, metavar="SCENE", help="Model only what this scene requires: a scene .toml (depth, spectrum, lenslets, snr), a photograph or a spectral EXR.")

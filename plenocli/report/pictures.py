@@ -89,26 +89,32 @@ def _outline(box):
     return Rectangle((box[2] - 0.5, box[0] - 0.5), box[3] - box[2], box[1] - box[0], fill=False, edgecolor="white", linewidth=1.0)
 
 
-def pif_columns(matrix, pixel_shape, object_shape, offsets, per_side=3):
-    """What the sensor sees of single object points: columns of A laid out on the superpixels, per_side x per_side points.
+def pif_columns(matrix, pixel_shape, object_shape, offsets, per_side=3, points=None):
+    """What the sensor sees of single object points: columns of A laid out on the superpixels, per_side x per_side points
+    or the given `points`, (row, column) each.
 
     matrix (lenslet, pixel, point), offsets (lenslet, 2) superpixel (row, column) from the point's own. The panels stand as
     the points' images do on the lenslet. Square-root scale, because the outer fringes are weak.
     """
-    wanted = [np.unique(np.round(np.linspace(0, n - 1, min(per_side, n))).astype(int)) for n in object_shape]
-    with drawing(7.6, 7.1) as made:
-        panels = made.figure.subplots(len(wanted[0]), len(wanted[1]), squeeze=False)
-        pictures = {(i, j): _on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets) for i in wanted[0] for j in wanted[1]}
-        top = max(picture.max() for picture in pictures.values()) or 1.0
-        for row, i in enumerate(wanted[0]):
-            for col, j in enumerate(wanted[1]):
-                axes, picture = panels[row, col], pictures[i, j]
-                image = axes.imshow(picture, cmap=LIGHT_MAP, norm=_root_norm(top), interpolation="nearest")
-                bare(axes, f"point ({i}, {j}), {picture.sum():.0%} of its light")
-                for line in range(1, picture.shape[0] // pixel_shape[0]):
-                    axes.axhline(line * pixel_shape[0] - 0.5, color=GRID_LINE, linewidth=0.6)
-                for line in range(1, picture.shape[1] // pixel_shape[1]):
-                    axes.axvline(line * pixel_shape[1] - 0.5, color=GRID_LINE, linewidth=0.6)
+    if points is None:
+        rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(per_side, n))).astype(int)) for n in object_shape)
+        points, across = [(i, j) for i in rows for j in columns], len(columns)
+    else:
+        across = min(3, len(points))
+    lines = -(-len(points) // across)
+    with drawing(2.4 * max(across, 2) + 0.6, 2.35 * lines + 0.15) as made:
+        panels = made.figure.subplots(lines, across, squeeze=False)
+        for axes in panels.flat[len(points):]:
+            axes.set_axis_off()
+        pictures = [_on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets) for i, j in points]
+        top = max(picture.max() for picture in pictures) or 1.0
+        for axes, (i, j), picture in zip(panels.flat, points, pictures, strict=False):
+            image = axes.imshow(picture, cmap=LIGHT_MAP, norm=_root_norm(top), interpolation="nearest")
+            bare(axes, f"point ({i}, {j}), {picture.sum():.0%} of its light")
+            for line in range(1, picture.shape[0] // pixel_shape[0]):
+                axes.axhline(line * pixel_shape[0] - 0.5, color=GRID_LINE, linewidth=0.6)
+            for line in range(1, picture.shape[1] // pixel_shape[1]):
+                axes.axvline(line * pixel_shape[1] - 0.5, color=GRID_LINE, linewidth=0.6)
         bar = made.figure.colorbar(image, ax=panels, fraction=0.03, pad=0.01)
         bar.set_label("share of the point's light in a pixel")
         bar.outline.set_linewidth(0.4)

@@ -54,6 +54,8 @@ def _is_number(cell):
 
 def add_pictures(page, document, pictures):
     """Pictures of results beside their truth; entries and pictures go together, pictures may hold None."""
+    from plenocli.report.figures import dictionary_figures
+
     pairs = [(entry, picture) for entry, picture in zip(document["results"], pictures, strict=True) if picture is not None]
     flat = [(e, p) for e, p in pairs if "truth" in p and p["result"].wavelengths is None]
     for shape in dict.fromkeys(p["truth"].shape for _, p in flat):
@@ -61,7 +63,8 @@ def add_pictures(page, document, pictures):
     add_spectra(page, document, [(e, p) for e, p in pairs if p["result"].wavelengths is not None])
     for entry, picture in pairs:
         if picture["result"].kind == "dictionary":
-            add_dictionary(page, entry["label"], picture["result"])
+            for drawn, caption in dictionary_figures(picture["result"], entry["label"]):
+                page.figure(drawn, caption)
 
 
 def add_reconstructions(page, pairs):
@@ -104,17 +107,6 @@ def add_spectra(page, document, pairs):
     for entry, picture in pairs[:4]:
         result = picture["result"]
         page.figure(band_pictures(result.values, result.wavelengths, result.quantity or "value"), f"{entry['label']}: one value a lenslet and band, and the colour they make together.")
-
-
-def add_dictionary(page, label, result, matrix=None, pixel_shape=None):
-    """Atoms of a dictionary, on the sensor too where the matrix is given."""
-    from plenocli.report.pictures import dictionary_atoms
-
-    shape = result.attrs.get("object_shape")
-    side = round(len(result.values) ** 0.5)
-    shape = tuple(int(n) for n in shape) if shape is not None and len(shape) == 2 else (side, side)
-    if shape[0] * shape[1] == len(result.values):
-        page.figure(dictionary_atoms(result.values, shape, matrix, pixel_shape), f"{label}: the first atoms of the dictionary.")
 
 
 def add_inputs(page, document):

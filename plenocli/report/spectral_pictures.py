@@ -83,6 +83,30 @@ def band_pictures(cube, wavelengths, quantity="value", light="D65"):
     return made.png
 
 
+def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
+    """Spectra of single lenslets with one standard deviation: cube and sigma (band, row, column), sigma None where unknown.
+
+    lenslets: (row, column) each; by default those whose brightness is at five even ranks, which shows dark and bright ones.
+    """
+    cube = np.asarray(cube, dtype=np.float64)
+    if lenslets is None:
+        level = cube.mean(axis=0)
+        known = np.argwhere(np.isfinite(level))
+        order = known[np.argsort(level[tuple(known.T)], kind="stable")]
+        lenslets = [tuple(int(n) for n in order[k]) for k in np.unique(np.round(np.linspace(0.02, 0.98, 5) * (len(order) - 1)).astype(int))] if len(order) else []
+    with drawing(6.4, 3.4) as made:
+        axes = made.figure.subplots()
+        for number, (row, col) in enumerate(lenslets):
+            spread = None if sigma is None else np.asarray(sigma)[:, row, col]
+            axes.errorbar(np.asarray(wavelengths) * 1e9, cube[:, row, col], spread, marker="o", markersize=3.5, capsize=2.5, linewidth=1.1,
+                          color=COLOURS[number % len(COLOURS)], label=f"lenslet ({row}, {col})")
+        axes.set(xlabel="wavelength [nm]", ylabel=quantity)
+        axes.grid(True)
+        if lenslets:
+            made.figure.legend(loc="outside right upper")
+    return made.png
+
+
 def patch_spectra(entries, wavelengths_nm, only_six=False):
     """Spectra of the chart's patches: truth as a line, each result as points with +- one standard deviation.
 

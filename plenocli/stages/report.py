@@ -4,7 +4,7 @@ import numpy as np
 
 from plenocli.errors import PlenoError
 from plenocli.report.page import Page
-from plenocli.report.score_page import add_dictionary, add_reconstructions, add_spectra, add_table
+from plenocli.report.score_page import add_reconstructions, add_spectra, add_table
 from plenocli.stages.run_folder import RunFolder
 from plenocli.stages.score_inputs import block_of, read_result, read_truth
 
@@ -125,45 +125,44 @@ def _drawn_results(page, run, file):
 
 def _alone(page, files):
     """Reconstructions that nobody scored, real captures' for instance."""
-    from plenocli.report.pictures import picture
+    from plenocli.report.figures import image_figures
 
     for file in files[:6]:
         result = read_result(file.path)
         if result.wavelengths is None:
-            page.figure(picture(result.values, file.name), f"{file.name}{': ' + result.method if result.method else ''}; no truth to compare with.")
+            _add(page, image_figures(result, file.name))
 
 
 def _capture(page, run, file):
     """One capture with its lenslet grid."""
     from plenocli.artefacts import read_mosaic
-    from plenocli.report.pictures import capture_picture
+    from plenocli.report.figures import capture_figures
 
     try:
         mosaic = read_mosaic(file.path)
     except PlenoError as error:
         page.warning(str(error))
         return
-    centres = pitch = None
+    centres = None
     if file.kind == "capture" and file.path.suffix == ".h5":
         centres = file.artefact().data.get("capture/lenslet_centre")
     calibration = next((u for u in run.users(file) if u.kind == "calibration"), None) or next(
         (run.by_digest(d) for u in run.users(file) for d in u.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "calibration"), None)
     if centres is None and calibration is not None:
         centres = calibration.artefact().data["grid/centre"]
-    shape = mosaic.meta.get("superpixel_shape")
-    if centres is None and shape is not None:
-        pitch = tuple(float(n) for n in np.ravel(shape))
-    words = [file.name, mosaic.meta.get("target"), None if mosaic.cfa == "mono" else f"colour filter array {mosaic.cfa}",
-             None if not mosaic.exposure_s else f"exposure {mosaic.exposure_s * 1e3:g} ms", None if not mosaic.band_m else f"{mosaic.band_m * 1e9:g} nm light"]
-    page.figure(capture_picture(mosaic.values, mosaic.units, centres, pitch, float(np.mean(mosaic.black))), ", ".join(str(w) for w in words if w) + ".")
+    _add(page, capture_figures(mosaic, file.name, centres))
+
+
+def _add(page, figures):
+    for picture, caption in figures:
+        page.figure(picture, caption)
 
 
 def _matrix(page, file):
-    from plenocli.report.pictures import matrix_summary, pif_columns
+    from plenocli.report.figures import matrix_figures
 
     artefact = file.artefact()
     data, attrs = artefact.data, artefact.attrs.get("pif", {})
-    shape = tuple(int(n) for n in data["pif/object_shape"])
     page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.command)
     bands, lenslets, pixels, points = data["pif/A"].shape
     facts = [("bands x superpixels x pixels x object points", f"{bands} x {lenslets} x {pixels} x {points}")]
@@ -171,10 +170,7 @@ def _matrix(page, file):
         ("rank", "numerical rank"), ("condition", "condition number"), ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
         ("coherent_ring", "rings of neighbours added coherently"), ("kappa", "kappa [1/m]"), ("model", "propagation")) if name in attrs]
     page.table(["", ""], [list(fact) for fact in facts], text=True)
-    page.figure(pif_columns(data["pif/A"][0], tuple(int(n) for n in data["pif/pixel_shape"]), shape, data["pif/lenslet_offset"]),
-                "What the sensor sees of single object points, one panel a point, square-root scale. Panels stand as the points' images do on the lenslet.")
-    page.figure(matrix_summary(data.get("pif/singular_values"), data["pif/column_energy"], data["pif/wavelength"], shape, attrs.get("rank")),
-                "Left: how many object patterns the sensor tells apart, and how well. Right: light that stays on the superpixels kept.")
+    _add(page, matrix_figures(artefact))
 
 
 def _text(value):
@@ -185,7 +181,7 @@ def _text(value):
 
 
 def _dictionary(page, run, file):
-    from plenocli.report.pictures import learning_history
+    from plenocli.report.figures import dictionary_figures, learning, own_matrix
 
     artefact = file.artefact()
     page.heading(f"Dictionary {file.name.removesuffix('.h5')}", file.command)
@@ -197,16 +193,8 @@ def _dictionary(page, run, file):
         page.warning(f"This dictionary does not beat LMMSE on held-out pictures ({notes.get('validation_psnr_db', 0):.2f} against "
                      f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead.")
     matrix = next((run.by_digest(d) for d in file.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "pif"), None)
-    system = pixel_shape = None
-    if matrix is not None:
-        pif = matrix.artefact()
-        own = np.flatnonzero((np.asarray(pif.data["pif/lenslet_offset"]) == 0).all(axis=1))
-        system, pixel_shape = pif.data["pif/A"][0, own[0] if own.size else 0], tuple(int(n) for n in pif.data["pif/pixel_shape"])
-        if system.shape[1] != artefact.data["dictionary/atoms"].shape[0]:
-            system = None
-    add_dictionary(page, file.name, read_result(file.path), system, pixel_shape)
-    history = {key.rsplit("/", 1)[1]: values for key, values in artefact.data.items() if key.startswith("dictionary/history/")}
-    page.figure(learning_history(history), "How learning went.")
+    system = None if matrix is None else own_matrix(matrix.artefact())
+    _add(page, dictionary_figures(read_result(file.path), file.name, learning(artefact), system))
 
 
 # --- spectral ----------------------------------------------------------------------------------------------------------
@@ -263,27 +251,17 @@ def _bands_alone(page, files):
 
 
 def _calibration(page, file):
-    from plenocli.report.spectral_pictures import calibration_picture, response_picture
+    from plenocli.report.figures import calibration_figures
 
     artefact = file.artefact()
-    data, attrs = artefact.data, artefact.attrs
+    attrs = artefact.attrs
     page.heading(f"Calibration {file.name.removesuffix('.h5')}", file.command)
     grid, response = attrs.get("grid", {}), attrs.get("response", {})
     rows = [[label, _listed(of[name])] for of, name, label in (
         (grid, "lattice", "lattice"), (grid, "pitch", "pitch, rows and columns [px]"), (grid, "angle", "rotation [deg]"), (grid, "rms", "rms distance from the lattice [px]"),
         (grid, "lenslets", "lenslets"), (response, "condition", "median condition number of F")) if name in of]
     page.table(["", ""], rows, text=True)
-    page.figure(calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual")), "The lenslet grid found on the white image.")
-    if "response/F" not in data:
-        return
-    values, window, wavelengths = data["response/F"], tuple(int(n) for n in data["response/window"]), data["response/wavelength"]
-    if values.ndim == 4:
-        seen = np.argwhere(np.isfinite(values).all(axis=(2, 3)) & data["grid/valid"].astype(bool))
-        if not len(seen):
-            return
-        row, col = seen[np.argmin(((seen - np.array(values.shape[:2]) / 2) ** 2).sum(axis=1))]
-        values = values[row, col]
-    page.figure(response_picture(values, window, wavelengths), f"Response F of the lenslet in the middle [{response.get('units', 'DN')} for unit relative radiance]: pixels that answer to each band.")
+    _add(page, calibration_figures(artefact))
 
 
 def _listed(value):

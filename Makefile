@@ -13,7 +13,7 @@ BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 
-.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr raw tiny clean
+.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr raw tiny tradeoff bench-pif clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,6 +53,13 @@ dslr: $(READY) ## the spectral experiment with a Bayer sensor
 
 raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. DARK=.. CAPTURES="a.nef b.nef"
 	$(PIPELINE) pipelines/raw.mk RUN=$(RUNS)/raw
+
+tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (hours)
+	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff
+
+bench-pif: $(READY) ## the system matrix beside prysm, poppy, hcipy and LightPipes: time and error of each
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python pipelines/benchmarks/pif.py --run $(RUNS)/bench-pif
 
 clean: ## remove results, keep the environment
 	rm -rf $(RUNS)

@@ -8,8 +8,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from plenocli.optics import exact, rays, shaped
-from plenocli.optics.plan import size_band
+from plenocli.optics.plan import distinct, grid_of, is_symmetric, size_band
+from plenocli.optics.psf import psf_nodes
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,12 @@ def _square_only(camera, view):
     return None
 
 
+def is_separable(camera):
+    """Whether the spread function is a single product: a plain square pupil."""
+    lens = camera.main_lens
+    return lens.aperture_shape == "square" and camera.filter_array is None and lens.wavefront is None and not lens.aberrations
+
+
 def _ray_error(camera, view):
     return min(2.0, math.hypot(rays.error_bound(camera, view), _paraxial_error(camera, view)))
 
@@ -48,10 +57,25 @@ def _no_error(camera, view):
 
 
 def _square_cost(camera, view, band, shape, double):
-    fine = view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
-    columns = shape[1] * shape[3]
-    return {"operations": 8.0 * fine * band.terms * columns, "seconds": fine * columns * (3e-9 if double else 1.5e-9) + band.psf_nodes**3 * 8e-9 + 0.05,
-            "bytes": 1 << 27}
+    """Counted from the tables that SquareLenslets fills; the factors are fitted to process times (docs/model.md)."""
+    grid = grid_of(shape[1])
+    terms, even = 1 if is_separable(camera) else band.terms, is_symmetric(camera)
+    real = even and view.blur == 0
+    pairs, lines = distinct(camera, view, shape)[1], view.pixel_shape[0] * band.pixel_nodes
+    fine = lines * view.pixel_shape[1] * band.pixel_nodes
+    item, axes = (16 if double else 8), (1 if real else 2)
+    lit = grid[0] if band.window is None else 2 * band.window + 1
+    few = lit * min(psf_nodes(view, view.lenslet_width / 2), band.lenslet_nodes)
+    half = band.psf_nodes / 2 if even else band.psf_nodes
+    points = (view.object_shape[0] + 1) // 2 if even else view.object_shape[0]
+    carried = points * grid[0] * lines * terms * (few if band.window is not None else few / lit)
+    table = view.object_shape[0] * grid[0] * lines * terms
+    setup = (1.2e-9 * half**3 + 6e-7 * half**2) * (1 if real else 3) + axes * (
+        1.6e-8 * points * few * half + 8e-8 * (2 * lit - 1) * lines * band.lenslet_nodes + 1e-8 * table + 2.5e-11 * (1 if real else 2) * carried * (2 if double else 1))
+    size = int(np.prod(shape[1:]))
+    return {"operations": 8.0 * 1.2 * fine * terms * pairs,
+            "seconds": setup + pairs * (2.5e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9) + 0.005,
+            "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (1 << 25)}
 
 
 def _exact_cost(camera, view, band, shape, double):

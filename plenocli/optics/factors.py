@@ -50,7 +50,10 @@ class Factors:
             right = self._right(self.wide[sx, columns[group[0]]])
             for start in range(0, len(group), step):
                 part = group[start:start + step]
-                left = self.high[sy, rows[part]].view(real).reshape(-1, 2 * terms)
+                chosen = rows[part]
+                if len(chosen) == 1 or (np.diff(chosen) == 1).all():  # neighbours in order lie together: no copy
+                    chosen = slice(chosen[0], chosen[-1] + 1)
+                left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
                 product = np.matmul(left, right, out=work[:len(left)])
                 out[part] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
 

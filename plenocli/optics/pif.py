@@ -154,12 +154,19 @@ class PifBuilder:
             count = stop if turn else rows
             j, i = (a.ravel() for a in np.meshgrid(np.arange(start, stop), np.arange(count), indexing="ij"))
             images = np.empty((len(i), *self.pixel_shape), self.dtype)
-            self._lenslets.superpixel(sy, sx, i, j, images)
+            if turn:
+                # a block of columns of different lengths: what is beyond their ends comes from the others later
+                within = i <= j
+                found = np.empty((int(within.sum()), *self.pixel_shape), self.dtype)
+                self._lenslets.superpixel(sy, sx, i[within], j[within], found)
+                images[within], images[~within] = found, 0
+            else:
+                self._lenslets.superpixel(sy, sx, i, j, images)
             share[:count, start:stop] = images.reshape(stop - start, count, -1).sum(axis=2, dtype=float).T
             planes[:, :, :count, start:stop] = images.reshape(stop - start, count, *self.pixel_shape).transpose(2, 3, 1, 0)
 
-        # a cache line of points at a time; where columns differ in length, fewer
-        step = 4 if turn else 16
+        # a cache line of points at a time; where columns differ in length, fewer, for threads to share
+        step = 8 if turn else 16
         spread([(start, min(start + step, columns)) for start in range(0, columns, step)], work, workers)
         if turn:
             _complete(planes, share, rows)

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from plenocli.optics.lens import at_wavelength
-from plenocli.optics.plan import BandPlan, blur_ring
+from plenocli.optics.plan import BandPlan, blur_ring, distinct
 from plenocli.optics.pupil import aperture_area, filter_cells, unit_radius
 
 SLAB = 1 << 17
@@ -63,7 +63,7 @@ def cost(camera, view, band, shape, double):
     spill = 1 + math.ceil(max(0.0, view.blur / 2 + view.D2 / 2) * abs(view.z3 * view.kappa) / view.superpixel_pitch - 1e-9)
     across = (1 if band.window is None else 2 * band.window + 1) * sum(view.pixel_shape)
     each = view.pixel_shape[0] * view.pixel_shape[1] * cells * 7e-8 * min(spill**2, 4) + across * 4e-8
-    return {"operations": 0.0, "seconds": shape[1] * shape[3] * each + 0.01, "bytes": 8 * SLAB * 8}
+    return {"operations": 0.0, "seconds": distinct(camera, view, shape)[1] * each + 0.01, "bytes": 8 * SLAB * 8}
 
 
 class RayLenslets:
@@ -74,7 +74,7 @@ class RayLenslets:
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
         self.eps, *self._tilt = _affine(lens, geometry)
         self.slope = geometry.z3 * (geometry.kappa * geometry.z2 * self.eps - 1 / geometry.z2)
-        self._below, self._joined = _measure(lens), geometry.pixel_active == geometry.pixel_pitch
+        self._below, self._joined = pupil_measure(lens), geometry.pixel_active == geometry.pixel_pitch
         cells = filter_cells(camera, geometry.wavelength)
         half = lens.aperture_diameter / 2
         self._cells = [((-half, half, -half, half), 1.0)] if cells is None else cells
@@ -176,7 +176,7 @@ def _affine(lens, geometry):
 # the pupil as a measure: its share below and left of a corner
 
 
-def _measure(lens):
+def pupil_measure(lens):
     """A function (y, x) -> share of the open aperture at smaller y and smaller x (m), broadcasting."""
     half = lens.aperture_diameter / 2
     if lens.aperture_shape == "image":

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.optics.plan import distinct, grid_of
 from plenocli.optics.psf import separable_field
 from plenocli.optics.quadrature import gauss, nodes_for, smooth_nodes
 from plenocli.optics.relay import lenslet_kernel, pixel_energy, sensor_nodes
@@ -275,14 +276,14 @@ def cost(camera, view, band, shape, double):
     """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
     seconds (what does not scale with them, one core) and bytes (beyond the result).
 
-    Counted from the node rules; the seconds are estimates, within 0.6 to 1.7 of the process times of isolated and joined circles and hexagons.
+    Counted from the node rules, without the points that symmetry gives.
     """
-    grid = _grid_of(shape[1])
+    grid = grid_of(shape[1])
     cut = chords(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), 1e-7)
     products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
-    points, nodes = shape[3], [n * band.pixel_nodes for n in view.pixel_shape]
-    across, along = nodes[1 - cut.axis], nodes[cut.axis]
-    lanes = min(points, view.object_shape[1 - cut.axis])
+    nodes = [n * band.pixel_nodes for n in view.pixel_shape]
+    points, across, along = distinct(camera, view, shape)[0], nodes[1 - cut.axis], nodes[cut.axis]
+    lanes = min(points, view.object_shape[1 - cut.axis] if points == shape[3] else (view.object_shape[1 - cut.axis] + 1) // 2)
     scan = sum(cut.at.size * len(p[cut.axis]) for p in products)
     chord = sum(sum(x.size for x, _ in cut.pieces) * len(p[1 - cut.axis]) for p in products)
     places = len({place[1 - cut.axis] for place in view.places(grid)}) if band.window is not None else shape[1]
@@ -294,9 +295,3 @@ def cost(camera, view, band, shape, double):
     heights = size_ * view.object_shape[cut.axis] * scan * band.terms * (1 if band.window is not None else shape[1])
     spread = size_ * len(cut.at) * len(products) * band.terms * across
     return {"operations": operations, "seconds": squares + guard + band.psf_nodes**3 * 8e-9 + 0.05, "bytes": int(heights + 2 * spread) + (1 << 27)}
-
-
-def _grid_of(count):
-    """(rows, columns) of so many superpixels: a square block, else one row."""
-    side = math.isqrt(count)
-    return (side, side) if side * side == count else (1, count)

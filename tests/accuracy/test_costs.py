@@ -1,0 +1,53 @@
+"""What costs are counted from: the columns that symmetry leaves, and the separable terms of the spread function."""
+
+import numpy as np
+import pytest
+
+from plenocli.accuracy import plan_pif
+from plenocli.optics.geometry import geometry
+from plenocli.optics.pif import PifBuilder
+from plenocli.optics.plan import distinct, expected_terms
+from plenocli.optics.psf import separable_field
+from tests.optics.cameras import small_camera
+
+CHANGES = {
+    "plain": {},
+    "odd": {"object.samples_per_lenslet": (5, 5)},
+    "oblong": {"object.samples_per_lenslet": (4, 6)},
+    "oblong pixels": {"sensor.pixels_per_lenslet": (8, 6)},
+    "coma": {"main_lens.aberrations": ({"noll": 8, "coefficient": 30e-9},)},
+}
+
+
+def counted(camera, plan):
+    """Columns that a builder asks its maker for: pairs of a superpixel and a point."""
+    builder, asked = PifBuilder(camera, plan.bands[0].wavelength, plan), []
+    original = builder._lenslets.superpixel
+
+    def superpixel(sy, sx, rows, columns, out):
+        asked.append(len(rows))
+        return original(sy, sx, rows, columns, out)
+
+    builder._lenslets.superpixel = superpixel
+    builder.fill(np.empty(plan.shape[1:]))
+    return sum(asked)
+
+
+@pytest.mark.parametrize("superpixels", [(1, 1), (3, 3)])
+@pytest.mark.parametrize("name", CHANGES)
+def test_columns_left_by_symmetry_are_those_computed(name, superpixels):
+    camera = small_camera().replace(**CHANGES[name])
+    plan = plan_pif(camera, model="fresnel", accuracy=1e-2, superpixels=superpixels)
+    assert plan.rung == "fresnel, low rank"
+    _, pairs = distinct(camera, geometry(camera, plan.bands[0].wavelength), plan.shape)
+    # an aberrated pupil may have one mirror left, on which the plan does not count
+    assert pairs == (2 if name == "coma" else 1) * counted(camera, plan)
+
+
+@pytest.mark.parametrize("half_pitches, tolerance", [(1, 1e-2), (1, 1e-5), (3, 1e-3), (3, 1e-7), (7, 1e-4), (7, 1e-8)])
+def test_expected_terms_are_those_found(half_pitches, tolerance):
+    camera = small_camera()
+    view = geometry(camera, camera.light.wavelengths[0])
+    half = half_pitches * view.D2 / 2
+    found = separable_field(camera, view, half, tolerance).terms
+    assert abs(expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance) - found) <= 2 + 0.1 * found

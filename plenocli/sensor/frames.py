@@ -1,6 +1,7 @@
 """Exposures of one scene made into one image: dark removed, exposure divided out, saturation masked, noise measured."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,9 +22,18 @@ class Dark:
     sigma: float | None
     variance: float = 0.0
 
+    @cached_property
+    def flat(self):
+        """Whether the dark image is the black level everywhere."""
+        return bool((self.mean == tiled(self.black, self.mean.shape, self.mean.dtype)).all())
+
+    def grows(self, exposure):
+        """Whether the dark image at another exposure is another one."""
+        return not (self.exposure is None or exposure is None or abs(exposure / self.exposure - 1) < SAME_EXPOSURE)
+
     def at(self, exposure):
         """Expected dark image at another exposure: the part above the black level grows with time."""
-        if self.exposure is None or exposure is None or abs(exposure / self.exposure - 1) < SAME_EXPOSURE:
+        if not self.grows(exposure):
             return self.mean
         level = tiled(self.black, self.mean.shape)
         return level + (self.mean - level) * np.float32(exposure / self.exposure)

@@ -28,8 +28,11 @@ def inside(origin, window, shape):
 def extract(mosaic, origin, window):
     """Pixels (R, C, h*w) of every window, row by row; NaN where a window is not wholly in the mosaic.
 
-    mosaic (rows, columns); origin (R, C, 2) int; window (h, w). Float arrays keep their type, others become float64.
+    mosaic (rows, columns), or a plenocli.sensor.readout.Readout; origin (R, C, 2) int; window (h, w). Float arrays keep their
+    type, others become float64.
     """
+    if hasattr(mosaic, "cut"):
+        return mosaic.cut(origin.reshape(-1, 2), window).reshape(*origin.shape[:-1], -1)
     mosaic = np.asarray(mosaic)
     kind = mosaic.dtype if mosaic.dtype.kind == "f" else float
     good = inside(origin, window, mosaic.shape)

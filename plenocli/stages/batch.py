@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from plenocli.errors import OutputError, PlenoError, UsageError
@@ -51,10 +52,10 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
     return Batch(output, True, jobs, [job for job in jobs if overwrite or not job[1].exists()])
 
 
-def attempt(work, capture, target):
-    """What `work(capture, target)` returns, or the PlenoError that it raises."""
+def attempt(work, *arguments):
+    """What `work(*arguments)` returns, or the PlenoError that it raises."""
     try:
-        return work(capture, target)
+        return work(*arguments)
     except PlenoError as error:
         return error
 
@@ -65,8 +66,36 @@ def one_by_one(batch, work):
         yield capture, attempt(work, capture, target)
 
 
+def outcomes(batch, work, write, workers=1):
+    """(capture, report or PlenoError) of every job to do, as they end.
+
+    work(capture) runs in up to `workers` threads, which share what it holds; write(what it returned, capture, target) runs in
+    this one, so that there is one writer, at once, so that a run that is killed loses no finished result. Not many more
+    results than workers are held. Linear algebra keeps to one thread each.
+    """
+    if workers == 1 or len(batch.todo) < 2:
+        yield from one_by_one(batch, lambda capture, target: write(work(capture), capture, target))
+        return
+    from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+
+    from threadpoolctl import threadpool_limits
+
+    waiting, running = iter(batch.todo), {}
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(min(workers, len(batch.todo))) as pool, bar(None, len(batch.todo), "captures") as progress:
+        try:
+            for _ in range(len(batch.todo)):
+                for job in islice(waiting, workers + 1 - len(running)):
+                    running[pool.submit(work, job[0])] = job
+                ended = next(iter(wait(running, return_when=FIRST_COMPLETED).done))
+                capture, target = running.pop(ended)
+                yield capture, attempt(lambda: write(ended.result(), capture, target))
+                progress.update()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
 def summarise(batch, outcomes):
-    """Summary dict of (capture, report or PlenoError) pairs.
+    """Summary dict of (capture, report or PlenoError) pairs, which may come in any order; its lists follow that of the captures.
 
     A capture that fails does not stop the others: its message is printed at once, and an error with the exit code of the
     worst is raised at the end. The error of a single capture is raised as it is.
@@ -74,14 +103,16 @@ def summarise(batch, outcomes):
     reports, errors = [], []
     for capture, outcome in outcomes:
         if not isinstance(outcome, PlenoError):
-            reports.append(outcome)
+            reports.append((capture, outcome))
         elif not batch.several:
             raise outcome
         else:
             note(f"error: {outcome}")
             errors.append((capture, outcome))
+    order = {capture: number for number, (capture, _) in enumerate(batch.jobs)}
+    reports, errors = (sorted(part, key=lambda pair: order[pair[0]]) for part in (reports, errors))
     if errors:
         worst = max((error for _, error in errors), key=lambda error: error.exit_code)
         raise type(worst)(f"{len(errors)} of {len(batch.jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", batch.output,
                           f"{len(batch.jobs) - len(errors)} are done; see the messages above")
-    return {"output": str(batch.output), "done": len(reports), "skipped": len(batch.jobs) - len(batch.todo), "captures": reports}
+    return {"output": str(batch.output), "done": len(reports), "skipped": len(batch.jobs) - len(batch.todo), "captures": [report for _, report in reports]}

@@ -12,7 +12,8 @@ from plenocli.cli.main import run
 from plenocli.scene.tables import SIX_PATCHES, colorchecker, patch_index
 from plenocli.sensor.noise import SensorModel
 from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import Response, Settings, _prior, estimate, run_demux
+from plenocli.stages.demux import Settings, run_demux
+from plenocli.stages.radiance import Response, estimate, light_prior
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME = 6, 9, 52, 6
@@ -104,7 +105,7 @@ def test_monte_carlo_errors_are_the_predicted_ones_with_everything_estimated(fol
     noise = (0.25, (0.25 * 4) ** 2 + 1 / 12)
     snr = {}
     for method in ("pinv", "wls", "lmmse", "single-pixel"):
-        found = estimate(c, values, noise, method, _prior(c))
+        found = estimate(c, values, noise, method, light_prior(c))
         error = found.value - found.value.mean(axis=(0, 1)) if method in ("single-pixel", "lmmse") else found.value - truth
         measured, predicted = error.var(axis=(0, 1)), (found.sigma**2).mean(axis=(0, 1))
         np.testing.assert_allclose(measured, predicted, rtol=0.05)  # 10 000 draws tell 1.4 % at one sigma
@@ -127,10 +128,10 @@ def test_when_starved_the_prior_pays_and_auto_takes_it():
     truth = np.repeat(PATCHES[:, None], 400, axis=1)
     values = np.rint(0.25 * (rng.poisson(4 * truth * LIGHT @ response.T) + rng.normal(0, 4, (6, 400, 4))))
     c, noise = ideal(response, (6, 400)), (0.25, 13 / 12)
-    error = {m: rmse(estimate(c, values, noise, m, _prior(c)).value / LIGHT, truth).mean() for m in ("pinv", "wls", "lmmse")}
+    error = {m: rmse(estimate(c, values, noise, m, light_prior(c)).value / LIGHT, truth).mean() for m in ("pinv", "wls", "lmmse")}
     assert error["lmmse"] < 0.95 * error["wls"]
     assert error["pinv"] == pytest.approx(error["wls"])  # as many pixels as bands: nothing to weigh
-    found = estimate(c, values, noise, "auto", _prior(c))
+    found = estimate(c, values, noise, "auto", light_prior(c))
     assert found.method == "lmmse" and "wls" in found.why
 
 

@@ -7,8 +7,8 @@ each axis, the lens and the curvature of h separate; the rest is the short sum o
     M = sum over lenslets m, n of X_m (C_mn (x) S_mn) X_n^T,
     X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
 
-Its 1000 or so columns are compressed to the rank of M by a randomised range finder (Halko, Martinsson, Tropp 2011) that
-takes columns of M itself as its sketch; what is left are factor tables as the paraxial rung has them (optics.factors).
+Terms (r, i) that all couplings leave too weak to matter are left out, and M is compressed to its own rank (optics.product):
+what is left are factor tables as the paraxial rung has them (optics.factors).
 """
 
 import math
@@ -16,22 +16,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.errors import NumericsError
 from plenocli.optics.debye import spherical_field
 from plenocli.optics.factors import Factors
 from plenocli.optics.plan import BandPlan, size_band
+from plenocli.optics.product import FILL, Product
 from plenocli.optics.psf import legendre, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
 from plenocli.optics.residual import Residuals, path
 
-MIXERS = 2
-FILL = 0.82
-"""Largest part of a sketch that the terms kept may fill."""
-CUT, CUT_EFFECT = 0.4, 1.3
-"""Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.5 to 1.8)."""
-MAX_SKETCH = 2500
-"""Columns of the largest sketch: beyond it the set-up takes minutes and the model is refused."""
+CUT, CUT_EFFECT = 0.5, 1.3
+"""Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.9 to 1.7)."""
+EDGE = 2.0
+"""Extra weight of points at a lenslet's edge in the cut."""
 
 
 @dataclass(frozen=True)
@@ -91,21 +88,22 @@ class ExactSquareLenslets:
         half = geometry.lenslet_width / 2
         self._x, self._w = half * t, half * w
         self._offsets = self._interval_list()
-        tolerance = band.cut / 3
         extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
         self._extent = extent
         self._residuals = Residuals([o for o, _ in self._offsets.values()], [c for _, c in self._offsets.values()], max(extent), half,
-                                    geometry.z3, geometry.k, None if self._parabolic else geometry.f2, tolerance)
+                                    geometry.z3, geometry.k, None if self._parabolic else geometry.f2, band.cut / 3)
         self._number = {key: i for i, key in enumerate(self._offsets)}
-        self._sheets, self._local = {}, {}
-        self._grams = [self._gram(axis) for axis in (0, 1)]
+        self._local, self._sheets = {}, {}
+        grams = [self._gram(axis) for axis in (0, 1)]
+        self._entering = (grams[0].reshape(len(grams[0]), -1) @ grams[1].reshape(len(grams[1]), -1).T).real
+        self._kept = self._strong_terms()
         self._tables, ranks = {}, []
         for sy, sx in self._pairs():
             self._tables[sy, sx] = self._compressed(sy, sx)
             ranks.append(self._tables[sy, sx].high.shape[3])
-        self._sheets, self._local = {}, {}
+        self._local, self._sheets = {}, {}
         self.notes = {"separable_terms": max(ranks), "field_tail": self._field.tail, "psf_terms": self._field.terms,
-                      "residual_terms": max(m.shape[1] for m in self._residuals._mix)}
+                      "residual_terms": max(len(a) for a in self._residuals.core.values()), "products": max(len(r) for r, _ in self._kept.values())}
 
     # which lenslets light which superpixels
 
@@ -157,7 +155,7 @@ class ExactSquareLenslets:
         would be a larger share of their columns."""
         g = self.geometry
         edge = (g.D2 / 2 - np.abs(self._points(s, axis))) * g.D1 / (g.wavelength * g.z2)
-        return 1 + 0.8 * np.exp(-edge)
+        return 1 + EDGE * np.exp(-edge)
 
     def _points(self, s, axis):
         """Object points (m, on the array) along one axis that are computed for superpixel s; the others mirror them."""
@@ -172,8 +170,31 @@ class ExactSquareLenslets:
         u, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s)
         return u.ravel(), np.sqrt(w.ravel())
 
+    def _strong_terms(self):
+        """{(s, m, axis): (r, i)}: which terms of each X are made; what the others carry together is a quarter of the cut."""
+        intervals = [(s, m, axis) for axis in (0, 1) for s, m in self._offsets if s <= self._reach(axis) and m in self._lenslets(s, axis)]
+        strength = {}
+        for key in intervals:
+            rows = self._local_terms(*key)
+            strength[key] = 0.0
+            for other in intervals:
+                if other[2] != key[2]:
+                    columns = self._local_terms(*other)
+                    s = rows.coefficients(key[2]) @ columns.coefficients(other[2]).T * columns.norms[other[2]]
+                    c = self._residuals.core[self._number[key[:2]], self._number[other[:2]]]
+                    found = np.outer((np.abs(c) ** 2).sum(axis=1), (np.abs(s) ** 2).sum(axis=1) * rows.norms[key[2]] ** 2)
+                    strength[key] = np.maximum(strength[key], found)
+        kept = {}
+        for key, power in strength.items():
+            order = np.argsort(power, axis=None)
+            weak = np.cumsum(power.ravel()[order]) <= (self.band.cut / 4) ** 2 / len(self._lenslets(key[0], key[2]))
+            keep = np.ones(power.size, bool)
+            keep[order[weak]] = False
+            kept[key] = np.nonzero(keep.reshape(power.shape))
+        return kept
+
     def _sheet(self, s, axis):
-        """X of superpixel s along one axis: list of (m, (sensor nodes x points, r, i) array, e in Legendre form)."""
+        """X of superpixel s along one axis: list of (m, (sensor nodes x points, terms) array)."""
         axis = 0 if self._turn else axis
         if (s, axis) in self._sheets:
             return self._sheets[s, axis]
@@ -182,20 +203,21 @@ class ExactSquareLenslets:
         points, x = self._points(s, axis), self._x
         sheets = []
         for m in self._lenslets(s, axis):
-            offset, share = self._offsets[s, m]
-            d = offset + u[:, None] - x
+            d = self._offsets[s, m][0] + u[:, None] - x
             place = m * g.D2 + x
             phase = path(d, g.z3) - path(u, g.z3)[:, None] + place**2 / (2 * g.z2)
             phase = phase - (x * x / (2 * g.f2) if self._parabolic else path(x, g.f2))
             wave = (root[:, None] * self._w / math.sqrt(g.wavelength * g.z3)) * np.exp(1j * k * phase)
-            terms = self._residuals.functions(self._number[s, m], u, x)
-            local = self._local_terms(s, m, axis)
-            values = local.evaluate(place[:, None] - points, axis) * self._emphasis(s, axis)[:, None]
-            flat = values.reshape(len(x), -1).astype(self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype)
-            sheet = np.empty((len(u), len(points), len(terms), values.shape[2]), self.dtype)
-            for r, term in enumerate(terms):
-                sheet[:, :, r] = _times((wave * term).astype(self.dtype), flat).reshape(len(u), len(points), -1)
-            sheets.append((m, sheet.reshape(len(u) * len(points), len(terms), -1), local))
+            values = self._local_terms(s, m, axis).evaluate(place[:, None] - points, axis) * self._emphasis(s, axis)[:, None]
+            values = values.astype(self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype)
+            kept_r, kept_i = self._kept[s, m, axis]
+            sheet = np.empty((len(u), len(points), len(kept_r)), self.dtype)
+            for r, term in enumerate(self._residuals.functions(self._number[s, m], u, x)):
+                some = np.flatnonzero(kept_r == r)
+                if len(some):
+                    flat = values[:, :, kept_i[some]].reshape(len(x), -1)
+                    sheet[:, :, some[0]:some[-1] + 1] = _times((wave * term).astype(self.dtype), flat).reshape(len(u), len(points), -1)
+            sheets.append((m, sheet.reshape(len(u) * len(points), -1)))
         self._sheets[s, axis] = sheets
         return sheets
 
@@ -204,28 +226,30 @@ class ExactSquareLenslets:
         if key not in self._local:
             g, share = self.geometry, self._offsets[s, m][1]
             if self.band.window is None and (not self._turn or self._field.signs is not None):
-                return AllTerms(self._field, self._turn)
-            reach = self._x[-1] + np.abs(g.points(axis)).max()
-            low, high = max(m * g.D2 - reach, -self.band.half), min(m * g.D2 + reach, self.band.half)
-            self._local[key] = LocalTerms(self._field, axis, low, high, self.band.cut / 3 / share)
+                self._local[key] = AllTerms(self._field, self._turn)
+            else:
+                reach = self._x[-1] + np.abs(g.points(axis)).max()
+                low, high = max(m * g.D2 - reach, -self.band.half), min(m * g.D2 + reach, self.band.half)
+                self._local[key] = LocalTerms(self._field, axis, low, high, self.band.cut / 3 / share)
         return self._local[key]
 
     # products of two axes
 
-    def _couplings(self, left, right, sy, sx):
-        """{(a, b): (C, S)} for the sheets a, b of the two axes."""
-        found = {}
-        for a, (m, _, rows) in enumerate(left):
-            for b, (n, _, columns) in enumerate(right):
-                c = self._residuals.core[self._number[sy, m], self._number[sx, n]]
-                s = rows.coefficients(0) @ columns.coefficients(1).T
-                found[a, b] = c.astype(self.dtype), s.astype(self.dtype)
+    def _couplings(self, sy, sx, left, right):
+        """{(a, b): K_ab} for the terms kept on sheets a, b of the two axes."""
+        found, second = {}, 0 if self._turn else 1
+        for a, (m, _) in enumerate(left):
+            for b, (n, _) in enumerate(right):
+                (r, i), (s, j) = self._kept[sy, m, 0], self._kept[sx, n, second]
+                core = self._residuals.core[self._number[sy, m], self._number[sx, n]]
+                terms = self._local_terms(sy, m, 0).coefficients(0) @ self._local_terms(sx, n, second).coefficients(1).T
+                found[a, b] = (core[r[:, None], s] * terms[i[:, None], j]).astype(self.dtype)
         return found
 
     def _compressed(self, sy, sx):
         """Factors of superpixel (sy, sx)."""
         left, right = self._sheet(sy, 0), self._sheet(sx, 1)
-        product = Product(left, right, self._couplings(left, right, sy, sx), self._turn and sy == sx)
+        product = Product([x for _, x in left], [x for _, x in right], self._couplings(sy, sx, left, right), self._turn and sy == sx)
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         high, wide = product.factors(self.band.cut * math.sqrt(count), self._first_guess())
         return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes)
@@ -254,8 +278,7 @@ class ExactSquareLenslets:
 
     def incident(self, rows, columns):
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
-        gy, gx = self._grams
-        return np.einsum("iab,iab->i", gy[rows], gx[columns]).real
+        return self._entering[rows, columns]
 
     def columns(self, rows, columns, out):
         """As Factors.columns."""
@@ -286,6 +309,7 @@ class AllTerms:
 
     def __init__(self, field, turn):
         self._field, self._turn = field, turn
+        self.norms = [field_norms(field, axis) for axis in (0, 1)]
 
     def coefficients(self, axis):
         return np.diag(self._field.signs) if axis and self._turn else np.eye(self._field.terms)
@@ -308,6 +332,7 @@ class LocalTerms:
         tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
         basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
         self._mixing = [basis.conj().T @ v for v in values]
+        self.norms = [np.ones(basis.shape[1])] * 2
         degrees = np.arange(count)
         self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))
 
@@ -328,87 +353,6 @@ def field_norms(field, axis):
     return np.sqrt((np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half)
 
 
-class Product:
-    """M = sum_ab X_a (C_ab (x) S_ab) X_b^T, never formed: its compression to two factors."""
-
-    def __init__(self, left, right, couplings, symmetric):
-        self.left, self.right = [x for _, x, _ in left], [x for _, x, _ in right]
-        self.couplings, self.symmetric = couplings, symmetric
-        self.rng = np.random.default_rng(20130701)
-
-    def _through(self, side, blocks):
-        """The core times blocks (r, i, t) of the other side's columns: list of (r x i, t) for this side's sheets."""
-        out = []
-        mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
-        for a, x in enumerate(mine):
-            total = 0
-            for b, y in enumerate(blocks):
-                c, s = self.couplings[(a, b) if side == 0 else (b, a)]
-                if side:
-                    c, s = c.T, s.T
-                moved = np.matmul(s, y)
-                total = total + (c @ moved.reshape(len(moved), -1)).reshape(len(c), *moved.shape[1:])
-            out.append(total.reshape(-1, total.shape[-1]))
-        return out
-
-    def _sketch(self, side, count):
-        """`count` random combinations of the columns of M (side 0) or of M^T (1), of which each goes into two."""
-        mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
-        mixers = [_mixer(len(other[0]), count, self.rng) for _ in range(MIXERS)]
-        mixed = [sum(mixer(x.reshape(len(x), -1)) for mixer in mixers).reshape(count, *x.shape[1:]).transpose(1, 2, 0) for x in other]
-        return sum(x.reshape(len(x), -1) @ c for x, c in zip(mine, self._through(side, mixed)))
-
-    def _extend(self, side, count, basis, inner):
-        """A basis of the range of M (side 0) or M^T (1) with `count` more columns, and the sheets seen through it, (r, i, basis)."""
-        sheets = self.left if side == 0 else self.right
-        columns = self._sketch(side, count)
-        if basis is not None:
-            for _ in range(2):
-                columns -= basis @ (basis.conj().T @ columns)
-        new = _orthonormal(columns)
-        if basis is not None:
-            # what was numerically nothing is no direction of its own
-            new = _orthonormal(new - basis @ (basis.conj().T @ new))
-        seen = [(new.conj().T @ x.reshape(len(x), -1)).reshape(-1, *x.shape[1:]).transpose(1, 2, 0) for x in sheets]
-        if basis is None:
-            return new, seen
-        return np.hstack([basis, new]), [np.concatenate(pair, axis=2) for pair in zip(inner, seen)]
-
-    def factors(self, cut, count):
-        """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
-
-        NumericsError where no sketch of MAX_SKETCH columns holds M.
-        """
-        limit = min(len(self.left[0]), len(self.right[0]))
-        add, q, p, outer, inner = min(count, limit), None, None, None, None
-        while True:
-            q, outer = self._extend(0, add, q, outer)
-            p, inner = (q, outer) if self.symmetric else self._extend(1, add, p, inner)
-            size = q.shape[1]
-            core = sum(o.reshape(-1, size).T @ c for o, c in zip(outer, self._through(0, inner)))
-            u, s, vh = np.linalg.svd(core)
-            tails = np.sqrt(np.cumsum(s.astype(float)[::-1] ** 2)[::-1])
-            terms = max(1, int(np.count_nonzero(tails > cut)))
-            root = np.sqrt(s[:terms])
-            high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
-            missed = self._missed(high, wide)
-            if size >= limit or (terms <= FILL * size and missed <= 2 * cut):
-                return high, wide
-            if size >= MAX_SKETCH:
-                raise NumericsError(
-                    f"the exact field has more than {terms} separable terms (error {missed / cut:.1g} of what is allowed)",
-                    "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
-            add = min(MAX_SKETCH, limit, max(size // 4, int(terms / FILL) - size + 8) + size) - size
-
-    def _missed(self, high, wide):
-        """Root sum of squares of M - H B^T, estimated on random entries."""
-        rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
-        core = self._through(0, [x[columns].transpose(1, 2, 0) for x in self.right])
-        exact = sum(x[rows].reshape(len(rows), -1) @ c for x, c in zip(self.left, core))
-        difference = exact - high[rows] @ wide[columns].T
-        return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
-
-
 def _times(kernel, values):
     """kernel @ values for a complex kernel and real or complex values of the same precision."""
     if np.iscomplexobj(values):
@@ -416,23 +360,3 @@ def _times(kernel, values):
     out = np.empty((len(kernel), values.shape[1]), kernel.dtype)
     out.real, out.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ values, 2)
     return out
-
-
-def _mixer(n, count, rng):
-    """A function that adds up n rows, in random order and with random signs, into `count` rows."""
-    order, signs = rng.permutation(n), rng.choice([-1, 1], n)
-    starts = np.linspace(0, n, count, endpoint=False).astype(int)
-
-    def mix(rows):
-        chosen = rows[order]
-        chosen *= signs.astype(rows.real.dtype)[:, None]
-        return np.add.reduceat(chosen, starts, axis=0)
-
-    return mix
-
-
-def _orthonormal(columns):
-    """An orthonormal basis of the columns."""
-    from scipy.linalg import qr
-
-    return qr(columns, mode="economic", check_finite=False)[0]

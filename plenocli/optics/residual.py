@@ -42,6 +42,10 @@ def ell(y, x, f, k):
     return np.exp(-1j * k * psi)
 
 
+MAX_GRID = 96
+"""Nodes along u and x that carry the functions P: half of the displacements' span each."""
+
+
 class Residuals:
     """kappa ell for all pairs of `offsets` (m) along the two axes.
 
@@ -52,7 +56,7 @@ class Residuals:
 
     def __init__(self, offsets, weights, reach_u, reach_x, z, k, f, tolerance):
         self.offsets, self.z, self.k, self.f = np.asarray(offsets, float), z, k, f
-        self.reach = reach_u + reach_x
+        self.reach_u, self.reach_x, self.reach = reach_u, reach_x, reach_u + reach_x
         weights = np.asarray(weights, float)
         nodes = _nodes(np.abs(self.offsets).max() + self.reach, self.reach, z, k)
         t, _ = gauss(nodes)
@@ -63,45 +67,45 @@ class Residuals:
         bases = [_left(np.hstack([weights[a] * weights[b] * blocks[a, b] for b in count]), tolerance / 4) for a in count]
         core = {(a, b): bases[a].conj().T @ blocks[a, b] @ bases[b].conj() for a, b in blocks}
         self._series = [_series(t) @ (basis * np.sqrt(nodes)) for basis in bases]
-        self._lens, lens_core = self._lens_terms(reach_x, tolerance)
-        grid_u, _ = gauss(min(nodes, 64))
-        sampled = [self._products(o, reach_u * grid_u, reach_x * grid_u, a).reshape(len(grid_u) ** 2, -1) / len(grid_u)
-                   for a, o in enumerate(self.offsets)]
-        self._mix, into = [], []
-        full = {(a, b): np.kron(lens_core, core[a, b]) for a, b in core}
+        lens, lens_core = self._lens_terms(reach_x, tolerance)
+        self._grid, _ = gauss(min(nodes, MAX_GRID))
+        sampled = [self._products(a, lens) for a in count]
+        full, self._values, into = {(a, b): np.kron(lens_core, core[a, b]) for a, b in core}, [], []
         for a in count:
             u, s, vh = np.linalg.svd(sampled[a], full_matrices=False)
             keep = s > 1e-9 * s[0]
             reduced = (s[:, None] * vh)[keep]
             stack = np.hstack([weights[a] * weights[b] * reduced @ full[a, b] @ _gram_root(sampled[b]) for b in count])
             basis = _left(stack, tolerance)
-            self._mix.append((vh[keep].conj().T / s[keep]) @ basis)
+            # values on the grid of (u, x), whose mean square is 1
+            self._values.append((u[:, keep] @ basis * len(self._grid)).T.reshape(-1, len(self._grid), len(self._grid)))
             into.append(basis.conj().T @ reduced)
         self.core = {(a, b): into[a] @ full[a, b] @ into[b].T for a, b in full}
 
     def _lens_terms(self, reach_x, tolerance):
+        """Functions of the lens on the grid's x, a function of x, and their core."""
         if self.f is None:
-            return None, np.ones((1, 1))
-        x_max = reach_x / self.f
-        nodes = int(20 + 2 * self.k * self.f * x_max**4)
+            return lambda x: np.ones((len(x), 1)), np.ones((1, 1))
+        nodes = int(20 + 2 * self.k * self.f * (reach_x / self.f) ** 4)
         t, _ = gauss(nodes)
         block = ell(reach_x * t[:, None], reach_x * t, self.f, self.k) / nodes
         basis = _left(block, tolerance / 4)
-        return (reach_x, _series(t) @ (basis * np.sqrt(nodes))), basis.conj().T @ block @ basis.conj()
+        series = _series(t) @ (basis * np.sqrt(nodes))
+        return lambda x: legendre(x / reach_x, nodes, 1) @ series, basis.conj().T @ block @ basis.conj()
 
-    def _products(self, offset, u, x, a):
-        """All products of kappa's and the lens's functions of one axis: (len(u), len(x), lens terms x kappa terms)."""
-        d = (u[:, None] - x) / self.reach
-        values = legendre(d.ravel(), len(self._series[a]), 1) @ self._series[a]
-        values = values.reshape(len(u), len(x), 1, -1)
-        if self._lens is not None:
-            reach, series = self._lens
-            values = values * (legendre(x / reach, len(series), 1) @ series)[:, :, None]
-        return values.reshape(len(u), len(x), -1)
+    def _products(self, a, lens):
+        """All products of kappa's and the lens's functions of offset number a on the grid: (u x x, lens terms x kappa terms), over the
+        grid's size."""
+        t = self._grid
+        d = (self.reach_u * t[:, None] - self.reach_x * t) / self.reach
+        values = (legendre(d.ravel(), len(self._series[a]), 1) @ self._series[a]).reshape(len(t), len(t), 1, -1)
+        return (values * lens(self.reach_x * t)[:, :, None]).reshape(len(t) ** 2, -1) / len(t)
 
     def functions(self, a, u, x):
         """P_r of offset number a at sensor positions u and lenslet positions x (m, from their centres): (terms, len(u), len(x))."""
-        return np.ascontiguousarray((self._products(self.offsets[a], u, x, a) @ self._mix[a]).transpose(2, 0, 1))
+        series = _series(self._grid)
+        rows, columns = (legendre(place / reach, len(series), 1) @ series for place, reach in ((u, self.reach_u), (x, self.reach_x)))
+        return rows @ self._values[a] @ columns.T
 
 
 def _nodes(far, reach, z, k):

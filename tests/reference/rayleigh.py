@@ -16,14 +16,15 @@ try:
 except ImportError:
     njit = None
 
+BLOCK = 16
+"""Sensor nodes whose waves are in memory together."""
 
-def panels(low, high, slope, count=None):
-    """Composite Gauss-Legendre nodes and weights for phases of at most `slope` rad/m: at most 36 rad in a panel of 20 nodes."""
-    pieces = max(1, int(np.ceil(slope * (high - low) / 36)))
-    t, w = roots_legendre(count or 20)
-    half = (high - low) / 2 / pieces
-    middle = low + half * (2 * np.arange(pieces) + 1)
-    return (middle[:, None] + half * t).ravel(), np.tile(half * w, pieces)
+
+def nodes(low, high, slope):
+    """Gauss-Legendre nodes and weights for phases of at most `slope` rad/m."""
+    half = (high - low) / 2
+    t, w = roots_legendre(int(np.ceil(slope * half / 2 + 3 * np.cbrt(slope * half) + 10)))
+    return (low + high) / 2 + half * t, half * w
 
 
 def amplitude(name, s2):
@@ -37,10 +38,10 @@ def pupil_directions(camera, density=1.0, wavelength=None):
     k, radius, pitch = 2 * np.pi / (wavelength or camera.light.wavelengths[0]), lens.aperture_diameter / 2, camera.lenslet_array.pitch
     rate = density * k / z * 3 * pitch
     if lens.aperture_shape == "square":
-        p, w = panels(-radius, radius, rate)
+        p, w = nodes(-radius, radius, rate)
         y, x, weight = np.repeat(p, len(p)), np.tile(p, len(p)), np.outer(w, w).ravel()
     else:
-        r, w = panels(radius * lens.obscuration, radius, rate)
+        r, w = nodes(radius * lens.obscuration, radius, rate)
         turns = int(40 + 1.3 * rate * radius)
         phi = 2 * np.pi * (np.arange(turns) + 0.5) / turns
         y, x = np.outer(r, np.sin(phi)).ravel(), np.outer(r, np.cos(phi)).ravel()
@@ -90,8 +91,14 @@ def lens_phase(profile, f, y, x, k):
     return np.exp(-1j * k * (r2 / (2 * f) if profile == "parabolic" else np.sqrt(f * f + r2) - f))
 
 
-def pixel_energies(camera, wavelength, image_point, lenslets, centre, *, rows=None, density=1.0, pixel_nodes=6, f2=None, spheres=False):
-    """Energy in each pixel (of `rows`, default all) of a superpixel at `centre` (m, on the sensor): (rows, columns).
+def pixel_energies(camera, wavelength, image_point, lenslets, centre, **how):
+    """Energy in each pixel of a superpixel at `centre` (m, on the sensor) from one point: (rows, columns). how: as column_energies."""
+    return column_energies(camera, wavelength, [image_point], lenslets, centre, **how)[0]
+
+
+def column_energies(camera, wavelength, image_points, lenslets, centre, *, rows=None, density=1.0, pixel_nodes=6, f2=None, spheres=False):
+    """Energy in each pixel (of `rows`, default all) of a superpixel at `centre` (m, on the sensor) from each of the `image_points`:
+    (points, rows, columns).
 
     lenslets: list of (row, column) whose fields add; density scales the nodes of pupil and lenslet.
     """
@@ -103,64 +110,72 @@ def pixel_energies(camera, wavelength, image_point, lenslets, centre, *, rows=No
         chosen = (np.asarray(rows)[:, None] * pixel_nodes + np.arange(pixel_nodes)).ravel()
         v, wv = v[chosen], wv[chosen]
     directions = pupil_directions(camera, density, wavelength)
-    total = np.zeros((len(v), len(u)), complex)
+    total = np.zeros((len(image_points), len(v), len(u)), complex)
     for row, column in lenslets:
-        far = max(np.abs(v - row * array.pitch).max(), np.abs(u - column * array.pitch).max()) + width / 2
-        slope = density * k * (far / np.hypot(z, far) + camera.main_lens.aperture_diameter / (2 * array.distance) + width / (2 * f2))
-        y, wy = panels(-width / 2, width / 2, slope)
-        x, wx = panels(-width / 2, width / 2, slope)
+        cy, cx = row * array.pitch, column * array.pitch
+        # slopes of the lenslet's phase and of the way to either edge of the superpixel
+        edge, ways = np.linspace(-width / 2, width / 2, 41), []
+        for nodes_there, middle in ((v, cy), (u, cx)):
+            d = edge - np.array([[nodes_there.min()], [nodes_there.max()]]) + middle
+            bend = edge / f2 if array.profile == "parabolic" else edge / np.hypot(edge, f2)
+            ways.append(np.abs(d / np.hypot(d, z) - bend).max())
+        slope = density * k * (1.1 * max(ways) + camera.main_lens.aperture_diameter / (2 * array.distance))
+        (y, wy), (x, wx) = nodes(-width / 2, width / 2, slope), nodes(-width / 2, width / 2, slope)
+        lens = lens_phase(array.profile, f2, y, x, k) * wy[:, None] * wx
         if spheres:
-            field = field_of_spheres(camera, wavelength, image_point, y + row * array.pitch, x + column * array.pitch)
+            fields = [field_of_spheres(camera, wavelength, point, y + cy, x + cx) for point in image_points]
         else:
-            field = field_on_array(camera, wavelength, image_point, y + row * array.pitch, x + column * array.pitch, directions)
-        field = field * lens_phase(array.profile, f2, y, x, k) * wy[:, None] * wx
-        total += rayleigh_sum(field, y + row * array.pitch, x + column * array.pitch, v, u, z, k)
+            fields = [field_on_array(camera, wavelength, point, y + cy, x + cx, directions) for point in image_points]
+        total += rayleigh_sum(np.array(fields) * lens, y + cy, x + cx, v, u, z, k)
     energy = np.abs(total) ** 2 * wv[:, None] * wu
-    return energy.reshape(-1, pixel_nodes, sensor.pixels_per_lenslet[1], pixel_nodes).sum(axis=(1, 3))
+    return energy.reshape(len(image_points), -1, pixel_nodes, sensor.pixels_per_lenslet[1], pixel_nodes).sum(axis=(2, 4))
 
 
-def rayleigh_sum(field, y, x, v, u, z, k):
-    """sum of field(y, x) K(v - y, u - x), exp(j k z) left out: (len(v), len(u))."""
-    if njit is None:
-        return _plain_sum(field, y, x, v, u, z, k)
-    return _fast_sum(np.ascontiguousarray(field.real), np.ascontiguousarray(field.imag), y, x, v, u, z, k) * k / (2j * np.pi)
+def rayleigh_sum(fields, y, x, v, u, z, k):
+    """sum over y, x of each of `fields` (points, y, x) times K(v - y, u - x), exp(j k z) left out: (points, len(v), len(u)).
 
-
-def _plain_sum(field, y, x, v, u, z, k):
-    total = np.zeros((len(v), len(u)), complex)
+    Every node of the lenslet sends its wave to every node of the sensor, a few of those at a time.
+    """
+    count, waves = len(fields), _fast_waves if njit else _waves
+    fields = fields.reshape(count, -1)
+    parts = np.concatenate([fields.real, fields.imag])
+    total = np.zeros((count, len(v), len(u)), complex)
     for i, at in enumerate(v):
-        for j, across in enumerate(u):
-            q = (at - y[:, None]) ** 2 + (across - x) ** 2
-            side = np.sqrt(z * z + q)
-            total[i, j] = (field * (z / side**2 * (1 + 1j / (k * side))) * np.exp(1j * k * q / (side + z))).sum()
+        for start in range(0, len(u), BLOCK):
+            some = slice(start, start + BLOCK)
+            real, imag = (parts @ wave.reshape(len(wave), -1).T for wave in waves((at - y) ** 2, u[some], x, z, k))
+            total[:, i, some] = real[:count] - imag[count:] + 1j * (imag[:count] + real[count:])
     return total * k / (2j * np.pi)
 
 
-def _fast(real, imag, y, x, v, u, z, k):
-    """The same sum in compiled code; sine and cosine from the Taylor series of a quarter of the angle."""
-    out = np.zeros((len(v), len(u)), np.complex128)
-    for i in range(len(v)):
-        for j in range(len(u)):
-            total_r, total_i = 0.0, 0.0
-            for a in range(len(y)):
-                dy2 = (v[i] - y[a]) ** 2
-                for b in range(len(x)):
-                    q = dy2 + (u[j] - x[b]) ** 2
-                    side = np.sqrt(z * z + q)
-                    turns = k / (2 * np.pi) * q / (side + z)
-                    t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
-                    t2 = t * t
-                    s = t * (1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210)))))))
-                    c = 1 - t2 / 2 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182 * (1 - t2 / 240)))))))
-                    s, c = 2 * s * c, 1 - 2 * s * s
-                    s, c = 2 * s * c, 1 - 2 * s * s
-                    size = z / (side * side)
-                    tilt = size / (k * side)
-                    kr, ki = size * c - tilt * s, size * s + tilt * c
-                    total_r += real[a, b] * kr - imag[a, b] * ki
-                    total_i += real[a, b] * ki + imag[a, b] * kr
-            out[i, j] = total_r + 1j * total_i
-    return out
+def _waves(dy2, u, x, z, k):
+    """Real and imaginary part of z/R^2 (1 + j/(k R)) exp(j k (R - z)), R^2 = z^2 + dy2 + (u - x)^2: (len(u), len(dy2), len(x)) each."""
+    q = dy2[:, None] + (u[:, None, None] - x) ** 2
+    side = np.sqrt(z * z + q)
+    wave = z / side**2 * (1 + 1j / (k * side)) * np.exp(1j * k * q / (side + z))
+    return wave.real, wave.imag
 
 
-_fast_sum = njit(fastmath=True, error_model="numpy")(_fast) if njit else None
+def _fast(dy2, u, x, z, k):
+    """The same in compiled code; sine and cosine from the Taylor series of a quarter of the angle."""
+    real, imag = np.empty((len(u), len(dy2), len(x))), np.empty((len(u), len(dy2), len(x)))
+    for i in range(len(u)):
+        for a in range(len(dy2)):
+            for b in range(len(x)):
+                q = dy2[a] + (u[i] - x[b]) ** 2
+                side = np.sqrt(z * z + q)
+                turns = k / (2 * np.pi) * q / (side + z)
+                t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
+                t2 = t * t
+                s = t * (1 - t2 * (1 / 6) * (1 - t2 * (1 / 20) * (1 - t2 * (1 / 42) * (1 - t2 * (1 / 72) * (1 - t2 * (1 / 110) * (1 - t2 * (1 / 156)))))))
+                c = 1 - t2 * (1 / 2) * (1 - t2 * (1 / 12) * (1 - t2 * (1 / 30) * (1 - t2 * (1 / 56) * (1 - t2 * (1 / 90) * (1 - t2 * (1 / 132) * (1 - t2 * (1 / 182)))))))
+                s, c = 2 * s * c, 1 - 2 * s * s
+                s, c = 2 * s * c, 1 - 2 * s * s
+                size = z / (side * side)
+                tilt = size / (k * side)
+                real[i, a, b] = size * c - tilt * s
+                imag[i, a, b] = size * s + tilt * c
+    return real, imag
+
+
+_fast_waves = njit(fastmath=True, error_model="numpy")(_fast) if njit else None

@@ -8,6 +8,7 @@ Reading goes the other way: all bytes once, digest, structure, declared sizes, a
 
 import errno
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -33,6 +34,7 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
 _CHUNK_BYTES = 1 << 20
 _READ_BYTES = 1 << 22
+_NUMBER = itertools.count()
 _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 
@@ -295,7 +297,8 @@ def _open_image(image):
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fapl_core(max(len(image), 1), False)
     access.set_file_image(image)
-    return h5py.h5f.open(b"artefact", h5py.h5f.ACC_RDONLY, access)
+    # HDF5 takes two images of one name, open at once in two threads, for one file and answers with the first
+    return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
 def _parse(path, file, kind, limit):

@@ -317,3 +317,16 @@ def test_no_damage_is_ever_read_as_data(tmp_path, make):
             read_artefact(tmp_path / "x.h5")
         refused += 1
     assert refused > 300
+
+
+def test_threads_that_read_at_the_same_time_get_their_own_files(tmp_path):
+    """HDF5 takes two images of one name for one file."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    for number in range(8):
+        artefact = spectra()
+        artefact.data["spectra/value"] = artefact.data["spectra/value"] * 0 + number
+        write_artefact(tmp_path / f"{number}.h5", artefact)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda number: read_artefact(tmp_path / f"{number % 8}.h5").data["spectra/value"].ravel()[0], range(160)))
+    assert found == [number % 8 for number in range(160)]

@@ -1,118 +1,164 @@
-"""Active-set Newton method for one l1 problem in Gram form; compiled by numba where it is installed, else plain numpy.
+"""Active-set Newton method for l1 problems in Gram form, compiled by numba: one Cholesky factor a signal, updated, never rebuilt.
 
-Imported late (by plenocli.solvers.l1), because importing numba takes a second. The same statements run either way; only the
-Cholesky factor and what goes with it have two spellings, loops for the compiler and whole arrays for numpy.
+Imported late (by plenocli.solvers.l1), because importing numba takes a second; without numba plenocli.solvers.l1_plain does
+the work. The problem of one signal is min c^T G c - 2 b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
+
+Three nested sets of atoms keep the cost down: all (q from whole rows of G, a few times a signal), a working set of those
+with the largest |q| / threshold (its block of G is copied close together), and the active ones, where the factor lives. The
+first passes use a raised threshold, which finds most of the support while the active set is small. Loops run over slices
+that start at 0: a variable offset in an index keeps the compiler from vectorising.
 """
 
-import os
+from collections import namedtuple
 
+import numba
 import numpy as np
-
-try:
-    import numba
-except ImportError:
-    numba = None
-else:  # the one threading layer that ships with numba itself and does not share an OpenMP runtime with the BLAS
-    if "NUMBA_THREADING_LAYER" not in os.environ:
-        numba.config.THREADING_LAYER = "workqueue"
 
 JITTER = 1e-12
 """Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms cannot break the factor. They
 move far along the flat direction, and the line search stops them where one of them reaches zero and leaves."""
 
-if numba is None:
-    COMPILED = False
-    prange = range
+WORKING_SET = 192
+"""Least size of the working set; it is at least twice the active set."""
 
-    def _jit(function):
-        return function
+LOWERING = 0.03
+"""The threshold starts at this fraction of the largest |b|, and falls by as much from pass to pass until it is the true one."""
 
-    def _parallel(function):
-        return function
-else:
-    COMPILED = True
-    prange = numba.prange
-    _jit = numba.njit(cache=True, fastmath={"reassoc", "contract"})
-    _parallel = numba.njit(cache=True, fastmath={"reassoc", "contract"}, parallel=True)
+_FLAGS = {"reassoc", "contract", "nsz"}
+_jit = numba.njit(cache=True, fastmath=_FLAGS)
+
+Work = namedtuple("Work", "factor block x sign h d v crossing local active")
+"""Scratch of one thread, `capacity` long or square. factor: upper triangular, factor^T factor = G over the active atoms in the
+order of `local` (their places in the working set).  block: G over the working set.  h = q - threshold sign, over active atoms."""
 
 
-def _factor_by_rows(matrix):
-    """Lower Cholesky factor in place of matrix + JITTER diag (row-wise, dot products)."""
-    n = matrix.shape[0]
+@_jit
+def _workspace(capacity):
+    return Work(np.empty((capacity, capacity)), np.empty((capacity, capacity)), np.empty(capacity), np.empty(capacity), np.empty(capacity),
+                np.empty(capacity), np.empty(capacity), np.empty(capacity), np.empty(capacity, np.int64), np.empty(capacity, np.bool_))
+
+
+@_jit
+def _copy(values, n, target):
     for i in range(n):
-        row = matrix[i]
-        diagonal = row[i] * (1.0 + JITTER)
-        for j in range(i):
-            other = matrix[j]
-            total = row[j]
-            for k in range(j):
-                total -= row[k] * other[k]
-            row[j] = total / other[j]
-        total = diagonal
-        for k in range(i):
-            total -= row[k] * row[k]
-        row[i] = np.sqrt(max(total, 0.5 * JITTER * diagonal))
-    return matrix
+        target[i] = values[i]
 
 
-def _factor_by_columns(matrix):
-    """The same factor, one matrix-vector product a column."""
-    for j in range(matrix.shape[0]):
-        diagonal = matrix[j, j] * (1.0 + JITTER)
-        column = matrix[j:, j] - matrix[j:, :j] @ matrix[j, :j]
-        pivot = np.sqrt(max(column[0] + JITTER * matrix[j, j], 0.5 * JITTER * diagonal))
-        matrix[j:, j] = column / pivot
-        matrix[j, j] = pivot
-    return matrix
+@_jit
+def _spread(values, index, target):
+    """target[index] = values, zero elsewhere."""
+    for i in range(target.shape[0]):
+        target[i] = 0.0
+    for i in range(index.shape[0]):
+        target[index[i]] = values[i]
 
 
-def _solve_by_loops(factor, h):
-    """d with L L^T d = h."""
-    n = h.shape[0]
-    d = np.empty(n)
-    for i in range(n):
-        row = factor[i]
-        total = h[i]
-        for k in range(i):
-            total -= row[k] * d[k]
-        d[i] = total / row[i]
-    for i in range(n - 1, -1, -1):
-        row = factor[i]
-        value = d[i] / row[i]
-        d[i] = value
-        for k in range(i):
-            d[k] -= value * row[k]
-    return d
+@_jit
+def _forward(factor, n, d):
+    """d <- factor^-T d, four rows at a time."""
+    k = 0
+    while k + 4 <= n:
+        a0 = d[k] / factor[k, k]
+        a1 = (d[k + 1] - a0 * factor[k, k + 1]) / factor[k + 1, k + 1]
+        a2 = (d[k + 2] - a0 * factor[k, k + 2] - a1 * factor[k + 1, k + 2]) / factor[k + 2, k + 2]
+        a3 = (d[k + 3] - a0 * factor[k, k + 3] - a1 * factor[k + 1, k + 3] - a2 * factor[k + 2, k + 3]) / factor[k + 3, k + 3]
+        d[k], d[k + 1], d[k + 2], d[k + 3] = a0, a1, a2, a3
+        rest = d[k + 4 : n]
+        r0, r1, r2, r3 = factor[k, k + 4 : n], factor[k + 1, k + 4 : n], factor[k + 2, k + 4 : n], factor[k + 3, k + 4 : n]
+        for i in range(n - k - 4):
+            rest[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
+        k += 4
+    while k < n:
+        d[k] /= factor[k, k]
+        for i in range(k + 1, n):
+            d[i] -= d[k] * factor[k, i]
+        k += 1
 
 
-def _solve_by_lapack(factor, h):
-    """The same solution."""
-    from scipy.linalg import solve_triangular
+@_jit
+def _backward(factor, n, d):
+    """d <- factor^-1 d, four rows at a time."""
+    k = n
+    while k >= 4:
+        k -= 4
+        rest = d[k + 4 : n]
+        r0, r1, r2, r3 = factor[k, k + 4 : n], factor[k + 1, k + 4 : n], factor[k + 2, k + 4 : n], factor[k + 3, k + 4 : n]
+        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+        for i in range(n - k - 4):
+            value = rest[i]
+            t0 += r0[i] * value
+            t1 += r1[i] * value
+            t2 += r2[i] * value
+            t3 += r3[i] * value
+        d[k + 3] = (d[k + 3] - t3) / factor[k + 3, k + 3]
+        d[k + 2] = (d[k + 2] - t2 - factor[k + 2, k + 3] * d[k + 3]) / factor[k + 2, k + 2]
+        d[k + 1] = (d[k + 1] - t1 - factor[k + 1, k + 2] * d[k + 2] - factor[k + 1, k + 3] * d[k + 3]) / factor[k + 1, k + 1]
+        d[k] = (d[k] - t0 - factor[k, k + 1] * d[k + 1] - factor[k, k + 2] * d[k + 2] - factor[k, k + 3] * d[k + 3]) / factor[k, k]
+    for back in range(k):
+        r = k - 1 - back
+        total = 0.0
+        for i in range(r + 1, n):
+            total += factor[r, i] * d[i]
+        d[r] = (d[r] - total) / factor[r, r]
 
-    half = solve_triangular(factor, h, lower=True, check_finite=False)
-    return solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
+
+@_jit
+def _append(factor, n, column, diagonal):
+    """One more atom at the end: `column` (overwritten) is G between it and the n others, `diagonal` its own entry."""
+    _forward(factor, n, column)
+    total = diagonal * (1.0 + JITTER)
+    for k in range(n):
+        factor[k, n] = column[k]
+        total -= column[k] * column[k]
+    factor[n, n] = np.sqrt(max(total, 0.5 * JITTER * diagonal))
 
 
-def _gather_by_loops(gram, index):
-    """gram[index][:, index]."""
-    n = index.shape[0]
-    block = np.empty((n, n))
-    for i in range(n):
-        row = gram[index[i]]
-        for j in range(n):
-            block[i, j] = row[index[j]]
-    return block
+@_jit
+def _remove(factor, n, place, v):
+    """Atom `place` of n out: its column goes, and rotations work its row into those below (an update, so always stable)."""
+    below = n - 1 - place
+    for i in range(place):
+        row = factor[i, place:n]
+        for j in range(below):
+            row[j] = row[j + 1]
+    last = factor[place, place + 1 : n]
+    for j in range(below):
+        v[j] = last[j]
+    for k in range(below):
+        row, target, rest = factor[place + 1 + k, place + 1 + k : n], factor[place + k, place + k : n], v[k:below]
+        length = np.sqrt(row[0] * row[0] + rest[0] * rest[0])
+        cosine, sine = row[0] / length, rest[0] / length
+        target[0] = length
+        for j in range(1, below - k):
+            a, b = row[j], rest[j]
+            target[j] = cosine * a + sine * b
+            rest[j] = cosine * b - sine * a
 
 
-def _gather_by_index(gram, index):
-    """The same block."""
-    return gram[np.ix_(index, index)]
+@_jit
+def _drop(w, n, place):
+    """Forget active atom `place` of n."""
+    w.active[w.local[place]] = False
+    _remove(w.factor, n, place, w.v)
+    for k in range(place, n - 1):
+        w.local[k], w.x[k], w.sign[k], w.h[k], w.d[k] = w.local[k + 1], w.x[k + 1], w.sign[k + 1], w.h[k + 1], w.d[k + 1]
 
 
-if COMPILED:
-    _factor, _solve_factored, _gather = _jit(_factor_by_rows), _jit(_solve_by_loops), _jit(_gather_by_loops)
-else:
-    _factor, _solve_factored, _gather = _factor_by_columns, _solve_by_lapack, _gather_by_index
+@_jit
+def _subtract(q, x, n, gram, place):
+    """q -= sum_k x_k gram[place_k], four rows at a time."""
+    k = 0
+    while k + 4 <= n:
+        x0, x1, x2, x3 = x[k], x[k + 1], x[k + 2], x[k + 3]
+        r0, r1, r2, r3 = gram[place[k]], gram[place[k + 1]], gram[place[k + 2]], gram[place[k + 3]]
+        for j in range(q.shape[0]):
+            q[j] -= x0 * r0[j] + x1 * r1[j] + x2 * r2[j] + x3 * r3[j]
+        k += 4
+    while k < n:
+        row = gram[place[k]]
+        for j in range(q.shape[0]):
+            q[j] -= x[k] * row[j]
+        k += 1
 
 
 @_jit
@@ -141,113 +187,232 @@ def relative_gap(b, q, x, index, signal_energy, threshold):
 
 
 @_jit
-def _step_length(x, d, h, threshold):
+def _step_length(w, n, threshold):
     """(alpha, zero): the minimum of the piecewise quadratic along x + alpha d, 0 < alpha <= 1; `zero` is the value that
     lands on 0 there, or -1.  h = G d, so that the slope at alpha with the first signs is 2 (alpha - 1) d^T h."""
-    curvature = np.dot(d, h)
-    crossing = np.full(x.shape[0], np.inf)
-    for i in range(x.shape[0]):
-        if x[i] * d[i] < 0.0:
-            crossing[i] = -x[i] / d[i]
-    order = np.argsort(crossing)
+    curvature, left = 0.0, 0
+    for i in range(n):
+        curvature += w.d[i] * w.h[i]
+        w.crossing[i] = np.inf
+        if w.x[i] * w.d[i] < 0.0 and abs(w.x[i]) < abs(w.d[i]):
+            w.crossing[i] = -w.x[i] / w.d[i]
+            left += 1
     jumps = 0.0
-    for k in range(order.shape[0]):
-        i = order[k]
-        if crossing[i] >= 1.0:
+    while left > 0:
+        i = np.argmin(w.crossing[:n])
+        alpha = w.crossing[i]
+        if (alpha - 1.0) * curvature + jumps >= 0.0:
             break
-        if (crossing[i] - 1.0) * curvature + jumps >= 0.0:
-            break
-        jumps += 2.0 * threshold[i] * abs(d[i])
-        if (crossing[i] - 1.0) * curvature + jumps >= 0.0:
-            return crossing[i], i
+        jumps += 2.0 * threshold[w.local[i]] * abs(w.d[i])
+        if (alpha - 1.0) * curvature + jumps >= 0.0:
+            return alpha, i
+        w.crossing[i] = np.inf
+        left -= 1
     if curvature <= 0.0:
         return 1.0, -1
     return min(max(1.0 - jumps / curvature, 0.0), 1.0), -1
 
 
 @_jit
-def _settle(gram, b, threshold, index, x, sign, inner_limit):
-    """Minimise over the atoms `index` from x: Newton steps, exact line search, atoms at zero leave. Returns (index, x, sign)."""
-    for _ in range(inner_limit):
-        n = index.shape[0]
+def _settle(w, n, threshold, limit):
+    """Minimise over the n active atoms: Newton steps, exact line search, atoms at zero leave. Returns how many are left."""
+    for _ in range(limit):
         if n == 0:
             break
-        block = _gather(gram, index)
-        h = b[index] - threshold[index] * sign - np.dot(block, x)
-        d = _solve_factored(_factor(block), h)
-        keep = np.ones(n, np.bool_)
-        rejected = False
+        _copy(w.h, n, w.d)
+        _forward(w.factor, n, w.d)
+        _backward(w.factor, n, w.d)
+        before = n
+        for k in range(before):  # new atoms that would move against their sign
+            i = before - 1 - k
+            if w.x[i] == 0.0 and w.d[i] * w.sign[i] <= 0.0:
+                _drop(w, n, i)
+                n -= 1
+        if n < before:
+            continue
+        alpha, zero = _step_length(w, n, threshold)
+        settled = alpha == 1.0
         for i in range(n):
-            if x[i] == 0.0 and d[i] * sign[i] <= 0.0:
-                keep[i] = False
-                rejected = True
-        if not rejected:
-            alpha, zero = _step_length(x, d, h, threshold[index])
-            x = x + alpha * d
-            if zero >= 0:
-                x[zero] = 0.0
-            settled = alpha == 1.0
-            for i in range(n):
-                if x[i] == 0.0:
-                    keep[i] = False
-                else:
-                    new = 1.0 if x[i] > 0.0 else -1.0
-                    if new != sign[i]:
-                        settled = False
-                    sign[i] = new
-            index, x, sign = index[keep], x[keep], sign[keep]
-            if settled:
-                break
-        else:
-            index, x, sign = index[keep], x[keep], sign[keep]
-    return index, x, sign
+            w.x[i] += alpha * w.d[i]
+            w.h[i] *= 1.0 - alpha
+        if zero >= 0:
+            w.x[zero] = 0.0
+        for k in range(before):
+            i = before - 1 - k
+            if w.x[i] == 0.0:
+                _drop(w, n, i)
+                n -= 1
+            elif w.x[i] * w.sign[i] < 0.0:
+                w.sign[i] = -w.sign[i]
+                w.h[i] -= 2.0 * threshold[w.local[i]] * w.sign[i]
+                settled = False
+        if settled:
+            break
+    return n
 
 
 @_jit
-def _newcomers(q, threshold, active, most):
-    """Up to `most` atoms outside `active` whose |q| exceeds the threshold most."""
+def _enter(w, n, q, threshold, newcomers):
+    """Atoms `newcomers` of the working set become active at zero. Returns how many are."""
+    for i in range(n):
+        w.h[i] = q[w.local[i]] - threshold[w.local[i]] * w.sign[i]
+    for j in newcomers:
+        for i in range(n):
+            w.v[i] = w.block[j, w.local[i]]
+        _append(w.factor, n, w.v, w.block[j, j])
+        w.local[n], w.active[j], w.x[n], w.sign[n] = j, True, 0.0, np.sign(q[j])
+        w.h[n] = q[j] - threshold[j] * w.sign[n]
+        n += 1
+    return n
+
+
+@_jit
+def _kth_largest(values, k):
+    """The k-th largest of `values` (k from 1), by quickselect on a copy. (np.partition would take the compiler ten seconds.)"""
+    a = values.copy()
+    low, high, wanted = 0, a.shape[0] - 1, k - 1
+    while low < high:
+        pivot = a[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while a[i] > pivot:
+                i += 1
+            while a[j] < pivot:
+                j -= 1
+            if i <= j:
+                a[i], a[j] = a[j], a[i]
+                i += 1
+                j -= 1
+        if wanted <= j:
+            high = j
+        elif wanted >= i:
+            low = i
+        else:
+            break
+    return a[wanted]
+
+
+@_jit
+def _newcomers(w, size, q, threshold, most, tol):
+    """Up to `most` atoms outside the active set whose |q| exceeds the threshold most."""
     ratio = np.abs(q) / threshold
-    for i in range(active.shape[0]):
-        ratio[active[i]] = 0.0
-    candidate = np.flatnonzero(ratio > 1.0 + 1e-12)
+    for j in range(size):
+        if w.active[j]:
+            ratio[j] = 0.0
+    candidate = np.flatnonzero(ratio > 1.0 + tol)
     if candidate.shape[0] > most:
         value = ratio[candidate]
-        cut = np.partition(value, value.shape[0] - most)[value.shape[0] - most]
-        candidate = candidate[value >= cut]
+        candidate = candidate[value >= _kth_largest(value, most)]
     return candidate
 
 
 @_jit
-def solve_signal(gram, b, signal_energy, threshold, tol, outer_limit):
-    """(c, objective, relative gap, passes) for one signal: min |y - Dc|^2 + sum_j 2 threshold_j |c_j|."""
-    index = np.empty(0, np.int64)
-    x = np.empty(0)
-    sign = np.empty(0)
+def _solve_working_set(w, n, b, q, threshold, tol):
+    """Solve the problem of the working set (slices of b, q, threshold) from the n active atoms. Returns how many there are."""
+    size = b.shape[0]
+    for rounds in range(200):
+        new = _newcomers(w, size, q, threshold, max(10, n // 10), tol)
+        if rounds > 0 and new.shape[0] == 0:
+            break
+        n = _enter(w, n, q, threshold, new)
+        n = _settle(w, n, threshold, 1000)
+        _copy(b, size, q)
+        _subtract(q, w.x, n, w.block, w.local)
+    return n
+
+
+@_jit
+def _choose_working_set(ratio, size):
+    """Exactly `size` indices of the largest ratios, rising."""
+    if size >= ratio.shape[0]:
+        return np.arange(ratio.shape[0])
+    cut = _kth_largest(ratio, size)
+    spare = size - np.count_nonzero(ratio > cut)
+    chosen = np.empty(size, np.int64)
+    n = 0
+    for j in range(ratio.shape[0]):
+        if ratio[j] > cut or (ratio[j] == cut and spare > 0):
+            if ratio[j] == cut:
+                spare -= 1
+            chosen[n] = j
+            n += 1
+    return chosen
+
+
+@_jit
+def _load(w, gram, working, index):
+    """Copy G over the working set, and find the active atoms `index` in it."""
+    for i in range(working.shape[0]):
+        row, target = gram[working[i]], w.block[i]
+        for j in range(working.shape[0]):
+            target[j] = row[working[j]]
+        w.active[i] = False
+    for k in range(index.shape[0]):
+        low, high = 0, working.shape[0] - 1
+        while low < high:
+            middle = (low + high) // 2
+            if working[middle] < index[k]:
+                low = middle + 1
+            else:
+                high = middle
+        w.local[k], w.active[low] = low, True
+
+
+@_jit
+def _resume(w, gram, index, value):
+    """Factor and values of the active set `index` from its coefficients."""
+    for n in range(index.shape[0]):
+        for i in range(n):
+            w.v[i] = gram[index[n], index[i]]
+        _append(w.factor, n, w.v, gram[index[n], index[n]])
+        w.x[n], w.sign[n] = value[n], np.sign(value[n])
+
+
+@_jit
+def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
+    """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,), which are overwritten.
+
+    Not finished: the workspace is too small for the active set; call again with a larger one.
+    """
+    index = np.flatnonzero(c)
+    capacity, passes, stalled, raised = w.x.shape[0], 0, 0, 1.0
+    if min(c.shape[0], 2 * index.shape[0]) > capacity:
+        return False, 0.0, 1.0, 0
+    _resume(w, gram, index, c[index])
     q = b.copy()
-    objective, gap = relative_gap(b, q, x, index, signal_energy, threshold)
-    passes = 0
-    stalled = 0
-    while gap > tol and passes < outer_limit and stalled < 3:
-        new = _newcomers(q, threshold, index, max(30, index.shape[0] // 2))
+    _subtract(q, w.x, index.shape[0], gram, index)
+    objective, gap = relative_gap(b, q, w.x, index, signal_energy, threshold)
+    if index.shape[0] == 0:
+        raised = max(1.0, LOWERING * np.max(np.abs(q) / threshold))
+    while gap > tol and passes < pass_limit and stalled < 3:
         passes += 1
-        index = np.concatenate((index, new))
-        x = np.concatenate((x, np.zeros(new.shape[0])))
-        sign = np.concatenate((sign, np.sign(q[new])))
-        index, x, sign = _settle(gram, b, threshold, index, x, sign, 1000)
-        q = b.copy()
-        for i in range(index.shape[0]):
-            q -= x[i] * gram[index[i]]
-        before = objective
-        objective, gap = relative_gap(b, q, x, index, signal_energy, threshold)
-        stalled = stalled + 1 if objective > before * (1.0 - 1e-9) else 0
-    c = np.zeros(b.shape[0])
-    for i in range(index.shape[0]):
-        c[index[i]] = x[i]
-    return c, objective, gap, passes
+        size = min(c.shape[0], max(WORKING_SET, 2 * index.shape[0]))
+        if size > capacity:
+            return False, objective, gap, passes
+        ratio = np.abs(q) / threshold
+        ratio[index] = np.inf
+        working = _choose_working_set(ratio, size)
+        _load(w, gram, working, index)
+        n = _solve_working_set(w, index.shape[0], b[working], q[working], raised * threshold[working], 0.25 * tol)
+        index = working[w.local[:n]]
+        _spread(w.x, index, c)
+        _copy(b, q.shape[0], q)
+        _subtract(q, w.x, n, gram, index)
+        if raised == 1.0:
+            before = objective
+            objective, gap = relative_gap(b, q, w.x, index, signal_energy, threshold)
+            stalled = stalled + 1 if objective > before * (1.0 - 1e-9) else 0
+        raised = max(1.0, raised * LOWERING)
+    return True, objective, gap, passes
 
 
-@_parallel
-def solve_signals(gram, b, signal_energy, threshold, tol, outer_limit, c, objective, gap, passes):
-    """solve_signal for every row of b (signal, atom), into c (signal, atom), objective, gap and passes (signal,)."""
-    for i in prange(b.shape[0]):
-        c[i], objective[i], gap[i], passes[i] = solve_signal(gram, b[i], signal_energy[i], threshold, tol, outer_limit)
+@numba.njit(cache=True, fastmath=_FLAGS, nogil=True)
+def solve_signals(gram, b, signal_energy, threshold, tol, pass_limit, c, objective, gap, passes):
+    """solve_signal for every row of b and c (signal, atom), into c, objective, gap and passes (signal,); one thread, no lock held."""
+    w = _workspace(min(c.shape[1], WORKING_SET))
+    for i in range(b.shape[0]):
+        while True:
+            finished, objective[i], gap[i], passes[i] = solve_signal(gram, b[i], signal_energy[i], threshold, tol, pass_limit, c[i], w)
+            if finished:
+                break
+            w = _workspace(min(c.shape[1], 2 * w.x.shape[0]))

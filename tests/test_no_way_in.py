@@ -1,0 +1,64 @@
+"""Nothing that a file says is run, followed or drawn as markup."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import Artefact, Provenance, read_pif, write_artefact
+from plenocli.errors import InputError
+from plenocli.stages.report import run_report
+
+PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"
+FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal", "yaml", "joblib", "jsonpickle", "xmlrpc"}
+FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "builtins.eval", "np.fromstring"}
+FORBIDDEN_KEYWORDS = {"shell", "allow_pickle"}
+
+
+def offences(text):
+    """What in Python source `text` could run what a file says: (line, what)."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        found += [(node.lineno, n) for n in names if n.split(".")[0] in FORBIDDEN_MODULES]
+        if isinstance(node, ast.Call):
+            if ast.unparse(node.func) in FORBIDDEN_CALLS:
+                found.append((node.lineno, ast.unparse(node.func)))
+            found += [(node.lineno, k.arg) for k in node.keywords if k.arg in FORBIDDEN_KEYWORDS and not (isinstance(k.value, ast.Constant) and k.value.value is False)]
+    return found
+
+
+@pytest.mark.parametrize("text, count", [("import pickle", 1), ("from yaml import load", 1), ("eval(x)", 1), ("np.load(f, allow_pickle=True)", 1), ("np.load(f, allow_pickle=False)", 0),
+                                         ("subprocess.run(c, shell=True)", 1), ("import json\njson.loads(x)", 0), ("model.evaluate(x)", 0)])
+def test_the_check_finds_what_it_looks_for(text, count):
+    assert len(offences(text)) == count
+
+
+def test_no_module_runs_what_a_file_says():
+    files = sorted(PACKAGE.rglob("*.py"))
+    assert len(files) > 100
+    assert {str(f.relative_to(PACKAGE)): offences(f.read_text()) for f in files if offences(f.read_text())} == {}
+
+
+@pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "a/b.h5", "", "x\0.h5", 3])
+def test_names_inside_a_file_never_become_paths(tmp_path, name):
+    (tmp_path / "secret.h5").write_bytes(b"x")
+    folder = tmp_path / "here"
+    folder.mkdir()
+    data = {"pif/wavelength": np.array([5e-7]), "pif/lenslet_offset": np.zeros((1, 2), int), "pif/pixel_shape": np.array([2, 2]), "pif/object_shape": np.array([1, 1]),
+            "pif/column_energy": np.ones((1, 1)), "pif/shard": np.zeros(1, np.int32)}
+    write_artefact(folder / "i.h5", Artefact("pif-index", data, {"pif": {"shards": [{"name": name, "sha256": "0" * 64}]}}, Provenance("t")))
+    with pytest.raises(InputError, match="i.h5: does not name the files"):
+        read_pif(folder / "i.h5")
+
+
+def test_the_report_escapes_what_files_say(tmp_path):
+    evil = '<script>alert(1)</script>"><img src=x onerror=y>'
+    (tmp_path / "run").mkdir()
+    write_artefact(tmp_path / "run" / "a.h5", Artefact("image", {"image/value": np.random.default_rng(0).random((8, 8))}, {"image": {"method": evil}},
+                                                       Provenance(evil, {evil: {"name": evil, "sha256": "0" * 64}}, 1, evil, {evil: evil})))
+    (tmp_path / "run" / "score.json").write_text('{"results": [{"name": "x", "label": "%s", "metrics": {"psnr_db": 3.0}}], "command": "%s"}' % ((evil.replace('"', '\\"'),) * 2))
+    run_report(tmp_path / "run", tmp_path / "r.html", title=evil)
+    page = (tmp_path / "r.html").read_text()
+    assert "&lt;script&gt;" in page and "<script" not in page and "<img src=x" not in page

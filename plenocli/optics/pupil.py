@@ -26,6 +26,20 @@ def aperture_area(lens):
     return math.pi * radius**2 * (1 - (lens.obscuration or 0.0) ** 2)
 
 
+def aperture_picture(lens, y, x):
+    """Intensity transmittance of the open aperture at pupil coordinates y, x (m), broadcasting; filters not counted."""
+    half = lens.aperture_diameter / 2
+    edge = half * (1 + 1e-9)
+    if lens.aperture_shape == "image":
+        image = lens.samples("aperture_image")
+        row, column = (np.clip(((v / lens.aperture_diameter + 0.5) * len(image)).astype(int), 0, len(image) - 1) for v in np.broadcast_arrays(y, x))
+        return image[row, column] * ((np.abs(y) <= edge) & (np.abs(x) <= edge))
+    if lens.aperture_shape == "square":
+        return 1.0 * ((np.abs(y) <= edge) & (np.abs(x) <= edge))
+    r = np.hypot(y, x)
+    return 1.0 * ((r <= edge) & (r >= half * (lens.obscuration or 0.0)))
+
+
 def filter_transmittance(filter_, wavelength):
     """Intensity transmittance of one filter at `wavelength` (m): peak exp(-4 ln2 ((l - center)/fwhm)^2) + blocking."""
     arg = (wavelength - filter_.center) / filter_.fwhm
@@ -123,12 +137,8 @@ def _sampled_slopes(lens):
     axis = np.linspace(-half, half, max(count, 129))
     slopes = np.gradient(wavefront(lens, axis[:, None], axis[None, :]), axis[1] - axis[0], edge_order=2)
     y, x = np.broadcast_arrays(axis[:, None], axis[None, :])
-    if lens.aperture_shape == "image":
-        image = lens.samples("aperture_image")
-        cell = np.clip(((axis / lens.aperture_diameter + 0.5) * len(image)).astype(int), 0, len(image) - 1)
-        inside = image[np.ix_(cell, cell)] > 0
-    else:
-        inside = np.hypot(y, x) <= unit_radius(lens) * (1 + 1e-9)
+    # a central obscuration is integrated over, and taken away again
+    inside = aperture_picture(lens, y, x) > 0 if lens.aperture_shape == "image" else np.hypot(y, x) <= unit_radius(lens) * (1 + 1e-9)
     return y[inside], x[inside], slopes[0][inside], slopes[1][inside]
 
 

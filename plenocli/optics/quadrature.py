@@ -65,6 +65,16 @@ def cell_rows(cell, radius, slope):
 
     `radius` None means no disc. Panels end where the circle meets the rectangle's sides, so every integrand is smooth.
     """
+    panels = []
+    for y, weight, left, right in cell_chords(cell, radius, slope):
+        t, w = gauss(nodes_for(slope * np.max(right - left) / 2))
+        x = ((left + right) / 2)[:, None] + ((right - left) / 2)[:, None] * t
+        panels.append(Rows(y, x, (weight * (right - left) / 2)[:, None] * w))
+    return panels
+
+
+def cell_chords(cell, radius, slope):
+    """The same region as chords: panels (y, weight, left, right), (rows,) each; weights integrate over y alone, m."""
     y0, y1, x0, x1 = cell
     if radius is None:
         return [_panel(y0, y1, lambda y: (np.full_like(y, x0), np.full_like(y, x1)), None, slope)]
@@ -87,7 +97,7 @@ def cell_rows(cell, radius, slope):
 
 
 def _panel(low, high, ends, radius, slope):
-    """Gauss-Legendre rows between y = low and high; on a disc in theta = asin(y/radius), where its rim is smooth."""
+    """Chords between y = low and high at Gauss-Legendre nodes; on a disc in theta = asin(y/radius), where its rim is smooth."""
     if radius is None:
         t, w = gauss(nodes_for(slope * (high - low) / 2))
         y, wy = (low + high) / 2 + (high - low) / 2 * t, (high - low) / 2 * w
@@ -96,7 +106,4 @@ def _panel(low, high, ends, radius, slope):
         t, w = gauss(nodes_for(slope * radius * (b - a) / 2))
         theta = (a + b) / 2 + (b - a) / 2 * t
         y, wy = radius * np.sin(theta), (b - a) / 2 * w * radius * np.cos(theta)
-    left, right = ends(y)
-    t, w = gauss(nodes_for(slope * np.max(right - left) / 2))
-    x = ((left + right) / 2)[:, None] + ((right - left) / 2)[:, None] * t
-    return Rows(y, x, (wy * (right - left) / 2)[:, None] * w)
+    return y, wy, *ends(y)

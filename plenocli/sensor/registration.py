@@ -7,7 +7,9 @@ A gain of the whole capture cannot be told from brighter radiances, and a mixtur
 other radiances: neither is visible here. docs/model.md, "Registration".
 """
 
+import threading
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,6 +20,8 @@ SAMPLE = 48  # lenslets that tell the motion; the answer is far better known tha
 WEAK = 0.02  # of a band's best colour: a colour with less response is filled in from its neighbours before interpolation
 UNSURE = 0.02  # of a band's peak: pixels whose interpolated response may be off by more take no part
 SIGNIFICANT = 4.0  # standard deviations
+CLOSE = 0.01  # px: a step after which the next would be 1e-4 px
+GOOD_FIT = 1.5  # residual over noise, mean squares, up to which a fit needs no second look
 LEAST_SHIFT = 0.01  # px: what less than this costs is below the noise of one lenslet
 
 
@@ -119,6 +123,14 @@ class Smooth:
         if not good.all():
             smooth = _filled(smooth, good.astype(np.float32))
         self.smooth = smooth
+
+    @classmethod
+    def of(cls, pictures, window, cfa, gains):
+        """From smooth pictures (lenslet, h, w, band) made before."""
+        out = cls.__new__(cls)
+        out.window, out.cfa, out.gains, out.smooth = tuple(window), cfa, gains, pictures
+        out.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
+        return out
 
     def _measure(self, response, origin):
         where = self._colours(origin)
@@ -242,19 +254,88 @@ def own_pixels(window):
     return keep.ravel()
 
 
+class Reference:
+    """What registration needs of a calibration, whatever the capture: where lenslets are, and smooth responses of a few of them,
+    made when first asked for. Arguments as find_motion; shape (rows, columns) of the sensor.
+    """
+
+    def __init__(self, response, origin, window, centres, cfa, shape, sample=SAMPLE):
+        from plenocli.sensor.superpixel import inside
+
+        self.window, self.cfa, self.sample = tuple(window), cfa, sample
+        whole = inside(origin - REACH, np.asarray(window) + 2 * REACH, shape)
+        place = np.argwhere(whole)
+        place = place[_spread(len(place), 4 * sample)]
+        if response.ndim > 2 and len(place):
+            place = place[np.isfinite(response[tuple(place.T)]).all(axis=-1).mean(axis=-1) > 0.5]
+        place = tuple(place.T)
+        self.origin, self.centres = origin[place], centres[place]
+        self.shared = response.ndim == 2
+        self._response = np.asarray(response[None] if self.shared else response[place], np.float32)
+        corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)
+        self.middle, self.extremes = corners.mean(axis=0), np.array([[f(corners[:, 0]), g(corners[:, 1])] for f in (np.min, np.max) for g in (np.min, np.max)])
+        self._smooth, self._still = {}, {}
+        self._lock = threading.Lock()
+
+    @cached_property
+    def gains(self):
+        """Of the mosaic's colours, from lenslets all over the array."""
+        some = slice(1) if self.shared else _spread(len(self.origin), self.sample)
+        return Smooth(self._response[some], self.origin[some], self.window, self.cfa).gains
+
+    def response(self, which):
+        """F (lenslet, pixel, band) of lenslets by their index."""
+        return np.broadcast_to(self._response[0], (len(which), *self._response.shape[1:])) if self.shared else self._response[which]
+
+    def smooth(self, which):
+        """Smooth responses of lenslets by their index."""
+        self._make(which)
+        return Smooth.of(np.stack([self._smooth[key] for key in self._keys(which)]), self.window, self.cfa, self.gains)
+
+    def still(self, which):
+        """F and its derivatives by row and by column shift, three (lenslet, pixel, band), where nothing moved."""
+        self._make(which)
+        return [np.stack([self._still[key][k] for key in self._keys(which)]) for k in range(3)]
+
+    def _keys(self, which):
+        """What lenslets have in common if they share a response: the colours under their windows."""
+        return [tuple(o % 2) for o in self.origin[which]] if self.shared else [int(n) for n in which]
+
+    def _make(self, which):
+        with self._lock:
+            missing = {key: number for number, key in zip(which, self._keys(which)) if key not in self._smooth}
+            if not missing:
+                return
+            todo = np.array(list(missing.values()))
+            smooth = Smooth(self.response(todo), self.origin[todo], self.window, self.cfa, self.gains)
+            parts = smooth.at(self.origin[todo], np.zeros((1, 2)), derivatives=True, sharp=False)
+            for k, key in enumerate(self._keys(todo)):
+                self._smooth[key], self._still[key] = smooth.smooth[k], [part[k] for part in parts]
+
+
+def _spread(count, wanted):
+    """Indices of at most `wanted` of `count` things, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)) if count else np.zeros(0, int)
+
+
 def find_motion(signal, response, origin, window, centres, cfa="mono", noise=None, response_variance=None, sample=SAMPLE):
     """Motion of the lenslets of a capture since their calibration; None where fewer than three lenslets show it.
 
-    signal (rows, columns): dark removed, NaN where saturated. response (R, C, pixel, band), or (pixel, band) for all; origin
-    (R, C, 2) first pixels of the windows, those of lenslets without response far outside; centres (R, C, 2) px. noise: (gain,
-    read variance) of the signal, None: unknown, all pixels weigh the same. response_variance (pixel, band): of the response
-    itself, None: taken as exact. Displacements beyond REACH px are not found.
+    signal (rows, columns), or a plenocli.sensor.readout.Readout: dark removed, NaN where saturated. response (R, C, pixel, band),
+    or (pixel, band) for all; origin (R, C, 2) first pixels of the windows, those of lenslets without response far outside;
+    centres (R, C, 2) px. noise: (gain, read variance) of the signal, None: unknown, all pixels weigh the same. response_variance
+    (pixel, band): of the response itself, None: taken as exact. Displacements beyond REACH px are not found.
     """
-    data = _Sample(signal, response, origin, window, centres, cfa, noise, response_variance, sample)
+    return motion_since(Reference(response, origin, window, centres, cfa, signal.shape, sample), signal, noise, response_variance)
+
+
+def motion_since(reference, signal, noise=None, response_variance=None):
+    """As find_motion, for any number of captures with one Reference."""
+    data = _Sample(reference, signal, noise, response_variance)
     if data.count < 3:
         return None
     first = data.fit(np.zeros(2))
-    if first.after <= 1.5 and first.reach <= 0.7:
+    if first.after <= GOOD_FIT and first.reach <= 0.7:
         return first
     start = data.search()
     if not start.any():
@@ -265,32 +346,28 @@ def find_motion(signal, response, origin, window, centres, cfa="mono", noise=Non
 class _Sample:
     """The lenslets that tell the motion: bright, whole and spread over the array."""
 
-    def __init__(self, signal, response, origin, window, centres, cfa, noise, response_variance, sample):
-        from plenocli.sensor.superpixel import extract, inside
+    def __init__(self, reference, signal, noise, response_variance):
+        from plenocli.sensor.superpixel import extract
 
-        margin = np.asarray(window) + 2 * REACH
-        whole = inside(origin - REACH, margin, signal.shape)
-        if response.ndim > 2:
-            whole &= np.isfinite(response).all(axis=-1).mean(axis=-1) > 0.5
-        place = np.argwhere(whole)
-        if len(place):
-            place = place[np.unique(np.linspace(0, len(place) - 1, min(len(place), 4 * sample)).astype(int))]
-        values = extract(signal, origin[tuple(place.T)][:, None], window)[:, 0]
+        values = extract(signal, reference.origin[:, None], reference.window)[:, 0]
         known = np.isfinite(values)
         level, power = (np.where(known, one, 0).sum(axis=-1, dtype=float) for one in (values, np.square(values, dtype=float)))
         spread = power - level**2 / np.maximum(known.sum(axis=-1), 1)  # of a sum of pixels that are noise alone
         level[(known.mean(axis=-1) <= 0.5) | (level < 6 * np.sqrt(np.maximum(spread, 0)))] = 0
         bright = np.flatnonzero(level > 0.25 * np.percentile(level, 90)) if len(level) else np.zeros(0, int)
-        chosen = bright[np.unique(np.linspace(0, len(bright) - 1, min(len(bright), sample)).astype(int))] if len(bright) else bright
-        place = tuple(place[chosen].T)
-        self.count, self.signal, self.window, self.noise = len(chosen), signal, tuple(window), noise
+        self.which = bright[_spread(len(bright), reference.sample)]
+        self.reference, self.count, self.signal, self.window, self.noise = reference, len(self.which), signal, reference.window, noise
         self.spread = None if response_variance is None else np.nan_to_num(response_variance)
-        self.origin, self.centres = origin[place], centres[place]
-        corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)
-        self.middle, self.extremes = corners.mean(axis=0), np.array([[f(corners[:, 0]), g(corners[:, 1])] for f in (np.min, np.max) for g in (np.min, np.max)])
-        if self.count:
-            self.response = np.asarray(response[place] if response.ndim > 2 else np.broadcast_to(response, (self.count, *response.shape)), np.float32)
-            self.smooth = Smooth(self.response, self.origin, window, cfa)
+        self.origin, self.centres = reference.origin[self.which], reference.centres[self.which]
+        self.middle, self.extremes = reference.middle, reference.extremes
+
+    @cached_property
+    def response(self):
+        return self.reference.response(self.which)
+
+    @cached_property
+    def smooth(self):
+        return self.reference.smooth(self.which)
 
     def values(self, whole):
         from plenocli.sensor.superpixel import extract
@@ -299,7 +376,7 @@ class _Sample:
 
     def search(self):
         """Displacement (2,) in whole pixels (an even number where there is a colour mosaic) that leaves the least residual."""
-        step = 1 if self.smooth.cfa == "mono" else 2
+        step = 1 if self.reference.cfa == "mono" else 2
         some = slice(None, None, max(1, self.count // 24))
         known = np.isfinite(self.response[some]).all(axis=-1)
         q = np.linalg.qr(np.where(known[..., None], self.response[some], 0))[0]
@@ -323,7 +400,7 @@ class _Sample:
         before = after = None
         for _ in range(ITERATIONS):
             shifts = arms @ q.T
-            normal, right, chi = self._equations(shifts, arms)
+            normal, right, chi, product = self._equations(shifts, arms)
             before = chi if before is None else before
             solved, spread = _solve(normal, right)
             step = solved[: q.size].reshape(q.shape)
@@ -331,9 +408,10 @@ class _Sample:
             q = q + step / max(1.0, length)
             if np.abs(q[:, 0]).max() > REACH + 1:
                 break
-            if length < 1e-4:
+            if length < CLOSE:  # steps shrink by their square
                 break
-        after = self._equations(arms @ q.T, arms)[2]
+        linear = length < CLOSE and np.median(chi) < GOOD_FIT  # a poor fit is bent by what the equations leave out
+        after = _chi_after(product, chi, arms @ step.T) if linear else self._equations(arms @ q.T, arms)[2]
         scale = np.sqrt(max(np.median(after), 1.0)) if self.noise is not None else 1.0
         size = np.abs(self.extremes - self.middle).max(axis=0)
         matrix = q[:, 1:] / size if affine else np.zeros((2, 2))
@@ -349,22 +427,22 @@ class _Sample:
         median weigh less.
         """
         whole = np.rint(shifts).astype(int)
-        if self.smooth.cfa == "mono":
+        if self.reference.cfa == "mono":
             whole = np.broadcast_to(np.rint(shifts.mean(axis=0)).astype(int), whole.shape)
-        f, by_row, by_column = self.smooth.at(self.origin + whole, shifts - whole, derivatives=True, sharp=False)
+        parts = self.smooth.at(self.origin + whole, shifts - whole, derivatives=True, sharp=False) if shifts.any() else self.reference.still(self.which)
         x = self.values(whole)
-        f, by_row, by_column = (np.asarray(part, float) for part in (f, by_row, by_column))
+        f, by_row, by_column = (np.asarray(part, float) for part in parts)
         good = np.isfinite(x) & np.isfinite(f).all(axis=-1)
         f, x = np.where(good[..., None], f, 0), np.where(good, x, 0)
         root = np.sqrt(good.astype(float))
-        b = np.linalg.pinv(f) @ x[..., None]
+        b = _solved(*np.linalg.qr(f), x)
         if self.noise is not None:
             expected = self.noise[0] * np.clip((f @ b)[..., 0], 0, None) + self.noise[1]
             if self.spread is not None:
                 expected = expected + (self.spread @ b**2)[..., 0]
             root = root / np.sqrt(np.maximum(expected, 1e-12))
-        orthogonal = np.linalg.qr(f * root[..., None])[0]
-        b = np.linalg.pinv(f * root[..., None]) @ (x * root)[..., None]
+        orthogonal, triangle = np.linalg.qr(f * root[..., None])
+        b = _solved(orthogonal, triangle, x * root)
         light = np.maximum((f @ b)[..., 0].sum(axis=-1) / np.maximum(good.sum(axis=-1), 1), 0)
         design = np.stack([(by_row @ b)[..., 0], (by_column @ b)[..., 0], np.ones_like(x), np.broadcast_to(light[:, None], x.shape)], axis=-1)
         design = np.concatenate([design, (x - (f @ b)[..., 0])[..., None]], axis=-1) * root[..., None]
@@ -380,7 +458,21 @@ class _Sample:
         turned = np.swapaxes(carry, -1, -2) * weight[:, None, None]
         normal = (turned @ product[:, :4, :4] @ carry).sum(axis=0)
         right = (turned @ product[:, :4, 4:]).sum(axis=0)[:, 0]
-        return normal, right, chi
+        return normal, right, chi, product
+
+
+def _solved(q, r, x):
+    """Radiances (lenslet, band, 1) of least squares; 0 where F cannot tell them."""
+    size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    good = size.min(axis=-1) > 1e-8 * size.max(axis=-1)
+    r = np.where(good[:, None, None], r, np.eye(r.shape[-1]))
+    return np.where(good[:, None, None], np.linalg.solve(r, np.swapaxes(q, -1, -2) @ x[..., None]), 0.0)
+
+
+def _chi_after(product, chi, step):
+    """chi a lenslet after a small displacement `step` (lenslet, 2), from the products of the equations before it."""
+    gain = 2 * (step * product[:, :2, 4]).sum(axis=-1) - (step[:, None] @ product[:, :2, :2] @ step[..., None])[:, 0, 0]
+    return chi * (1 - gain / np.maximum(product[:, 4, 4], 1e-300))
 
 
 def _solve(normal, right):

@@ -22,12 +22,12 @@ def align(calibration, signal, noise, mode, path, levels=True):
     there is more of it than chance (None: there is not). record: what was found, for the file and the report (None: off).
     levels: whether offset and stray light are corrected, which mean nothing where the motion cannot be followed.
     """
-    from plenocli.sensor.registration import REACH, find_motion
+    from plenocli.sensor.registration import REACH, motion_since
 
     c = calibration
     if mode == "off":
         return c, signal, None, None
-    motion = find_motion(signal, c.response, np.where(c.valid[..., None], c.origin, -(2**20)), c.window, c.centres, c.cfa, noise, c.variance)
+    motion = motion_since(c.reference, signal, noise, c.variance)
     if motion is None:
         if mode == "on":
             raise NumericsError("cannot be registered: fewer than three lenslets hold light", path, "expose longer, or use --register off")
@@ -114,30 +114,6 @@ def _record(motion, corrected):
 
 def _or_none(value):
     return float(value) if np.isfinite(value) else None
-
-
-def residuals(c, values, radiance, noise, stray=None):
-    """Mean square of x - F b over its expected one (R, C): 1 is noise alone. None where the noise is not known."""
-    if noise is None:
-        return None
-    out = np.full(c.valid.shape, np.nan, np.float32)
-    spread = None if c.variance is None else np.nan_to_num(c.variance).astype(np.float32)
-    bands, unknowns = len(c.wavelengths), radiance.shape[-1]
-    level = np.float32(max(float(np.nanmax(c.response)), 1e-30))
-    for row in range(len(out)):
-        f = c.response if c.response.ndim == 2 else c.response[row]
-        b = radiance[row, :, :bands].astype(np.float32)
-        mean = np.matmul(f, b[..., None])[..., 0]
-        if stray is not None:
-            mean = mean + level * np.matmul(stray[row], radiance[row, :, bands:, None].astype(np.float32))[..., 0]
-        expected = np.float32(noise[0]) * np.maximum(mean, 0) + np.float32(noise[1])
-        if spread is not None:
-            expected = expected + (b**2 @ spread.T)
-        part = (values[row] - mean) ** 2 / np.maximum(expected, np.float32(1e-12))
-        good = np.isfinite(part)
-        freedom = good.sum(axis=-1) - unknowns
-        out[row] = np.where(freedom > 0, np.where(good, part, 0).sum(axis=-1) / np.maximum(freedom, 1), np.nan)
-    return out
 
 
 def misfit(residual):

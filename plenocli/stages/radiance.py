@@ -50,6 +50,14 @@ class Response:
         return factor(self.response, None if self.shared else self.sites)
 
     @cached_property
+    def reference(self):
+        """plenocli.sensor.registration.Reference for the captures of this camera."""
+        from plenocli.sensor.registration import Reference
+
+        origin = np.where(self.valid[..., None], self.origin, -(2**20))
+        return Reference(self.response, origin, self.window, self.centres, self.cfa, self.dark.mean.shape)
+
+    @cached_property
     def pixels(self):
         """(pixel of each band (lenslet or 1, band), F there (lenslet or 1, pixel's band, band)) for single-pixel extraction."""
         from plenocli.solvers.spectral import choose_pixels

@@ -71,18 +71,19 @@ def reference(camera, model, window, superpixels, folder):
     """
     import numpy as np
 
-    key = hashlib.sha256(json.dumps([camera.text, model, window, superpixels, 2]).encode()).hexdigest()[:20]
+    key = hashlib.sha256(json.dumps([camera.text, model, window, superpixels, 3]).encode()).hexdigest()[:20]
     path = folder / f"{key}.npz"
     if path.exists():
         with np.load(path) as kept:
             return kept["columns"], float(kept["change"])
-    compute = {"fresnel": _fresnel_columns, "exact": _exact_columns}[model]
-    columns = compute(camera, window, superpixels)
-    if window is None:
-        change = 0.0
-    else:
-        before = compute(camera, window - 2, superpixels)
-        change = float(max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(columns, before)))
+    columns = (_exact_columns if model == "exact" else _fresnel_columns)(camera, window, superpixels)
+    change = 0.0
+    if window is not None:
+        own = [(0, 0)]
+        # the exact sum affords few lenslets: what those further out do is taken from the paraxial model
+        far = _fresnel_columns(camera, window + 3, own) if model == "exact" else columns[:, [superpixels.index((0, 0))]]
+        near = _fresnel_columns(camera, window if model == "exact" else window - 2, own)
+        change = float(max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(far, near)))
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(path, columns=columns, change=change)
     return columns, change
@@ -113,8 +114,23 @@ def _fresnel_columns(camera, window, superpixels):
     return np.array(found)
 
 
+def exact_rows(camera):
+    """Pixel rows of the own superpixel that the exact sum is compared on: it costs seconds a row and lenslet."""
+    count = camera.sensor.pixels_per_lenslet[0]
+    return sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
+
+
 def _exact_columns(camera, window, superpixels):
-    raise NotImplementedError
+    import numpy as np
+
+    from tests.reference.rayleigh import pixel_energies
+
+    far = 0 if window is None else window
+    lenslets = [(r, c) for r in range(-far, far + 1) for c in range(-far, far + 1)]
+    wavelength, nodes = camera.light.wavelengths[0], _pixel_nodes(camera, window)
+    found = [[pixel_energies(camera, wavelength, point, lenslets, (0, 0), rows=exact_rows(camera), pixel_nodes=nodes) for _ in superpixels]
+             for point in _image_points(camera)]
+    return np.array(found)
 
 
 # one case, in a process of its own
@@ -142,17 +158,30 @@ def run_case(name, accuracy, request, rung):
     case |= {"rung": plan.rung, "model": plan.model, "superpixels": list(plan.superpixels), "coherent_ring": plan.coherent_ring,
              "estimated_error": plan.estimated, "split": plan.split, "estimated_seconds": dial.seconds_here(chosen), "estimated_bytes": plan.memory,
              "double": plan.double, "others": [_other(c, dial) for c in plan.candidates if c is not chosen]}
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    before = _resident(reset=True)
     start = time.process_time()
     try:
         pif = build_pif(camera, plan)
     except NumericsError as error:
         return case | {"refused": str(error)}
     case["seconds"] = time.process_time() - start
-    case["bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    case["bytes"] = _resident() - before
     blocks = np.ascontiguousarray(pif.A[0][:, :, places(camera)].transpose(2, 0, 1))
     case["blocks"] = blocks.astype(float)
     return case
+
+
+def _resident(reset=False):
+    """The highest resident memory (bytes) of this process, so far or since it was reset; where Linux does not let reset it, so far."""
+    status = Path("/proc/self/status")
+    if reset and status.exists():
+        try:
+            Path("/proc/self/clear_refs").write_text("5")
+        except OSError:
+            pass
+    if status.exists():
+        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _arguments(request):
@@ -196,15 +225,19 @@ def case_main(text, folder):
 
 
 def measure(case, camera, model, window, folder):
-    """Add the achieved error (worst of the three columns, over the superpixels kept) to a case."""
+    """Add the achieved error to a case: worst of the three columns, over the superpixels kept (exact model: over some rows of the own one)."""
     import numpy as np
 
     blocks = case.pop("blocks")
     rows, columns = case["superpixels"]
     reach = [(r, c) for r in range(-(rows // 2), rows // 2 + 1) for c in range(-(columns // 2), columns // 2 + 1)]
+    if model == "exact":
+        own = blocks[:, reach.index((0, 0))].reshape(len(blocks), *camera.sensor.pixels_per_lenslet)
+        blocks, reach = own[:, exact_rows(camera)], [(0, 0)]
+        window = None if window is None else 1
     truth, change = reference(camera, model, window, reach, folder / "reference")
     errors = [float(np.linalg.norm(b.ravel() - t.ravel()) / np.linalg.norm(t)) for b, t in zip(blocks, truth)]
-    case |= {"errors": errors, "achieved": max(errors), "reference_change": change}
+    case |= {"errors": errors, "achieved": max(errors), "reference_change": change, "reference": model}
     return case
 
 
@@ -248,12 +281,19 @@ def _race(case, name, accuracy, request, run):
     case["regret"] = case["seconds"] / min([case["seconds"], *raced])
 
 
+def verdict(case):
+    """held, missed, or open: beyond the accuracy by no more than the reference's own."""
+    if case["achieved"] <= case["accuracy"]:
+        return "held"
+    return "missed" if case["achieved"] > case["accuracy"] + 1.5 * case["reference_change"] else "open"
+
+
 def line(case):
     """One case in one line of text."""
     head = f"{case['camera']:18s} {case['scope']:9s} {case['accuracy']:7.0e} "
     if "achieved" not in case:
         return head + ("refused: " + case["refused"][:110] if "refused" in case else f"FAILED: {case['failed']}")
-    return head + (f"est {case['estimated_error']:.1e} got {case['achieved']:.1e} {'ok ' if case['achieved'] <= case['accuracy'] else 'BAD'} "
+    return head + (f"est {case['estimated_error']:.1e} got {case['achieved']:.1e} {verdict(case)} "
                    f"time est {case['estimated_seconds']:.2f} got {case['seconds']:.2f} s, {case['rung']}, {case['superpixels'][0]}x{case['superpixels'][1]} "
                    f"ring {case['coherent_ring']} mem est {case['estimated_bytes'] / 2**20:.0f} got {case['bytes'] / 2**20:.0f} MiB"
                    + (f" (reference {case['reference_change']:.0e})" if case["reference_change"] > 0.1 * case["achieved"] else ""))
@@ -269,7 +309,7 @@ def summary(cases):
     solid = [c for c in done if c["reference_change"] < 0.3 * c["achieved"] or c["scope"] == "isolated"]
     return {
         "cases": len(cases), "computed": len(done), "refused": sum("refused" in c for c in cases), "failed": sum("failed" in c for c in cases),
-        "held": sum(c["achieved"] <= c["accuracy"] for c in done),
+        **{word: sum(verdict(c) == word for c in done) for word in ("held", "open", "missed")},
         "error_estimate_within_10": share(lambda c: 0.1 <= c["estimated_error"] / max(c["achieved"], 1e-300) <= 10, solid),
         "time_estimate_within_2": share(lambda c: 0.5 <= c["estimated_seconds"] / c["seconds"] <= 2),
         "choice_within_1.5": share(lambda c: c.get("regret", 1) <= 1.5),
@@ -286,7 +326,7 @@ def markdown(cases, totals):
         if "achieved" not in c:
             lines.append(head + f"| refused: {(c.get('refused') or str(c.get('failed'))).splitlines()[0]} |" + " |" * 9)
             continue
-        lines.append(head + f"| {c['estimated_error']:.1e} | {c['achieved']:.1e}{'' if c['achieved'] <= c['accuracy'] else ' **missed**'} "
+        lines.append(head + f"| {c['estimated_error']:.1e} | {c['achieved']:.1e}{'' if verdict(c) == 'held' else f' **{verdict(c)}**'} "
                      f"| {c['estimated_seconds']:.2g} | {c['seconds']:.2g} | {c['estimated_bytes'] / 2**20:.0f} | {c['bytes'] / 2**20:.0f} | {c['rung']} "
                      f"| {c['superpixels'][0]}x{c['superpixels'][1]} | {c['coherent_ring']} | {c.get('regret', 1):.2f} |")
     return "\n".join([*lines, "", *(f"- {k}: {v if not isinstance(v, float) else round(v, 3)}" for k, v in totals.items())]) + "\n"

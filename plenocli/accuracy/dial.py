@@ -18,8 +18,8 @@ BEST_ACCURACY = 1e-8
 MODELS = ("auto", "ray", "fresnel", "exact")
 MAX_RING = 8
 """Rings of coherent neighbours that the dial adds by itself."""
-SINGLE_LIMIT = 1e-5
-"""Single precision serves sampling errors down to this."""
+SINGLE_LIMIT = 3e-6
+"""Single precision serves sampling errors down to this: ten times its rounding."""
 ROUNDING = {False: 3e-7, True: 3e-10}
 """Error of a column from rounding in single and double precision (measured)."""
 BAND_SHARE = 0.5

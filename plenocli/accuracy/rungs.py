@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.optics import exact, rays, shaped
-from plenocli.optics.plan import distinct, grid_of, is_symmetric, size_band
+from plenocli.optics.plan import distinct, field_seconds, grid_of, is_symmetric, size_band
 from plenocli.optics.psf import psf_nodes
 
 
@@ -70,7 +70,7 @@ def _square_cost(camera, view, band, shape, double):
     points = (view.object_shape[0] + 1) // 2 if even else view.object_shape[0]
     carried = points * grid[0] * lines * terms * (few if band.window is not None else few / lit)
     table = view.object_shape[0] * grid[0] * lines * terms
-    setup = (1.2e-9 * half**3 + 6e-7 * half**2) * (1 if real else 3) + axes * (
+    setup = field_seconds(camera, view, band) + axes * (
         1.6e-8 * points * few * half + 8e-8 * (2 * lit - 1) * lines * band.lenslet_nodes + 1e-8 * table + 2.5e-11 * (1 if real else 2) * carried * (2 if double else 1))
     size = int(np.prod(shape[1:]))
     return {"operations": 8.0 * 1.2 * fine * terms * pairs,

@@ -144,6 +144,12 @@ def is_symmetric(camera):
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 
 
+def field_seconds(camera, view, band):
+    """Seconds of one core to bring the spread function into separable terms: fitted to process times."""
+    half = band.psf_nodes / 2 if is_symmetric(camera) else band.psf_nodes
+    return (1.2e-9 * half**3 + 6e-7 * half**2) * (1 if is_symmetric(camera) and view.blur == 0 else 3)
+
+
 def grid_of(count):
     """(rows, columns) of so many superpixels: a square block, else one row."""
     side = math.isqrt(count)

@@ -20,6 +20,7 @@ COMMANDS = (
     "reconstruct",
     "score",
     "report",
+    "colorchecker",
     "show",
     "inspect",
     "lens",

@@ -293,9 +293,9 @@ class Reference:
         return Smooth.of(np.stack([self._smooth[key] for key in self._keys(which)]), self.window, self.cfa, self.gains)
 
     def still(self, which):
-        """F and its derivatives by row and by column shift, three (lenslet, pixel, band), where nothing moved."""
+        """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel) where nothing moved."""
         self._make(which)
-        return [np.stack([self._still[key][k] for key in self._keys(which)]) for k in range(3)]
+        return np.stack([self._still[key] for key in self._keys(which)])
 
     def _keys(self, which):
         """What lenslets have in common if they share a response: the colours under their windows."""
@@ -308,9 +308,9 @@ class Reference:
                 return
             todo = np.array(list(missing.values()))
             smooth = Smooth(self.response(todo), self.origin[todo], self.window, self.cfa, self.gains)
-            parts = smooth.at(self.origin[todo], np.zeros((1, 2)), derivatives=True, sharp=False)
+            parts = _stacked(smooth.at(self.origin[todo], np.zeros((1, 2)), derivatives=True, sharp=False))
             for k, key in enumerate(self._keys(todo)):
-                self._smooth[key], self._still[key] = smooth.smooth[k], [part[k] for part in parts]
+                self._smooth[key], self._still[key] = smooth.smooth[k], parts[k]
 
 
 def _spread(count, wanted):
@@ -351,7 +351,8 @@ class _Sample:
 
         values = extract(signal, reference.origin[:, None], reference.window)[:, 0]
         known = np.isfinite(values)
-        level, power = (np.where(known, one, 0).sum(axis=-1, dtype=float) for one in (values, np.square(values, dtype=float)))
+        values = np.where(known, values, 0)
+        level, power = values.sum(axis=-1, dtype=float), np.vecdot(values, values)
         spread = power - level**2 / np.maximum(known.sum(axis=-1), 1)  # of a sum of pixels that are noise alone
         level[(known.mean(axis=-1) <= 0.5) | (level < 6 * np.sqrt(np.maximum(spread, 0)))] = 0
         bright = np.flatnonzero(level > 0.25 * np.percentile(level, 90)) if len(level) else np.zeros(0, int)
@@ -429,26 +430,21 @@ class _Sample:
         whole = np.rint(shifts).astype(int)
         if self.reference.cfa == "mono":
             whole = np.broadcast_to(np.rint(shifts.mean(axis=0)).astype(int), whole.shape)
-        parts = self.smooth.at(self.origin + whole, shifts - whole, derivatives=True, sharp=False) if shifts.any() else self.reference.still(self.which)
-        x = self.values(whole)
-        f, by_row, by_column = (np.asarray(part, float) for part in parts)
-        good = np.isfinite(x) & np.isfinite(f).all(axis=-1)
-        f, x = np.where(good[..., None], f, 0), np.where(good, x, 0)
-        root = np.sqrt(good.astype(float))
-        b = _solved(*np.linalg.qr(f), x)
+        parts = self._parts(self.origin + whole, shifts - whole) if shifts.any() else self.reference.still(self.which)
+        bands, x = parts.shape[1] // 3, self.values(whole)
+        good = np.isfinite(x) & np.isfinite(parts[:, :bands]).all(axis=1)
+        x, weight = np.where(good, x, 0), good.astype(float)
+        f = np.where(good[:, None], parts[:, :bands], 0)
         if self.noise is not None:
-            expected = self.noise[0] * np.clip((f @ b)[..., 0], 0, None) + self.noise[1]
+            b = _rough(f, x)
+            expected = self.noise[0] * np.clip((b[:, None] @ f)[:, 0], 0, None) + self.noise[1]
             if self.spread is not None:
-                expected = expected + (self.spread @ b**2)[..., 0]
-            root = root / np.sqrt(np.maximum(expected, 1e-12))
-        orthogonal, triangle = np.linalg.qr(f * root[..., None])
-        b = _solved(orthogonal, triangle, x * root)
-        light = np.maximum((f @ b)[..., 0].sum(axis=-1) / np.maximum(good.sum(axis=-1), 1), 0)
-        design = np.stack([(by_row @ b)[..., 0], (by_column @ b)[..., 0], np.ones_like(x), np.broadcast_to(light[:, None], x.shape)], axis=-1)
-        design = np.concatenate([design, (x - (f @ b)[..., 0])[..., None]], axis=-1) * root[..., None]
-        design = design - orthogonal @ (np.swapaxes(orthogonal, -1, -2) @ design)
-        product = np.swapaxes(design, -1, -2) @ design
-        chi = product[:, -1, -1] / np.maximum(good.sum(axis=-1) - f.shape[-1], 1)
+                expected = expected + b**2 @ self.spread.T
+            weight = weight / np.maximum(expected, 1e-12)
+        rows = np.concatenate([f, parts[:, bands:], np.ones_like(x)[:, None], x[:, None]], axis=1)
+        rows *= np.sqrt(weight)[:, None]
+        product = _reduced(rows @ np.swapaxes(rows, -1, -2), bands, f.sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)[:, None])
+        chi = product[:, -1, -1] / np.maximum(good.sum(axis=-1) - bands, 1)
         unit = 1.0 if self.noise is not None else max(float(np.median(chi)), 1e-30)
         weight = 1 / unit / np.maximum(1, chi / max(np.median(chi), 1e-30)) ** 2
         terms = arms.shape[1]
@@ -460,13 +456,38 @@ class _Sample:
         right = (turned @ product[:, :4, 4:]).sum(axis=0)[:, 0]
         return normal, right, chi, product
 
+    def _parts(self, origin, shifts):
+        """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel)."""
+        return _stacked(self.smooth.at(origin, shifts, derivatives=True, sharp=False))
 
-def _solved(q, r, x):
-    """Radiances (lenslet, band, 1) of least squares; 0 where F cannot tell them."""
-    size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    good = size.min(axis=-1) > 1e-8 * size.max(axis=-1)
-    r = np.where(good[:, None, None], r, np.eye(r.shape[-1]))
-    return np.where(good[:, None, None], np.linalg.solve(r, np.swapaxes(q, -1, -2) @ x[..., None]), 0.0)
+
+def _stacked(parts):
+    """Three (lenslet, pixel, band) as one (lenslet, 3 * band, pixel), float64."""
+    return np.ascontiguousarray(np.swapaxes(np.concatenate(parts, axis=-1), -1, -2), float)
+
+
+def _rough(f, x):
+    """Radiances (lenslet, band) by normal equations, good enough for weights; f (lenslet, band, pixel)."""
+    gram = f @ np.swapaxes(f, -1, -2)
+    gram += (1e-10 * np.trace(gram, axis1=-2, axis2=-1) + 1e-300)[:, None, None] * np.eye(f.shape[-2])
+    return np.linalg.solve(gram, (f @ x[..., None]))[..., 0]
+
+
+def _reduced(gram, bands, mean):
+    """Products (lenslet, 5, 5) of what remains, outside the span of F, of the columns (row shift, column shift, offset, stray, x).
+
+    gram: weighted products of F, its derivatives by row and by column shift (band each), 1 and x. mean (lenslet, band): of F over
+    pixels. F that cannot tell radiances counts as far as it does.
+    """
+    size = np.sqrt(np.maximum(np.diagonal(gram, axis1=-2, axis2=-1)[:, :bands], 1e-300))
+    inverse = np.linalg.pinv(gram[:, :bands, :bands] / (size[:, :, None] * size[:, None]), rcond=1e-12, hermitian=True) / (size[:, :, None] * size[:, None])
+    b = (inverse @ gram[:, :bands, -1:])[..., 0]
+    light = np.maximum((mean * b).sum(axis=-1), 0)
+    rest = gram[:, bands:, bands:] - gram[:, bands:, :bands] @ inverse @ gram[:, :bands, bands:]
+    mix = np.zeros((len(gram), rest.shape[-1], 5))
+    mix[:, :bands, 0] = mix[:, bands:2 * bands, 1] = b
+    mix[:, -2, 2], mix[:, -2, 3], mix[:, -1, 4] = 1, light, 1
+    return np.swapaxes(mix, -1, -2) @ rest @ mix
 
 
 def _chi_after(product, chi, step):

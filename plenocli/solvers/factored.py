@@ -8,12 +8,13 @@ lost so many pixels that this fails are said to be hard, and `plenocli.solvers.s
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from plenocli.solvers.spectral import LARGEST_CONDITION, _masked
 
-BLOCK_NUMBERS = 90_000  # pixels of a block: four arrays of it stay in a core's cache
+BLOCK_NUMBERS = 90_000, 45_000  # pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
 FACTOR_NUMBERS = 1_000_000
 HARD = 1e-3  # least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
 
@@ -32,6 +33,26 @@ class Factored:
     def shared(self):
         """Whether one response serves all lenslets."""
         return len(self.q) == 1
+
+    @cached_property
+    def inverse(self):
+        """R^-1 (lenslet or 1, band, band), of a unit matrix where F is not sound."""
+        return np.linalg.inv(np.where(self.sound[:, None, None], self.r, np.eye(self.r.shape[-1])))
+
+    @cached_property
+    def blank(self):
+        """(lenslets, their pixels) that are not used, ordered by lenslet; None where all are."""
+        return None if self.used is None else np.nonzero(~self.used)
+
+    def blanks(self, part):
+        """Indices of the pixels that are not used in a block (lenslet, pixel) of the lenslets in the slice `part`; None: there are none."""
+        if self.blank is None:
+            return None
+        rows, pixels = self.blank
+        if self.shared:
+            return slice(None), pixels
+        first, last = np.searchsorted(rows, (part.start, part.stop))
+        return rows[first:last] - part.start, pixels[first:last]
 
     def some(self, which):
         """The Factored of lenslets by their index."""
@@ -96,7 +117,9 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
     square = (total, bands, bands)
     out = Sums(np.zeros((total, bands)), np.broadcast_to(np.eye(bands), square).copy(), np.empty(square), np.zeros((total, bands)),
                np.empty(square) if sandwich else None, np.zeros(total), np.full(total, factored.q.shape[-1]), np.zeros(total, bool))
-    step = max(1, BLOCK_NUMBERS // factored.q.shape[-1])
+    if factored.used is not None:
+        out.count[:] = factored.used.sum(axis=1)
+    step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.q.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
         _block(factored, basis, part, cut(part), variance, None if radiance is None else radiance[part], out)
@@ -105,27 +128,29 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
 
 def _block(factored, basis, part, x, variance, radiance, out):
     """Fill `out` for one block of lenslets."""
+    blank = factored.blanks(part)
+    if blank is not None:
+        x[blank] = 0
     c = basis.project(part, x)
-    holes = _holes(factored, basis, part, x, c, out)
+    holes = _holes(factored, basis, part, x, c, blank, out) if np.isnan(c).any() else None
     out.plain[part] = c
-    mean = basis.picture(part, c.astype(np.float32))
-    np.subtract(x, mean, out=x)
+    mean = basis.subtract(part, c, x)
     if holes is not None:
         x[holes[0]] *= holes[1]
     if variance is None:
         out.normal[part] = out.start[part]
         out.chi[part] = np.vecdot(x, x)
         return
-    spread = variance.of(basis, part, mean, c, radiance)
+    weight = variance.of(basis, part, c, mean, radiance)
     if out.spread is not None:
-        kept = spread
+        kept = weight
         if holes is not None:
-            kept = spread.copy()
+            kept = weight.copy()
             kept[holes[0]] *= holes[1]
         out.spread[part] = basis.normal(part, kept)
     if variance.doubt is not None:
-        out.chi[part] = np.vecdot(x / (spread + variance.doubtful(part, c, radiance)), x)
-    weight = np.reciprocal(spread, out=spread)
+        out.chi[part] = np.vecdot(x / (weight + variance.square(part, c, radiance) @ variance.doubt), x)
+    np.reciprocal(weight, out=weight)
     if holes is not None:
         weight[holes[0]] *= holes[1]
     out.normal[part] = basis.normal(part, weight)
@@ -135,30 +160,32 @@ def _block(factored, basis, part, x, variance, radiance, out):
         out.chi[part] = np.vecdot(weight, x)
 
 
-def _holes(factored, basis, part, x, c, out):
-    """(rows, their masks as numbers) of lenslets in this block that lack pixels, or None; x is 0 there, c and `out` made good."""
-    lacking = np.isnan(c).any(axis=1)
-    calibrated = None
-    if factored.used is not None:
-        calibrated = np.broadcast_to(factored.used[0], x.shape) if factored.shared else factored.used[part]
-        some = ~calibrated.all(axis=1)
-    if not lacking.any() and (calibrated is None or not some.any()):
-        return None
-    rows = np.flatnonzero(lacking if calibrated is None else lacking | some)
-    mask = np.isfinite(x[rows])
-    if calibrated is not None:
-        mask &= calibrated[rows]
+def _holes(factored, basis, part, x, c, blank, out):
+    """(rows, their masks as numbers) of lenslets in this block that lack pixels; x is 0 there, c and `out` made good."""
+    rows = np.flatnonzero(np.isnan(c).any(axis=1))
+    mask = np.isfinite(x)
+    if blank is not None:
+        mask[blank] = False
+    mask = mask[rows]
     x[rows] = np.where(mask, x[rows], 0)
     weight = mask.astype(np.float32)
     at = part.start + rows
     out.count[at] = mask.sum(axis=1)
     own = basis.rows(part, rows)
     start = own.normal(slice(None), weight)
-    least = np.linalg.eigvalsh(start)[:, 0]
-    out.start[at], out.hard[at] = start, least < HARD
+    out.start[at], out.hard[at] = start, np.linalg.eigvalsh(start)[:, 0] < HARD
     start[out.hard[at]] = np.eye(start.shape[-1])
     c[rows] = np.linalg.solve(start, own.project(slice(None), x[rows])[..., None])[..., 0]
     return rows, weight
+
+
+def _add(target, factor, left, right):
+    """target += factor * left @ right in one pass, all float32 (n, k), (k, m), (n, m)."""
+    from scipy.linalg.blas import sgemm
+
+    done = sgemm(factor, right.T, left.T, 1.0, target.T, overwrite_c=True)  # BLAS counts along columns
+    if not np.shares_memory(done, target):
+        target[:] = done.T
 
 
 class _One:
@@ -172,7 +199,7 @@ class _One:
         self.products = np.ascontiguousarray((self.wide[pairs[0]] * self.wide[pairs[1]]).T)
         self.unfold = np.zeros((bands, bands), int)
         self.unfold[pairs] = self.unfold[pairs[::-1]] = np.arange(len(pairs[0]))
-        self.buffer = np.zeros((0, self.wide.shape[1]), np.float32)
+        self.buffer, self.terms = np.zeros((0, self.wide.shape[1]), np.float32), None
 
     def rows(self, part, rows):
         return self
@@ -181,11 +208,17 @@ class _One:
         """Q^T x (lenslet, band), float64."""
         return (x @ self.tall).astype(float)
 
-    def picture(self, part, c):
-        """Q c (lenslet, pixel), in a buffer that the next call overwrites."""
+    def subtract(self, part, c, x):
+        """x - Q c in place of x; Q c, or None where it was not formed."""
+        _add(x, -1.0, c.astype(np.float32), self.wide)
+
+    def mixed(self, part, c, mean, weights, patterns):
+        """Q c + weights (lenslet, n) @ patterns (n, pixel), in a buffer that the next call overwrites."""
         if len(self.buffer) < len(c):
             self.buffer = np.empty((len(c), self.wide.shape[1]), np.float32)
-        return np.matmul(c, self.wide, out=self.buffer[: len(c)])
+        if self.terms is None:
+            self.terms = np.concatenate([self.wide, patterns])
+        return np.matmul(np.concatenate([c, weights], axis=1, dtype=np.float32, casting="same_kind"), self.terms, out=self.buffer[: len(c)])
 
     def normal(self, part, weight):
         """Q^T W Q (lenslet, band, band), float64."""
@@ -203,13 +236,24 @@ class _Each:
         return _Each(Factored(self.q[part][rows], None, None, None))
 
     def project(self, part, x):
-        return np.matmul(self.q[part], x[..., None])[..., 0].astype(float)
+        return np.vecdot(self.q[part], x[:, None]).astype(float)
 
-    def picture(self, part, c):
+    def subtract(self, part, c, x):
+        mean = self._picture(part, c)
+        np.subtract(x, mean, out=x)
+        return mean
+
+    def mixed(self, part, c, mean, weights, patterns):
+        if mean is None:
+            mean = self._picture(part, c)
+        _add(mean, 1.0, weights.astype(np.float32), patterns)
+        return mean
+
+    def _picture(self, part, c):
         q = self.q[part]
         if len(self.buffer) < len(c):
             self.buffer = np.empty((len(c), 1, q.shape[-1]), np.float32)
-        return np.matmul(c[:, None], q, out=self.buffer[: len(c)])[:, 0]
+        return np.matmul(c.astype(np.float32)[:, None], q, out=self.buffer[: len(c)])[:, 0]
 
     def normal(self, part, weight):
         q = self.q[part]
@@ -220,32 +264,34 @@ class _Each:
 
 
 class _Variance:
-    """Variance of pixel values, in place of their mean."""
+    """Variance of pixel values: gain F b + read variance + b^2 var(F), at least the read variance."""
 
     def __init__(self, factored, noise, response_variance, doubt):
-        self.r, self.inverse = factored.r, np.linalg.inv(np.where(factored.sound[:, None, None], factored.r, np.eye(factored.r.shape[-1])))
-        self.gain, self.read = (np.float32(v) for v in noise)
-        self.spread, self.doubt = (None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32) for v in (response_variance, doubt))
+        self.factored = factored
+        self.gain, self.read = noise[0], np.float32(max(noise[1], 1e-12))
+        self.known, self.doubt = (None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32) for v in (response_variance, doubt))
+        constant = np.full((1, factored.q.shape[-1]), self.read)
+        self.patterns = constant if self.known is None else np.concatenate([constant, self.known])
 
-    def of(self, basis, part, mean, c, radiance):
-        """gain F b + read variance + b^2 var(F) (lenslet, pixel), at least the read variance; b from c, or `radiance` where given."""
+    def of(self, basis, part, c, mean, radiance):
+        """(lenslet, pixel) in the buffer of `basis`; b from c, whose picture `mean` may be, or `radiance` where given."""
+        weights = np.ones((len(c), 1))
+        if self.known is not None:
+            weights = np.concatenate([weights, self.square(part, c, radiance)], axis=1)
         if radiance is not None:
-            own = part if len(self.r) > 1 else slice(None)
-            mean = basis.picture(part, (self.r[own] @ np.clip(radiance, 0, None)[..., None])[..., 0].astype(np.float32))
-        mean *= self.gain
-        mean += self.read
-        if self.spread is not None:
-            mean += self._square(part, c, radiance) @ self.spread
-        return np.maximum(mean, max(self.read, np.float32(1e-12)), out=mean)
+            c, mean = (self._own(self.factored.r, part) @ np.clip(radiance, 0, None)[..., None])[..., 0], None
+        if mean is not None:
+            mean *= np.float32(self.gain)
+        out = basis.mixed(part, self.gain * c, mean, weights, self.patterns)
+        return np.maximum(out, self.read, out=out)
 
-    def doubtful(self, part, c, radiance):
-        """b^2 doubt (lenslet, pixel)."""
-        return self._square(part, c, radiance) @ self.doubt
-
-    def _square(self, part, c, radiance):
-        own = part if len(self.r) > 1 else slice(None)
-        b = (self.inverse[own] @ c[..., None])[..., 0] if radiance is None else radiance
+    def square(self, part, c, radiance):
+        """b^2 (lenslet, band) float32, negative radiances counting as 0."""
+        b = (self._own(self.factored.inverse, part) @ c[..., None])[..., 0] if radiance is None else radiance
         return np.square(np.clip(b, 0, None)).astype(np.float32)
+
+    def _own(self, matrices, part):
+        return matrices[part] if len(matrices) > 1 else matrices
 
 
 # --- answers ------------------------------------------------------------------------------------------------------------
@@ -258,7 +304,7 @@ def answer(factored, sums, method, prior=None, weighed=True):
     is estimated from the residual, one number a superpixel.
     """
     bands = factored.r.shape[-1]
-    inverse = np.linalg.inv(np.where(factored.sound[:, None, None], factored.r, np.eye(bands)))
+    inverse = factored.inverse
     known = factored.sound & ~sums.hard & (sums.count >= (0 if method == "lmmse" else bands))
     normal = np.where(known[:, None, None], sums.start if method == "pinv" else sums.normal, np.eye(bands))
     if not weighed:

@@ -43,6 +43,21 @@ class Response:
         return np.nonzero(self.valid)
 
     @cached_property
+    def corners(self):
+        """First pixels (lenslet, 2) of the valid lenslets' windows."""
+        return self.origin[self.sites]
+
+    @cached_property
+    def levels(self):
+        """Dark levels under the windows, None where they are black levels alone or some window is not on the sensor."""
+        from plenocli.sensor.readout import Levels
+        from plenocli.sensor.superpixel import inside
+
+        if self.dark.flat or not inside(self.corners, self.window, self.dark.mean.shape).all():
+            return None
+        return Levels(self.dark, self.corners, self.window).keep()
+
+    @cached_property
     def factored(self):
         """plenocli.solvers.factored.Factored of the valid lenslets."""
         from plenocli.solvers.factored import factor
@@ -119,7 +134,7 @@ def readout(exposure, c, path):
         raise InputError("and the calibration do not both know their exposure time", path, "use files of one kind for all captures")
     scale = 1.0 if c.exposure is None else c.exposure / exposure.seconds
     top = exposure.white if np.isfinite(exposure.white) else c.white_level
-    signal = Readout(exposure.values, c.dark, exposure.seconds, exposure.black, top, scale)
+    signal = Readout(exposure.values, c.dark, exposure.seconds, exposure.black, top, scale, ready=c.levels)
     if exposure.sigma is not None:
         return signal, (0.0, (exposure.sigma * scale) ** 2)
     gain = c.gain if c.gain is not None else exposure.gain
@@ -221,15 +236,11 @@ class _Job:
         self.total = len(self.c.sites[0])
         self.sample = np.unique(np.linspace(0, self.total - 1, min(self.total, SAMPLE)).astype(int))
         self.factored = self.whole.factored
-        self.inverse = np.linalg.inv(np.where(self.factored.sound[:, None, None], self.factored.r, np.eye(self.unknowns)))
         if isinstance(self.values, np.ndarray):
-            self.values = self.values[self.c.sites]
-
-    def cut(self, which):
-        """Values (lenslet, pixel) float32 of lenslets by their index or a slice, free to be overwritten."""
-        if isinstance(self.values, np.ndarray):
-            return np.array(self.values[which], np.float32)
-        return self.values.cut(self.c.origin[self.c.sites[0][which], self.c.sites[1][which]], self.c.window)
+            own = self.values[self.c.sites]
+            self.cut = lambda which: np.array(own[which], np.float32)  # lenslets by their index or a slice, free to be overwritten
+        else:
+            self.cut = self.values.cutter(self.c.corners, self.c.window)
 
     def collect(self, which=None, **settings):
         """Sums of all lenslets, or those of an index array."""
@@ -296,8 +307,8 @@ class _Job:
 
     def _radiance(self, sums, which=None):
         """Plain radiances (lenslet, band) of the calibration's bands."""
-        inverse = self.inverse if len(self.inverse) == 1 or which is None else self.inverse[which]
-        b = (inverse @ sums.plain[..., None])[..., 0][:, : self.bands]
+        inverse = self.factored.inverse
+        b = ((inverse if len(inverse) == 1 or which is None else inverse[which]) @ sums.plain[..., None])[..., 0][:, : self.bands]
         return np.where(sums.hard[:, None], np.nan, b)
 
     def _single_pixel_error(self, radiance):

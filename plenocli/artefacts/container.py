@@ -70,10 +70,11 @@ def write_artefact(path, artefact, *, overwrite=False):
         seal(descriptor, frame.size)
 
 
-def read_artefact(path, kind=None, *, mem_limit=None):
+def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
     """Read and verify the artefact at `path`.
 
-    kind: the kind due, or a tuple of kinds, or None for any. mem_limit: bytes, default half of the machine's memory.
+    kind: the kind due, or a tuple of kinds, or None for any. mem_limit: bytes, default half of the machine's memory. skip:
+    datasets that are not wanted; their bytes are verified, their values are not looked at.
     Raises InputError for a file that is missing, not an artefact, damaged, too large, of another kind, or breaks its table.
     """
     path = Path(path)
@@ -81,7 +82,7 @@ def read_artefact(path, kind=None, *, mem_limit=None):
     image = _verified_bytes(path, limit)
     try:
         with h5py.File(_open_image(image), "r") as file:
-            return _parse(path, file, kind, limit)
+            return _parse(path, file, kind, limit, skip)
     except PlenoError:
         raise
     except Exception as error:  # h5py raises half a dozen types for a malformed file
@@ -301,7 +302,7 @@ def _open_image(image):
     return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
-def _parse(path, file, kind, limit):
+def _parse(path, file, kind, limit, skip):
     declared = survey(path, file, limit)
     root = {name: read_attribute(path, file, name) for name in tables.ROOT_ATTRIBUTES if name in attribute_names(file)}
     missing = [name for name in tables.ROOT_ATTRIBUTES if name not in root]
@@ -311,7 +312,7 @@ def _parse(path, file, kind, limit):
     problems = tables.declared_problems(schema, declared)
     attrs = _read_attributes(path, file, schema, declared, problems)
     if not problems:
-        data = {name: file[name][()] for name in declared}
+        data = {name: file[name][()] for name in declared if name not in skip}
         data = {name: values if isinstance(values, np.ndarray) else np.asarray(values) for name, values in data.items()}
         problems = tables.value_problems(schema, data)
     if problems:

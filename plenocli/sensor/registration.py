@@ -17,6 +17,7 @@ ITERATIONS = 8
 REACH = 4  # px: how far the search for a whole-pixel displacement goes
 DEGREE = 5
 SAMPLE = 48  # lenslets that tell the motion; the answer is far better known than it needs to be
+GAIN_PIXELS = 30_000  # that tell the gains of a mosaic's colours
 WEAK = 0.02  # of a band's best colour: a colour with less response is filled in from its neighbours before interpolation
 UNSURE = 0.02  # of a band's peak: pixels whose interpolated response may be off by more take no part
 SIGNIFICANT = 4.0  # standard deviations
@@ -279,8 +280,9 @@ class Reference:
 
     @cached_property
     def gains(self):
-        """Of the mosaic's colours, from lenslets all over the array."""
-        some = slice(1) if self.shared else _spread(len(self.origin), self.sample)
+        """Of the mosaic's colours, from lenslets all over the array, fewer where they have many pixels."""
+        count = self._response.shape[1]
+        some = slice(1) if self.shared else _spread(len(self.origin), int(np.clip(GAIN_PIXELS // count, 12, self.sample)))
         return Smooth(self._response[some], self.origin[some], self.window, self.cfa).gains
 
     def response(self, which):

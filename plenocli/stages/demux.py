@@ -46,7 +46,7 @@ class Demultiplexer:
         self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
         found = read_response(calibration)
         self.prior = light_prior(found)
-        self.calibration = replace(found, white=None)
+        self.calibration = replace(found, white=None).prepare()
         self.reference = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._plain_method())[0]

@@ -73,16 +73,36 @@ class Response:
         return Reference(self.response, origin, self.window, self.centres, self.cfa, self.dark.mean.shape)
 
     @cached_property
-    def pixels(self):
+    def sample(self):
+        """Indices of lenslets all over the array, enough to compare methods on."""
+        return np.unique(np.linspace(0, len(self.sites[0]) - 1, min(len(self.sites[0]), SAMPLE)).astype(int))
+
+    @cached_property
+    def sampled(self):
+        """`factored` of the sample."""
+        return self.factored.some(self.sample)
+
+    @cached_property
+    def sampled_pixels(self):
+        """`pixels` of the sample."""
+        return self.pixels(self.sample)
+
+    def pixels(self, which):
         """(pixel of each band (lenslet or 1, band), F there (lenslet or 1, pixel's band, band)) for single-pixel extraction."""
         from plenocli.solvers.spectral import choose_pixels
 
         if self.shared:
             pixels = choose_pixels(self.response)[None]
-            return pixels, self.response[pixels]
-        parts = np.array_split(np.arange(len(self.sites[0])), 1 + self.response.size // 4_000_000)
-        pixels = np.concatenate([choose_pixels(self.response[self.sites[0][p], self.sites[1][p]]) for p in parts])
-        return pixels, self.response[self.sites[0][:, None], self.sites[1][:, None], pixels]
+            return pixels, self.response[pixels].astype(float)
+        rows, columns = (part[which] for part in self.sites)
+        step = max(1, 4_000_000 // self.response[0, 0].size)
+        pixels = np.concatenate([choose_pixels(self.response[rows[s:s + step], columns[s:s + step]]) for s in range(0, len(rows), step)])
+        return pixels, self.response[rows[:, None], columns[:, None], pixels].astype(float)
+
+    def prepare(self):
+        """Make now what every capture needs and several threads would make at once; returns itself."""
+        self.factored, self.sampled, self.sampled_pixels, self.levels, self.reference
+        return self
 
 
 @dataclass(frozen=True)
@@ -104,7 +124,7 @@ def read_response(path):
     from plenocli.artefacts import read_artefact
     from plenocli.sensor.frames import Dark
 
-    artefact = read_artefact(path, "calibration")
+    artefact = read_artefact(path, "calibration", skip=("white/flat", "white/level"))
     data, attrs = artefact.data, artefact.attrs
     if "response/F" not in data:
         raise InputError("holds no response F, only the lenslet grid", path, "calibrate with --band captures")
@@ -234,7 +254,7 @@ class _Job:
     def __post_init__(self):
         self.bands, self.unknowns = len(self.c.wavelengths), self.whole.response.shape[-1]
         self.total = len(self.c.sites[0])
-        self.sample = np.unique(np.linspace(0, self.total - 1, min(self.total, SAMPLE)).astype(int))
+        self.sample = self.c.sample
         self.factored = self.whole.factored
         if isinstance(self.values, np.ndarray):
             own = self.values[self.c.sites]
@@ -248,7 +268,10 @@ class _Job:
 
         if which is None:
             return collect(self.factored, self.cut, self.total, **settings)
-        return collect(self.factored.some(which), lambda part: self.cut(which[part]), len(which), **settings)
+        return collect(self._some(which), lambda part: self.cut(which[part]), len(which), **settings)
+
+    def _some(self, which):
+        return self.factored if which is None else self.whole.sampled if which is self.sample else self.factored.some(which)
 
     def weighted(self, which=None, sandwich=True):
         """Sums weighted by the noise that is expected."""
@@ -287,8 +310,7 @@ class _Job:
         """(radiances, standard deviations) of lenslets by one method; the few that single precision cannot do, in double."""
         from plenocli.solvers.factored import answer
 
-        factored = self.factored if which is None else self.factored.some(which)
-        value, sigma = answer(factored, sums, method, self.prior, self.noise is not None)
+        value, sigma = answer(self._some(which), sums, method, self.prior, self.noise is not None)
         hard = np.flatnonzero(sums.hard)
         if len(hard):
             value[hard], sigma[hard] = self._double(hard if which is None else which[hard], method)
@@ -313,23 +335,18 @@ class _Job:
 
     def _single_pixel_error(self, radiance):
         """Mean square error that single-pixel extraction would make on the sample: crosstalk bias and the noise of one pixel."""
-        rows = self._rows(self.sample)[1]
+        rows = self.c.sampled_pixels[1]
         own = np.diagonal(rows, axis1=-2, axis2=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             bias = (rows @ np.nan_to_num(radiance)[..., None])[..., 0] / own - radiance
             variance = (self.noise[0] * np.clip(own * radiance, 0, None) + self.noise[1]) / own**2
             return float(np.nanmean(bias**2 + variance))
 
-    def _rows(self, which):
-        """(pixel of each band, F there) of lenslets."""
-        pixels, rows = (np.asarray(part, part.dtype if part.dtype.kind == "i" else float) for part in self.c.pixels)
-        return (pixels, rows) if len(pixels) == 1 else (pixels[which], rows[which])
-
     def single_pixel(self, sums):
         """x[p] / F[p] at the calibrated pixels, sigma without the crosstalk bias; NaN sigma where the noise is not known."""
         from plenocli.solvers.spectral import noise_variance
 
-        pixels, rows = self._rows(slice(None))
+        pixels, rows = self.c.pixels(slice(None))
         pixels = np.broadcast_to(pixels, (self.total, self.bands))
         step = max(1, 4_000_000 // self.c.response.shape[-2])
         x = np.concatenate([np.take_along_axis(self.cut(slice(s, s + step)), pixels[s:s + step], axis=1) for s in range(0, self.total, step)]).astype(float)

@@ -42,7 +42,7 @@ class ExactBand(BandPlan):
 
 def exact_band(view, grid, ring, accuracy, tolerance):
     """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and accuracy as in size_band."""
-    base = size_band(view, grid, ring, accuracy, tolerance)
+    base = size_band(view, grid, ring, 0.7 * accuracy, tolerance)
     phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
     count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4))
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
@@ -167,23 +167,22 @@ class ExactSquareLenslets:
         if self.band.sensor_count:
             t, w = gauss(self.band.sensor_count)
             return self._extent[axis] * t, np.sqrt(self._extent[axis] * w)
-        u, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s)
+        u, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
         return u.ravel(), np.sqrt(w.ravel())
 
     def _strong_terms(self):
         """{(s, m, axis): (r, i)}: which terms of each X are made; what the others carry together is a quarter of the cut."""
         intervals = [(s, m, axis) for axis in (0, 1) for s, m in self._offsets if s <= self._reach(axis) and m in self._lenslets(s, axis)]
-        strength = {}
-        for key in intervals:
-            rows = self._local_terms(*key)
-            strength[key] = 0.0
+        norms = {key: self._mean_norms(*key) for key in intervals}
+        strength = dict.fromkeys(intervals, 0.0)
+        for one in intervals:
             for other in intervals:
-                if other[2] != key[2]:
-                    columns = self._local_terms(*other)
-                    s = rows.coefficients(key[2]) @ columns.coefficients(other[2]).T * columns.norms[other[2]]
-                    c = self._residuals.core[self._number[key[:2]], self._number[other[:2]]]
-                    found = np.outer((np.abs(c) ** 2).sum(axis=1), (np.abs(s) ** 2).sum(axis=1) * rows.norms[key[2]] ** 2)
-                    strength[key] = np.maximum(strength[key], found)
+                if one[2] == 0 and other[2] == 1:
+                    c = np.abs(self._residuals.core[self._number[one[:2]], self._number[other[:2]]]) ** 2
+                    t = np.abs(self._local_terms(*one).coefficients(0) @ self._local_terms(*other).coefficients(1).T) ** 2
+                    t *= np.outer(norms[one], norms[other])
+                    strength[one] = np.maximum(strength[one], np.outer(c.sum(axis=1), t.sum(axis=1)))
+                    strength[other] = np.maximum(strength[other], np.outer(c.sum(axis=0), t.sum(axis=0)))
         kept = {}
         for key, power in strength.items():
             order = np.argsort(power, axis=None)
@@ -192,6 +191,13 @@ class ExactSquareLenslets:
             keep[order[weak]] = False
             kept[key] = np.nonzero(keep.reshape(power.shape))
         return kept
+
+    def _mean_norms(self, s, m, axis):
+        """Mean square over the points of what each e_i has on lenslet m, times the share of it that reaches superpixel s."""
+        points = self._points(s, axis)
+        values = self._local_terms(s, m, axis).evaluate(m * self.geometry.D2 + self._x[:, None] - points, axis)
+        power = np.einsum("xpi,x,p->i", np.abs(values) ** 2, self._w, self._emphasis(s, axis) ** 2) / len(points)
+        return power * self._offsets[s, m][1] ** 2
 
     def _sheet(self, s, axis):
         """X of superpixel s along one axis: list of (m, (sensor nodes x points, terms) array)."""
@@ -264,7 +270,7 @@ class ExactSquareLenslets:
         factor = factor.reshape(len(u), -1)
         points = len(self._points(s, axis))
         if self.band.sensor_count:
-            v, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s)
+            v, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
             t, wt = gauss(len(u))
             degrees = np.arange(len(u))
             back = legendre(t, len(u), 1).T * wt * ((2 * degrees + 1) / 2)[:, None]
@@ -309,7 +315,6 @@ class AllTerms:
 
     def __init__(self, field, turn):
         self._field, self._turn = field, turn
-        self.norms = [field_norms(field, axis) for axis in (0, 1)]
 
     def coefficients(self, axis):
         return np.diag(self._field.signs) if axis and self._turn else np.eye(self._field.terms)
@@ -332,7 +337,6 @@ class LocalTerms:
         tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
         basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
         self._mixing = [basis.conj().T @ v for v in values]
-        self.norms = [np.ones(basis.shape[1])] * 2
         degrees = np.arange(count)
         self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))
 

@@ -71,11 +71,12 @@ class Residuals:
         self._grid, _ = gauss(min(nodes, MAX_GRID))
         sampled = [self._products(a, lens) for a in count]
         full, self._values, into = {(a, b): np.kron(lens_core, core[a, b]) for a, b in core}, [], []
+        grams = [_gram_root(columns) for columns in sampled]
         for a in count:
             u, s, vh = np.linalg.svd(sampled[a], full_matrices=False)
             keep = s > 1e-9 * s[0]
             reduced = (s[:, None] * vh)[keep]
-            stack = np.hstack([weights[a] * weights[b] * reduced @ full[a, b] @ _gram_root(sampled[b]) for b in count])
+            stack = np.hstack([weights[a] * weights[b] * reduced @ full[a, b] @ grams[b] for b in count])
             basis = _left(stack, tolerance)
             # values on the grid of (u, x), whose mean square is 1
             self._values.append((u[:, keep] @ basis * len(self._grid)).T.reshape(-1, len(self._grid), len(self._grid)))

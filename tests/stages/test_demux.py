@@ -77,6 +77,31 @@ def test_exr_holds_value_and_preview(files, tmp_path):
     np.testing.assert_allclose(np.moveaxis(np.asarray(cube), 0, -1), 0.99 * files["truth"][1], atol=0.012)
 
 
+def test_both_files_hold_the_same_and_others_read_them(files, tmp_path):
+    """HDF5 by h5py alone and as NXdata, EXR by the OpenEXR package: value, sigma and bands, nothing lost."""
+    import h5py
+
+    OpenEXR = pytest.importorskip("OpenEXR")
+    for name in ("s.h5", "s.exr"):
+        run_demux([files["shots"][1]], tmp_path / name, calibration=files["calibration"])
+    with h5py.File(tmp_path / "s.h5") as file, OpenEXR.File(str(tmp_path / "s.exr"), separate_channels=True) as picture:
+        group, channels, header = file["spectra"], picture.channels(), picture.header()
+        assert file.attrs["default"] == b"spectra" and group.attrs["NX_class"] == b"NXdata"
+        assert group.attrs["signal"] == b"value" and list(group.attrs["axes"]) == [b"wavelength", b".", b"."]
+        for k, wavelength in enumerate(group["wavelength"]):
+            label = f"{wavelength * 1e9:.6f}nm".replace(".", ",")
+            np.testing.assert_array_equal(channels[f"S0.{label}"].pixels, group["value"][k])
+            np.testing.assert_array_equal(channels[f"sigma.{label}"].pixels, group["sigma"][k])
+        preview = np.stack([channels[c].pixels for c in "RGB"])
+        assert np.isfinite(preview).all() and preview.max() > 0.1
+        assert header["spectralLayoutVersion"] == "1.0" and header["emissiveUnits"] == "relative"
+        assert json.loads(header["parameters"]) == json.loads(group.attrs["parameters"])
+    nxdata = pytest.importorskip("silx.io.nxdata")
+    with h5py.File(tmp_path / "s.h5") as file:
+        plot = nxdata.get_default(file)
+        assert plot.is_valid and plot.signal_name == "value" and plot.axes_names[0] == "wavelength (m)"
+
+
 def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files, tmp_path):
     report = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])["captures"][0]
     assert report["method"] == "pinv" and "not known" in report["reason"]

@@ -141,8 +141,9 @@ def test_libraw_and_exiftool_take_the_dng_for_what_it_is(camera, tmp_path, cfa):
 
     if cfa != "mono":
         camera.write_text(camera.read_text().replace("[light]", f'cfa = "{cfa}"\ncamera = "Nikon 5100 (NPL)"\n[light]'))
-    inside = capture(camera, "--target", "white", "--seed", 2, "-o", tmp_path / "w.h5")
-    assert run(["capture-sim", str(camera), "--target", "white", "--seed", "2", "-o", str(tmp_path / "w.dng")]) == 0
+    arguments = [str(camera), "--target", "mono:550nm", "--model", "fresnel", "--accuracy", "1e-2", "--seed", "2", "-o"]
+    inside = capture(*arguments, tmp_path / "w.h5")
+    assert run(["capture-sim", *arguments, str(tmp_path / "w.dng")]) == 0
     with rawpy.imread(str(tmp_path / "w.dng")) as file:
         np.testing.assert_array_equal(file.raw_image, inside.data["capture/mosaic"])
         assert file.num_colors == (1 if cfa == "mono" else 3) and file.white_level == inside.attrs["capture"]["white"]

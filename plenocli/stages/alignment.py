@@ -9,7 +9,8 @@ from plenocli.stages.progress import note
 
 MODES = ("auto", "on", "off")
 POOR_FIT = 1.5  # residual over noise, mean squares, above which the calibration does not describe the capture
-BELIEVED = 0.1  # share of the residual that may be left where an offset or stray light is taken off a capture that stays poorly described
+FITS = 1.02  # residual over noise up to which a correction is believed without further question
+BELIEVED = 0.15  # share of the residual's excess over noise that a correction may leave where the capture fits worse than that
 LEAST_OFFSET = 0.1  # standard deviations of one pixel in the dark: less costs less than the noise of one lenslet
 
 
@@ -122,9 +123,14 @@ def misfit(residual):
 
 
 def doubtful(residual, record):
-    """Whether an offset or stray light was taken off although the calibration does not describe the capture: another shape of
-    the superpixels (focus, filters) passes for both."""
-    return misfit(residual) > POOR_FIT and record is not None and bool({"offset", "stray light"} & set(record["corrected"]))
+    """Whether something was corrected although the calibration does not quite describe the capture: another shape of the
+    superpixels (focus, filters), or neighbours' light, passes for a little motion, an offset and stray light."""
+    return misfit(residual) > FITS and record is not None and bool(record["corrected"])
+
+
+def believed(residual, plain):
+    """Whether the residuals with a correction are as far below those without (plain) as they are if that is what was wrong."""
+    return misfit(residual) - 1 <= BELIEVED * (misfit(plain) - 1)
 
 
 def judge(residual, record, path):

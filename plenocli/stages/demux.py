@@ -65,23 +65,34 @@ class Demultiplexer:
 
     def estimate(self, exposure, path, method=None):
         """The Estimate of a capture that was read already."""
-        from plenocli.stages.alignment import BELIEVED, doubtful, judge, misfit
+        from plenocli.stages.alignment import doubtful, judge
 
         method = method or self.settings.method
         signal, noise = readout(exposure, self.calibration, path)
-        found = self._aligned(signal, noise, method, path)
-        if doubtful(found.residual, found.record):
-            plain = self._aligned(signal, noise, method, path, levels=False)
-            if misfit(found.residual) > BELIEVED * misfit(plain.residual):
-                found = plain
+        found = self._aligned(signal, noise, method, path, self.settings.register)
+        if self.settings.register == "auto" and doubtful(found.residual, found.record):
+            found = self._believed(found, signal, noise, method, path)
         if not np.isfinite(found.value).any():
             raise NumericsError("no lenslet could be demultiplexed", path, "check exposure and calibration")
         return replace(found, warning=judge(found.residual, found.record, path))
 
-    def _aligned(self, signal, noise, method, path, levels=True):
+    def _believed(self, found, signal, noise, method, path):
+        """`found`, or the estimate with motion alone corrected, or with nothing: the first that explains its residuals."""
+        from plenocli.stages.alignment import believed
+
+        plain = self._aligned(signal, noise, method, path, "off")
+        if believed(found.residual, plain.residual):
+            return found
+        if "motion" in found.record["corrected"]:
+            moved = found if found.record["corrected"] == ["motion"] else self._aligned(signal, noise, method, path, "auto", levels=False)
+            if believed(moved.residual, plain.residual):
+                return moved
+        return replace(plain, record=found.record | {"corrected": []})
+
+    def _aligned(self, signal, noise, method, path, mode, levels=True):
         from plenocli.stages.alignment import align
 
-        c, signal, stray, record = align(self.calibration, signal, noise, self.settings.register, path, levels)
+        c, signal, stray, record = align(self.calibration, signal, noise, mode, path, levels)
         return replace(estimate(c, signal, noise, method, self.prior, self.settings.reference is not None, stray), record=record)
 
     def write(self, done, capture, target):

@@ -17,6 +17,7 @@ from plenocli.artefacts.limits import default_mem_limit
 from plenocli.artefacts.provenance import require_file
 from plenocli.errors import InputError
 
+CHILD = Path(__file__).with_name("raw_child.py")
 TIMEOUT_S = 120
 _CPU_S = 90
 _BASE_BYTES = 3 << 29  # what Python, numpy and LibRaw map before they read anything
@@ -65,7 +66,7 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
 
 def _from_child(path, limit, timeout_s):
     """(description, mosaic bytes) from the child process; a crash there becomes an InputError here."""
-    command = [sys.executable, "-P", str(Path(__file__).with_name("raw_child.py")), str(path.resolve()), str(limit + _BASE_BYTES), str(_CPU_S)]
+    command = [sys.executable, "-P", str(CHILD), str(path.resolve()), str(limit + _BASE_BYTES), str(_CPU_S)]
     single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}  # threads map memory
     try:
         done = subprocess.run(command, capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL, env={**os.environ, **single})
@@ -77,7 +78,10 @@ def _from_child(path, limit, timeout_s):
             raise InputError(f"made LibRaw crash or hit its limits (signal {-done.returncode})", path, _FIX)
         detail = done.stderr.decode("utf-8", "replace").strip().splitlines()
         raise InputError(f"could not be read by the RAW process ({detail[-1] if detail else 'no answer'})", path, _FIX)
-    return json.loads(line), pixels
+    try:
+        return dict(json.loads(line)), pixels
+    except (TypeError, ValueError) as error:
+        raise InputError("came back garbled from LibRaw", path, _FIX) from error
 
 
 def _reason(found, size):

@@ -78,7 +78,7 @@ def main():
     except MemoryError:
         found = {"refused": "needs more memory than the limit allows"}
     except Exception as error:
-        text = error.args[0] if error.args else ""
+        text = getattr(error, "strerror", None) or (error.args[0] if error.args else "")
         text = text.decode("latin-1") if isinstance(text, bytes) else str(text)
         found = {"refused": f"{text}", "error": type(error).__name__}
     channel.write(json.dumps(found).encode() + b"\n" + pixels)

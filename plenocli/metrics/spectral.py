@@ -16,6 +16,9 @@ DEFINITIONS = {
     "over a patch's lenslets (Berkner et al. 2013)",
     "six_patch_rmse": "mean of six_patch_rmse_per_band over the bands",
     "spectral_angle_deg": "mean angle between spectrum and truth as vectors, degrees; blind to brightness",
+    "rmse_over_single_pixel": "rmse divided by that of the result of single pixel extraction",
+    "six_patch_rmse_over_single_pixel": "six_patch_rmse divided by that of the result of single pixel extraction",
+    "delta_e_over_single_pixel": "delta_e_2000 divided by that of the result of single pixel extraction",
     "delta_e_2000": "mean CIEDE2000 colour difference under the light named, spectra taken as piecewise linear between bands",
 }
 

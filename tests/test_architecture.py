@@ -59,7 +59,7 @@ def test_commands_only_parse(path):
 HEAVY = ("numpy", "scipy", "h5py", "colour", "matplotlib", "pydantic", "skimage", "rawpy", "OpenImageIO", "numba", "tqdm")
 
 
-@pytest.mark.parametrize("command", ["", "simulate-pif", "capture-sim", "calibrate", "demux", "learn-dict", "reconstruct", "score", "report", "inspect", "lens", "schema"])
+@pytest.mark.parametrize("command", ["", "simulate-pif", "simulate-response", "capture-sim", "calibrate", "demux", "learn-dict", "reconstruct", "score", "report", "inspect", "lens", "schema"])
 def test_help_imports_nothing_heavy(command):
     code = (
         "import sys; from plenocli.cli.main import run\n"

@@ -13,6 +13,7 @@ from plenocli.errors import PlenoError
 
 COMMANDS = (
     "simulate-pif",
+    "simulate-response",
     "capture-sim",
     "calibrate",
     "demux",

@@ -6,7 +6,7 @@ lens then only exchange object points with one another. What is left is the pupi
 
     F(pixel) = opening/cell * integral over the pupil of T(x) * integral over the pixel of spot(t - m pitch + (z3/z2) x) dt dx / pupil area,
 
-summed over lenslets m; section 16 of docs/model.md. The spot of a lenslet is its opening, z3 kappa wide per
+summed over lenslets m; docs/model.md, "The response predicted". The spot of a lenslet is its opening, z3 kappa wide per
 unit, by rays, and |Fourier transform of its opening with the phase k kappa u^2/2|^2 by waves. The fields of different lenslets
 are added in intensity: over a pupil of many diffraction cells their interference averages out.
 """
@@ -21,10 +21,10 @@ from plenocli.optics.pupil import aperture_area, aperture_picture, filter_cells,
 from plenocli.optics.quadrature import cell_chords, gauss, nodes_for
 from plenocli.optics.rays import pupil_measure
 
-TAIL = 8
+TAIL = 6
 """Pitches beyond the pupil's image over which the diffraction of neighbouring lenslets is followed."""
-SAMPLES = 12
-"""Samples of a spot's integral per diffraction cell lambda z3/w, for splines of degree 5 (1e-7 of the cell)."""
+SAMPLES = 6
+"""Samples of a spot's integral per diffraction cell lambda z3/w, for splines of degree 5 (4e-7 of a response)."""
 OPENING_STEPS = 8
 """Nodes across a lenslet for each pixel that its spot is wide, where areas of the pupil are summed over them."""
 
@@ -55,13 +55,15 @@ def uniform_response(camera, wavelength, model, shifts=((0.0, 0.0),)):
     separable = view.lenslet_shape == "square" and (model == "fresnel" or lens.aperture_shape == "square")
     spot = _spot(view, model) if separable else None
     strips = _strips(view, lens, cells) if separable else None
-    out = []
-    for shift in shifts:
-        edges = [view.pixels(axis) + shift[axis] * view.pixel_pitch + np.array([[-1], [1]]) * view.pixel_active / 2 for axis in (0, 1)]
-        out.append(_through_spot(view, spot, strips, edges, _reach(view, model)) if separable
-                   else _through_opening(view, lens, cells, edges, _reach(view, model)))
-    scale = 1 / (aperture_area(lens) * view.row_spacing * view.D2**2)
-    return np.array(out).reshape(len(shifts), -1) * scale
+    reach, scale = _reach(view, model), 1 / (aperture_area(lens) * view.row_spacing * view.D2**2)
+    # lenslets of one row are often shifted alike
+    lines, which = zip(*(np.unique(shifts[:, axis], return_inverse=True) for axis in (0, 1)))
+    edges = [[view.pixels(axis) + (shift + np.array([[-0.5], [0.5]]) * view.pixel_active / view.pixel_pitch) * view.pixel_pitch for shift in lines[axis]] for axis in (0, 1)]
+    if separable:
+        out = _through_spot(view, spot, strips, edges, which, reach)
+    else:
+        out = np.stack([_through_opening(view, lens, cells, (edges[0][i], edges[1][j]), reach) for i, j in zip(*which)])
+    return out.reshape(len(shifts), -1) * scale
 
 
 def field_response(builder):
@@ -181,29 +183,31 @@ def _strips(view, lens, cells):
     return strips
 
 
-def _through_spot(view, spot, strips, edges, reach):
-    """Light (pixel row, pixel column) of a separable lenslet, times pupil area and cell area."""
+def _through_spot(view, spot, strips, edges, which, reach):
+    """Light (lenslet, pixel row, pixel column) of separable lenslets, times pupil area and cell area.
+
+    edges: for both axes a list of pixel edges (2, pixel); which: for both axes the number of each lenslet in it.
+    """
     minify = view.z3 / view.z2
-    total = 0.0
-    for products in view.neighbourhood(reach):
+    out = np.zeros((len(which[0]), *(line[0].shape[1] for line in edges)))
+    for rows, columns in view.neighbourhood(reach):
         for weight, top, bottom, left, right in strips:
-            down = across = 0.0
-            for far in products[0]:
-                t = edges[0] - far * view.superpixel_pitch
-                if bottom is None:
-                    down = down + _between(spot.first, t, minify * top)
-                else:
-                    down = down + (_between(spot.second, t, minify * bottom) - _between(spot.second, t, minify * top)) / minify
-            for far in products[1]:
-                t = edges[1] - far * view.superpixel_pitch
-                across = across + (_between(spot.second, t, minify * right) - _between(spot.second, t, minify * left)) / minify
-            total = total + (weight[:, None] * down).T @ across
-    return total * view.lenslet_width**2
+            if bottom is None:
+                down = [_summed(spot.first, t, rows * view.superpixel_pitch, minify * top) for t in edges[0]]
+            else:
+                down = [(_summed(spot.second, t, rows * view.superpixel_pitch, minify * bottom) - _summed(spot.second, t, rows * view.superpixel_pitch, minify * top)) / minify
+                        for t in edges[0]]
+            across = [(_summed(spot.second, t, columns * view.superpixel_pitch, minify * right) - _summed(spot.second, t, columns * view.superpixel_pitch, minify * left)) / minify
+                      for t in edges[1]]
+            for n, (i, j) in enumerate(zip(*which)):
+                out[n] += (weight[:, None] * down[i]).T @ across[j]
+    return out * view.lenslet_width**2
 
 
-def _between(integral, t, place):
-    """integral(upper edge + place) - integral(lower edge + place): (place, pixel) for edges t (2, pixel)."""
-    return integral(t[1] + place[:, None]) - integral(t[0] + place[:, None])
+def _summed(integral, t, far, place):
+    """integral(upper edge + place) - integral(lower edge + place), summed over lenslets `far` (m) away: (place, pixel) for edges t (2, pixel)."""
+    s = t[:, None, None] + place[:, None, None] - far[:, None]
+    return np.subtract(*integral(s[::-1])).sum(axis=1)
 
 
 def _through_opening(view, lens, cells, edges, reach):

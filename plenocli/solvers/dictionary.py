@@ -6,7 +6,9 @@ A is scaled to unit spectral norm and x lies in [0, 1]: lambda and delta mean no
 silent or its pseudo-code does not work:
 - atom 0 is constant and free of the penalty (nearly all light is in the mean, which the total flux fixes well); all other
   atoms have zero mean, so that it is not learnt over and over;
-- the dictionary step is solved in closed form (a Sylvester equation), and its normal equations are checked;
+- the dictionary step is solved in closed form (a Sylvester equation), and its normal equations are checked; the paper's
+  gradient steps are there beside it (`gradient_step`);
+- directions in which the sensor sees less than a hundredth of the noise's power are left out of the coding;
 - atoms that no patch of the batch used are replaced by training patches;
 - iteration i draws from its own random stream, so a resumed run equals an uninterrupted one bit for bit;
 - progress is measured on a fixed validation batch, since each iteration has another objective.
@@ -17,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from plenocli.metrics.coherence import column_coherence
-from plenocli.solvers.l1 import sparse_code
+from plenocli.solvers.l1 import lambda_path, sparse_code
 from plenocli.solvers.natural import draw_patches
 
 HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "coherence_mean", "coherence_max", "worst_gap", "step_residual")
@@ -25,13 +27,14 @@ HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "
 number of penalised atoms in use, |Phi - previous Phi|_F over kept atoms, mean and largest |cosine| of two columns of
 A Phi (kept atoms), largest relative duality gap, relative residual of the dictionary step's normal equations."""
 
-_DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION = 0, 1, 2
+_DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION, _DRAW_POWER, _DRAW_SYNTHESIS = range(5)
 
 
 @dataclass(frozen=True)
 class Settings:
     """lam, delta: weights in the scaled problem (see `Learner`).  batch: patches an iteration (the paper: at least 4 per
-    atom).  snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.  initial: patches, random or pca."""
+    atom).  snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.  initial: patches, random or pca.
+    gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form."""
 
     atoms: int
     batch: int
@@ -42,6 +45,11 @@ class Settings:
     initial: str = "patches"
     validation: int = 256
     tol: float = 1e-4
+    gradient_steps: int = 0
+
+
+FAINT = 0.01
+"""Directions with less than this ratio of signal to noise power (mean over training patches) are not coded."""
 
 
 @dataclass
@@ -68,8 +76,9 @@ class Learner:
 
     svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which everything is divided.
     training, held_out: lists of 2-D linear images in [0, 1]; validation patches come from `held_out` (other scenes).
-    object_shape: points (rows, columns) of a patch.  A appears only as S V^T / scale acting on patches: U^T y carries all
-    that least squares can see, and noise in it is as white as in y, so it is drawn there.
+    object_shape: points (rows, columns) of a patch.  A appears only as S V^T / scale acting on patches, `seen`: U^T y carries all
+    that least squares can see, and noise in it is as white as in y, so it is drawn there. `seen` ends where FAINT says: what
+    follows is noise to the coder, and half of its work.
     """
 
     def __init__(self, svd, object_shape, training, held_out, settings, *, workers=None):
@@ -80,16 +89,30 @@ class Learner:
         self.pixels = svd.u.shape[0]
         if settings.atoms < 2 or settings.batch < 1:
             raise ValueError("a dictionary needs at least two atoms and a batch of one")
+        self._leave_out_faint()
         rng = np.random.default_rng([settings.seed, _DRAW_VALIDATION])
         self.validation = draw_patches(held_out, self.object_shape, settings.validation, rng)
         self.measured, self.sigma = self.measure(self.validation, rng)
         self._step_basis = None
 
+    def _leave_out_faint(self):
+        patches = draw_patches(self.training, self.object_shape, 512, np.random.default_rng([self.settings.seed, _DRAW_POWER]))
+        power = np.mean((self.seen @ patches) ** 2, axis=1)
+        strong = np.flatnonzero(power >= FAINT * self._noise_power(np.sum(power)))
+        self.seen = np.ascontiguousarray(self.seen[: strong[-1] + 1 if len(strong) else 1])
+
+    def _noise_power(self, signal_power):
+        """sigma^2 from the signal's power summed over all directions, which is that summed over all pixels."""
+        return signal_power / self.pixels * 10 ** (-self.settings.snr_db / 10)
+
     def measure(self, patches, rng):
         """(noisy U^T A X / scale, sigma) of patches (point, count)."""
         clean = self.seen @ patches
-        sigma = np.sqrt(np.sum(clean**2) / (self.pixels * patches.shape[1]) * 10 ** (-self.settings.snr_db / 10))
-        return clean + sigma * rng.standard_normal(clean.shape), float(sigma)
+        sigma = np.sqrt(self._noise_power(np.einsum("ij,ij->", clean, clean) / patches.shape[1]))
+        measured = rng.standard_normal(clean.shape)
+        measured *= sigma
+        measured += clean
+        return measured, float(sigma)
 
     def start(self):
         """The state before the first iteration."""
@@ -118,7 +141,7 @@ class Learner:
         patches = draw_patches(self.training, self.object_shape, settings.batch, rng)
         measured, _ = self.measure(patches, rng)
         code = self.code(state.atoms, measured)
-        refitted, residual = self._refit(patches, code.c[1:])
+        refitted, residual = self._refit(patches, code.c[1:], state.atoms[:, 1:])
         norm = np.linalg.norm(refitted, axis=0)
         dead = (np.count_nonzero(code.c[1:], axis=1) == 0) | (norm < 1e-9)
         fresh = draw_patches(self.training, self.object_shape, int(dead.sum()), rng) if dead.any() else np.zeros((len(refitted), 0))
@@ -131,8 +154,14 @@ class Learner:
     def validate(self, atoms):
         """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
         code = self.code(atoms, self.measured)
-        error = np.mean((atoms @ code.c - self.validation) ** 2)
-        return float(code.objective.mean()), float(-10 * np.log10(max(error, np.finfo(float).tiny))), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+        return float(code.objective.mean()), psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+
+    def validate_path(self, atoms, lams):
+        """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda, from the largest down."""
+        table = []
+        for lam, code in lambda_path(self.seen @ atoms, self.measured, lams, free=[0], tol=self.settings.tol, workers=self.workers):
+            table.append((lam, psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean())))
+        return table
 
     def _record(self, after, before, dead, gap, residual):
         objective, quality, nonzeros, worst = self.validate(after.atoms)
@@ -142,42 +171,93 @@ class Learner:
         for name, value in zip(HISTORY, values):
             after.history[name].append(value)
 
-    def _refit(self, patches, c):
-        """Zero-mean atoms (point, atom - 1) of the closed-form dictionary step, and its relative residual."""
-        from scipy.linalg import eigh
-        from scipy.sparse import csr_array
+    def synthesis(self, state):
+        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X - Phi C|^2 over a fresh batch.
 
+        They only paint; the coding keeps the learnt atoms. Ridge and constant atom as in the dictionary step.
+        """
+        rng = np.random.default_rng([self.settings.seed, _DRAW_SYNTHESIS, state.iteration])
+        patches = draw_patches(self.training, self.object_shape, self.settings.batch, rng)
+        code = self.code(state.atoms, self.measure(patches, rng)[0])
+        gram, right = _moments(patches, code.c)
+        gram[np.diag_indices_from(gram)] += _ridge(gram)
+        return np.linalg.solve(gram, right.T).T
+
+    def _refit(self, patches, c, atoms):
+        """Zero-mean atoms (point, atom - 1) of the dictionary step, and the relative residual of its normal equations."""
         if self._step_basis is None:
             centred = self.seen - self.seen.mean(axis=1, keepdims=True)
-            energy, basis = eigh(centred.T @ centred, driver="evr")
-            self._step_basis = np.maximum(energy, 0), basis
-        sparse = csr_array(c)
-        gram = (sparse @ sparse.T).toarray() / patches.shape[1]
-        right = (patches - patches.mean(axis=0)) @ c.T / patches.shape[1]
+            strength, basis = np.linalg.svd(centred, full_matrices=False)[1:]
+            self._step_basis = strength**2, basis.T
+        gram, right = _moments(patches - patches.mean(axis=0), c)
+        if self.settings.gradient_steps:
+            return gradient_step(*self._step_basis, gram, right, self.settings.delta, atoms, self.settings.gradient_steps)
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
+
+
+def _moments(patches, c):
+    """(C C^T / B, X C^T / B); C is mostly zeros."""
+    from scipy.sparse import csr_array
+
+    sparse = csr_array(c)
+    return (sparse @ sparse.T).toarray() / patches.shape[1], (sparse @ patches.T).T / patches.shape[1]
+
+
+def psnr(estimate, truth):
+    """Peak signal-to-noise ratio in dB of patches in [0, 1], nothing clipped."""
+    return float(-10 * np.log10(max(np.mean((estimate - truth) ** 2), np.finfo(float).tiny)))
 
 
 def dictionary_step(energy, basis, gram, right, delta):
     """(Phi, residual): the minimum of (1/B)|X - Phi C|^2 + delta |A Phi|^2, in closed form.
 
-    Its normal equations are the Sylvester equation delta Q Phi + Phi (G + e I) = R with Q = A^T A = basis diag(energy) basis^T,
-    G = C C^T / B `gram`, R = X C^T / B `right`, and a ridge e = 1e-6 tr(G) / atoms that keeps it solvable where atoms are not
+    Its normal equations are the Sylvester equation delta Q Phi + Phi (G + e I) = R with Q = A^T A = basis diag(energy) basis^T
+    (energy (k,), basis (point, k): directions of no energy may be left out), G = C C^T / B `gram`, R = X C^T / B `right`, and a ridge e = 1e-6 tr(G) / atoms that keeps it solvable where atoms are not
     used. residual: |left - right|_F / |R|_F; above 1e-8 is NumericsError.
     """
     from scipy.linalg import eigh  # five times faster at 1600 atoms than numpy's
 
     from plenocli.errors import NumericsError
 
-    ridge = max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
+    ridge = _ridge(gram)
     use, directions = eigh(gram, driver="evr")
     use = np.maximum(use, 0) + ridge
-    inner = (basis.T @ (right @ directions)) / (delta * energy[:, None] + use[None, :])
-    atoms = basis @ inner @ directions.T
-    left = delta * (basis @ (energy[:, None] * (basis.T @ atoms))) + atoms @ gram + ridge * atoms
-    residual = float(np.linalg.norm(left - right) / max(np.linalg.norm(right), np.finfo(float).tiny))
+    turned = right @ directions
+    inside = basis.T @ turned
+    atoms = (turned / use + basis @ (inside / (delta * energy[:, None] + use) - inside / use)) @ directions.T
+    residual = _normal_residual(energy, basis, gram, right, delta, atoms)
     if not residual <= 1e-8:
         raise NumericsError(f"the dictionary step solves its equations only to {residual:.1e}", fix="use a larger --batch or another --delta")
     return atoms, residual
+
+
+def gradient_step(energy, basis, gram, right, delta, atoms, steps):
+    """(Phi, residual): `steps` steps down the gradient 2 (Phi (G + e I) - R + delta Q Phi) from `atoms`, as published.
+
+    Arguments as in `dictionary_step`. Step length 1 / (2 (largest eigenvalue of G + e + delta times that of Q)), the largest that
+    is safe; Nesterov's momentum. The residual says how far from the minimum they end.
+    """
+    ridge = _ridge(gram)
+    length = 1 / (np.linalg.norm(gram, 2) + ridge + delta * energy.max())
+    ahead, momentum = atoms, 1.0
+    for _ in range(steps):
+        pull = delta * (basis @ (energy[:, None] * (basis.T @ ahead))) if delta else 0.0
+        moved = ahead - length * (ahead @ gram + ridge * ahead - right + pull)
+        after = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        ahead, atoms, momentum = moved + (momentum - 1) / after * (moved - atoms), moved, after
+    return atoms, _normal_residual(energy, basis, gram, right, delta, atoms)
+
+
+def _ridge(gram):
+    return max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
+
+
+def _normal_residual(energy, basis, gram, right, delta, atoms):
+    """|delta Q Phi + Phi (G + e I) - R|_F / |R|_F."""
+    left = atoms @ gram + _ridge(gram) * atoms
+    if delta:
+        left += delta * (basis @ (energy[:, None] * (basis.T @ atoms)))
+    return float(np.linalg.norm(left - right) / max(np.linalg.norm(right), np.finfo(float).tiny))
 
 
 def _unit(atoms, rng):

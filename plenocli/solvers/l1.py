@@ -33,13 +33,13 @@ def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, pa
     what was reached is in the result.  Zero columns get a zero coefficient.  start: coefficients (L, B) to begin with.
     workers: threads over signals (compiled code only; default all cores); the result does not depend on it.
     """
-    problem = _prepare(dictionary, signals, lam, weights, free)
+    problem = prepare(dictionary, signals, lam, weights, free)
     return _active_set(problem, problem.d.T @ problem.d, problem.threshold, tol, passes, start, workers)
 
 
 def lambda_path(dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, passes=300, workers=None):
     """Yields (lambda, SparseCode) from the largest of `lams` down, each solved from the solution before; D^T D is formed once."""
-    problem = _prepare(dictionary, signals, 1.0, weights, free)
+    problem = prepare(dictionary, signals, 1.0, weights, free)
     gram, code = problem.d.T @ problem.d, None
     for lam in sorted({float(lam) for lam in lams}, reverse=True):
         _check_lambda(lam)
@@ -49,7 +49,7 @@ def lambda_path(dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, p
 
 def largest_lambda(dictionary, signals, *, weights=None, free=()):
     """The smallest lambda per signal for which c = 0 (outside `free`): 2 max_j |D_j^T y| / w_j."""
-    problem = _prepare(dictionary, signals, 1.0, weights, free)
+    problem = prepare(dictionary, signals, 1.0, weights, free)
     return np.max(np.abs(problem.b) / problem.threshold, axis=1)
 
 
@@ -70,7 +70,7 @@ def fista(dictionary, signals, lam, *, weights=None, free=(), tol=1e-4, iteratio
     Arguments and result as in `sparse_code`; stops when every signal's gap is <= tol or after `iterations`. On a plenoptic
     system matrix the gap stays near 1 for thousands of iterations, and says so.
     """
-    problem = _prepare(dictionary, signals, lam, weights, free)
+    problem = prepare(dictionary, signals, lam, weights, free)
     gram = problem.d.T @ problem.d
     step = 1.0 / max(np.linalg.norm(gram, 2), np.finfo(float).tiny)
     c = np.zeros_like(problem.b)
@@ -155,7 +155,9 @@ def _compiled(solve_signals, gram, problem, threshold, tol, passes, c, done, wor
 
 
 @dataclass
-class _Problem:
+class Problem:
+    """The problem without its free atoms: d (M, penalised atom) and y (M, signal) outside their span, b = y^T d, threshold = lambda w / 2."""
+
     d: np.ndarray
     y: np.ndarray
     b: np.ndarray
@@ -182,7 +184,8 @@ def _check_lambda(lam):
         raise ValueError(f"lambda must be positive and finite, not {lam}")
 
 
-def _prepare(dictionary, signals, lam, weights, free):
+def prepare(dictionary, signals, lam, weights, free):
+    """Problem of `sparse_code`'s arguments, checked; ValueError says what is wrong with them."""
     d, y = np.asarray(dictionary, float), np.asarray(signals, float)
     if d.ndim != 2 or y.ndim != 2 or d.shape[0] != y.shape[0]:
         raise ValueError(f"dictionary {d.shape} and signals {y.shape} must be (M, L) and (M, B)")
@@ -199,4 +202,4 @@ def _prepare(dictionary, signals, lam, weights, free):
     part, overlap = basis.T @ y, basis.T @ rest
     rest, y = rest - basis @ overlap, y - basis @ part
     b = np.ascontiguousarray(y.T @ rest)
-    return _Problem(rest, y, b, lam * w[penalised] / 2, penalised, free, basis, factor, part, overlap)
+    return Problem(rest, y, b, lam * w[penalised] / 2, penalised, free, basis, factor, part, overlap)

@@ -4,7 +4,7 @@ Imported late (by plenocli.solvers.l1), because importing numba takes a second; 
 the work. The problem of one signal is min c^T G c - 2 b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
 
 Three nested sets of atoms keep the cost down: all (q from whole rows of G, a few times a signal), a working set of those
-with the largest |q| / threshold (its block of G is copied close together), and the active ones, where the factor lives. The
+with the largest |q| / threshold, which grows (its block of G is copied close together), and the active ones, where the factor lives. The
 first passes use a raised threshold, which finds most of the support while the active set is small. Loops run over slices
 that start at 0: a variable offset in an index keeps the compiler from vectorising.
 """
@@ -18,24 +18,28 @@ JITTER = 1e-12
 """Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms cannot break the factor. They
 move far along the flat direction, and the line search stops them where one of them reaches zero and leaves."""
 
-WORKING_SET = 192
-"""Least size of the working set; it is at least twice the active set."""
+JOINING = 32
+"""Atoms that join the working set in a pass; at least half as many as are active."""
 
-LOWERING = 0.03
+CAPACITY = 288
+"""Of the first workspace; doubled when the working set outgrows it."""
+
+LOWERING = 0.1
 """The threshold starts at this fraction of the largest |b|, and falls by as much from pass to pass until it is the true one."""
 
 _FLAGS = {"reassoc", "contract", "nsz"}
 _jit = numba.njit(cache=True, fastmath=_FLAGS)
 
-Work = namedtuple("Work", "factor block x sign h d v crossing local active")
-"""Scratch of one thread, `capacity` long or square. factor: upper triangular, factor^T factor = G over the active atoms in the
-order of `local` (their places in the working set).  block: G over the working set.  h = q - threshold sign, over active atoms."""
+Work = namedtuple("Work", "factor block x sign h d v crossing local active working")
+"""Scratch of one thread, `capacity` long or square. factor: upper triangular U with U^T U = G over the active atoms in the
+order of `local` (their places in the working set); its diagonal holds 1 / U_kk, since divisions would dominate.  block: G over
+`working`, the atoms of the working set.  h = q - threshold sign, over active atoms."""
 
 
 @_jit
 def _workspace(capacity):
     return Work(np.empty((capacity, capacity)), np.empty((capacity, capacity)), np.empty(capacity), np.empty(capacity), np.empty(capacity),
-                np.empty(capacity), np.empty(capacity), np.empty(capacity), np.empty(capacity, np.int64), np.empty(capacity, np.bool_))
+                np.empty(capacity), np.empty(capacity), np.empty(capacity), np.empty(capacity, np.int64), np.empty(capacity, np.bool_), np.empty(capacity, np.int64))
 
 
 @_jit
@@ -58,10 +62,10 @@ def _forward(factor, n, d):
     """d <- factor^-T d, four rows at a time."""
     k = 0
     while k + 4 <= n:
-        a0 = d[k] / factor[k, k]
-        a1 = (d[k + 1] - a0 * factor[k, k + 1]) / factor[k + 1, k + 1]
-        a2 = (d[k + 2] - a0 * factor[k, k + 2] - a1 * factor[k + 1, k + 2]) / factor[k + 2, k + 2]
-        a3 = (d[k + 3] - a0 * factor[k, k + 3] - a1 * factor[k + 1, k + 3] - a2 * factor[k + 2, k + 3]) / factor[k + 3, k + 3]
+        a0 = d[k] * factor[k, k]
+        a1 = (d[k + 1] - a0 * factor[k, k + 1]) * factor[k + 1, k + 1]
+        a2 = (d[k + 2] - a0 * factor[k, k + 2] - a1 * factor[k + 1, k + 2]) * factor[k + 2, k + 2]
+        a3 = (d[k + 3] - a0 * factor[k, k + 3] - a1 * factor[k + 1, k + 3] - a2 * factor[k + 2, k + 3]) * factor[k + 3, k + 3]
         d[k], d[k + 1], d[k + 2], d[k + 3] = a0, a1, a2, a3
         rest = d[k + 4 : n]
         r0, r1, r2, r3 = factor[k, k + 4 : n], factor[k + 1, k + 4 : n], factor[k + 2, k + 4 : n], factor[k + 3, k + 4 : n]
@@ -69,7 +73,7 @@ def _forward(factor, n, d):
             rest[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
         k += 4
     while k < n:
-        d[k] /= factor[k, k]
+        d[k] *= factor[k, k]
         for i in range(k + 1, n):
             d[i] -= d[k] * factor[k, i]
         k += 1
@@ -90,16 +94,16 @@ def _backward(factor, n, d):
             t1 += r1[i] * value
             t2 += r2[i] * value
             t3 += r3[i] * value
-        d[k + 3] = (d[k + 3] - t3) / factor[k + 3, k + 3]
-        d[k + 2] = (d[k + 2] - t2 - factor[k + 2, k + 3] * d[k + 3]) / factor[k + 2, k + 2]
-        d[k + 1] = (d[k + 1] - t1 - factor[k + 1, k + 2] * d[k + 2] - factor[k + 1, k + 3] * d[k + 3]) / factor[k + 1, k + 1]
-        d[k] = (d[k] - t0 - factor[k, k + 1] * d[k + 1] - factor[k, k + 2] * d[k + 2] - factor[k, k + 3] * d[k + 3]) / factor[k, k]
+        d[k + 3] = (d[k + 3] - t3) * factor[k + 3, k + 3]
+        d[k + 2] = (d[k + 2] - t2 - factor[k + 2, k + 3] * d[k + 3]) * factor[k + 2, k + 2]
+        d[k + 1] = (d[k + 1] - t1 - factor[k + 1, k + 2] * d[k + 2] - factor[k + 1, k + 3] * d[k + 3]) * factor[k + 1, k + 1]
+        d[k] = (d[k] - t0 - factor[k, k + 1] * d[k + 1] - factor[k, k + 2] * d[k + 2] - factor[k, k + 3] * d[k + 3]) * factor[k, k]
     for back in range(k):
         r = k - 1 - back
         total = 0.0
         for i in range(r + 1, n):
             total += factor[r, i] * d[i]
-        d[r] = (d[r] - total) / factor[r, r]
+        d[r] = (d[r] - total) * factor[r, r]
 
 
 @_jit
@@ -110,7 +114,7 @@ def _append(factor, n, column, diagonal):
     for k in range(n):
         factor[k, n] = column[k]
         total -= column[k] * column[k]
-    factor[n, n] = np.sqrt(max(total, 0.5 * JITTER * diagonal))
+    factor[n, n] = 1.0 / np.sqrt(max(total, 0.5 * JITTER * diagonal))
 
 
 @_jit
@@ -126,9 +130,9 @@ def _remove(factor, n, place, v):
         v[j] = last[j]
     for k in range(below):
         row, target, rest = factor[place + 1 + k, place + 1 + k : n], factor[place + k, place + k : n], v[k:below]
-        length = np.sqrt(row[0] * row[0] + rest[0] * rest[0])
-        cosine, sine = row[0] / length, rest[0] / length
-        target[0] = length
+        top = 1.0 / row[0]
+        target[0] = 1.0 / np.sqrt(top * top + rest[0] * rest[0])
+        cosine, sine = top * target[0], rest[0] * target[0]
         for j in range(1, below - k):
             a, b = row[j], rest[j]
             target[j] = cosine * a + sine * b
@@ -322,78 +326,63 @@ def _solve_working_set(w, n, b, q, threshold, tol):
 
 
 @_jit
-def _choose_working_set(ratio, size):
-    """Exactly `size` indices of the largest ratios, rising."""
-    if size >= ratio.shape[0]:
-        return np.arange(ratio.shape[0])
-    cut = _kth_largest(ratio, size)
-    spare = size - np.count_nonzero(ratio > cut)
-    chosen = np.empty(size, np.int64)
-    n = 0
+def _extend(w, size, gram, ratio, more):
+    """`more` atoms of the largest ratios join the `size` of the working set. Returns its size."""
+    for j in w.working[:size]:
+        ratio[j] = -1.0
+    cut, first = _kth_largest(ratio, more), size
+    spare = more - np.count_nonzero(ratio > cut)
     for j in range(ratio.shape[0]):
         if ratio[j] > cut or (ratio[j] == cut and spare > 0):
             if ratio[j] == cut:
                 spare -= 1
-            chosen[n] = j
-            n += 1
-    return chosen
-
-
-@_jit
-def _load(w, gram, working, index):
-    """Copy G over the working set, and find the active atoms `index` in it."""
-    for i in range(working.shape[0]):
-        row, target = gram[working[i]], w.block[i]
-        for j in range(working.shape[0]):
-            target[j] = row[working[j]]
-        w.active[i] = False
-    for k in range(index.shape[0]):
-        low, high = 0, working.shape[0] - 1
-        while low < high:
-            middle = (low + high) // 2
-            if working[middle] < index[k]:
-                low = middle + 1
-            else:
-                high = middle
-        w.local[k], w.active[low] = low, True
+            w.working[size], w.active[size] = j, False
+            size += 1
+    for i in range(first, size):
+        row = gram[w.working[i]]
+        for j in range(i + 1):
+            w.block[i, j] = w.block[j, i] = row[w.working[j]]
+    return size
 
 
 @_jit
 def _resume(w, gram, index, value):
-    """Factor and values of the active set `index` from its coefficients."""
+    """Working set, factor and values of the active set `index` from its coefficients."""
     for n in range(index.shape[0]):
-        for i in range(n):
-            w.v[i] = gram[index[n], index[i]]
-        _append(w.factor, n, w.v, gram[index[n], index[n]])
-        w.x[n], w.sign[n] = value[n], np.sign(value[n])
+        w.working[n] = index[n]
+        for i in range(n + 1):
+            w.block[n, i] = w.block[i, n] = gram[index[n], index[i]]
+            w.v[i] = w.block[n, i]
+        _append(w.factor, n, w.v, w.block[n, n])
+        w.local[n], w.active[n], w.x[n], w.sign[n] = n, True, value[n], np.sign(value[n])
 
 
 @_jit
 def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
     """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,), which are overwritten.
 
-    Not finished: the workspace is too small for the active set; call again with a larger one.
+    Not finished: the workspace is too small for the working set; call again with a larger one.
     """
     index = np.flatnonzero(c)
-    capacity, passes, stalled, raised = w.x.shape[0], 0, 0, 1.0
-    if min(c.shape[0], 2 * index.shape[0]) > capacity:
+    n = size = index.shape[0]
+    passes, stalled, raised = 0, 0, 1.0
+    if size > w.x.shape[0]:
         return False, 0.0, 1.0, 0
     _resume(w, gram, index, c[index])
     q = b.copy()
-    _subtract(q, w.x, index.shape[0], gram, index)
+    _subtract(q, w.x, n, gram, index)
     objective, gap = relative_gap(b, q, w.x, index, signal_energy, threshold)
-    if index.shape[0] == 0:
+    if n == 0:
         raised = max(1.0, LOWERING * np.max(np.abs(q) / threshold))
     while gap > tol and passes < pass_limit and stalled < 3:
         passes += 1
-        size = min(c.shape[0], max(WORKING_SET, 2 * index.shape[0]))
-        if size > capacity:
+        more = min(c.shape[0] - size, max(JOINING, n // 2))
+        if size + more > w.x.shape[0]:
             return False, objective, gap, passes
-        ratio = np.abs(q) / threshold
-        ratio[index] = np.inf
-        working = _choose_working_set(ratio, size)
-        _load(w, gram, working, index)
-        n = _solve_working_set(w, index.shape[0], b[working], q[working], raised * threshold[working], 0.25 * tol)
+        if more > 0:
+            size = _extend(w, size, gram, np.abs(q) / threshold, more)
+        working = w.working[:size]
+        n = _solve_working_set(w, n, b[working], q[working], raised * threshold[working], 0.25 * tol)
         index = working[w.local[:n]]
         _spread(w.x, index, c)
         _copy(b, q.shape[0], q)
@@ -409,7 +398,7 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
 @numba.njit(cache=True, fastmath=_FLAGS, nogil=True)
 def solve_signals(gram, b, signal_energy, threshold, tol, pass_limit, c, objective, gap, passes):
     """solve_signal for every row of b and c (signal, atom), into c, objective, gap and passes (signal,); one thread, no lock held."""
-    w = _workspace(min(c.shape[1], WORKING_SET))
+    w = _workspace(min(c.shape[1], CAPACITY))
     for i in range(b.shape[0]):
         while True:
             finished, objective[i], gap[i], passes[i] = solve_signal(gram, b[i], signal_energy[i], threshold, tol, pass_limit, c[i], w)

@@ -1,0 +1,203 @@
+"""Sparse coding beside other solvers: processor time a signal, and the duality gap that each reached, recomputed for all alike.
+
+The problem is  min |y - D c|^2 + lambda |c|_1  for signals of held-out photographs: D = A Phi with the matrix of one isolated lenslet of
+a configuration and a dictionary learnt for it, noise at 60 dB, lambda the best on validation patches. A and y are compressed by A's
+singular vectors, which changes nothing but a constant, and the constant atom, which is free of the penalty, is projected out: every
+solver gets the same D and Y and starts from them, so Gram matrices count. All run in one process on one thread, in turns; a time is
+the median over the turns of the process time. Slow solvers get the first few signals only. The gap comes from the residual in
+double precision: (P - dual) / P with the scaled residual as the dual point. Solvers that are not installed are left out:
+`pip install -e '.[bench]'`.
+
+Writes RUN/sparse.json and RUN/sparse.md. Run from the project's root: python pipelines/benchmarks/sparse.py --help.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+import warnings
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[name] = "1"
+
+import numpy as np  # noqa: E402
+
+SNR_DB = 60.0
+LAMBDAS = np.logspace(-8, -4, 17)
+PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior point": "clarabel"}
+
+
+# the problem
+
+
+def problem(config, iterations, count, seed):
+    """dict: D (row, atom), Y (row, signal), lambda, and the validation table that chose it."""
+    from plenocli.accuracy import plan_pif
+    from plenocli.config import load_camera
+    from plenocli.optics.pif import build_pif
+    from plenocli.solvers.dictionary import Learner, Settings
+    from plenocli.solvers.linear import decompose
+    from plenocli.solvers.natural import draw_patches
+    from plenocli.stages.training import at_scales, read_training, split_by_scene
+
+    camera = load_camera(config)
+    shape = camera.object.samples_per_lenslet
+    matrix = build_pif(camera, plan_pif(camera, model="fresnel", superpixels=(1, 1), coherent_ring=0, accuracy=1e-5)).A[0, 0]
+    training, held = ([p for _, p in at_scales(part, shape)] for part in split_by_scene(read_training((), shape)))
+    points = int(np.prod(shape))
+    settings = Settings(points, 4 * points, 1e-6, 1e-3, SNR_DB, seed=seed)
+    learner = Learner(decompose(matrix), shape, training, held, settings, workers=1)
+    state = learner.start()
+    for k in range(iterations):
+        state = learner.step(state)
+        print(f"learning: iteration {k + 1} of {iterations}, validation {state.history['validation_psnr'][-1]:.2f} dB", flush=True)
+    table = learner.validate_path(state.atoms, LAMBDAS)
+    lam = max(table, key=lambda row: row[1])[0]
+    rng = np.random.default_rng([seed, 99])
+    signals, _ = learner.measure(draw_patches(held, shape, count, rng), rng)
+    effective = learner.seen @ state.atoms
+    constant = effective[:, :1] / np.linalg.norm(effective[:, 0])
+    effective, signals = (x - constant @ (constant.T @ x) for x in (effective[:, 1:], signals))
+    return {"D": effective, "Y": signals, "lambda": lam, "validation": [(float(a), float(b), float(c)) for a, b, c in table]}
+
+
+# the solvers: (D, Y, lambda) -> coefficients (atom, signal)
+
+
+def ours(d, y, lam):
+    from plenocli.solvers.l1 import sparse_code
+
+    return sparse_code(d, y, lam, tol=1e-6, workers=1).c
+
+
+def fista(d, y, lam):
+    from plenocli.solvers.l1 import fista
+
+    return fista(d, y, lam, iterations=300).c
+
+
+def interior(d, y, lam):
+    from plenocli.solvers.l1_interior import interior_point
+
+    return interior_point(d, y, lam).c
+
+
+def spams_cholesky(d, y, lam):
+    import spams
+
+    return spams.lasso(np.asfortranarray(y), D=np.asfortranarray(d), lambda1=lam / 2, mode=2, cholesky=True, numThreads=1).toarray()
+
+
+def spams_lars(d, y, lam):
+    import spams
+
+    return spams.lasso(np.asfortranarray(y), D=np.asfortranarray(d), lambda1=lam / 2, mode=2, numThreads=1).toarray()
+
+
+def sklearn_lars(d, y, lam):
+    from sklearn.decomposition import sparse_encode
+
+    return sparse_encode(y.T, d.T, algorithm="lasso_lars", alpha=lam / 2, max_iter=4000, n_jobs=1).T
+
+
+def sklearn_cd(d, y, lam):
+    from sklearn.decomposition import sparse_encode
+
+    return sparse_encode(y.T, d.T, algorithm="lasso_cd", alpha=lam / 2, max_iter=1000, n_jobs=1).T
+
+
+SOLVERS = {
+    "ours": (ours, None), "SPAMS lasso, Cholesky": (spams_cholesky, None), "SPAMS lasso, LARS": (spams_lars, None),
+    "scikit-learn lasso_lars (4000)": (sklearn_lars, 4), "scikit-learn lasso_cd (1000)": (sklearn_cd, 8), "FISTA (300)": (fista, 64), "interior point": (interior, 1),
+}
+"""Name: (function, how many of the signals it gets; None: all)."""
+
+
+# measuring
+
+
+def measure(task, rounds, chosen):
+    """Rows of the table, and the packages that are missing."""
+    from plenocli.solvers.l1 import duality_gap
+
+    d, y, lam = task["D"], task["Y"], task["lambda"]
+    threshold = np.full(d.shape[1], lam / 2)
+    times, codes, missing = {}, {}, []
+    ours(d[:, :20], y[:, :2], lam)  # compiled before the clock starts
+    for _ in range(rounds):
+        for name in chosen:
+            if name in missing:
+                continue
+            solver, most = SOLVERS[name]
+            part = y[:, :most]
+            try:
+                begun = time.process_time()
+                codes[name] = solver(d, part, lam)
+                times.setdefault(name, []).append((time.process_time() - begun) / part.shape[1])
+            except Exception as error:
+                if not isinstance(error, ImportError) and "needs Clarabel" not in str(error):
+                    raise
+                missing.append(name)
+    rows = []
+    for name, c in codes.items():
+        _, gap, _ = duality_gap(d, y[:, : c.shape[1]], np.ascontiguousarray(c.T), threshold)
+        rows.append({"solver": name, "signals": c.shape[1], "ms": 1e3 * float(np.median(times[name])), "ms_all": [1e3 * t for t in times[name]],
+                     "gap_median": float(np.median(gap)), "gap_95": float(np.percentile(gap, 95)), "gap_max": float(gap.max()), "nonzeros": float(np.count_nonzero(c, axis=0).mean())})
+    return rows, missing
+
+
+def markdown(task, rows, missing):
+    """The table, with times relative to the first row."""
+    lines = [f"D {task['D'].shape[0]} x {task['D'].shape[1]}, {task['Y'].shape[1]} signals, {SNR_DB:g} dB, lambda {task['lambda']:.2e}; versions: {', '.join(versions())}", "",
+             "| solver | signals | CPU ms a signal | times ours | gap median | 95 % | max | non-zeros |", "|---|---|---|---|---|---|---|---|"]
+    for row in rows:
+        lines.append(f"| {row['solver']} | {row['signals']} | {row['ms']:.2f} | {row['ms'] / rows[0]['ms']:.1f} | {row['gap_median']:.0e} | {row['gap_95']:.0e} | {row['gap_max']:.0e} | {row['nonzeros']:.0f} |")
+    lines += [""] + [f"Not installed: {name}." for name in missing]
+    return "\n".join(lines) + "\n"
+
+
+def versions():
+    """Name and version of what was compared."""
+    out = [f"numpy {np.__version__}"]
+    for name, package in PACKAGES.items():
+        try:
+            out.append(f"{name} {version(package)}")
+        except PackageNotFoundError:
+            pass
+    return out
+
+
+def main():
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, default=Path("runs/bench-sparse"), help="folder of the results; the problem is kept there too")
+    parser.add_argument("--config", type=Path, default=ROOT / "sample_configs" / "seed_spatial.toml", help="camera (default: the paper's)")
+    parser.add_argument("--iterations", type=int, default=3, help="iterations of the dictionary (default 3)")
+    parser.add_argument("--signals", type=int, default=1024, help="signals (default 1024)")
+    parser.add_argument("--rounds", type=int, default=3, help="turns of every solver (default 3)")
+    parser.add_argument("--lambda-factor", type=float, default=1.0, help="times the best lambda (default 1)")
+    parser.add_argument("--solver", action="append", choices=list(SOLVERS), help="only this solver beside ours (repeatable)")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    options.run.mkdir(parents=True, exist_ok=True)
+    kept = options.run / f"problem-{options.config.stem}-{options.iterations}-{options.signals}-{options.seed}.npz"
+    if not kept.exists():
+        np.savez(kept, **problem(options.config, options.iterations, options.signals, options.seed))
+    with np.load(kept) as stored:
+        task = {name: stored[name] for name in stored.files}
+    task["lambda"] = float(task["lambda"]) * options.lambda_factor
+    rows, missing = measure(task, options.rounds, ["ours", *(options.solver or list(SOLVERS)[1:])])
+    (options.run / "sparse.json").write_text(json.dumps({"lambda": task["lambda"], "validation": task["validation"].tolist(), "rows": rows, "missing": missing, "versions": versions()}, indent=1) + "\n")
+    text = markdown(task, rows, missing)
+    (options.run / "sparse.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,9 @@ import numpy as np
 from plenocli.errors import InputError, PlenoError, UsageError
 from plenocli.plain import plain
 from plenocli.stages.progress import note
-from plenocli.stages.score_inputs import CHART, block_of, read_labels, read_result, read_truth, read_white
+from plenocli.stages.score_inputs import CHART, block_of, read_result, read_truth, read_whites
+from plenocli.stages.score_response import score_calibration
+from plenocli.stages.score_spectra import against_single_pixel, score_spectra
 
 GROUPS = {
     "psnr": ("psnr_db", "psnr_inner_db", "psnr_clipped_db"),
@@ -18,6 +20,9 @@ GROUPS = {
     "patches": ("patches", "patch_rmse_per_band", "six_patch_rmse", "six_patch_rmse_per_band", "six_patches_seen"),
     "spectral-angle": ("spectral_angle_deg",),
     "delta-e": ("delta_e_2000",),
+    "classification": ("classification_accuracy", "nearest_patch_accuracy"),
+    "single-pixel": ("rmse_over_single_pixel", "six_patch_rmse_over_single_pixel", "delta_e_over_single_pixel", "snr_over_single_pixel_db"),
+    "response": ("response_gain_per_band", "response_error_per_band", "response_error_lenslet_per_band", "response_pixel_per_band", "response_leak"),
     "limits": ("noise_relative", "model_error_relative", "limited_by"),
     "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
     "coherence": (
@@ -27,23 +32,22 @@ GROUPS = {
 }
 """What --metric may ask for, and the numbers that each brings."""
 
-WHITE_LABEL = 19  # of the chart's patches row by row, the first of the last row
-
 
 def run_score(
     results, output, *, truth=None, report=None, metrics=(), whites=(), patches=None, pif=None, capture=None, block=None,
-    sampling="fit", light="D65", overwrite=False, mem_limit=None, command="",
+    sampling="fit", light="D65", camera=None, overwrite=False, mem_limit=None, command="",
 ):
     """Score every result, write `output` (JSON) and perhaps `report` (HTML); returns the JSON document as a dict.
 
     results: paths. truth: path or scene name, needed but for dictionaries. whites: spectra of a white target, frames.
     patches: label map or "colorchecker". pif: system matrix (dictionaries need it). capture: for its sensor-model SNR.
-    block: object samples per lenslet (h, w), else from the files. light: for colour differences. One bad result does not
-    stop the others: its message stands in its place and is raised at the end.
+    block: object samples per lenslet (h, w), else from the files. light: for colour differences. camera: TOML, through whose
+    filters spectra see the truth. One bad result does not stop the others: its message stands in its place and is raised at the
+    end.
     """
     from plenocli.artefacts import check_output, describe_inputs, publish, read_pif
 
-    inputs = [*results, truth, *whites, patches, pif, capture]
+    inputs = [*results, truth, *whites, patches, pif, capture, camera]
     files = [path for path in inputs if path is not None and Path(path).is_file()]
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
@@ -51,18 +55,22 @@ def run_score(
     if report is not None and Path(report) == Path(output):
         raise UsageError("--output and --report name the same file", output, "give the report another name, such as report.html")
     system = read_pif(pif, mem_limit) if pif else None
-    context = _Context(truth, whites, patches, system, capture, block, sampling, light, mem_limit)
+    context = _Context(truth, whites, patches, system, capture, block, sampling, light, camera, mem_limit)
     scored, pictures, errors = [], [], []
     for path in results:
         try:
             entry, picture = _score_one(path, context)
-            _keep(entry["metrics"], metrics)
         except PlenoError as error:
-            note(f"error: {error}")
-            errors.append(error)
-            entry, picture = {"name": Path(path).name, "error": str(error).replace(str(path), Path(path).name), "metrics": {}}, None
+            entry, picture = _failed(path, error, errors), None
         scored.append(entry)
         pictures.append(picture)
+    against_single_pixel(scored)
+    for i, path in enumerate(results):
+        try:
+            if "error" not in scored[i]:
+                _keep(scored[i]["metrics"], metrics)
+        except PlenoError as error:
+            scored[i], pictures[i] = _failed(path, error, errors), None
     if len(errors) == len(results):
         raise errors[0]
     _name_apart(scored, results)
@@ -73,7 +81,7 @@ def run_score(
         "command": command,
         "inputs": describe_inputs({
             "result": list(results), "truth": truth if truth and Path(truth).is_file() else None, "white": list(whites),
-            "patches": patches if patches and Path(patches).is_file() else None, "pif": pif, "capture": capture,
+            "camera": camera, "patches": patches if patches and Path(patches).is_file() else None, "pif": pif, "capture": capture,
         }),
     }
     document = plain(document)
@@ -87,25 +95,37 @@ def run_score(
     return document
 
 
+def _failed(path, error, errors):
+    """The entry of a result that cannot be scored; its error is told and kept."""
+    note(f"error: {error}")
+    errors.append(error)
+    return {"name": Path(path).name, "error": str(error).replace(str(path), Path(path).name), "metrics": {}}
+
+
 class _Context:
     """Everything a result is scored with; files are read once."""
 
-    def __init__(self, truth, whites, patches, system, capture, block, sampling, light, mem_limit):
+    def __init__(self, truth, whites, patches, system, capture, block, sampling, light, camera, mem_limit):
         from plenocli.scene.tables import illuminant
+        from plenocli.stages.cameras import read_camera
 
         illuminant(light, [560e-9])  # an unknown name is refused before any work
         if patches is None and str(truth) == CHART:
             patches = CHART
         self.truth, self.patches, self.system, self.block = truth, patches, system, block
         self.sampling, self.light, self.mem_limit = sampling, light, mem_limit
-        self.whites = read_white(whites, mem_limit) if whites else None
+        self.whites = read_whites(whites, mem_limit)
+        self.camera = read_camera(camera) if camera else None
         self.sensor_snr = _sensor_snr(capture, mem_limit) if capture else None
 
 
 def _score_one(path, context):
     """(JSON-able entry, what the report draws) of one result."""
-    result = read_result(path, mem_limit=context.mem_limit)
+    result = read_result(path, ("image", "spectra", "dictionary", "calibration"), context.mem_limit)
     entry = {"name": Path(path).name, "kind": result.kind}
+    if result.kind == "calibration":
+        wavelengths, entry["metrics"] = score_calibration(path, context.truth, context.mem_limit)
+        return entry | {"wavelengths_nm": [round(float(w) * 1e9, 6) for w in wavelengths]}, None
     if result.method:
         entry["method"] = result.method
     if result.kind == "dictionary":
@@ -113,7 +133,7 @@ def _score_one(path, context):
         return entry, {"result": result}
     if context.truth is None:
         raise UsageError("the truth is missing", path, "name it with --truth: a capture, photograph, spectral EXR, image, spectra or colorchecker")
-    truth = read_truth(context.truth, result, context.sampling)
+    truth = read_truth(context.truth, result, context.sampling, context.camera)
     if not np.isfinite(truth).any():
         raise InputError("holds no finite value", context.truth)
     picture = {"result": result, "truth": truth}
@@ -123,7 +143,7 @@ def _score_one(path, context):
         picture["block"] = block
     else:
         entry["wavelengths_nm"] = [round(float(w) * 1e9, 6) for w in result.wavelengths]
-        entry["metrics"], entry["patches"] = _score_spectra(path, result, truth, context)
+        entry["metrics"], entry["patches"] = score_spectra(path, result, truth, context)
         picture["patches"] = entry["patches"]
     limits = result.attrs.get("parameters", {}).get("limits") if isinstance(result.attrs.get("parameters"), dict) else None
     if limits:
@@ -142,75 +162,6 @@ def _score_image(path, result, truth, block):
         raise UsageError(f"{result.grid[0]} x {result.grid[1]} points are no whole number of {block[0]} x {block[1]} blocks", path,
                          "correct --block")
     return score_picture(result.values, truth, block)
-
-
-def _score_spectra(path, result, truth, context):
-    """(metrics, patches) of a spectral cube."""
-    from plenocli.metrics.quality import score_picture
-    from plenocli.metrics.spectral import patch_statistics, score_cube, score_patches
-    from plenocli.scene.tables import SIX_PATCHES, colorchecker, patch_index
-
-    values = _reflectance(path, result, context)
-    labels = None if context.patches is None else read_labels(context.patches, result.grid)
-    scores = score_cube(values, truth, result.wavelengths, context.light)
-    if not scores["lenslets"]:
-        raise InputError("has no lenslet with values in all bands", path, "check the calibration it was made with")
-    if result.kind == "image":
-        scores |= score_picture(values, truth)
-    listed = []
-    if labels is not None:
-        six = tuple(patch_index(name) + 1 for name in SIX_PATCHES)
-        scores |= score_patches(values, truth, labels, six)
-        true = patch_statistics(truth, labels)
-        names = colorchecker()[0]
-        for label, found in patch_statistics(values, labels).items():
-            listed.append({
-                "label": label, "name": names[label - 1], "lenslets": found["count"], "mean": found["mean"].tolist(),
-                "std": found["std"].tolist(), "truth": true[label]["mean"].tolist() if label in true else None,
-                "one_of_six": label in six,
-            })
-    scores |= _snr(result, labels, context)
-    return scores, listed
-
-
-def _reflectance(path, result, context):
-    """The result's values as reflectance: as they are, or radiance divided by that of the white target."""
-    from plenocli.config import REFERENCE_REFLECTANCE
-
-    if result.quantity != "radiance":
-        return result.values
-    if context.whites is None:
-        if str(context.truth) == CHART:
-            raise UsageError("holds radiance, the truth is reflectance", path, "demux with --reference, or name the spectra of a white target with --white")
-        return result.values
-    white = context.whites[0].mean(axis=0)
-    if white.shape != result.values.shape:
-        raise UsageError(f"is {result.values.shape}, the white target {white.shape}", path, "demultiplex both with one calibration")
-    return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * REFERENCE_REFLECTANCE
-
-
-def _snr(result, labels, context):
-    """Capture and predicted SNR on the white target, or on the chart's white patch where there is none."""
-    from plenocli.metrics.snr import snr_capture, snr_predicted
-
-    if context.whites is not None:
-        frames, sigma = context.whites
-        target = f"white target, {len(frames)} frames over time" if len(frames) > 1 else "white target, one frame over its lenslets"
-    elif labels is not None and (labels == WHITE_LABEL).any():
-        here = labels == WHITE_LABEL
-        frames, sigma = result.values[None][:, :, here], None if result.sigma is None else np.asarray(result.sigma)[:, here]
-        target = "white patch of the chart, over its lenslets"
-    else:
-        return {}
-    scores = {"snr_target": target, "snr_capture_db": snr_capture(frames)}
-    if sigma is not None:
-        scores["snr_predicted_db"] = snr_predicted(frames[0], sigma)
-    for name in ("snr_capture", "snr_predicted"):
-        if f"{name}_db" in scores:
-            bands = scores[f"{name}_db"]
-            scores[f"{name}_mean_db"] = float(bands.mean()) if np.isfinite(bands).all() else None
-            scores[f"{name}_db"] = bands.tolist()
-    return scores
 
 
 def _sensor_snr(path, mem_limit):
@@ -259,9 +210,12 @@ _NEEDS = {
     "patches": "give a label map with --patches",
     "block-mean": "give the object samples per lenslet with --block 40x40",
     "coherence": "give a dictionary and --pif",
+    "response": "give a calibration and name another one with --truth",
     "spectral-angle": "give a spectral result",
     "limits": "give a picture that reconstruct made with a --pif of known accuracy",
     "delta-e": "give a spectral result",
+    "classification": "give a spectral result and its --patches, two or more; one of the two numbers needs scikit-learn (plenocli[ml])",
+    "single-pixel": "give spectra of demux --method single-pixel among the results",
 }
 
 
@@ -274,15 +228,17 @@ def _name_apart(scored, paths):
 
 
 def _definitions(scored):
-    from plenocli.metrics import coherence, quality, snr, spectral
+    from plenocli.metrics import classify, coherence, quality, response, snr, spectral
 
     found = {}
     for entry in scored:
         home = {"dictionary": [coherence], "image": [quality], "spectra": [spectral]}.get(entry.get("kind"), [])
-        if "wavelengths_nm" in entry:
+        if entry.get("kind") == "calibration":
+            home = [response]
+        elif "wavelengths_nm" in entry:
             home = [spectral, quality]
         for name in entry["metrics"]:
-            for module in (*home, snr):
+            for module in (*home, snr, classify):
                 if name in module.DEFINITIONS:
                     found[name] = module.DEFINITIONS[name]
                     break

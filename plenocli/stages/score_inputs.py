@@ -15,7 +15,8 @@ _CHART_OVERSAMPLING = 20  # chart samples per lenslet and side when the truth of
 class Result:
     """values: (row, column) or (band, row, column) float64; wavelengths (band,) m or None; quantity "" for pictures.
 
-    kind: "image", "spectra" or "dictionary" (values are then the atoms). sigma: like values, or None.
+    kind: "image", "spectra", "dictionary" (values are then the atoms) or "calibration" (values are then the response as stored).
+    sigma: like values, or None.
     """
 
     name: str
@@ -57,6 +58,8 @@ def _from_artefact(path, kinds, mem_limit):
     attrs = artefact.attrs.get(artefact.kind, {})
     if artefact.kind == "dictionary":
         return Result(path.stem, "dictionary", artefact.data["dictionary/atoms"], attrs=attrs)
+    if artefact.kind == "calibration":
+        return Result(path.stem, "calibration", artefact.data.get("response/F"), attrs=attrs)
     kind = artefact.kind
     data = {part: artefact.data.get(f"{kind}/{part}") for part in ("value", "sigma", "wavelength")}
     values = np.asarray(data["value"], dtype=np.float64)
@@ -80,15 +83,18 @@ def _from_exr(path, mem_limit):
     return Result(path.stem, "image", np.asarray(values, dtype=np.float64), attrs=dict(attrs))
 
 
-def read_truth(truth, result, sampling="fit"):
+def read_truth(truth, result, sampling="fit", camera=None):
     """The truth on the grid and at the wavelengths of `result`: an array like result.values.
 
     truth: a path or a name that stages.scenes.read_scene knows. A capture brings the object that it was simulated from; a
-    finer grid is averaged over areas; other wavelengths are interpolated. InputError where no comparison is possible.
+    finer grid is averaged over areas; other wavelengths are interpolated. camera: a Camera through whose filters a scene is seen
+    (width, leak, light and all), instead of at their centres. InputError where no comparison is possible.
     """
     rows, cols = result.grid
     spectral = result.wavelengths is not None
-    known = _known_truth(truth)
+    known = None if camera is not None and Path(truth).suffix == ".h5" and _is_scene(truth) else _known_truth(truth)
+    if known is not None and camera is not None:
+        raise InputError("is known at some wavelengths only and cannot be seen through filters", truth, "name the scene itself: an image with wavelengths, a spectral EXR or colorchecker")
     if known is None:
         from plenocli.stages.scenes import Chart, read_scene
 
@@ -96,7 +102,10 @@ def read_truth(truth, result, sampling="fit"):
         if not spectral and getattr(scene, "spectral", False):
             raise InputError("is spectral, the result is a single picture", truth, "compare with a photograph or with the capture's own scene")
         fine = _CHART_OVERSAMPLING if isinstance(scene, Chart) else 1
-        planes = [_coarser(scene.at(w, rows * fine, cols * fine), rows, cols) for w in (result.wavelengths if spectral else [550e-9])]
+        plane = lambda w: _coarser(scene.at(w, rows * fine, cols * fine), rows, cols)  # noqa: E731
+        if spectral and camera is not None:
+            return _through_filters(plane, camera, result.wavelengths)
+        planes = [plane(w) for w in (result.wavelengths if spectral else [550e-9])]
         return np.array(planes) if spectral else planes[0]
     values, wavelengths = known
     if not spectral and len(values) != 1:
@@ -106,6 +115,37 @@ def read_truth(truth, result, sampling="fit"):
     _same_aspect(values.shape[-2:], (rows, cols), truth)
     values = np.array([_coarser(plane, rows, cols) for plane in values])
     return values if spectral else values[0]
+
+
+def _is_scene(path):
+    """Whether an .h5 is an image with wavelengths, which serves as a scene at any of them."""
+    from plenocli.artefacts import read_artefact
+
+    artefact = read_artefact(path, ("capture", "spectra", "image"))
+    return artefact.kind == "image" and artefact.data["image/value"].ndim == 3
+
+
+def _through_filters(plane, camera, bands):
+    """Reflectance (band, row, column) as a camera with one filter a band sees it: mean of plane(wavelength), weighted with the light's
+    photons, the filter's transmittance and the sensor's sensitivity (mean of its colours)."""
+    from plenocli.optics.pupil import filter_transmittance
+    from plenocli.scene.tables import illuminant
+    from plenocli.sensor.cfa import sensitivity
+    from plenocli.sensor.light import broadband
+
+    if camera.filter_array is None:
+        raise UsageError("has no [filter_array], through which the truth could be seen", "--camera", "leave --camera out")
+    filters = [min(camera.filter_array.filters, key=lambda f: abs(f.center - band)) for band in bands]
+    far = [band for band, f in zip(bands, filters, strict=True) if abs(f.center - band) > f.fwhm]
+    if far:
+        raise UsageError(f"has no filter at {far[0] * 1e9:.4g} nm, a band of the result", "--camera", "name the camera that the result was made with")
+    light = broadband(camera, lambda wavelengths: illuminant(camera.light.illuminant, wavelengths))
+    seen = sensitivity(camera, light.wavelengths)[1].mean(axis=0)
+    weights = np.array([[n * q * filter_transmittance(f, w) for w, n, q in zip(light.wavelengths, light.photons, seen, strict=True)] for f in filters])
+    total = 0.0
+    for weight, wavelength in zip(weights.T, light.wavelengths, strict=True):
+        total = total + weight[:, None, None] * plane(wavelength)
+    return total / weights.sum(axis=1)[:, None, None]
 
 
 def _known_truth(truth):
@@ -205,11 +245,13 @@ def block_of(result, truth, pif=None):
     return None
 
 
-def read_white(paths, mem_limit=None):
-    """Spectra of a white target, one a frame: (values (frame, band, row, column), sigma of the first or None)."""
-    frames = [read_result(path, ("spectra",), mem_limit) for path in paths]
-    first = frames[0]
-    for path, frame in zip(paths, frames, strict=True):
-        if frame.values.shape != first.values.shape:
-            raise UsageError(f"is {frame.values.shape}, {paths[0]} is {first.values.shape}", path, "give white targets demultiplexed with one calibration")
-    return np.array([frame.values for frame in frames]), first.sigma
+def read_whites(paths, mem_limit=None):
+    """Spectra of white targets by method: dict method -> (values (frame, band, row, column), sigma of the first or None)."""
+    groups = {}
+    for path in paths:
+        frame = read_result(path, ("spectra",), mem_limit)
+        group = groups.setdefault(frame.method, [])
+        if group and frame.values.shape != group[0].values.shape:
+            raise UsageError(f"is {frame.values.shape}, {group[0].name} is {group[0].values.shape}", path, "give white targets demultiplexed with one calibration")
+        group.append(frame)
+    return {method: (np.array([frame.values for frame in group]), group[0].sigma) for method, group in groups.items()}

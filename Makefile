@@ -13,7 +13,7 @@ BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 
-.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr raw tiny tradeoff bench-pif clean
+.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr colorchecker raw tiny tradeoff bench-pif clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,7 +24,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "plenocli needs Python 3.11 or newer; say which: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
 	@echo "making the environment in $(VENV) (once, a few minutes)"
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plot,fast,dev]'
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plot,fast,ml,dev]'
 	@touch $@
 
 demo: $(READY) ## both experiments at a small size, with pictures: runs/demo/report.html
@@ -50,6 +50,10 @@ spectral: $(READY) ## section 3-1 of the paper: calibrate from narrow-band captu
 
 dslr: $(READY) ## the spectral experiment with a Bayer sensor
 	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/dslr CONFIG=sample_configs/dslr.toml
+
+colorchecker: $(READY) ## a real ColorChecker under narrow-band light against its spectrometer, and through the camera: make colorchecker DATA=folder
+	@test -d "$(DATA)" || { echo "say where the captures are: make colorchecker DATA=folder" >&2; exit 2; }
+	$(PIPELINE) pipelines/colorchecker.mk RUN=$(RUNS)/colorchecker DATA="$(DATA)"
 
 raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. DARK=.. CAPTURES="a.nef b.nef"
 	$(PIPELINE) pipelines/raw.mk RUN=$(RUNS)/raw

@@ -119,6 +119,7 @@ SPECTRA = Schema("spectra", 1, "Spectrum behind each lenslet.", (
 
 DICTIONARY = Schema("dictionary", 1, "Dictionary of object patches learnt for one system matrix.", (
     Field("dictionary/atoms", "point atom", "f", "1", "patches, unit norm, one a column"),
+    Field("dictionary/synthesis", "point atom", "f", "1", "what paints the coefficients found with the atoms, if not the atoms", optional=True),
     Field("dictionary/history/*", None, "f i b", "see name", "value after each iteration", maskable=True),
     Field("dictionary/state/*", None, "f i b", "see name", "what a resumed run needs", maskable=True),
 ), attrs={"dictionary": (

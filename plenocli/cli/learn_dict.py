@@ -5,6 +5,16 @@ import click
 from plenocli.cli import options
 
 
+class Lambda(click.ParamType):
+    """A positive number, or the word noise."""
+
+    name = "NUMBER|noise"
+
+    def convert(self, value, param, ctx):
+        """float, or the word."""
+        return value if value == "noise" else options.POSITIVE.convert(value, param, ctx)
+
+
 @click.command("learn-dict", short_help="Learn a dictionary of object patches for a system matrix.")
 @click.argument("images", nargs=-1, metavar="[IMAGE]...")
 @click.option("--pif", required=True, type=options.FILE, help="System matrix A (from simulate-pif).")
@@ -13,9 +23,11 @@ from plenocli.cli import options
 @click.option("--batch", type=click.IntRange(1), help="Patches an iteration; default 4 an atom, as in the paper.")
 @click.option("--iterations", type=click.IntRange(0, 100000), default=10, show_default=True, help="Iterations in all, those of --resume included.")
 @click.option("--snr", "snr_db", type=options.DECIBEL, default="60dB", show_default=True, help="Noise of the measurements: sigma^2 = mean(y^2) 10^(-SNR/10).")
-@click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 with A scaled to unit spectral norm; default chosen on held-out patches.")
+@click.option("--lambda", "lam", type=Lambda(), help="Weight of |c|_1 with A scaled to unit spectral norm, or `noise`: what codes noise as zero; default chosen on held-out patches.")
 @click.option("--delta", type=options.NON_NEGATIVE, default="0.001", show_default=True, help="Weight of |A Phi|^2, which keeps A and the atoms incoherent.")
 @click.option("--init", "initial", type=click.Choice(["patches", "pca", "random"]), default="patches", show_default=True, help="Starting atoms; random is the paper's.")
+@click.option("--gradient-steps", type=click.IntRange(0), default=0, show_default=True, help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.")
+@click.option("--synthesis", is_flag=True, help="Also regress atoms that paint what the learnt ones code; reconstruct uses them.")
 @click.option("--resume", type=options.FILE, help="Go on from this dictionary; the result equals that of one long run.")
 @options.seed
 @click.option("--workers", type=click.IntRange(1, 1024), default=None, help="Threads of the compiled solver; default all cores. The result does not depend on it.")
@@ -24,7 +36,7 @@ from plenocli.cli import options
 @options.as_json
 @click.pass_context
 def command(ctx, images, pif, output, resume, overwrite, as_json, **settings):
-    """Learn from IMAGEs (photographs, or skimage:NAME; default those that ship with scikit-image, without the astronaut).
+    """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship with scikit-image, without the astronaut).
 
     Every fifth picture is held out; the result is compared there with LMMSE, a linear method that learns nothing but a
     covariance, and says so if it does not win. The dictionary holds its history and what --resume needs.

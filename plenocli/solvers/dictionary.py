@@ -151,10 +151,10 @@ class Learner:
         self._record(after, state, np.concatenate([[False], dead]), float(code.gap.max()), residual)
         return after
 
-    def validate(self, atoms):
-        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
+    def validate(self, atoms, synthesis=None):
+        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary; `synthesis` atoms paint."""
         code = self.code(atoms, self.measured)
-        return float(code.objective.mean()), psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+        return float(code.objective.mean()), psnr((atoms if synthesis is None else synthesis) @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
 
     def validate_path(self, atoms, lams):
         """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda, from the largest down."""

@@ -42,11 +42,11 @@ def autocovariance(images, reach):
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     total, pairs = np.zeros((2 * reach + 1,) * 2), np.zeros((2 * reach + 1,) * 2)
-    mean = np.sum([i.sum() for i in images]) / np.sum([i.size for i in images])
+    mean = np.sum([i.sum(dtype=float) for i in images]) / np.sum([i.size for i in images])
     lags = np.arange(-reach, reach + 1)
     for image in images:
         shape = [next_fast_len(n + reach, real=True) for n in image.shape]
-        power = [np.abs(rfft2(x, shape)) ** 2 for x in (image - mean, np.ones(image.shape))]
+        power = [np.abs(rfft2(x, shape)) ** 2 for x in (np.asarray(image, float) - mean, np.ones(image.shape))]
         lag_sum, lag_count = (irfft2(p, shape) for p in power)
         reached = (np.abs(lags)[:, None] < image.shape[0]) & (np.abs(lags)[None, :] < image.shape[1])
         total += np.where(reached, lag_sum[np.ix_(lags, lags)], 0)

@@ -208,7 +208,7 @@ class Estimators:
 
     @cached_property
     def _learnt(self):
-        """(atoms, attributes) of the dictionary; a note where it was learnt for another matrix."""
+        """(atoms that code, atoms that paint, attributes) of the dictionary; a note where it was learnt for another matrix."""
         from plenocli.artefacts import file_digest, read_artefact
 
         path = self.settings.dictionary
@@ -218,12 +218,12 @@ class Estimators:
             raise InputError(f"has atoms of {len(atoms)} points, the system matrix {self.system.own.shape[1]}", path, "learn it with this pif")
         if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(self.system.path):
             note(f"the dictionary was learnt for another system matrix than {self.system.path.name}")
-        return atoms, artefact.attrs["dictionary"]
+        return atoms, np.asarray(artefact.data.get("dictionary/synthesis", atoms), float), artefact.attrs["dictionary"]
 
     def _dictionary(self, stacked, sigma, truth, report):
         from plenocli.solvers.l1 import sparse_code
 
-        atoms, attrs = self._learnt
+        atoms, paint, attrs = self._learnt
         scale = float(self.svd.s[0])
         learnt = float(attrs["parameters"]["sigma"])
         louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
@@ -235,7 +235,7 @@ class Estimators:
         def solve(y):
             code = sparse_code(seen, self.svd.compress(y)[:kept] / scale, lam, free=[0])
             report.update(worst_gap=float(code.gap.max()), nonzeros=float(np.count_nonzero(code.c[1:], axis=0).mean()))
-            return atoms @ code.c
+            return paint @ code.c
 
         return solve
 

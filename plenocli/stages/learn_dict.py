@@ -17,15 +17,19 @@ LAMBDAS = np.logspace(-7, -4, 7)
 
 @dataclass(frozen=True)
 class Settings:
-    """atoms: None means one an object point.  lam: None chooses on the validation patches.  snr_db: noise of the measurement."""
+    """atoms: None means one an object point.  lam: None chooses on the validation patches, "noise" takes it from the noise.
+    snr_db: noise of the measurement.  gradient_steps: of the dictionary step; 0 is its closed form.  synthesis: also regress atoms
+    that paint."""
 
     atoms: int | None = None
     batch: int | None = None
     iterations: int = 10
-    lam: float | None = None
+    lam: float | str | None = None
     delta: float = 1e-3
     snr_db: float = 60.0
     initial: str = "patches"
+    gradient_steps: int = 0
+    synthesis: bool = False
     seed: int = 0
     workers: int | None = None
     mem_limit: int | None = None
@@ -56,16 +60,20 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
     def learner(lam):
         return Learner(svd, system.object_shape, [p for _, p in training], [p for _, p in held], replace(chosen, lam=lam), workers=settings.workers)
 
-    if chosen.lam is None:
-        chosen = replace(chosen, lam=_choose_lambda(learner))
+    if not isinstance(chosen.lam, float):
+        chosen = replace(chosen, lam=_choose_lambda(learner(1.0), chosen.lam))
     machine = learner(chosen.lam)
     state = earlier[0] if earlier else machine.start()
     if state.iteration > settings.iterations:
         raise UsageError(f"{Path(resume).name} has done {state.iteration} iterations, more than {settings.iterations}", "--iterations", "ask for more")
     for _ in bar(range(settings.iterations - state.iteration), settings.iterations - state.iteration, "iterations"):
         state = machine.step(state)
+        _tell(state)
     summary = _judge(machine, state, svd, training, chosen)
-    _write(output, state, machine, chosen, system, summary, dict(
+    synthesis = machine.synthesis(state) if settings.synthesis else None
+    if synthesis is not None:
+        summary["synthesis_psnr_db"] = machine.validate(state.atoms, synthesis)[1]
+    _write(output, state, synthesis, machine, chosen, system, summary, dict(
         command=command, pif=pif, files=files, resume=None, seed=chosen.seed, names=[n for n, _ in training], held=[n for n, _ in held]), overwrite)
     return summary | {"output": str(output)}
 
@@ -79,14 +87,14 @@ def _resolve(settings, system, earlier):
         stored = dictionary.Settings(**earlier[1])
         wanted = {"atoms": settings.atoms, "batch": settings.batch, "lam": settings.lam}
         for name, value in wanted.items():
-            if value is not None and value != getattr(stored, name):
+            if value is not None and value != "noise" and value != getattr(stored, name):
                 raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
-        for name, value in (("delta", settings.delta), ("snr_db", settings.snr_db), ("seed", settings.seed), ("initial", settings.initial)):
+        for name, value in (("delta", settings.delta), ("snr_db", settings.snr_db), ("seed", settings.seed), ("initial", settings.initial), ("gradient_steps", settings.gradient_steps)):
             if value != getattr(stored, name) and value != getattr(Settings, name):
                 raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
         return stored
     atoms = settings.atoms or points
-    return dictionary.Settings(atoms, settings.batch or 4 * atoms, settings.lam, settings.delta, settings.snr_db, settings.seed, settings.initial)
+    return dictionary.Settings(atoms, settings.batch or 4 * atoms, settings.lam, settings.delta, settings.snr_db, settings.seed, settings.initial, gradient_steps=settings.gradient_steps)
 
 
 def _read_resume(path, system):
@@ -104,15 +112,24 @@ def _read_resume(path, system):
         raise InputError(f"lacks {error}, which a resumed run needs", path, "start a new dictionary") from None
 
 
-def _choose_lambda(learner):
-    """lambda with the best validation PSNR for the starting dictionary."""
-    quality = []
-    for lam in LAMBDAS:
-        machine = learner(float(lam))
-        quality.append(machine.validate(machine.start().atoms)[1])
-    best = float(LAMBDAS[int(np.argmax(quality))])
-    note(f"lambda = {best:.2e}: validation {max(quality):.2f} dB with the starting atoms, out of {len(LAMBDAS)} values")
+def _choose_lambda(machine, rule):
+    """lambda with the best validation PSNR for the starting dictionary, or by the noise."""
+    from plenocli.solvers.l1 import noise_lambda
+
+    atoms = machine.start().atoms
+    if rule == "noise":
+        lam = noise_lambda(machine.seen @ atoms[:, 1:], machine.sigma)
+        note(f"lambda = {lam:.2e}, from the noise")
+        return lam
+    best, quality, nonzeros = max(machine.validate_path(atoms, LAMBDAS), key=lambda row: row[1])
+    note(f"lambda = {best:.2e}: validation {quality:.2f} dB with the starting atoms ({nonzeros:.0f} of them a patch), out of {len(LAMBDAS)} values")
     return best
+
+
+def _tell(state):
+    last = {name: values[-1] for name, values in state.history.items()}
+    note(f"iteration {state.iteration}: validation {last['validation_psnr']:.2f} dB, objective {last['objective']:.3e}, {last['nonzeros']:.0f} atoms a patch, {last['dead_share']:.1%} dead, "
+         f"coherence mean {last['coherence_mean']:.3f} max {last['coherence_max']:.4f}, gap {last['worst_gap']:.0e}, step residual {last['step_residual']:.0e}")
 
 
 def _judge(machine, state, svd, training, chosen):
@@ -135,13 +152,13 @@ def _judge(machine, state, svd, training, chosen):
             "objective": objective, "dead_share": state.history["dead_share"][-1] if state.iteration else None, "coherence": measures}
 
 
-def _write(output, state, machine, chosen, system, summary, origin, overwrite):
+def _write(output, state, synthesis, machine, chosen, system, summary, origin, overwrite):
     from dataclasses import asdict
 
     from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact
 
     measures = summary["coherence"]
-    data = {"dictionary/atoms": state.atoms}
+    data = {"dictionary/atoms": state.atoms} | ({} if synthesis is None else {"dictionary/synthesis": synthesis})
     data |= {f"dictionary/history/{name}": np.array(values) for name, values in state.history.items()}
     data |= {f"dictionary/state/{name}": value for name, value in state.save().items()}
     attrs = {"delta": chosen.delta, "lambda": chosen.lam, "object_shape": list(system.object_shape), "iterations": state.iteration, "scale": machine.scale,
@@ -149,7 +166,7 @@ def _write(output, state, machine, chosen, system, summary, origin, overwrite):
              "coherence_raw": measures["coherence_raw"], "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
              "coherence_welch": measures["welch_bound"], "coherence": measures,
              "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "training": sorted({Path(n).name for n in origin["names"]}), "validation": sorted({Path(n).name for n in origin["held"]})},
-             "notes": {k: summary[k] for k in ("validation_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap")}}
+             "notes": {k: summary[k] for k in ("validation_psnr_db", "synthesis_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap") if k in summary}}
     attrs = {k: v for k, v in attrs.items() if v is not None}
     provenance = Provenance(origin["command"], describe_inputs({"pif": origin["pif"], "image": origin["files"]}), origin["seed"])
     write_artefact(output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite)

@@ -14,37 +14,72 @@ DEFAULT = ("skimage:camera", "skimage:coffee", "skimage:chelsea", "skimage:rocke
 
 SCALES = (1, 2, 4)
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".ppm", ".pgm", ".webp")
+"""What is taken for a picture in a folder."""
 
-def read_training(names, shape, *, not_scene=None):
-    """Linear luminance pictures [(name, (row, column) float64)] of at least `shape`, from files or skimage:NAME; () means DEFAULT.
+IN_MEMORY = 1 << 30
+"""Bytes of pictures that are held in memory; more go to a temporary file that is mapped, so that thousands of pictures stream."""
+
+
+class Shelf:
+    """Keeps float32 pictures: in memory up to `limit` bytes, the rest in a nameless temporary file."""
+
+    def __init__(self, limit=None):
+        self.limit, self.held, self.file = IN_MEMORY if limit is None else limit, 0, None
+
+    def keep(self, picture):
+        """The picture as float32, wherever it now lies."""
+        picture = np.asarray(picture, np.float32)
+        self.held += picture.nbytes
+        if self.held <= self.limit:
+            return picture
+        import tempfile
+
+        self.file = self.file or tempfile.TemporaryFile()
+        begin = self.file.seek(0, 2)
+        self.file.write(np.ascontiguousarray(picture).data)
+        self.file.flush()
+        return np.memmap(self.file, np.float32, "r", begin, picture.shape)
+
+
+def read_training(names, shape, *, not_scene=None, limit=None):
+    """Linear luminance pictures [(name, (row, column) float32)] of at least `shape`, from files, folders or skimage:NAME; () means DEFAULT.
+
+    A folder stands for the pictures in it and below; what cannot be read there is left out with a note. One picture is decoded
+    at a time; beyond `limit` bytes (IN_MEMORY) they lie in a temporary file.
 
     not_scene: name of a test scene; a default picture of that name is left out with a note, one asked for is an error
     (statistics from the test picture would flatter every result). InputError where nothing is left.
     """
     from plenocli.scene.sample import luminance
 
+    wanted, shelf = _expand(names or DEFAULT), Shelf(limit)
     stem = Path(str(not_scene).removeprefix(EMBEDDED)).stem if not_scene else None
     pictures = []
-    for name in names or DEFAULT:
+    for name, asked in wanted:
+        asked = asked and bool(names)
         if stem and Path(str(name).removeprefix(EMBEDDED)).stem == stem:
-            if names:
+            if asked:
                 raise InputError("is the captured scene itself; results trained on it would flatter", name, "train on other pictures")
             note(f"training leaves out {name}, which is the captured scene")
             continue
         try:
             picture = np.asarray(luminance(_values(name)), float)
         except InputError as error:
-            if names:
+            if asked:
                 raise
-            note(f"training leaves out a default picture: {error}")
+            note(f"training leaves out a picture: {error}")
             continue
         if min(picture.shape[0] - shape[0], picture.shape[1] - shape[1]) < 0:
             note(f"training leaves out {name}: {picture.shape[0]} x {picture.shape[1]} pixels are less than a block of {shape[0]} x {shape[1]}")
             continue
         if not (picture.min() >= 0 and np.ptp(picture) > 0):
+            if not asked:
+                note(f"training leaves out {name}: no structure, or values below 0")
+                continue
             raise InputError("has no structure to learn from, or values below 0", name, "train on photographs")
         top = float(picture.max(initial=0))
-        pictures.append((str(name), picture / top if top > 1 else picture))
+        pictures.append((str(name), shelf.keep(picture / top if top > 1 else picture)))
     if not pictures:
         raise InputError("no training picture is left", fix=f"give pictures of at least {shape[0]} x {shape[1]} pixels")
     return pictures
@@ -59,16 +94,30 @@ def split_by_scene(pictures):
     return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
 
 
-def at_scales(pictures, shape):
+def at_scales(pictures, shape, *, limit=None):
     """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of `shape` fit: scenes come in all sizes."""
     from plenocli.scene.sample import block_mean
 
-    out = []
+    out, shelf = [], Shelf(limit)
     for name, picture in pictures:
         for k in SCALES:
             rows, columns = (n // k * k for n in picture.shape)
             if k == 1 or min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
-                out.append((name, block_mean(picture[:rows, :columns], (k, k)) if k > 1 else picture))
+                out.append((name, shelf.keep(block_mean(np.asarray(picture[:rows, :columns], float), (k, k))) if k > 1 else picture))
+    return out
+
+
+def _expand(names):
+    """[(name, asked for by itself)], folders replaced by their pictures in order of their paths."""
+    out = []
+    for name in names:
+        if str(name).startswith(EMBEDDED) or not Path(name).is_dir():
+            out.append((name, True))
+            continue
+        found = sorted(p for p in Path(name).rglob("*") if p.suffix.lower() in SUFFIXES)
+        if not found:
+            raise InputError("holds no pictures", name, f"give a folder with {', '.join(SUFFIXES)}")
+        out += [(str(p), False) for p in found]
     return out
 
 
@@ -81,5 +130,5 @@ def _values(name):
 
 
 def files_of(names):
-    """The paths among the names, for the provenance of an artefact."""
-    return [str(n) for n in names if not str(n).startswith(EMBEDDED)] or None
+    """The paths among the names, folders as their pictures, for the provenance of an artefact."""
+    return [str(n) for n, _ in _expand(names) if not str(n).startswith(EMBEDDED)] or None

@@ -13,7 +13,7 @@ BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 
-.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr colorchecker raw tiny tradeoff bench-pif clean
+.PHONY: help env demo test test-slow spatial spatial-250um spectral dslr colorchecker raw dictionary bench-sparse tiny tradeoff bench-pif clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -60,6 +60,13 @@ raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. 
 
 tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (hours)
 	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff
+
+dictionary: $(READY) ## Algorithm 1 at the paper's size, 20 iterations: a line for each, the history as a plot
+	$(PIPELINE) pipelines/dictionary.mk RUN=$(RUNS)/dictionary
+
+bench-sparse: $(READY) ## sparse coding beside SPAMS, scikit-learn, FISTA and an interior-point method: time and gap of each
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python pipelines/benchmarks/sparse.py --run $(RUNS)/bench-sparse
 
 bench-pif: $(READY) ## the system matrix beside prysm, poppy, hcipy and LightPipes: time and error of each
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'

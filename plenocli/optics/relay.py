@@ -7,21 +7,23 @@ lenslet n of the neighbourhood contributes, per axis,
       * integral of h(n D2 + x' - xp) exp(j k kappa x'^2/2) exp(-j k x' (v - n D2 (1 + z3/z2))/z3) dx'
 
 with kappa = 1/z2 + 1/z3 - 1/f2, the same for every lenslet. Fields of one object point add before the square is taken.
-Pixel energies are Gauss-Legendre sums over `nodes` points per axis; sub-nodes run slowest, so that summing them is adding
+Pixel energies are sums over `nodes` points per axis; sub-nodes run slowest, so that summing them is adding
 whole planes.
 """
 
 import numpy as np
 
-from plenocli.optics.quadrature import gauss
+from plenocli.optics.quadrature import band_rule
 
 
-def sensor_nodes(geometry, axis, count, place=0.0):
+def sensor_nodes(geometry, axis, count, place=0.0, rule=0):
     """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel along `axis`: (count, pixels).
+
+    rule: the step of quadrature.band_rule, 0 for Gauss-Legendre.
 
     place: where the superpixel's centre lies along the axis, in superpixel pitches; it matters on a sensor's own raster only.
     """
-    t, w = gauss(count)
+    t, w = band_rule(count, rule)
     half = geometry.pixel_active / 2
     return half * t[:, None] + (geometry.pixels(axis) + geometry.window_shift(axis, place)), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
 

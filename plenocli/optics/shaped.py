@@ -77,7 +77,7 @@ class ShapedLenslets:
 
     def __init__(self, camera, geometry, plan, band):
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
-        self.pixel_nodes, self.dtype = band.pixel_nodes, np.complex128 if plan.double else np.complex64
+        self.pixel_nodes, self.pixel_rule, self.dtype = band.pixel_nodes, band.pixel_rule, np.complex128 if plan.double else np.complex64
         self.field = separable_field(camera, geometry, band.half, plan.tolerance)
         self.symmetry, self.notes = self.field.symmetry, {"separable_terms": self.field.terms, "field_tail": self.field.tail}
         self.cut = chords(geometry.lenslet_shape, geometry.lenslet_width, _slope(camera, geometry, plan.superpixels, band.window), plan.tolerance / 30)
@@ -100,7 +100,7 @@ class ShapedLenslets:
     def _across(self, positions, place):
         """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by piece (chord, node, sensor node)."""
         axis = 1 - self.cut.axis
-        u, wu = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place))
+        u, wu = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule))
         parts = []
         for x, w in self.cut.pieces:
             kernels = [(lenslet_kernel(self.geometry, n - place, u, wu, x.ravel()) * w.ravel()).reshape(len(u), *x.shape) for n in positions]
@@ -128,7 +128,7 @@ class ShapedLenslets:
     def _kernel(self, products, place):
         """Kernel from the scan nodes of all products to the superpixel at `place`: (sensor node, sums of all, differences of all)."""
         axis = self.cut.axis
-        v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place))
+        v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule))
         sums, differences = [], []
         for product in products:
             kernels = np.stack([lenslet_kernel(self.geometry, n - place, v, wv, self.cut.at.ravel()) * self.cut.weight.ravel() for n in product[axis]], axis=-1)

@@ -61,7 +61,7 @@ class SquareLenslets(Factors):
         stands at `place` (superpixel pitches; it matters on a sensor's own raster only)."""
         key = axis, n, None if self._centred else place
         if key not in self._kernels:
-            v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self._band.pixel_nodes, place))
+            v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self._band.pixel_nodes, place, self._band.pixel_rule))
             x, carry = self._basis
             kernel = lenslet_kernel(self.geometry, n, v, wv, x)
             parts = np.stack([kernel.real, kernel.imag], axis=1).astype(self._real)

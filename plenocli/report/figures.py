@@ -34,7 +34,7 @@ def calibration_figures(artefact):
     data = artefact.data
     figures = []
     if "grid/centre" in data:
-        figures.append((calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual")), "The lenslet grid found on the white image."))
+        figures.append((calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual")), _grid_caption(artefact)))
     if "response/F" not in data:
         return figures
     values, window, wavelengths = data["response/F"], tuple(int(n) for n in data["response/window"]), data["response/wavelength"]
@@ -46,6 +46,12 @@ def calibration_figures(artefact):
         values = values[row, col]
     units = artefact.attrs.get("response", {}).get("units", "DN")
     return [*figures, (response_picture(values, window, wavelengths), f"Response F of the lenslet in the middle [{units} for unit relative radiance]: pixels that answer to each band.")]
+
+
+def _grid_caption(artefact):
+    model = artefact.attrs.get("grid", {}).get("model")
+    predicted = isinstance(model, dict) and model.get("kind") == "description"
+    return "The lenslet grid of the camera's description." if predicted else "The lenslet grid found on the white image."
 
 
 def dictionary_figures(result, name, history=None, system=None):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from plenocli.report.drawing import (
-    COLOURS, LEVEL_MAP, LIGHT_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail,
+    COLOURS, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail,
 )
 
 
@@ -50,6 +50,50 @@ def response_picture(response, window, wavelengths):
             image = axes.imshow(values, cmap=LIGHT_MAP, vmin=0, interpolation="nearest")
             bare(axes, nanometres(wavelengths[band]))
             colour_bar(axes, image, "")
+    return made.png
+
+
+def response_errors(error, peak, window, wavelengths):
+    """Differences of two responses (pixel, band) over the brightest pixel of each band (band,): which pixels of the superpixel differ, on one scale."""
+    count = len(wavelengths)
+    shares = 100 * np.asarray(error) / np.asarray(peak)
+    limit = float(np.nanmax(np.abs(shares))) or 1.0
+    with drawing(min(2.5 * count, 10.2), 2.7) as made:
+        panels = made.figure.subplots(1, count, squeeze=False)[0]
+        for band, axes in enumerate(panels):
+            image = axes.imshow(np.nan_to_num(shares[:, band]).reshape(window), cmap=SIGN_MAP, vmin=-limit, vmax=limit, interpolation="nearest")
+            bare(axes, nanometres(wavelengths[band]))
+        made.figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, label="% of the peak")
+    return made.png
+
+
+def filters_picture(camera):
+    """The filter array in the pupil of the main lens, and what filters and sensor let through, by wavelength; b"" without filters."""
+    from matplotlib.patches import Circle, Rectangle
+
+    from plenocli.optics.pupil import filter_cells, filter_transmittance
+    from plenocli.sensor.cfa import sensitivity
+
+    if camera.filter_array is None:
+        return b""
+    filters, half = camera.filter_array.filters, camera.main_lens.aperture_diameter / 2 * 1e3
+    wavelengths = np.linspace(400e-9, 700e-9, 601)
+    letters, curves = sensitivity(camera, wavelengths)
+    with drawing(8.6, 2.9) as made:
+        pupil, through = made.figure.subplots(1, 2, width_ratios=(1, 2.2))
+        square = camera.main_lens.aperture_shape in ("square", "image")
+        pupil.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, color="#444444") if square else Circle((0, 0), half, color="#444444"))
+        for number, (((y0, y1, x0, x1), _), one) in enumerate(zip(filter_cells(camera, filters[0].center), filters, strict=True)):
+            colour = COLOURS[number % len(COLOURS)]
+            pupil.add_patch(Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour))
+            pupil.text((x0 + x1) * 500, (y0 + y1) * 500, f"{one.center * 1e9:.4g}", ha="center", va="center", color="white")
+            through.plot(wavelengths * 1e9, [filter_transmittance(one, w) for w in wavelengths], color=colour)
+        pupil.set(xlim=(-1.05 * half, 1.05 * half), ylim=(1.05 * half, -1.05 * half), aspect="equal", xlabel="pupil [mm]", title="filters [nm]")
+        for letter, curve in zip(letters, curves, strict=True):
+            through.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
+            through.annotate("sensor" if len(letters) == 1 else letter, (wavelengths[np.argmax(curve)] * 1e9, curve.max()), ha="center", va="bottom", fontsize=7.5)
+        through.set(xlim=(400, 700), ylim=(0, 1.05), xlabel="wavelength [nm]", title="transmittance, and quantum efficiency of the sensor")
+        through.grid(True)
     return made.png
 
 

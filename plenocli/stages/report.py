@@ -206,8 +206,18 @@ def _spectral(page, run, scores):
         return None
     page.section("Spectral", "Filters in the pupil of the main lens send each band to its own pixels behind a lenslet. The response F, measured under "
                              "narrow-band light, is inverted for every lenslet.")
-    for folder in dict.fromkeys(file.folder for file in scores):
-        _merged_scores(page, run, [file for file in scores if file.folder == folder])
+    responses = [file for file in scores if all(entry.get("kind") == "calibration" for entry in file.content["results"] if "error" not in entry)]
+    groups = {}
+    for file in scores:
+        if file not in responses:
+            result = run.by_digest(file.sources.get("result 1"))
+            groups.setdefault(file.folder if result is None else result.folder, []).append(file)
+    for folder, files in groups.items():
+        if len(groups) > 1:
+            page.heading(f"Results in {folder.relative_to(run.root).as_posix()}")
+        _merged_scores(page, run, files)
+    for file in responses:
+        _agreement(page, run, file)
     scored = {digest for file in scores for digest in file.sources.values()}
     _bands_alone(page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)])
     for file in calibrations:
@@ -238,6 +248,22 @@ def _merged_scores(page, run, files):
     add_spectra(page, document, pairs)
 
 
+def _agreement(page, run, file):
+    """Responses beside the one that was measured, band by band, and where in the superpixel the first one differs."""
+    from plenocli.metrics.response import response_error
+    from plenocli.report.spectral_pictures import response_errors
+    from plenocli.stages.score_response import paired_responses
+
+    page.heading("Responses compared", file.command)
+    add_table(page, file.content)
+    first, truth = (run.by_digest(file.sources.get(role)) for role in ("result 1", "truth"))
+    if first is None or truth is None:
+        return
+    response, other, wavelengths, window = paired_responses(first.path, truth.path)
+    error, _, mean = response_error(response, other)
+    page.figure(response_errors(error, np.nanmax(mean, axis=0), window, wavelengths), f"{first.name} less {truth.name}, after a gain for each band.")
+
+
 def _is_white(run, file):
     return any(role.startswith("white") and digest == file.digest for user in run.users(file) for role, digest in user.sources.items())
 
@@ -261,7 +287,19 @@ def _calibration(page, file):
         (grid, "lattice", "lattice"), (grid, "pitch", "pitch, rows and columns [px]"), (grid, "angle", "rotation [deg]"), (grid, "rms", "rms distance from the lattice [px]"),
         (grid, "lenslets", "lenslets"), (response, "condition", "median condition number of F")) if name in of]
     page.table(["", ""], rows, text=True)
-    _add(page, calibration_figures(artefact))
+    _add(page, [*_filters(artefact), *calibration_figures(artefact)])
+
+
+def _filters(artefact):
+    """The filter array of the camera that a calibration was made for, where it is described."""
+    from plenocli.config import parse_camera
+    from plenocli.report.spectral_pictures import filters_picture
+
+    try:
+        camera = parse_camera(artefact.provenance.config)
+    except PlenoError:  # measured, or made by a program that describes cameras otherwise
+        return []
+    return [(filters_picture(camera), "Filters in the pupil of the main lens, seen along the light, and their transmittance.")] if camera.filter_array else []
 
 
 def _listed(value):

@@ -1,5 +1,6 @@
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from plenocli.stages.run_folder import RunFolder
 from plenocli.stages.score import run_score
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def put(path, kind, data, attrs=None, inputs=None):
@@ -136,3 +138,23 @@ def test_command_line(folder, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["sections"] == ["Spectral"]
     assert run(arguments) == 2
     assert run(["report", str(tmp_path / "none"), "-o", str(tmp_path / "q.html")]) == 3
+
+
+def test_responses_are_compared_and_the_filters_of_a_described_camera_drawn(tmp_path):
+    rng = np.random.default_rng(2)
+    root = tmp_path / "run"
+    text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
+    rows, cols = np.mgrid[0:4, 0:5]
+    measured = rng.random((4, 5, 64, 4))
+    for name, response, config in (("measured", measured, ""), ("predicted", measured.mean(axis=(0, 1)) * 1.1, text)):
+        data = {"grid/centre": np.stack([rows * 8 + 3.5, cols * 8 + 3.5], -1), "grid/valid": np.ones((4, 5), bool), "response/F": response,
+                "response/window": np.array([8, 8]), "response/wavelength": BANDS, "response/origin": np.stack([rows * 8, cols * 8], -1)}
+        attrs = {"grid": {"lattice": "square"}, "response": {"condition": 1.3, "units": "DN"}}
+        root.mkdir(exist_ok=True)
+        write_artefact(root / f"{name}.h5", Artefact("calibration", data, attrs, Provenance("made here", {}, None, config)))
+    run_score([root / "predicted.h5"], root / "score-response.json", truth=root / "measured.h5")
+    run_report(root, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "Responses compared" in page and "error of the response, 450 nm" in page and "predicted.h5 less measured.h5" in page
+    assert page.count("<figure>") == 1 + 2 + 3  # difference; grid and response of either; filters of the one that is described
+    assert page.count("Filters in the pupil of the main lens, seen") == 2  # caption and description of one picture

@@ -28,7 +28,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 
 SNR_DB = 60.0
-LAMBDAS = np.logspace(-8, -4, 17)
+LAMBDAS = np.logspace(-7, -4.5, 11)
 PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior point": "clarabel"}
 
 

@@ -33,9 +33,12 @@ class Shelf:
         self.held += picture.nbytes
         if self.held <= self.limit:
             return picture
-        import tempfile
+        if self.file is None:
+            import tempfile
+            import weakref
 
-        self.file = self.file or tempfile.TemporaryFile()
+            self.file = tempfile.TemporaryFile()
+            weakref.finalize(self, self.file.close)  # the mapped pictures keep what they need
         begin = self.file.seek(0, 2)
         self.file.write(np.ascontiguousarray(picture).data)
         self.file.flush()

@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import solve_sylvester
 
 from plenocli.solvers import dictionary, linear
+from plenocli.solvers.natural import draw_patches
 
 SHAPE = (5, 6)
 
@@ -44,6 +45,47 @@ def test_step_solves_the_sylvester_equation(delta):
     assert residual < 1e-10
 
 
+def test_directions_without_energy_may_be_left_out():
+    rng = np.random.default_rng(1)
+    a, c, x = rng.random((5, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
+    gram, right = c @ c.T / 50, x @ c.T / 50
+    strength, basis = np.linalg.svd(a, full_matrices=False)[1:]
+    atoms, residual = dictionary.dictionary_step(strength**2, basis.T, gram, right, 0.1)
+    np.testing.assert_allclose(atoms, solve_sylvester(0.1 * a.T @ a, gram + 1e-6 * np.trace(gram) / 8 * np.eye(8), right), rtol=1e-7, atol=1e-10)
+    assert residual < 1e-10
+
+
+@pytest.mark.parametrize("delta", [0.0, 0.1])
+def test_gradient_steps_approach_the_closed_form(delta):
+    rng = np.random.default_rng(2)
+    a, c, x = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
+    energy, basis = np.linalg.eigh(a.T @ a)
+    system = energy, basis, c @ c.T / 50, x @ c.T / 50, delta
+    exact, start = dictionary.dictionary_step(*system)[0], rng.standard_normal((12, 8))
+    found = [dictionary.gradient_step(*system, start, steps) for steps in (10, 100, 1000)]
+    away = [np.linalg.norm(atoms - exact) for atoms, _ in found]
+    assert away[0] > away[1] > away[2] and away[2] < 1e-6 * np.linalg.norm(exact)
+    assert found[0][1] > found[1][1] > found[2][1]
+
+
+def test_one_gradient_step_goes_down_the_slope():
+    rng = np.random.default_rng(3)
+    a, c, x, phi = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50)), rng.standard_normal((12, 8))
+
+    def objective(phi):
+        return np.sum((x - phi @ c) ** 2) / 50 + 0.1 * np.sum((a @ phi) ** 2) + 1e-6 * np.trace(c @ c.T / 50) / 8 * np.sum(phi**2)
+
+    slope = np.empty_like(phi)
+    for place in np.ndindex(phi.shape):
+        nudge = np.zeros_like(phi)
+        nudge[place] = 1e-4
+        slope[place] = (objective(phi + nudge) - objective(phi - nudge)) / 2e-4
+    moved = dictionary.gradient_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1, phi, 1)[0] - phi
+    length = -np.sum(moved * slope) / np.sum(slope**2)
+    np.testing.assert_allclose(moved, -length * slope, atol=1e-6 * np.abs(moved).max())
+    assert objective(phi + moved) < objective(phi)
+
+
 def test_step_lowers_its_objective():
     rng = np.random.default_rng(2)
     a, c, x = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
@@ -80,6 +122,40 @@ def test_atoms_keep_their_form(setting):
     assert max(state.history["worst_gap"]) <= 1e-3 and max(state.history["step_residual"]) < 1e-10
 
 
+def test_gradient_steps_learn_too_and_say_how_far_they_got(setting):
+    exact, rough = (run(learner(setting, gradient_steps=n), learner(setting).start(), 2) for n in (0, 30))
+    assert rough.history["step_residual"][0] > 1e-6 > exact.history["step_residual"][0]
+    assert rough.history["validation_psnr"][-1] > learner(setting).validate(learner(setting).start().atoms)[1] - 1
+
+
+def test_directions_below_the_noise_are_left_out(setting):
+    quiet, loud = learner(setting, snr_db=60.0), learner(setting, snr_db=20.0)
+    assert 1 < len(loud.seen) < len(quiet.seen) < 42
+    patches = quiet.validation
+    power = np.mean((quiet.svd.s[:, None] / quiet.scale * (quiet.svd.vt @ patches)) ** 2, axis=1)
+    assert power[len(loud.seen) :].max() < 0.05 * loud.sigma**2  # what is left out is faint on other patches too
+
+
+def test_synthesis_is_the_regression_of_patches_on_their_codes(setting):
+    machine = learner(setting, batch=400)
+    state = run(machine, machine.start(), 2)
+    paint = machine.synthesis(state)
+    rng = np.random.default_rng([3, dictionary._DRAW_SYNTHESIS, 2])
+    patches = draw_patches(machine.training, SHAPE, 400, rng)
+    c = machine.code(state.atoms, machine.measure(patches, rng)[0]).c
+    best = np.linalg.lstsq(c.T, patches.T, rcond=None)[0].T
+    errors = [np.sum((patches - phi @ c) ** 2) for phi in (best, paint, state.atoms)]
+    assert errors[0] <= errors[1] < 1.001 * errors[0] and errors[1] < errors[2]
+
+
+def test_path_of_lambda_is_what_single_values_give(setting):
+    machine = learner(setting, tol=1e-8)
+    atoms = machine.start().atoms
+    for lam, quality, nonzeros in machine.validate_path(atoms, [1e-5, 1e-3]):
+        one = learner(setting, tol=1e-8, lam=lam).validate(atoms)
+        assert one[1] == pytest.approx(quality, abs=1e-3) and one[2] == pytest.approx(nonzeros, rel=0.02)
+
+
 def test_learning_beats_its_random_start(setting):
     machine = learner(setting, initial="random")
     start = machine.start()
@@ -96,5 +172,5 @@ def test_starts_are_seeded_and_differ(setting, initial):
 def test_scale_of_the_matrix_does_not_matter(setting):
     svd, pictures = setting
     louder = linear.Svd(svd.u, 1000 * svd.s, svd.vt)
-    one, other = (learner((s, pictures)).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
+    one, other = (learner((s, pictures), tol=1e-8).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
     assert one == pytest.approx(other, abs=0.05)

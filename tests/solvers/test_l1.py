@@ -1,5 +1,6 @@
 """Sparse coding: every solution carries its certificate, and the compiled and the plain kernel agree."""
 
+import itertools
 import sys
 
 import numpy as np
@@ -31,6 +32,135 @@ def test_solution_meets_the_subgradient_conditions(lam):
     assert code.gap.max() <= 1e-8  # at the smallest lambda the Gram form has no more digits
     assert optimality(d, y, code.c, lam) < 1e-4
     np.testing.assert_allclose(code.objective, np.sum((y - d @ code.c) ** 2, axis=0) + lam * np.abs(code.c).sum(axis=0), rtol=1e-6)
+
+
+def best_of_all_sign_patterns(d, y, lam):
+    """The minimum by trying every support and sign."""
+    best, where = np.sum(y**2), np.zeros(d.shape[1])
+    for signs in itertools.product((-1, 0, 1), repeat=d.shape[1]):
+        s = np.array(signs)
+        on = s != 0
+        if on.any():
+            part = d[:, on]
+            x = np.linalg.solve(part.T @ part, part.T @ y - lam / 2 * s[on])
+            if np.all(x * s[on] > 0):
+                value = np.sum((y - part @ x) ** 2) + lam * np.abs(x).sum()
+                if value < best:
+                    best, where = value, np.zeros(d.shape[1])
+                    where[on] = x
+    return best, where
+
+
+@pytest.mark.parametrize("lam", [0.02, 0.3, 2.0])
+def test_against_every_sign_pattern(lam):
+    rng = np.random.default_rng(8)
+    d, y = rng.standard_normal((7, 6)) @ np.diag([1, 0.5, 1, 0.1, 1, 0.3]), rng.standard_normal((7, 5))
+    code = l1.sparse_code(d, y, lam, tol=1e-12)
+    for k in range(5):
+        best, where = best_of_all_sign_patterns(d, y[:, k], lam)
+        assert code.objective[k] == pytest.approx(best, rel=1e-10)
+        np.testing.assert_allclose(code.c[:, k], where, atol=1e-6)
+
+
+@pytest.mark.parametrize("lam", [1e-6, 1e-8])
+def test_small_lambda_goes_by_the_factored_form(lam):
+    """Certified here in extended precision, down to 1e-10 of the largest useful lambda."""
+    d, y = plenoptic_like(seed=2)
+    d, y = d.astype(np.longdouble), y.astype(np.longdouble)
+    code = l1.sparse_code(d, y, lam, tol=1e-7)
+    c, threshold = code.c.astype(np.longdouble), lam / 2
+    residual = y - d @ c
+    primal = np.sum(residual**2, axis=0) + lam * np.abs(c).sum(axis=0)
+    t = np.clip(np.sum(residual * y, axis=0) / np.sum(residual**2, axis=0), *(sign * threshold / np.abs(d.T @ residual).max(axis=0) for sign in (-1, 1)))
+    gap = 1 - (2 * t * np.sum(residual * y, axis=0) - t**2 * np.sum(residual**2, axis=0)) / primal
+    assert gap.max() <= 1e-6 and np.all(np.abs(gap - code.gap) < 1e-7)
+    assert (code.factored > 0) == (lam < 1e-7)
+
+
+def test_lambda_path_equals_single_solutions():
+    d, y = plenoptic_like()
+    found = list(l1.lambda_path(d, y, [1e-5, 1e-3, 1e-4], free=[0], tol=1e-9))
+    assert [lam for lam, _ in found] == [1e-3, 1e-4, 1e-5]
+    for lam, code in found:
+        np.testing.assert_allclose(code.objective, l1.sparse_code(d, y, lam, free=[0], tol=1e-9).objective, rtol=1e-8)
+
+
+def test_a_warm_start_from_the_solution_has_nothing_to_do():
+    d, y = plenoptic_like()
+    code = l1.sparse_code(d, y, 1e-4, free=[3], tol=1e-9)
+    again = l1.sparse_code(d, y, 1e-4, free=[3], tol=1e-8, start=code.c)
+    assert not again.passes.any()
+    np.testing.assert_allclose(again.c, code.c, atol=1e-12)
+    far = l1.sparse_code(d, y, 1e-4, free=[3], tol=1e-9, start=np.random.default_rng(0).standard_normal(code.c.shape))
+    np.testing.assert_allclose(far.objective, code.objective, rtol=1e-8)
+
+
+def test_noise_is_coded_as_zero_at_the_noise_s_lambda():
+    d, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((200, 200)))
+    noise = 0.3 * np.random.default_rng(1).standard_normal((200, 400))
+    lam = l1.noise_lambda(d, 0.3)
+    assert lam == pytest.approx(2 * 0.3 * np.sqrt(2 * np.log(200)))
+    silent = [np.mean(~l1.sparse_code(d, noise, factor * lam).c.any(axis=0)) for factor in (1.2, 1.0, 0.6)]
+    assert silent[0] > 0.95 and silent[1] > 0.7 and silent[2] < 0.1  # normal theory: 0.99, 0.78, 0.01 for 200 atoms
+
+
+def test_large_active_sets_outgrow_the_first_workspace():
+    rng = np.random.default_rng(5)
+    d, y = rng.standard_normal((500, 700)), rng.standard_normal((500, 2))
+    code = l1.sparse_code(d, y, 1e-2, tol=1e-9)
+    assert np.count_nonzero(code.c, axis=0).min() > 400
+    assert code.gap.max() <= 1e-9 and optimality(d, y, code.c, 1e-2) < 1e-4
+
+
+def test_factor_follows_atoms_that_come_and_go():
+    kernel = pytest.importorskip("plenocli.solvers.l1_kernel", exc_type=ImportError)
+    rng = np.random.default_rng(4)
+    columns = rng.standard_normal((40, 30))
+    gram, held, factor, scratch = columns.T @ columns, [], np.full((30, 30), np.nan), np.empty(30)
+    for step in range(120):
+        n = len(held)
+        if n and (n == 30 or rng.random() < 0.45):
+            place = int(rng.integers(n))
+            kernel._remove(factor, n, place, scratch)
+            held.pop(place)
+        else:
+            new = int(rng.choice(np.setdiff1d(np.arange(30), held)))
+            scratch[:n] = gram[new, held]
+            kernel._append(factor, n, scratch, gram[new, new])
+            held.append(new)
+        n = len(held)
+        upper = np.triu(factor[:n, :n], 1) + np.diag(1 / np.diag(factor[:n, :n]))
+        np.testing.assert_allclose(upper.T @ upper, gram[np.ix_(held, held)], atol=1e-9)
+        h, d = rng.standard_normal(n), np.empty(n)
+        d[:] = h
+        kernel._forward(factor, n, d)
+        kernel._backward(factor, n, d)
+        np.testing.assert_allclose(gram[np.ix_(held, held)] @ d, h, atol=1e-8)
+
+
+def test_an_interior_point_method_agrees():
+    pytest.importorskip("clarabel")
+    from plenocli.solvers.l1_interior import interior_point
+
+    d, y = plenoptic_like(signals=3)
+    inner, newton = interior_point(d, y, 1e-4, free=[0], tol=1e-8), l1.sparse_code(d, y, 1e-4, free=[0], tol=1e-10)
+    assert inner.gap.max() < 1e-6
+    np.testing.assert_allclose(inner.objective, newton.objective, rtol=1e-6)
+
+
+def test_interior_point_says_what_it_needs(monkeypatch):
+    from plenocli.errors import InputError
+    from plenocli.solvers.l1_interior import interior_point
+
+    monkeypatch.setitem(sys.modules, "clarabel", None)
+    with pytest.raises(InputError, match="Clarabel"):
+        interior_point(np.eye(2), np.ones((2, 1)), 0.1)
+
+
+def test_first_order_method_admits_that_it_has_not_converged():
+    d, y = plenoptic_like()
+    rough = l1.fista(d, y, 1e-6, iterations=200)
+    assert np.median(rough.gap) > 0.1
 
 
 def test_one_atom_by_hand():
@@ -127,3 +257,7 @@ def test_bad_arguments():
         l1.sparse_code(np.eye(2), np.eye(2), 0.0)
     with pytest.raises(ValueError, match="weights"):
         l1.sparse_code(np.eye(2), np.eye(2), 1.0, weights=[1, 0])
+    with pytest.raises(ValueError, match="finite"):
+        l1.sparse_code(np.eye(2), np.array([[1.0], [np.nan]]), 1.0)
+    with pytest.raises(ValueError, match="lambda"):
+        list(l1.lambda_path(np.eye(2), np.eye(2), [1.0, -1.0]))

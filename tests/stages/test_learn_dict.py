@@ -79,3 +79,55 @@ def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
     write_exr(tmp_path / "flat.exr", {"Y": np.full((20, 20), level, np.float32)}, {})
     with pytest.raises(InputError, match="no structure"):
         read_training((str(tmp_path / "flat.exr"),), (8, 8))
+
+
+def test_a_folder_stands_for_its_pictures(tmp_path, capsys):
+    from plenocli.artefacts import write_exr
+
+    rng = np.random.default_rng(0)
+    (tmp_path / "more").mkdir()
+    for name in ("b", "more/a"):
+        write_exr(tmp_path / f"{name}.exr", {"Y": rng.random((20, 20), dtype=np.float32)}, {})
+    write_exr(tmp_path / "c.exr", {"Y": np.zeros((20, 20), np.float32)}, {})
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    (tmp_path / "notes.txt").write_text("not looked at")
+    found = read_training((str(tmp_path),), (8, 8))
+    assert [name[len(str(tmp_path)) + 1 :] for name, _ in found] == ["b.exr", "more/a.exr"]
+    told = capsys.readouterr().err
+    assert "broken.png" in told and "c.exr" in told and "notes" not in told
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no pictures"):
+        read_training((str(tmp_path / "empty"),), (8, 8))
+
+
+def test_pictures_that_do_not_fit_lie_in_a_file():
+    names = ("skimage:camera", "skimage:coins")
+    held, spilled = (at_scales(read_training(names, (8, 8), limit=limit), (8, 8), limit=limit) for limit in (None, 300_000))
+    assert not any(isinstance(p, np.memmap) for _, p in held) and any(isinstance(p, np.memmap) for _, p in spilled)
+    for (name, one), (other_name, other) in zip(held, spilled, strict=True):
+        assert name == other_name
+        np.testing.assert_array_equal(one, other)
+
+
+def test_history_is_told_line_by_line_and_lambda_may_come_from_the_noise(pif, tmp_path, capsys):
+    assert run(["learn-dict", "skimage:camera", "skimage:coins", "--pif", str(pif), "--batch", "40", "--lambda", "noise", "--iterations", "2", "-o", str(tmp_path / "d.h5")]) == 0
+    told = capsys.readouterr().err
+    assert "from the noise" in told and "iteration 1: validation" in told and "iteration 2: validation" in told
+    assert run(["learn-dict", "skimage:camera", "--pif", str(pif), "--lambda", "loud", "-o", str(tmp_path / "e.h5")]) == 2
+
+
+def test_atoms_that_paint_are_kept_beside_those_that_code(pif, tmp_path):
+    from plenocli.artefacts import read_artefact
+
+    assert learn(pif, "--iterations", 1, "--synthesis", "-o", tmp_path / "a.h5") == 0
+    assert learn(pif, "--iterations", 1, "-o", tmp_path / "b.h5") == 0
+    one, other = (read_artefact(tmp_path / f"{n}.h5", "dictionary") for n in "ab")
+    np.testing.assert_array_equal(one.data["dictionary/atoms"], other.data["dictionary/atoms"])
+    assert one.data["dictionary/synthesis"].shape == (9, 9) and "dictionary/synthesis" not in other.data
+
+
+def test_gradient_steps_are_part_of_what_a_resumed_run_keeps(pif, tmp_path, capsys):
+    assert learn(pif, "--iterations", 1, "--gradient-steps", 5, "-o", tmp_path / "a.h5") == 0
+    assert learn(pif, "--iterations", 2, "--gradient-steps", 6, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 2
+    assert "gradient_steps = 5" in capsys.readouterr().err
+    assert learn(pif, "--iterations", 2, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 0

@@ -108,40 +108,55 @@ class Smooth:
     response (lenslet, pixel, band) with NaN at pixels that are not known; origin (lenslet, 2) first pixels; window (h, w);
     cfa "mono" or four letters. Under narrow-band light the mosaic's filters multiply the picture of the pupil by one number
     each, which is why a motion by an odd number of pixels can be followed at all. gains (letter, band): None measures them.
+    smooth (lenslet, band, h, w).
     """
 
     def __init__(self, response, origin, window, cfa, gains=None):
-        self.window, self.cfa = tuple(window), cfa
-        response = np.asarray(response, np.float32).reshape(len(response), *self.window, -1)
-        self.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
-        self.gains = gains
+        self._set(window, cfa, gains)
+        response = np.ascontiguousarray(np.swapaxes(response, -1, -2), np.float32).reshape(len(response), -1, *self.window)
+        known = np.isfinite(response).all(axis=1)
         if gains is None:
-            self.gains = self._measure(response, origin) if len(self.letters) > 1 else np.ones((1, response.shape[-1]), np.float32)
-        gain = self.gain(origin)
-        good = np.isfinite(response).all(axis=-1, keepdims=True) & (gain > WEAK)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            smooth = np.where(good, response / gain, 0)
-        if not good.all():
-            smooth = _filled(smooth, good.astype(np.float32))
-        self.smooth = smooth
+            self._set(window, cfa, self._measure(response, known, origin) if len(self.letters) > 1 else np.ones((1, response.shape[1]), np.float32))
+        self.smooth = self._without_colours(response, known, origin)
 
     @classmethod
     def of(cls, pictures, window, cfa, gains):
-        """From smooth pictures (lenslet, h, w, band) made before."""
+        """From smooth pictures (lenslet, band, h, w) made before."""
         out = cls.__new__(cls)
-        out.window, out.cfa, out.gains, out.smooth = tuple(window), cfa, gains, pictures
-        out.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
+        out._set(window, cfa, gains)
+        out.smooth = pictures
         return out
 
-    def _measure(self, response, origin):
+    def _set(self, window, cfa, gains):
+        self.window, self.cfa, self.gains = tuple(window), cfa, gains
+        self.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
+        self._tiles = None if gains is None or len(self.letters) == 1 else np.moveaxis(np.asarray(gains, np.float32)[self._colours(PARITIES)], -1, 1).copy()
+
+    def _without_colours(self, response, known, origin):
+        """Pictures (lenslet, band, h, w) over their gains; unknown pixels and weak colours filled in from their neighbours."""
+        if self._tiles is None:
+            return response if known.all() else _filled(response, np.broadcast_to(known[:, None], response.shape))
+        strong = self._tiles > WEAK
+        over = np.where(strong, 1 / np.maximum(self._tiles, WEAK), 0)
+        kind = _parity(origin)
+        smooth = over[kind]
+        smooth *= response
+        if strong.all() and known.all():
+            return smooth
+        good = strong[kind]
+        good &= known[:, None]
+        some = ~good.all(axis=(0, 2, 3))  # bands that need it
+        smooth[:, some] = _filled(smooth[:, some], good[:, some])
+        return smooth
+
+    def _measure(self, response, known, origin):
         where = self._colours(origin)
-        known = np.isfinite(response).all(axis=-1)
         sites = [known & (where == k) for k in range(len(self.letters))]
-        mean = np.stack([response[one].mean(axis=0, dtype=float) for one in sites])
+        mean = np.stack([np.moveaxis(response, 1, -1)[one].mean(axis=0, dtype=float) for one in sites])
         gains = mean / np.maximum(mean.max(axis=0), 1e-30)
         with np.errstate(divide="ignore", invalid="ignore"):
-            smooth = np.where(known[..., None], response / gains.astype(np.float32)[where], 0)
-        return (gains * _flat_ratios(_filled(np.nan_to_num(smooth), known[..., None].astype(np.float32)), sites)).astype(np.float32)
+            smooth = np.where(known[:, None], response / np.moveaxis(gains.astype(np.float32)[where], -1, 1), 0)
+        return (gains * _flat_ratios(_filled(np.nan_to_num(smooth), np.broadcast_to(known[:, None], smooth.shape)), sites)).astype(np.float32)
 
     def _colours(self, origin):
         """Index (lenslet, h, w) into letters."""
@@ -151,8 +166,8 @@ class Smooth:
         return tile[rows[:, :, None], columns[:, None, :]]
 
     def gain(self, origin):
-        """Gains (lenslet, h, w, band) of the colours under windows at `origin` (lenslet, 2); the number 1 without a mosaic."""
-        return self.gains[self._colours(origin)] if len(self.letters) > 1 else np.float32(1)
+        """Gains (lenslet, band, h, w) of the colours under windows at `origin` (lenslet, 2); the number 1 without a mosaic."""
+        return np.float32(1) if self._tiles is None else self._tiles[_parity(origin)]
 
     def _sure(self, shift):
         """Mask (lenslet, h, w) of pixels whose spline is good: a sixth difference shows what a spline cannot know.
@@ -160,16 +175,22 @@ class Smooth:
         It passes the frequencies near Nyquist's, which alias; a shift by half a pixel errs by about all of them. Where a
         band would lose more than half of its light (cells of a few pixels), nothing is masked.
         """
-        from scipy.ndimage import convolve1d, maximum_filter1d
-
-        peak = np.maximum(np.abs(self.smooth).max(axis=(1, 2), keepdims=True), 1e-30)
-        error = 0
-        for axis in (1, 2):
-            rough = np.abs(convolve1d(self.smooth, np.array([1, -6, 15, -20, 15, -6, 1], np.float32) / 64, axis, mode="nearest"))
-            error = error + np.abs(np.sin(np.pi * shift[:, axis - 1]))[:, None, None, None] * maximum_filter1d(rough, 3, axis)
-        good = (error < UNSURE * peak).all(axis=-1)
         light = np.maximum(self.smooth, 0)
-        kept = (light * good[..., None]).sum(axis=(1, 2)) / np.maximum(light.sum(axis=(1, 2)), 1e-30)
+        peak = np.maximum(light.max(axis=(2, 3), keepdims=True), 1e-30)
+        aliased = np.abs(np.sin(np.pi * shift)).astype(np.float32)
+        error = None
+        for axis in (2, 3):
+            size = aliased[:, axis - 2, None, None, None]
+            if size.max() < 1e-3 * UNSURE:
+                continue
+            rough = _sixth_difference(self.smooth, axis)
+            rough *= size
+            error = rough if error is None else error + rough
+        if error is None:
+            return np.ones((len(self.smooth), *self.window), bool)
+        good = (error < UNSURE * peak).all(axis=1)
+        flat = light.reshape(*light.shape[:2], -1)
+        kept = (flat @ good.reshape(len(good), -1, 1).astype(np.float32))[..., 0] / np.maximum(flat.sum(axis=-1), 1e-30)
         return good | (kept < 0.5).any(axis=-1)[:, None, None]
 
     def at(self, origin, shift, derivatives=False, sharp=True):
@@ -177,24 +198,34 @@ class Smooth:
         px within them; with derivatives also those by row and by column shift. Rows and columns that the shift brings in
         from outside are NaN, and so are pixels that the spline cannot be trusted at unless sharp is False."""
         h, w = self.window
-        rows, columns = spline_matrix(h, shift[:, 0]).astype(np.float32), spline_matrix(w, shift[:, 1]).astype(np.float32)
+        rows, columns = (spline_matrix(n, shift[:, k]).astype(np.float32)[:, None] for k, n in enumerate((h, w)))
         gain = self.gain(origin)
-        across = _columns(self.smooth, columns)
-        out = [gain * _rows(across, rows)]
+        across = self.smooth @ np.swapaxes(columns, -1, -2)
+        out = [rows @ across]
         if derivatives:
-            out.append(gain * _rows(across, spline_matrix(h, shift[:, 0], derivative=True).astype(np.float32)))
-            out.append(gain * _rows(_columns(self.smooth, spline_matrix(w, shift[:, 1], derivative=True).astype(np.float32)), rows))
-        row, column = np.arange(h), np.arange(w)
-        seen = _seen(row, shift[:, 0], h)[:, :, None] & _seen(column, shift[:, 1], w)[:, None, :]
+            by_row, by_column = (spline_matrix(n, shift[:, k], derivative=True).astype(np.float32)[:, None] for k, n in enumerate((h, w)))
+            out += [by_row @ across, rows @ (self.smooth @ np.swapaxes(by_column, -1, -2))]
+        for part in out:
+            part *= gain
+        seen = _seen(np.arange(h), shift[:, 0], h)[:, :, None] & _seen(np.arange(w), shift[:, 1], w)[:, None, :]
         if sharp:
             seen = seen & self._sure(shift)
-        out[0] = np.where(seen[..., None], out[0], np.float32(np.nan))
-        flat = [part.reshape(len(part), h * w, -1) for part in out]
+        if not seen.all():
+            np.copyto(out[0], np.float32(np.nan), where=~seen[:, None])
+        flat = [np.swapaxes(part.reshape(*part.shape[:2], h * w), -1, -2) for part in out]
         return flat if derivatives else flat[0]
 
 
+PARITIES = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+
+
+def _parity(origin):
+    """Index (lenslet,) into PARITIES of windows by their first pixels."""
+    return origin[:, 0] % 2 * 2 + origin[:, 1] % 2
+
+
 def _flat_ratios(pictures, sites):
-    """Median (site class, band) of pictures (lenslet, h, w, band) over their local means, where there is light.
+    """Median (site class, band) of pictures (lenslet, band, h, w) over their local means, where there is light.
 
     The local mean weighs the four positions of a 2x2 mosaic alike and slopes cancel in it. Three pixels from any edge are
     left out: there colours sample the picture at different places.
@@ -202,16 +233,16 @@ def _flat_ratios(pictures, sites):
     from scipy.ndimage import convolve1d, minimum_filter
 
     local = pictures
-    for axis in (1, 2):
+    for axis in (2, 3):
         local = convolve1d(local, np.array([1, 2, 1], np.float32) / 4, axis, mode="nearest")
-    bright = local > 0.5 * np.percentile(local, 99.5, axis=(1, 2), keepdims=True)
-    bright = minimum_filter(bright, (0, 7, 7, 0), mode="constant")
-    out = np.ones((len(sites), pictures.shape[-1]))
+    bright = local > 0.5 * np.percentile(local, 99.5, axis=(2, 3), keepdims=True)
+    bright = minimum_filter(bright, (0, 0, 7, 7), mode="constant")
+    out = np.ones((len(sites), pictures.shape[1]))
     for k, site in enumerate(sites):
-        for band in range(pictures.shape[-1]):
-            where = site & bright[..., band]
+        for band in range(pictures.shape[1]):
+            where = site & bright[:, band]
             if where.sum() > 30:
-                out[k, band] = np.median(pictures[..., band][where] / local[..., band][where])
+                out[k, band] = np.median(pictures[:, band][where] / local[:, band][where])
     return out
 
 
@@ -222,27 +253,43 @@ def _seen(index, shift, count):
     return (position >= margin) & (position <= count - 1 - margin)
 
 
-def _rows(pictures, matrices):
-    lead, (h, w, bands) = len(pictures), pictures.shape[1:]
-    return (matrices @ pictures.reshape(lead, h, w * bands)).reshape(max(lead, len(matrices)), h, w, bands)
+def _sixth_difference(pictures, axis):
+    """Largest |[1, -6, 15, -20, 15, -6, 1] / 64| of each sample and its two neighbours along an axis; edges go on as they end."""
+    pad = [(0, 0)] * pictures.ndim
+    pad[axis] = (3, 3)
+    rough = np.abs(np.diff(np.pad(pictures, pad, mode="edge"), 6, axis))
+    rough *= np.float32(1 / 64)
+    low, high, out = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),), rough.copy()
+    np.maximum(out[low], rough[high], out=out[low])
+    np.maximum(out[high], rough[low], out=out[high])
+    return out
 
 
-def _columns(pictures, matrices):
-    return matrices[:, None] @ pictures
-
-
-def _filled(values, weight):
-    """Values (lenslet, h, w, band), those of weight 0 replaced by means of their neighbours, farther ones where it takes that."""
-    from scipy.ndimage import uniform_filter
-
-    out = np.where(weight > 0, values, 0)
-    todo = weight == 0
+def _filled(values, good):
+    """Values (..., h, w), those that are not good replaced by means of their good neighbours, farther ones where it takes that."""
+    out = np.where(good, values, 0)
+    kept, weight, todo = out.copy(), good.astype(np.float32), ~good
     for size in (3, 5, 9):
-        total, share = (uniform_filter(v, (0, size, size, 0), mode="constant") for v in (values * weight, weight + np.zeros_like(values)))
-        ready = todo & (share > 1e-3)
-        out = np.where(ready, total / np.where(share > 1e-3, share, 1), out)
-        todo = todo & ~ready
-    return out.astype(np.float32)
+        if not todo.any():
+            break
+        total, share = _box(kept, size), _box(weight, size)
+        ready = todo & (share > 0.5)
+        np.divide(total, share, out=out, where=ready)
+        todo &= ~ready
+    return out
+
+
+def _box(values, size):
+    """Sums over size x size neighbours (..., h, w), nothing beyond the edges."""
+    for axis in (-2, -1):
+        out = values.copy()
+        last = values.shape[axis]
+        for step in range(1, min(size // 2, last - 1) + 1):
+            low, high = ((..., slice(a, b)) + (slice(None),) * (-1 - axis) for a, b in ((None, last - step), (step, None)))
+            out[low] += values[high]
+            out[high] += values[low]
+        values = out
+    return values
 
 
 def own_pixels(window):

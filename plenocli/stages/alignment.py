@@ -11,6 +11,7 @@ MODES = ("auto", "on", "off")
 POOR_FIT = 1.5  # residual over noise, mean squares, above which the calibration does not describe the capture
 FITS = 1.02  # residual over noise up to which a correction is believed without further question
 BELIEVED = 0.15  # share of the residual's excess over noise that a correction may leave where the capture fits worse than that
+ALIKE = 0.02  # px: a shared response stays shared where displacements differ by less
 LEAST_OFFSET = 0.1  # standard deviations of one pixel in the dark: less costs less than the noise of one lenslet
 
 
@@ -19,10 +20,11 @@ def align(calibration, signal, noise, mode, path, levels=True):
 
     calibration: plenocli.stages.demux.Response; signal (rows, columns), dark removed; noise: (gain, read variance) or None.
     mode: auto corrects what is more than chance, on corrects whatever is found and fails where nothing can be, off looks at
-    nothing. stray (R, C, pixel, colour): patterns of stray light, even over a superpixel, that deserve unknowns of their own where
-    there is more of it than chance (None: there is not). record: what was found, for the file and the report (None: off).
+    nothing. stray: plenocli.sensor.moved.even_light, patterns that deserve unknowns of their own where there is more of it than
+    chance (None: there is not). record: what was found, for the file and the report (None: off).
     levels: whether offset and stray light are corrected, which mean nothing where the motion cannot be followed.
     """
+    from plenocli.sensor.moved import even_light
     from plenocli.sensor.registration import REACH, motion_since
 
     c = calibration
@@ -50,55 +52,36 @@ def align(calibration, signal, noise, mode, path, levels=True):
         c = _moved(c, motion)
     if "offset" in corrected:
         signal = signal - np.float32(motion.offset)
-    return c, signal, _even_light(c, signal.shape) if "stray light" in corrected else None, _record(motion, corrected)
-
-
-def _even_light(c, shape):
-    """Patterns (R, C, pixel, colour): 1 where a pixel has that colour, NaN at the window's border, where the neighbours' light
-    cannot be told from stray light."""
-    from plenocli.sensor.cfa import cfa_map
-    from plenocli.sensor.registration import own_pixels
-    from plenocli.sensor.superpixel import extract
-
-    where = cfa_map(shape, c.cfa)
-    patterns = [extract((where == letter).astype(np.float32), c.origin, c.window) for letter in dict.fromkeys(c.cfa if c.cfa != "mono" else where[0, 0])]
-    return np.where(own_pixels(c.window)[:, None], np.nan_to_num(np.stack(patterns, axis=-1)), np.float32(np.nan))
+    return c, signal, even_light(c.window, c.cfa) if "stray light" in corrected else None, _record(motion, corrected)
 
 
 def _moved(c, motion):
     """The calibration with windows moved by whole pixels and responses by what is left."""
+    from plenocli.sensor.moved import Moved
     from plenocli.sensor.registration import Smooth
 
-    valid = np.argwhere(c.valid)
-    at = tuple(valid.T)
-    shifts = motion.at(c.centres[at])
+    shifts = np.zeros((*c.valid.shape, 2))
+    shifts[c.sites] = motion.at(c.centres[c.sites])
+    here, corners, gains = shifts[c.sites], c.origin[c.sites], c.reference.gains
+    together = c.shared and np.ptp(here, axis=0).max() < ALIKE and not np.ptp(corners % 2, axis=0).any()
     whole = np.rint(shifts).astype(int)
-    if c.cfa == "mono":
-        whole[:] = np.rint(motion.at(motion.middle))
-    origin = c.origin.copy()
-    origin[at] += whole
-    rest = shifts - whole
-    window = c.window
-    if c.response.ndim == 2 and c.cfa == "mono" and np.ptp(rest, axis=0).max() < 0.02:
-        smooth = Smooth(c.response[None], origin[at][:1], window, c.cfa)
-        return replace(c, response=smooth.at(origin[at][:1], rest.mean(axis=0, keepdims=True))[0], origin=origin)
-    response = np.full((*c.valid.shape, window[0] * window[1], c.response.shape[-1]), np.nan, np.float32)
-    step = max(1, 2_000_000 // (window[0] * window[1] * c.response.shape[-1]))
-    own = c.response if c.response.ndim > 2 else np.broadcast_to(c.response, response.shape)
-    gains = None
-    for start in range(0, len(valid), step):
-        part = tuple(valid[start:start + step].T)
-        smooth = Smooth(own[part], c.origin[part], window, c.cfa, gains)
-        gains = smooth.gains
-        response[part] = smooth.at(origin[part], rest[start:start + step])
-    return replace(c, response=response, origin=origin, variance=_carried(c, smooth, origin, part))
+    if together or c.cfa == "mono":
+        whole[c.sites] = np.rint(here.mean(axis=0) if together else motion.at(motion.middle))
+    origin = c.origin + whole
+    variance = _carried(c, Smooth.of(None, c.window, c.cfa, gains), origin)
+    if together:
+        smooth = Smooth(c.response[None], corners[:1], c.window, c.cfa, gains)
+        rest = here.mean(axis=0, keepdims=True) - whole[c.sites][:1]
+        return replace(c, response=smooth.at(origin[c.sites][:1], rest)[0], origin=origin, variance=variance)
+    return replace(c, response=Moved(c.response, c.origin, origin, shifts - whole, c.window, c.cfa, gains), origin=origin, variance=variance)
 
 
-def _carried(c, smooth, origin, part):
+def _carried(c, smooth, origin):
     """Variance of the moved response (pixel, band): a pixel that takes its value from a weak colour takes its noise too."""
     if c.variance is None or c.cfa == "mono":
         return c.variance
-    before, after = (np.mean([smooth.gain(o[None]) ** 2 for o in one[part]], axis=0).reshape(c.variance.shape) for one in (c.origin, origin))
+    some = tuple(part[:: max(1, len(part) // 64)] for part in c.sites)
+    before, after = ((smooth.gain(one[some]) ** 2).mean(axis=0).reshape(c.variance.shape[::-1]).T for one in (c.origin, origin))
     return np.where(before > 0, c.variance * after / np.maximum(before, 1e-6), c.variance)
 
 

@@ -95,9 +95,13 @@ class Response:
             pixels = choose_pixels(self.response)[None]
             return pixels, self.response[pixels].astype(float)
         rows, columns = (part[which] for part in self.sites)
-        step = max(1, 4_000_000 // self.response[0, 0].size)
-        pixels = np.concatenate([choose_pixels(self.response[rows[s:s + step], columns[s:s + step]]) for s in range(0, len(rows), step)])
-        return pixels, self.response[rows[:, None], columns[:, None], pixels].astype(float)
+        step = max(1, 4_000_000 // int(np.prod(self.response.shape[-2:])))
+        found = []
+        for start in range(0, len(rows), step):
+            f = self.response[rows[start:start + step], columns[start:start + step]]
+            pixels = choose_pixels(f)
+            found.append((pixels, np.take_along_axis(f, pixels[..., None], axis=-2).astype(float)))
+        return tuple(np.concatenate(parts) for parts in zip(*found))
 
     def prepare(self):
         """Make now what every capture needs and several threads would make at once; returns itself."""
@@ -191,8 +195,8 @@ def estimate(c, values, noise, method, prior=None, ratio=False, stray=None):
     Least squares first gives the expected radiance from which the noise of each pixel follows (where a lenslet has too little
     light for that, LMMSE); `auto` compares the mean square errors that the methods predict on lenslets all over the array.
     noise: (gain, read variance), or None. ratio: the radiance will be divided by another one from the same F, so that the
-    error of F divides out (to first order, and but for crosstalk) and does not count. stray (R, C, pixel, n): patterns of light that is
-    no band's, unknowns of their own for all methods but single pixel.
+    error of F divides out (to first order, and but for crosstalk) and does not count. stray (4, pixel, n), by the parity of the
+    window's first pixel: patterns of light that is no band's, unknowns of their own for all methods but single pixel.
     """
     job = _Job(c, *_with_stray(c, stray, prior, values), values, noise, ratio)
     if noise is None:
@@ -216,11 +220,10 @@ def _with_stray(c, stray, prior, values):
     """Calibration and prior with the patterns of stray light as further bands, scaled to the light of the others."""
     if stray is None:
         return c, prior
-    level = np.float32(max(float(np.nanmax(c.response)), 1e-30))
-    if c.shared and (stray[c.sites][:1] == stray[c.sites]).all():
-        own, stray = c.response, stray[c.sites][0]
-    else:
-        own = np.broadcast_to(c.response, (*c.valid.shape, *c.response.shape[-2:]))
+    from plenocli.sensor.moved import widened
+
+    some = tuple(part[c.sample] for part in c.sites)
+    level = np.float32(max(float(np.nanmax(c.response if c.shared else c.response[some])), 1e-30))
     count = stray.shape[-1]
     variance = None if c.variance is None else np.concatenate([c.variance, np.zeros((len(c.variance), count))], axis=1)
     if prior is not None:
@@ -229,14 +232,13 @@ def _with_stray(c, stray, prior, values):
         wide = np.diag(np.concatenate([np.zeros(len(mean)), np.full(count, free)]))
         wide[: len(mean), : len(mean)] = covariance
         prior = np.concatenate([mean, np.zeros(count)]), wide
-    return replace(c, response=np.concatenate([own, stray * level], axis=-1), variance=variance), prior
+    return replace(c, response=widened(c.response, stray * level, c.origin, c.sites), variance=variance), prior
 
 
 def _brightest(c, values):
     if isinstance(values, np.ndarray):
         return np.nanmax(values)
-    some = tuple(part[:: max(1, len(part) // SAMPLE)] for part in c.sites)
-    return np.nanmax(values.cut(c.origin[some], c.window))
+    return np.nanmax(values.cut(c.corners[c.sample], c.window))
 
 
 @dataclass

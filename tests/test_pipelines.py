@@ -75,3 +75,20 @@ def test_a_broken_camera_leaves_nothing_behind(tmp_path):
     (tmp_path / "camera.toml").write_text("[main_lens]\n")
     lines = make("spatial", f"RUN={tmp_path}/run", f"CONFIG={tmp_path}/camera.toml", check=False)
     assert stages(lines) and not list((tmp_path / "run").rglob("*.h5"))
+
+
+@pytest.mark.slow
+def test_a_chart_is_measured_and_seen_through_the_camera(tmp_path):
+    from tests.reference.chart import paint_folder
+
+    (tmp_path / "data").mkdir()
+    variables = [f"RUN={tmp_path}/run", f"DATA={paint_folder(tmp_path / 'data')}", "CONFIG=sample_configs/demo_spectral.toml", "METHODS=pinv single-pixel"]
+    lines = make("colorchecker", *variables)
+    assert {"colorchecker", "simulate-pif", "capture-sim", "calibrate", "demux", "score", "report"} == set(stages(lines))
+    found, single = (r["metrics"] for r in json.loads((tmp_path / "run" / "score-long.json").read_text())["results"])
+    assert found["six_patch_rmse"] < 0.5 * single["six_patch_rmse"] and found["snr_over_single_pixel_db"] > 10
+    assert stages(make("colorchecker", *variables)) == []
+
+
+def test_the_chart_pipeline_asks_for_its_captures():
+    assert make("colorchecker", check=False) == []

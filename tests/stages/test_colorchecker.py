@@ -1,6 +1,5 @@
 """colorchecker on a folder that the test paints (known reflectances, light, camera) and on real captures of a chart."""
 
-import csv
 import json
 
 import numpy as np
@@ -9,48 +8,16 @@ import pytest
 from plenocli.artefacts import read_artefact
 from plenocli.cli.main import run
 from plenocli.scene.tables import colorchecker
-from plenocli.scene.target import outside
 from plenocli.stages.colorchecker import Settings, run_colorchecker, table
-from tests.reference.chart import CHART, SHAPE, label_map, light
+from tests.reference.chart import paint_folder
 
-Image = pytest.importorskip("PIL.Image")
+pytest.importorskip("PIL.Image")
 BANDS = [450, 550, 650]
-TIMES = {"25ms": 0.025, "250ms": 0.25, "2s": 2.0}
-FIELDS = [[-0.1, -0.4, -0.05, 0.03, -0.1], [0.0, -0.3, 0.02, 0.0, -0.15], [0.05, -0.25, 0.0, -0.03, -0.1]]
-COLOURS = {"B": [1.0, 0.3, 0.02], "G": [0.2, 1.0, 0.1], "R": [0.03, 0.15, 1.0]}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A GBRG camera, hot pixels, cut-off digits, saturation; a chart before paper with dots, light that falls off by half."""
-    folder = tmp_path_factory.mktemp("chart")
-    rng = np.random.default_rng(1)
-    labels, wavelengths = label_map(), np.arange(380, 781, 2) * 1e-9
-    names, _, spectra = colorchecker(wavelengths)
-    dots = np.where((np.arange(SHAPE[0])[:, None] % 9 < 3) & (np.arange(SHAPE[1]) % 9 < 3), 0.1, 0.85)
-    hot = np.where(rng.uniform(size=SHAPE) < 0.002, 60.0, 0.0)  # DN/s
-    (folder / "captures").mkdir()
-    for k, band in enumerate(BANDS):
-        reflectance = np.concatenate([[0.04], colorchecker([band * 1e-9])[2][:, 0]])[labels]
-        scene = np.where(outside(CHART, SHAPE), dots, reflectance) * light(np.array(FIELDS[k]))
-        colours = np.tile(np.array([[COLOURS[c][k] for c in pair] for pair in ("GB", "RG")]), (SHAPE[0] // 2, SHAPE[1] // 2))
-        for name, seconds in TIMES.items():
-            electrons = rng.poisson(20 * 900 * seconds * colours * scene)
-            save(folder / "captures" / f"d2_chart_{band}nm_{name}_2019-02-18.tif", electrons / 20 + hot * seconds)
-    for name, seconds in TIMES.items():
-        save(folder / f"dark_{name}.tif", hot * seconds)
-    Image.fromarray(labels.astype(np.uint8)).save(folder / "labels.png")
-    Image.fromarray(np.where(labels > 0, 255, 0).astype(np.uint8)).save(folder / "a_labels_mask.png")  # not one to be taken
-    filters = [np.exp(-(((wavelengths * 1e9 - band) / 6) ** 2)) for band in BANDS]
-    with open(folder / "spectra.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["Wavelength", *(f"{band} nm" for band in BANDS), *names])
-        writer.writerows(np.column_stack([wavelengths * 1e9, *filters, *spectra]).round(9).tolist())
-    return folder
-
-
-def save(path, values):
-    Image.fromarray(np.clip(np.floor(values), 0, 255).astype(np.uint8)).save(path)
+    return paint_folder(tmp_path_factory.mktemp("chart"))
 
 
 def test_a_painted_chart_is_measured_to_what_its_digits_allow(folder, tmp_path):

@@ -17,7 +17,7 @@ class Moved:
 
     def __init__(self, response, before, after, rest, window, cfa, gains):
         self.shape = (*before.shape[:2], *response.shape[-2:])
-        self._response, self._before, self._after, self._rest = response, before, after, rest
+        self._response, self._before, self._after, self._rest = response, before, after, np.round(rest, 4)  # 1e-4 px is nothing, and few values are quick
         self._kind = window, cfa, gains
 
     def __getitem__(self, places):

@@ -81,6 +81,7 @@ def spline_matrix(count, shift, degree=DEGREE, derivative=False):
     """
     from scipy.interpolate import BSpline
 
+    shift, places = np.unique(shift, return_inverse=True)  # of a moved array, many are alike
     half = (degree + 1) // 2
     kernel = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
 
@@ -98,8 +99,8 @@ def spline_matrix(count, shift, degree=DEGREE, derivative=False):
 
     index = np.arange(count, dtype=float)
     fit = np.linalg.inv(weights(index, 0))
-    position = index - np.asarray(shift, float)[..., None]
-    return (-1 if derivative else 1) * (weights(position, int(derivative)) @ fit)
+    position = index - shift[:, None].astype(float)
+    return ((-1 if derivative else 1) * (weights(position, int(derivative)) @ fit))[places]
 
 
 class Smooth:
@@ -175,19 +176,12 @@ class Smooth:
         It passes the frequencies near Nyquist's, which alias; a shift by half a pixel errs by about all of them. Where a
         band would lose more than half of its light (cells of a few pixels), nothing is masked.
         """
+        aliased = np.abs(np.sin(np.pi * shift)).astype(np.float32)
+        if aliased.sum(axis=1).max() < UNSURE:  # no difference is larger than the peak
+            return np.ones((len(self.smooth), *self.window), bool)
         light = np.maximum(self.smooth, 0)
         peak = np.maximum(light.max(axis=(2, 3), keepdims=True), 1e-30)
-        aliased = np.abs(np.sin(np.pi * shift)).astype(np.float32)
-        error = None
-        for axis in (2, 3):
-            size = aliased[:, axis - 2, None, None, None]
-            if size.max() < 1e-3 * UNSURE:
-                continue
-            rough = _sixth_difference(self.smooth, axis)
-            rough *= size
-            error = rough if error is None else error + rough
-        if error is None:
-            return np.ones((len(self.smooth), *self.window), bool)
+        error = sum(aliased[:, axis - 2, None, None, None] * _sixth_difference(self.smooth, axis) for axis in (2, 3))
         good = (error < UNSURE * peak).all(axis=1)
         flat = light.reshape(*light.shape[:2], -1)
         kept = (flat @ good.reshape(len(good), -1, 1).astype(np.float32))[..., 0] / np.maximum(flat.sum(axis=-1), 1e-30)
@@ -198,12 +192,12 @@ class Smooth:
         px within them; with derivatives also those by row and by column shift. Rows and columns that the shift brings in
         from outside are NaN, and so are pixels that the spline cannot be trusted at unless sharp is False."""
         h, w = self.window
-        rows, columns = (spline_matrix(n, shift[:, k]).astype(np.float32)[:, None] for k, n in enumerate((h, w)))
+        rows, columns = (_matrices(n, shift[:, k]) for k, n in enumerate((h, w)))
         gain = self.gain(origin)
         across = self.smooth @ np.swapaxes(columns, -1, -2)
         out = [rows @ across]
         if derivatives:
-            by_row, by_column = (spline_matrix(n, shift[:, k], derivative=True).astype(np.float32)[:, None] for k, n in enumerate((h, w)))
+            by_row, by_column = (_matrices(n, shift[:, k], derivative=True) for k, n in enumerate((h, w)))
             out += [by_row @ across, rows @ (self.smooth @ np.swapaxes(by_column, -1, -2))]
         for part in out:
             part *= gain
@@ -214,6 +208,11 @@ class Smooth:
             np.copyto(out[0], np.float32(np.nan), where=~seen[:, None])
         flat = [np.swapaxes(part.reshape(*part.shape[:2], h * w), -1, -2) for part in out]
         return flat if derivatives else flat[0]
+
+
+def _matrices(count, shift, **kind):
+    """spline_matrix for every band of a lenslet, (lenslet, 1, count, count) float32."""
+    return spline_matrix(count, shift, **kind).astype(np.float32)[:, None]
 
 
 PARITIES = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])

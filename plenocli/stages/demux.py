@@ -1,5 +1,6 @@
 """demux: band radiances or reflectances behind every lenslet of captures, with predicted standard deviations."""
 
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -46,7 +47,7 @@ class Demultiplexer:
         self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
         found = read_response(calibration)
         self.prior = light_prior(found)
-        self.calibration = replace(found, white=None).prepare()
+        self.calibration, self._lock = replace(found, white=None).prepare(), threading.Lock()
         self.reference = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._plain_method())[0]

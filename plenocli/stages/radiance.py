@@ -104,9 +104,16 @@ class Response:
         return tuple(np.concatenate(parts) for parts in zip(*found))
 
     def prepare(self):
-        """Make now what every capture needs and several threads would make at once; returns itself."""
-        self.factored, self.sampled, self.sampled_pixels, self.levels, self.reference
+        """Make now what all captures need and several threads would make at once; returns itself."""
+        self.levels, self.reference.gains
         return self
+
+    def keep(self, factored):
+        """Make what only captures that did not move need, or let go of the largest part of it."""
+        if factored:
+            self.factored, self.sampled, self.sampled_pixels
+        else:
+            self.__dict__.pop("factored", None)
 
 
 @dataclass(frozen=True)

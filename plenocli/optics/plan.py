@@ -127,7 +127,7 @@ def size_band(view, grid, ring, accuracy, tolerance):
     terms = expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance)
     # a point between lenslets that do not touch is dim, and what is missed weighs more in its column
     dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
-    light = own, joint, view.diffraction_cells, view.blur > 0
+    light = own, joint, view.diffraction_cells, view.blur / view.D2
     nodes, rule = pixel_nodes(accuracy / dim, *light)
     sampling = math.hypot(dim * pixel_error(nodes, rule, *light), CUT * tolerance)
     return BandPlan(view.wavelength, window, nodes_for(slope), nodes, count, terms, half, sampling, rule)
@@ -179,13 +179,13 @@ def distinct(camera, view, shape):
     return part(0, 0), sum(part(y, x) for y, x in firsts)
 
 
-def pixel_nodes(accuracy, own, joint, cells, blurred):
+def pixel_nodes(accuracy, own, joint, cells, blur):
     """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy`, and the step of quadrature.band_rule.
 
     own: cycles a pixel up to which one lenslet's light makes fringes; joint: up to which all lenslets together do; cells:
-    diffraction cells of a lenslet; blurred: whether points are out of focus.
+    diffraction cells of a lenslet; blur: of a point out of focus, in lenslets.
     """
-    light = own, joint, cells, blurred
+    light = own, joint, cells, blur
     count = next((n for n in range(2, 200) if pixel_error(n, 0, *light) <= accuracy / 1.5), None)
     if count is None:
         raise NumericsError(f"{joint:.0f} interference fringes a pixel cannot be integrated", "sensor.pixel_pitch", "use smaller pixels")
@@ -200,15 +200,15 @@ def pixel_nodes(accuracy, own, joint, cells, blurred):
     return best
 
 
-def pixel_error(count, rule, own, joint, cells, blurred):
+def pixel_error(count, rule, own, joint, cells, blur):
     """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis, at the step `rule` of band_rule.
 
     The light of two lenslets n apart makes fringes of (n - 1) own to (n + 1) own cycles a pixel, most of them in the middle.
     Against converged columns (700 of 8 cameras, isolated and joined, rules 0 to 7): a tenth to twice the measured error.
     """
-    # rules of wide bands err where the light is, not at its end; out of focus a lenslet's light has sharp edges
-    spread = (1 + min(own / 2, 2.0) if rule >= 5 else 1.0) * (2 if rule and blurred else 1)
-    worst = min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * _fringe_error(count, rule, own, 0)
+    # rules of wide bands err where the light is, not at its end; out of focus each lenslet's light is small and has sharp edges
+    spread = (1 + min(own / 2, 2.0) if rule >= 5 else 1.0) * (1.3 if rule and blur else 1.0)
+    worst = (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * _fringe_error(count, rule, own, 0)
     for apart in range(1, round(joint / own)):
         size, power = FRINGES[min(apart, len(FRINGES)) - 1]
         worst = max(worst, min(0.5, size * cells**-power) * _fringe_error(count, rule, own, apart))

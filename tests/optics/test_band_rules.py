@@ -31,7 +31,7 @@ def test_the_narrowest_band_is_gauss_legendre():
 @pytest.mark.parametrize("own, joint, cells", [(1.96, 1.96, 102), (0.45, 2.2, 24), (8.5, 8.5, 102), (2, 10, 6)])
 @pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-7])
 def test_as_few_nodes_as_serve_are_taken(own, joint, cells, accuracy):
-    light = own, joint, cells, False
+    light = own, joint, cells, 0.0
     count, rule = pixel_nodes(accuracy, *light)
     assert pixel_error(count, rule, *light) <= accuracy / 1.5
     assert count == 2 or pixel_error(count - 1, 0, *light) > accuracy / 1.5
@@ -40,4 +40,4 @@ def test_as_few_nodes_as_serve_are_taken(own, joint, cells, accuracy):
 
 def test_pixels_of_too_many_fringes_are_refused():
     with pytest.raises(NumericsError, match="cannot be integrated"):
-        pixel_nodes(1e-3, 300.0, 900.0, 50, False)
+        pixel_nodes(1e-3, 300.0, 900.0, 50, 0.0)

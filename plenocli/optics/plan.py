@@ -180,7 +180,8 @@ def distinct(camera, view, shape):
 
 
 def pixel_nodes(accuracy, own, joint, cells, blur):
-    """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy`, and the step of quadrature.band_rule.
+    """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy` (half, for rules that err all over their
+    band), and the step of quadrature.band_rule.
 
     own: cycles a pixel up to which one lenslet's light makes fringes; joint: up to which all lenslets together do; cells:
     diffraction cells of a lenslet; blur: of a point out of focus, in lenslets.
@@ -194,7 +195,7 @@ def pixel_nodes(accuracy, own, joint, cells, blur):
     while 2 < best[0] <= MAX_RULE:
         fewer = best[0] - 1
         rule = min(range(RULES), key=lambda step: pixel_error(fewer, step, *light))
-        if pixel_error(fewer, rule, *light) > accuracy / 1.5:
+        if pixel_error(fewer, rule, *light) > accuracy / 2:
             break
         best = fewer, rule
     return best

@@ -66,7 +66,8 @@ def problem(config, iterations, count, seed):
     return {"D": effective, "Y": signals, "lambda": lam, "validation": [(float(a), float(b), float(c)) for a, b, c in table]}
 
 
-# the solvers: (D, Y, lambda) -> coefficients (atom, signal)
+# the solvers: (D, Y, lambda) -> coefficients (atom, signal); libraries get the problem divided by lambda, since some of their
+# tolerances are absolute: as it stands scikit-learn's LARS ends after eleven atoms
 
 
 def ours(d, y, lam):
@@ -90,25 +91,25 @@ def interior(d, y, lam):
 def spams_cholesky(d, y, lam):
     import spams
 
-    return spams.lasso(np.asfortranarray(y), D=np.asfortranarray(d), lambda1=lam / 2, mode=2, cholesky=True, numThreads=1).toarray()
+    return lam * spams.lasso(np.asfortranarray(y / lam), D=np.asfortranarray(d), lambda1=0.5, mode=2, cholesky=True, numThreads=1).toarray()
 
 
 def spams_lars(d, y, lam):
     import spams
 
-    return spams.lasso(np.asfortranarray(y), D=np.asfortranarray(d), lambda1=lam / 2, mode=2, numThreads=1).toarray()
+    return lam * spams.lasso(np.asfortranarray(y / lam), D=np.asfortranarray(d), lambda1=0.5, mode=2, numThreads=1).toarray()
 
 
 def sklearn_lars(d, y, lam):
     from sklearn.decomposition import sparse_encode
 
-    return sparse_encode(y.T, d.T, algorithm="lasso_lars", alpha=lam / 2, max_iter=4000, n_jobs=1).T
+    return lam * sparse_encode(y.T / lam, d.T, algorithm="lasso_lars", alpha=0.5, max_iter=4000, n_jobs=1).T
 
 
 def sklearn_cd(d, y, lam):
     from sklearn.decomposition import sparse_encode
 
-    return sparse_encode(y.T, d.T, algorithm="lasso_cd", alpha=lam / 2, max_iter=1000, n_jobs=1).T
+    return lam * sparse_encode(y.T / lam, d.T, algorithm="lasso_cd", alpha=0.5, max_iter=1000, n_jobs=1).T
 
 
 SOLVERS = {

@@ -11,8 +11,11 @@ from plenocli.stages.seeds import stream
 from plenocli.stages.systems import read_system
 from plenocli.stages.training import at_scales, files_of, read_training, split_by_scene
 
-LAMBDAS = np.logspace(-7, -4, 7)
+LAMBDAS = np.logspace(-7, -4, 13)
 """Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
+
+INDIFFERENT_DB = 0.02
+"""Differences in validation PSNR below this do not count: the larger lambda is sparser, and cheaper, for nothing."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def _read_resume(path, system):
 
 
 def _choose_lambda(machine, rule):
-    """lambda with the best validation PSNR for the starting dictionary, or by the noise."""
+    """The largest lambda with the best validation PSNR for the starting dictionary, or lambda by the noise."""
     from plenocli.solvers.l1 import noise_lambda
 
     atoms = machine.start().atoms
@@ -121,7 +124,9 @@ def _choose_lambda(machine, rule):
         lam = noise_lambda(machine.seen @ atoms[:, 1:], machine.sigma)
         note(f"lambda = {lam:.2e}, from the noise")
         return lam
-    best, quality, nonzeros = max(machine.validate_path(atoms, LAMBDAS), key=lambda row: row[1])
+    table = machine.validate_path(atoms, LAMBDAS)
+    top = max(quality for _, quality, _ in table)
+    best, quality, nonzeros = max(row for row in table if row[1] > top - INDIFFERENT_DB)
     note(f"lambda = {best:.2e}: validation {quality:.2f} dB with the starting atoms ({nonzeros:.0f} of them a patch), out of {len(LAMBDAS)} values")
     return best
 

@@ -170,7 +170,7 @@ def command_line(ctx):
     return " ".join(words)
 
 
-_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report"}
+_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report", "measures"}
 """How a file was made, not what it holds: the same inputs give the same bytes whatever these say."""
 
 

@@ -106,7 +106,7 @@ def _measure(data, rates, sites, settings, folder):
         fields["paper"], blocks = paper_field(rates, sites, outside(chart, data.labels.shape))
     truth, six = next(iter(truths.values())), [patch_index(name) for name in SIX_PATCHES]
     names = colorchecker()[0]
-    document = {"bands_nm": (bands * 1e9).tolist(), "patch_names": names, "six": six, "truth": truth, "target": next(iter(truths)), "paper_blocks": blocks, "methods": {}}
+    document = {"bands_nm": np.round(bands * 1e9, 6).tolist(), "patch_names": names, "six": six, "truth": truth, "target": next(iter(truths)), "paper_blocks": blocks, "methods": {}}
     for name, field in fields.items():
         values = np.array([[_mean(rate / f, site & (cores == k)) for rate, site, f in zip(rates, sites, field)] for k in range(1, 25)])
         if not (values[WHITE] > 0).all():

@@ -8,6 +8,8 @@ machine. Run from the project's root: python pipelines/benchmarks/demux.py --hel
 """
 
 import argparse
+import copy
+import dataclasses
 import json
 import os
 import resource
@@ -146,24 +148,34 @@ def measure(run, kind, rounds):
             return raw.raw_image_visible.copy()
 
     worker = clock.time("prepare", lambda: Demultiplexer(run / f"{kind}.h5", Settings(), True, ""))
-    prepared = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    exposure = read_exposure(shot, cfa=worker.calibration.cfa)
+    clock.time("first", lambda: worker.estimate(exposure, shot))  # and what it leaves for the others
+    plain = replace(worker, "register", "off")
     for _ in range(rounds):
         clock.time("decode", decode)
         exposure = clock.time("read", lambda: read_exposure(shot, cfa=worker.calibration.cfa))
         found = clock.time("demux", lambda: worker.estimate(exposure, shot))
+        clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
         clock.time("write", lambda: worker.write((found, describe_inputs({"capture": shot})), shot, run / "shot.exr"))
     parts = clock.medians()
     ratio = sorted(d / max(e, 1e-9) for d, e in zip(clock.cpu["demux"], clock.cpu["decode"]))
-    return {"seconds": parts, "ratio": float(np.median(ratio)), "ratios": ratio, "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "prepared_mib": prepared / 1024,
-            "reader_mib": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024, "method": found.method, "load": os.getloadavg()[0]}
+    return {"seconds": parts, "ratio": float(np.median(ratio)), "ratios": ratio, "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "method": found.method, "load": os.getloadavg()[0]}
+
+
+def replace(worker, name, value):
+    """A Demultiplexer that shares everything with another but one setting."""
+    other = copy.copy(worker)
+    other.settings = dataclasses.replace(worker.settings, **{name: value})
+    return other
 
 
 def show(kind, found):
     """A few lines for a person."""
     print(f"{KINDS[kind]} (method {found['method']}, load {found['load']:.1f}):")
     for name, (cpu, wall) in found["seconds"].items():
-        print(f"  {name:8s} {cpu:7.3f} s CPU {wall:7.3f} s wall")
-    print(f"  demux / decode {found['ratio']:.2f} (rounds {', '.join(f'{r:.2f}' for r in found['ratios'])}); peak {found['peak_mib']:.0f} MiB, its RAW reader {found['reader_mib']:.0f} MiB")
+        print(f"  {name:22s} {cpu:7.3f} s CPU {wall:7.3f} s wall")
+    print(f"  demux / decode {found['ratio']:.2f} (rounds {', '.join(f'{r:.2f}' for r in found['ratios'])}); peak {found['peak_mib']:.0f} MiB")
 
 
 def batch(run, kind, files):
@@ -182,7 +194,7 @@ def batch(run, kind, files):
         plenocli("demux", *(str(shots / f"shot{n:02d}.dng") for n in range(files)), f"--calibration={run / f'{kind}.h5'}", f"--workers={workers}", "-o", str(out))
         found[workers] = [_cpu() - before, time.perf_counter() - start]
     (one, one_wall), (two, two_wall) = found[1], found[2]
-    print(f"{files} files, {KINDS[kind]}: 1 worker {one:.1f} s CPU {one_wall:.1f} s wall, 2 workers {two:.1f} s CPU {two_wall:.1f} s wall: wall ratio {one_wall / two_wall:.2f}, load {os.getloadavg()[0]:.1f}")
+    print(f"{files} files, {KINDS[kind]}: 1 worker {one:.1f} s CPU {one_wall:.1f} s wall, 2 workers {two:.1f} s CPU {two_wall:.1f} s wall: wall ratio {one_wall / two_wall:.2f}, load {os.getloadavg()[0]:.1f}", flush=True)
     return {"1": found[1], "2": found[2]}
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from plenocli.solvers.spectral import LARGEST_CONDITION
 
 BLOCK_NUMBERS = 90_000, 45_000  # pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
+COMPILED_FROM = 4_000_000  # pixels from which importing numba pays
 FACTOR_NUMBERS = 1_000_000
 HARD = 1e-3  # least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
 
@@ -142,11 +143,38 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
                np.empty(square) if sandwich else None, np.zeros(total), np.full(total, factored.q.shape[-1]), np.zeros(total, bool))
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
+    kernel = None if factored.shared or variance is None or radiance is not None or doubt is not None else _kernel(total * factored.q.shape[-1])
     step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.q.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
-        _block(factored, basis, part, cut(part), variance, None if radiance is None else radiance[part], out)
+        x = cut(part)
+        if kernel is None or not _compiled(kernel, factored, part, x, variance, out):
+            x = x if kernel is None else cut(part)
+            _block(factored, basis, part, x, variance, None if radiance is None else radiance[part], out)
     return out
+
+
+def _kernel(pixels):
+    """The compiled sums where there is enough to do for them, and numba; or None. One basis for all is as quick without."""
+    if pixels < COMPILED_FROM:
+        return None
+    from plenocli.solvers.factored_kernel import superpixels
+
+    return superpixels
+
+
+def _compiled(kernel, factored, part, x, variance, out):
+    """Fill `out` for one block by the compiled kernel; False where some lenslet lacks pixels, which is left to _block."""
+    blank = factored.blanks(part)
+    if blank is not None:
+        x[blank] = 0
+    known = variance.known if variance.known is not None else np.empty((0, x.shape[1]), np.float32)
+    sandwich = out.spread is not None
+    kernel(factored.q[part], factored.inverse[part], x, np.float32(variance.gain), variance.read, known, sandwich, out.plain[part], out.normal[part], out.right[part],
+           out.spread[part] if sandwich else out.normal[part], out.chi[part])
+    return not np.isnan(out.plain[part]).any()
+
+
 
 
 def _block(factored, basis, part, x, variance, radiance, out):

@@ -3,11 +3,20 @@
 import numpy as np
 import pytest
 
+import plenocli.solvers.factored as factored_module
 from plenocli.solvers.factored import answer, collect, factor
 from plenocli.solvers.spectral import demultiplex, noise_variance
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
 PRIOR = np.full(BANDS, 0.4), 0.04 * (0.6 * np.ones((BANDS, BANDS)) + 0.4 * np.eye(BANDS))
+
+
+@pytest.fixture(params=["arrays", "compiled"], autouse=True)
+def engine(request, monkeypatch):
+    """Both ways to the same sums."""
+    if request.param == "compiled":
+        pytest.importorskip("numba")
+        monkeypatch.setattr(factored_module, "COMPILED_FROM", 0)
 
 
 @pytest.fixture(params=["shared", "each"])

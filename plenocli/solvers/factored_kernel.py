@@ -1,0 +1,101 @@
+"""The sums of plenocli.solvers.factored for one superpixel after another, compiled by numba; None where it is not installed.
+
+Imported late, because importing numba takes a second. A superpixel's basis is read from memory once and everything else about
+it stays in the cache, where the array version passes over it a dozen times.
+"""
+
+import numpy as np
+
+try:
+    import numba
+except ImportError:
+    superpixels = None
+else:
+    _jit = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+
+    @_jit
+    def _dot(a, b):
+        total = np.float32(0)
+        for p in range(a.size):
+            total += a[p] * b[p]
+        return total
+
+    @_jit
+    def _dots(a, rows, first, out):
+        """out[k] = a . rows[k] for k from `first`; two at a time, since loading numbers is what takes the time."""
+        k = first
+        while k + 1 < len(rows):
+            one, two = np.float32(0), np.float32(0)
+            b, c = rows[k], rows[k + 1]
+            for p in range(a.size):
+                one += a[p] * b[p]
+                two += a[p] * c[p]
+            out[k], out[k + 1] = one, two
+            k += 2
+        if k < len(rows):
+            out[k] = _dot(a, rows[k])
+
+    @_jit
+    def _add(weights, rows, out):
+        """out += weights @ rows."""
+        k = 0
+        while k + 1 < len(rows):
+            one, two, b, c = np.float32(weights[k]), np.float32(weights[k + 1]), rows[k], rows[k + 1]
+            for p in range(out.size):
+                out[p] += one * b[p] + two * c[p]
+            k += 2
+        if k < len(rows):
+            one, b = np.float32(weights[k]), rows[k]
+            for p in range(out.size):
+                out[p] += one * b[p]
+
+    @_jit
+    def _normal(own, weight, carried, out):
+        """Q^T W Q of one superpixel."""
+        for i in range(len(own)):
+            row = own[i]
+            for p in range(weight.size):
+                carried[p] = row[p] * weight[p]
+            _dots(carried, own, i, out[i])
+            for j in range(i):
+                out[i, j] = out[j, i]
+
+    @_jit
+    def superpixels(q, inverse, x, gain, read, known, sandwich, plain, normal, right, spread, chi):
+        """Fill plain, right (lenslet, band), normal and, with sandwich, spread (lenslet, band, band) and chi (lenslet).
+
+        q (lenslet, band, pixel), x (lenslet, pixel), which becomes the residual, gain, read and known (band or 0, pixel): float32;
+        inverse (lenslet, band, band): of R, float64. A lenslet with NaN in x gets NaN in plain and nothing else.
+        """
+        count, pixels = x.shape
+        variance, weight, carried = np.empty(pixels, np.float32), np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+        square = np.empty(len(known))
+        for n in range(count):
+            own, r = q[n], inverse[n]
+            row, c = x[n], plain[n]
+            _dots(row, own, 0, c)
+            if np.isnan(c.sum()):
+                c[:] = np.nan
+                continue
+            variance[:] = 0
+            _add(c, own, variance)
+            for p in range(pixels):
+                row[p] -= variance[p]
+                variance[p] = variance[p] * gain + read
+            if len(known):
+                for k in range(len(known)):
+                    b = 0.0
+                    for j in range(len(own)):
+                        b += r[k, j] * c[j]
+                    square[k] = max(b, 0.0) ** 2
+                _add(square, known, variance)
+            for p in range(pixels):
+                variance[p] = max(variance[p], read)
+                weight[p] = np.float32(1) / variance[p]
+            _normal(own, weight, carried, normal[n])
+            if sandwich:
+                _normal(own, variance, carried, spread[n])
+            for p in range(pixels):
+                weight[p] *= row[p]
+            _dots(weight, own, 0, right[n])
+            chi[n] = _dot(weight, row)

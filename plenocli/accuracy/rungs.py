@@ -47,9 +47,7 @@ def _ray_error(camera, view):
 
 
 def _paraxial_error(camera, view):
-    """Fresnel against exact: the phase dropped at a lenslet's corner, the obliquity, and sine against tangent at the main lens."""
-    aperture = math.hypot(view.D1 / 2 / view.z2, view.lenslet_width / 2 / view.z3)
-    return min(1.0, 0.4 * view.quartic_phase + 1.5 * aperture**2)
+    return exact.fresnel_model_error(view, camera.lenslet_array.profile == "parabolic")
 
 
 def _no_error(camera, view):
@@ -78,17 +76,10 @@ def _square_cost(camera, view, band, shape, double):
             "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (1 << 25)}
 
 
-def _exact_cost(camera, view, band, shape, double):
-    found = _square_cost(camera, view, band, shape, double)
-    # terms beyond the paraxial ones carry the corner's phase, and the set-up finds them
-    more = 2 + 0.5 * view.quartic_phase * 16
-    return {"operations": more * found["operations"], "seconds": found["seconds"] + 0.3 * more, "bytes": 1 << 29}
-
-
 RUNGS = (
     Rung("rays", "ray", rays.valid_for, _ray_error, rays.size_band, rays.cost),
     Rung("fresnel, low rank", "fresnel", _square_only, _paraxial_error, size_band, _square_cost),
     Rung("fresnel, triple product", "fresnel", shaped.valid_for, _paraxial_error, size_band, shaped.cost),
-    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, _exact_cost),
+    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, exact.cost),
 )
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""

@@ -16,16 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.errors import NumericsError
 from plenocli.optics.debye import spherical_field
 from plenocli.optics.factors import Factors
-from plenocli.optics.plan import BandPlan, size_band
-from plenocli.optics.product import FILL, Product
+from plenocli.optics.plan import BandPlan, distinct, grid_of, is_symmetric, size_band
+from plenocli.optics.product import FILL, MAX_SKETCH, Product
 from plenocli.optics.psf import legendre, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
 from plenocli.optics.residual import Residuals, path
 
-CUT, CUT_EFFECT = 0.5, 1.3
+CUT, CUT_EFFECT = 0.45, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.9 to 1.7)."""
 EDGE = 2.0
 """Extra weight of points at a lenslet's edge in the cut."""
@@ -41,12 +42,19 @@ class ExactBand(BandPlan):
 
 
 def exact_band(view, grid, ring, accuracy, tolerance):
-    """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and accuracy as in size_band."""
-    base = size_band(view, grid, ring, 0.7 * accuracy, tolerance)
+    """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and accuracy as in size_band.
+
+    NumericsError where the field is expected to have far more terms than a sketch may hold.
+    """
+    base = size_band(view, grid, ring, accuracy, tolerance)
     phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
     count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4))
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     cut = CUT * accuracy
+    terms = expected_terms(view, base.terms, cut, True)
+    if terms > 1.2 * FILL * MAX_SKETCH:
+        raise NumericsError(f"the exact field has about {terms:.0f} separable terms, more than {int(FILL * MAX_SKETCH)}", "model",
+                            "ask for a looser accuracy or the paraxial model")
     return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * cut)}, cut=cut, sensor_count=count)
 
 
@@ -60,6 +68,26 @@ def valid_for(camera, view):
     return None
 
 
+def fresnel_model_error(view, parabolic):
+    """Estimated relative L2 error of the worst column of the paraxial model against the exact one.
+
+    Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P = D2/(2 f2) at the lenslet's,
+    a hyperbolic lenslet sends the ray through both 3/2 z3 T P (T + P) from where paraxial optics has it, a parabolic one
+    z3 P^3/2 more; sine against tangent at the main lens is a part of it. That is a share `moved` of the pupil image's half
+    width z3 T. A disc moved by it changes along its rim, which is one pixel or one diffraction cell wide: over the disc's norm
+    that is about moved sqrt(disc's width/rim's width). Points beside lenslets that leave gaps are dim, and what is moved weighs
+    more in their columns. Measured on 24 cameras (f/1.5 to f/64, 50 to 500 um, 0.4 to 10 um, 3 to 52 pixels, both profiles): between 0.9 and 2.5 times the
+    error found (docs/model.md, "Exact propagation").
+    """
+    # where a lenslet has few cells, diffraction spreads light further than the pupil does
+    spread = view.wavelength / (2 * view.D2)
+    pupil, lenslet = math.hypot(view.D1 / (2 * view.z2), spread), math.hypot(view.D2 / (2 * view.f2), spread)
+    moved = 1.5 * lenslet * (pupil + lenslet) + (lenslet**3 / (2 * pupil) if parabolic else 0.0)
+    across = 2 * view.z3 * pupil / view.pixel_pitch
+    dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
+    return min(1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, view.diffraction_cells))) * dim)
+
+
 def corner_phase(view):
     """Phase (rad) of the kernel that does not separate, at the largest displacements along both axes within one superpixel."""
     far = view.lenslet_width / 2 + max(view.pixel_shape) * view.pixel_pitch / 2
@@ -67,10 +95,44 @@ def corner_phase(view):
 
 
 def expected_terms(view, terms, cut, parabolic):
-    """Terms of an isolated lenslet's field, of whose spread function there are `terms` (fitted to f/8 and f/4.4, both profiles)."""
-    phase, decades = corner_phase(view), math.log10(1e-3 / cut)
-    first = (1 if parabolic else 1.1) * (1 + 0.22 * phase**0.62)
-    return terms * (first + decades * (1 if parabolic else 1.47) * (0.45 + 0.12 * phase**0.57))
+    """Terms of a lenslet's field whose spread function has `terms`: fitted to 144 cases (f/1.5 to f/64, cut 5e-3 to 5e-7), 8 % rms."""
+    phase, decades = corner_phase(view), math.log10(5e-3 / cut)
+    spread = (0.48 if parabolic else 0.73) * view.diffraction_cells**0.71 * (1 + 5 * phase) ** 0.33
+    return max(2.0, terms * (0.75 + 0.23 * phase**0.45) + decades * spread)
+
+
+def expected_products(view, terms, lit, parabolic):
+    """Terms (r, i) of one lenslet's sheet before compression to `terms`, where `lit` lenslets along an axis are followed (fitted alike)."""
+    return 1.27 * (1 if parabolic else 1.36) * (1 + corner_phase(view)) ** 0.22 * terms * lit
+
+
+def cost(camera, view, band, shape, double):
+    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
+    seconds (what does not scale with them, one core) and bytes (beyond the result); fitted to process times (docs/model.md)."""
+    parabolic, grid, even = camera.lenslet_array.profile == "parabolic", grid_of(shape[1]), is_symmetric(camera)
+    lit = 1 if band.window is None else 2 * band.window + 1
+    reach, points = grid[0] // 2, max(view.object_shape)
+    places = range(0 if even else -reach, reach + 1)
+    lines = band.pixel_nodes * max(view.pixel_shape)
+    terms = expected_terms(view, band.terms, band.cut, parabolic) * (0.2 if even and camera.main_lens.aperture_shape == "square" else 1.0)
+    sketch, products = 1.05 / FILL * terms + 8, expected_products(view, terms, lit, parabolic)
+    nodes, rate, item = band.sensor_count or lines, 2 if double else 1, 16 if double else 8
+    rows = [nodes * ((points + 1) // 2 if even and s == 0 else points) for s in places]
+    tables = [(a, b) for a in range(len(rows)) for b in range(len(rows)) if b <= a or not even]
+    setup = (2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 1e-9 * points * band.lenslet_nodes * band.terms * (band.terms + band.psf_nodes) + 0.01
+             + 0.02 * (len(places) * lit) ** 2)
+    for n in rows:
+        setup += (1 if even else 2) * lit * n * products * (1.2e-10 * band.lenslet_nodes + 4e-9) * rate
+    for a, b in tables:
+        n = rows[a] + (0 if even and a == b else rows[b])
+        setup += rate * (n * sketch * (3.5e-10 * lit * products + 6e-10 * sketch) + 4e-9 * sketch**3
+                         + 2.5e-10 * lit**2 * products**2 * sketch + 1.5e-10 * (rows[a] + rows[b]) * terms * (lines if band.sensor_count else 10))
+    pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
+    size = shape[1] * shape[2] * shape[3]
+    return {"operations": 8.0 * 1.2 * fine * terms * pairs,
+            "seconds": setup + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
+            "bytes": int(item * ((1 if even else 2) * lit * sum(rows) * products + 4 * max(rows) * sketch
+                                 + 2 * len(tables) * points * lines * terms)) + (1 << 25)}
 
 
 class ExactSquareLenslets:
@@ -284,7 +346,8 @@ class ExactSquareLenslets:
 
     def incident(self, rows, columns):
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
-        return self._entering[rows, columns]
+        # the cut, of weighted fields, may add as well as take
+        return self._entering[rows, columns] * (1 + self.band.sampling)
 
     def columns(self, rows, columns, out):
         """As Factors.columns."""

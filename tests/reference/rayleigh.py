@@ -178,4 +178,4 @@ def _fast(dy2, u, x, z, k):
     return real, imag
 
 
-_fast_waves = njit(fastmath=True, error_model="numpy")(_fast) if njit else None
+_fast_waves = njit(fastmath=True, error_model="numpy", cache=True)(_fast) if njit else None

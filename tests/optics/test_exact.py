@@ -1,0 +1,238 @@
+"""The exact rung against direct sums of Rayleigh and Sommerfeld's integral, and what must hold of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plenocli import accuracy
+from plenocli.errors import NumericsError
+from plenocli.optics import exact, product
+from plenocli.optics.exact import fresnel_model_error
+from plenocli.optics.geometry import geometry
+from plenocli.optics.pif import PifBuilder
+from plenocli.optics.residual import Residuals, ell, kappa
+from tests.optics.cameras import WAVELENGTH, small_camera
+from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, pupil_directions
+
+ISOLATED = [(0, 0)]
+NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
+ROWS = [0, 4]
+PROFILES = ["hyperbolic", "parabolic"]
+
+
+def fast_camera(f_number=2.5, **changes):
+    """18 um superpixels of 9x9 pixels at another f-number of main lens and lenslets: at f/2.5 a lenslet's corner is 3 rad from where
+    the separable phase has it."""
+    focal = 18e-6 * f_number
+    return small_camera(**{"main_lens__aperture_diameter": 55e-3 / f_number, "lenslet_array__focal_length": focal, "lenslet_array__pitch": 18e-6,
+                           "sensor__distance": focal, "sensor__pixels_per_lenslet": (9, 9)} | changes)
+
+
+def image_points(camera, points):
+    shape, pitch = camera.object.samples_per_lenslet, camera.lenslet_array.pitch
+    return [tuple((i - (n - 1) / 2) * pitch / n for i, n in zip(divmod(p, shape[1]), shape)) for p in points]
+
+
+def columns(camera, points, *, superpixel=0, superpixels=(1, 1), ring=0, asked=1e-4, **changes):
+    """Pixel energies (point, row, column) on one superpixel by the exact rung."""
+    plan = replace(accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=ring), **changes)
+    builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+    return builder.columns(points)[superpixel].T.reshape(-1, *builder.pixel_shape)
+
+
+def errors(found, truth):
+    """Relative L2 error of each column."""
+    return np.sqrt(((found - truth) ** 2).sum(axis=(1, 2)) / (truth**2).sum(axis=(1, 2)))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_accuracy_holds_in_the_worst_column(profile):
+    camera, points = fast_camera(lenslet_array__profile=profile), [0, 3, 9, 27, 35]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=11)
+    for asked in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
+        assert errors(columns(camera, points, asked=asked), truth).max() <= asked
+
+
+def test_the_reference_has_converged():
+    camera, point = fast_camera(), image_points(fast_camera(), [0])
+    coarse, fine = (column_energies(camera, WAVELENGTH, point, ISOLATED, (0, 0), pixel_nodes=n, density=d, rows=[2, 7]) for n, d in ((11, 1.0), (13, 1.3)))
+    assert errors(coarse, fine).max() < 2e-10
+
+
+@pytest.mark.parametrize("change", [
+    {"sensor__pixels_per_lenslet": (7, 10)},
+    {"object__samples_per_lenslet": (5, 8)},
+    {"object__distance": 0.53},
+    {"lenslet_array__fill_factor": 0.8},
+    {"sensor__distance": 41e-6, "sensor__pixel_fill_factor": 0.64},
+    {"main_lens__aperture_shape": "square"},
+    {"main_lens__apodisation": "uniform-pupil", "lenslet_array__profile": "parabolic"},
+    {"main_lens__apodisation": "uniform-sine", "main_lens__aperture_shape": "annulus", "main_lens__obscuration": 0.4},
+], ids=str)
+def test_every_kind_of_camera(change):
+    camera, points = fast_camera(**change), [0, 12, 19]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    assert errors(columns(camera, points, asked=1e-5), truth).max() <= 1e-5
+
+
+def test_a_window_of_pixels_off_the_superpixel_s_centre():
+    camera, points, shift = fast_camera(), [0, 12, 63], (0.3, -0.2)
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, tuple(s * camera.sensor.pixel_pitch for s in shift), pixel_nodes=9)
+    assert errors(columns(camera, points, pixel_shift=shift), truth).max() <= 1e-4
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_neighbours_add_before_the_square(profile):
+    camera, points = fast_camera(lenslet_array__profile=profile), [0, 4, 27]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), NEIGHBOURS, (0, 0), pixel_nodes=9, rows=ROWS)
+    assert errors(columns(camera, points, ring=1)[:, ROWS], truth).max() <= 1e-4
+    # the isolated lenslet is far off at the corner, so the sum of fields is what was tested
+    assert errors(columns(camera, points)[:, ROWS], truth)[0] > 0.05
+
+
+def test_superpixels_beside_the_own_one():
+    camera, points, rows = fast_camera(4.0), [0, 7, 58], [1, 6]
+    pitch = geometry(camera, WAVELENGTH).superpixel_pitch
+    lenslets = [(r, c) for r in range(-2, 3) for c in range(-2, 3)]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), lenslets, (-pitch, pitch), pixel_nodes=7, rows=rows)
+    found = columns(camera, points, superpixel=2, superpixels=(3, 3), ring=1, asked=1e-3)[:, rows]
+    # the accuracy asked for is the whole column's; this superpixel holds a small part of it
+    whole = columns(camera, points, superpixels=(1, 1), ring=1, asked=1e-3)
+    assert (np.linalg.norm(found - truth, axis=(1, 2)) <= 1e-3 * np.linalg.norm(whole, axis=(1, 2))).all()
+
+
+def test_symmetry_changes_nothing(monkeypatch):
+    camera, points = fast_camera(object__samples_per_lenslet=(5, 5)), np.arange(25)
+    used = columns(camera, points, asked=1e-6)
+    field = exact.separable_field
+    monkeypatch.setattr(exact, "separable_field", lambda *args: replace(field(*args), symmetry=(False, False, False), signs=None))
+    assert errors(columns(camera, points, asked=1e-6), used).max() < 1e-6
+    plan = accuracy.plan_pif(camera, model="exact", accuracy=1e-6, superpixels=(1, 1), coherent_ring=0)
+    assert PifBuilder(camera, WAVELENGTH, plan).symmetry == (False, False, False)
+
+
+def test_no_light_is_made_and_only_the_far_field_is_lost():
+    """What a window of pixels misses of the light that enters the lenslet is the edges' diffraction, which falls as one over its width."""
+    missed, points, directions = [], [0, 27], pupil_directions(fast_camera(4.0))
+    t, w = np.polynomial.legendre.leggauss(70)
+    enters = np.array([np.abs(field_on_array(fast_camera(4.0), WAVELENGTH, point, 9e-6 * t, 9e-6 * t, directions)) ** 2 @ w @ w * 9e-6**2
+                       for point in image_points(fast_camera(4.0), points)])
+    for pixels in (27, 55):
+        seen = columns(fast_camera(4.0, sensor__pixels_per_lenslet=(pixels, pixels)), points).sum(axis=(1, 2))
+        missed.append(enters - seen)
+    assert (np.array(missed) > 0).all() and (missed[1] < 0.03 * enters).all()
+    assert np.allclose(missed[0] / missed[1], 55 / 27, rtol=0.15)
+
+
+def test_slow_lenses_are_paraxial():
+    """The paraxial model's error falls a little faster than the square of the f-number."""
+    found = []
+    for f_number in (4, 8, 16):
+        camera = fast_camera(f_number)
+        both = [accuracy.system_matrix(camera, model=model, accuracy=1e-7, superpixels=(1, 1), coherent_ring=0).A[0, 0] for model in ("fresnel", "exact")]
+        found.append(np.linalg.norm(both[0] - both[1]) / np.linalg.norm(both[1]))
+    assert found[-1] < 2e-3
+    assert all(4 < a / b < 6 for a, b in zip(found, found[1:]))
+
+
+@pytest.mark.parametrize("change", [{}, {"f_number": 8, "lenslet_array__profile": "parabolic"}, {"f_number": 4, "sensor__pixels_per_lenslet": (3, 3), "sensor__pixel_pitch": 6e-6}], ids=str)
+def test_law_of_the_paraxial_error(change):
+    camera = fast_camera(**change)
+    both = [accuracy.system_matrix(camera, model=model, accuracy=3e-4, superpixels=(1, 1), coherent_ring=0).A[0, 0] for model in ("fresnel", "exact")]
+    worst = (np.linalg.norm(both[0] - both[1], axis=0) / np.linalg.norm(both[1], axis=0)).max()
+    law = fresnel_model_error(geometry(camera, WAVELENGTH), camera.lenslet_array.profile == "parabolic")
+    assert 0.8 * worst < law < 3 * worst
+
+
+def test_main_lens_against_spherical_waves():
+    """Point by point over an evenly lit exit pupil, distances exact: the direction cosines are the right coordinates."""
+    camera = fast_camera(4.0, main_lens__apodisation="uniform-pupil")
+    y = np.linspace(-9e-6, 9e-6, 9)
+    point = (3e-6, -4e-6)
+    whole = field_of_spheres(camera, WAVELENGTH, point, y, y)
+    debye = field_on_array(camera, WAVELENGTH, point, y, y, pupil_directions(camera))
+    whole = whole * np.vdot(whole, debye) / abs(np.vdot(whole, debye))
+    assert np.linalg.norm(whole - debye) < 1e-3 * np.linalg.norm(whole)
+
+
+def test_residual_functions_reproduce_the_kernel():
+    k, z, half, offsets = 2 * np.pi / WAVELENGTH, 65e-6, 13e-6, [0.0, 26e-6]
+    residuals = Residuals(offsets, [1.0, 0.3], half, half, z, k, z, 1e-7)
+    rng = np.random.default_rng(3)
+    u, x, v, y = rng.uniform(-half, half, (4, 30))
+    for a, b in ((0, 0), (0, 1), (1, 1)):
+        left, right = residuals.functions(a, v, y), residuals.functions(b, u, x)
+        found = np.tensordot(np.tensordot(left, residuals.core[a, b], (0, 0)), right, 1)
+        d, e = offsets[a] + v[:, None] - y, offsets[b] + u[:, None] - x
+        true = kappa(d[:, :, None, None], e, z, k) * ell(y[None, :, None, None], x[None, None, None, :], z, k)
+        assert np.abs(found - true).max() < 1e-5
+
+
+def test_residual_is_what_the_paths_leave():
+    k, z = 2 * np.pi / WAVELENGTH, 65e-6
+    dy, dx = np.random.default_rng(4).uniform(-4e-5, 4e-5, (2, 50))
+    side = np.sqrt(z * z + dy**2 + dx**2)
+    kernel = z / (1j * WAVELENGTH * side**2) * (1 + 1j / (k * side)) * np.exp(1j * k * (side - z))
+    separable = np.exp(1j * k * (np.sqrt(z * z + dy**2) - z + np.sqrt(z * z + dx**2) - z)) / (1j * WAVELENGTH * z)
+    assert np.allclose(kernel, separable * kappa(dy, dx, z, k), rtol=1e-9)
+    lens = np.exp(-1j * k * (np.sqrt(z * z + dy**2 + dx**2) - z))
+    axes = np.exp(-1j * k * (np.sqrt(z * z + dy**2) - z + np.sqrt(z * z + dx**2) - z))
+    assert np.allclose(lens, axes * ell(dy, dx, z, k), rtol=1e-9)
+
+
+def _random_product(rng, rows, terms, decay):
+    weights = np.exp(-decay * np.arange(terms))
+    left, right = (rng.normal(size=(rows, terms)) + 1j * rng.normal(size=(rows, terms)) for _ in range(2))
+    return left, right, np.diag(weights).astype(complex)
+
+
+def test_compression_keeps_what_was_asked():
+    rng = np.random.default_rng(5)
+    left, right, core = _random_product(rng, 90, 60, 0.3)
+    high, wide = product.Product([left], [right], {(0, 0): core}, False).factors(1e-2, 10)
+    full = left @ core @ right.T
+    assert np.linalg.norm(high @ wide.T - full) < 1.5e-2
+    singular = np.linalg.svd(full, compute_uv=False)
+    assert high.shape[1] <= np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > 1e-2) + 1
+
+
+def test_too_many_terms_are_refused(monkeypatch):
+    monkeypatch.setattr(product, "MAX_SKETCH", 20)
+    left, right, core = _random_product(np.random.default_rng(6), 90, 60, 0.01)
+    with pytest.raises(NumericsError, match="separable terms"):
+        product.Product([left], [right], {(0, 0): core}, False).factors(1e-3, 10)
+
+
+def test_refusals():
+    with pytest.raises(NumericsError, match="square lenslets"):
+        accuracy.plan_pif(fast_camera(lenslet_array__aperture_shape="circle"), model="exact", accuracy=1e-3)
+    with pytest.raises(NumericsError, match="oblique"):
+        accuracy.plan_pif(fast_camera(), model="exact", accuracy=1e-3, lenslet=(0, 1))
+
+
+def full_camera(name, profile):
+    """52x52 pixels and 40x40 points: f/4.4 and f/8 with 250 um lenslets, f/8 with 104 um ones."""
+    f_number, pitch, pixel = {"f/4.4": (4.4, 250e-6, 4.808e-6), "f/8": (8, 250e-6, 4.808e-6), "f/8, 104 um": (8, 104e-6, 2e-6), "f/2.2": (2.2, 250e-6, 4.808e-6)}[name]
+    return fast_camera(main_lens__focal_length=0.1, main_lens__aperture_diameter=0.11 / f_number, object__distance=1.1, lenslet_array__distance=0.11,
+                       lenslet_array__pitch=pitch, lenslet_array__focal_length=pitch * f_number, lenslet_array__profile=profile,
+                       sensor__distance=pitch * f_number, sensor__pixel_pitch=pixel, sensor__pixels_per_lenslet=(52, 52), object__samples_per_lenslet=(40, 40))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("name", ["f/4.4", "f/8", "f/8, 104 um"])
+def test_full_size(name, profile):
+    """On every sixth row of pixels: 1e-4 in single and 1e-6 in double precision, the corner's column as well."""
+    camera, points, rows = full_camera(name, profile), [0, 19, 137, 412, 551, 820], range(0, 52, 6)
+    nodes = {"f/4.4": 8, "f/8": 6, "f/8, 104 um": 5}[name]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=nodes, rows=rows)
+    for asked in (1e-2, 1e-4, 1e-6):
+        assert errors(columns(camera, points, asked=asked)[:, rows], truth).max() <= asked
+
+
+@pytest.mark.slow
+def test_full_size_at_f_2_2():
+    camera, points, rows = full_camera("f/2.2", "parabolic"), [0, 137, 820], [3, 26]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=12, rows=rows)
+    assert errors(columns(camera, points, asked=2e-4)[:, rows], truth).max() <= 2e-4

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.config import REFERENCE_REFLECTANCE
-from plenocli.errors import NumericsError
+from plenocli.errors import InputError, NumericsError
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.mosaics import read_exposure
+from plenocli.stages.progress import note
 from plenocli.stages.radiance import estimate, light_prior, read_response, readout
 
 
@@ -34,7 +35,44 @@ def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".ex
     """
     batch = plan_batch(captures, output, suffix, "spectra are", overwrite=overwrite, inputs=[*captures, calibration, settings.reference])
     job = Demultiplexer(calibration, settings, overwrite, command) if batch.todo else None  # a broken calibration ends the run here, before any capture
+    _say_what_is_old(batch, calibration, settings)
     return summarise(batch, outcomes(batch, job and job.demux, job and job.write, workers))
+
+
+def _say_what_is_old(batch, calibration, settings):
+    """A note where finished results, which stay, were made in another way than this run would make them, or are damaged."""
+    from plenocli.artefacts import describe_inputs
+
+    kept = [target for job in batch.jobs if job not in batch.todo for target in job[1:]]
+    if not kept:
+        return
+    ours = _recipe(describe_inputs({"calibration": calibration, "reference": settings.reference}), settings.method, settings.register == "off")
+    old = [target.name for target in kept if _recipe_of(target) != ours]
+    if old:
+        note(f"warning: {len(old)} of {len(kept)} finished results in {batch.output} were made with another calibration, reference or method, or are damaged, and stay as they are "
+             f"({', '.join(old[:3])}{', ...' if len(old) > 3 else ''}): delete them, or pass --overwrite to make all anew")
+
+
+def _recipe(inputs, method, unregistered):
+    return {role: inputs.get(role, {}).get("sha256") for role in ("calibration", "reference")} | {"method": method, "unregistered": unregistered}
+
+
+def _recipe_of(target):
+    """The recipe of a finished result, None where it cannot be read."""
+    import json
+
+    from plenocli.artefacts import read_artefact, read_provenance_texts, read_spectral_exr
+
+    try:
+        if target.suffix == ".h5":
+            artefact = read_artefact(target, "spectra")
+            inputs, parameters = artefact.provenance.inputs, artefact.attrs["spectra"]["parameters"]
+        else:
+            attrs = read_spectral_exr(target).attrs
+            inputs, parameters = read_provenance_texts(attrs).inputs, json.loads(attrs["parameters"])
+        return _recipe(inputs, parameters["asked"], parameters["registration"] is None)
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
 
 
 class Demultiplexer:

@@ -14,7 +14,7 @@ from plenocli.artefacts import Artefact, write_artefact
 from plenocli.errors import InputError, PlenoError
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import run_demux
+from plenocli.stages.demux import Settings, run_demux
 
 PITCH, COUNT, FILES = 12, 9, 14
 
@@ -51,7 +51,7 @@ def shots(folder):
 def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path, seed):
     """Killed at a random moment after a random number of results, then run again: the same bytes, finished files untouched."""
     rng, out = np.random.default_rng(seed), tmp_path / "out"
-    code = (f"from pathlib import Path; from plenocli.stages.demux import run_demux; f = Path({str(folder)!r}); "
+    code = (f"from pathlib import Path; from plenocli.stages.demux import Settings, run_demux; f = Path({str(folder)!r}); "
             f"run_demux(sorted(f.glob('shot*.h5')), Path({str(out)!r}), calibration=f / 'c.h5', suffix='.exr', workers={1 + seed % 2})")
     child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True)
     wanted, deadline = int(rng.integers(1, FILES - 3)), time.monotonic() + 300
@@ -70,6 +70,21 @@ def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path
     assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in (folder / "whole").iterdir())  # nothing half-written is left
     for path in out.iterdir():
         assert path.read_bytes() == (folder / "whole" / path.name).read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".h5"])
+def test_finished_results_of_another_recipe_stay_and_are_named(folder, tmp_path, suffix, capsys):
+    def rerun(**settings):
+        report = run_demux(shots(folder)[:3], tmp_path / "out", calibration=folder / "c.h5", suffix=suffix, settings=Settings(**settings))
+        return report["done"], report["skipped"], capsys.readouterr().err
+
+    assert rerun()[:2] == (3, 0)
+    assert rerun() == (0, 3, "")
+    for other in (dict(method="pinv"), dict(register="off"), dict(reference=folder / "white.h5")):
+        done, skipped, said = rerun(**other)
+        assert (done, skipped) == (0, 3) and "3 of 3 finished results" in said and "--overwrite" in said
+    (tmp_path / "out" / f"shot01{suffix}").write_bytes(b"torn")
+    assert "1 of 3 finished results" in rerun()[2]
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])

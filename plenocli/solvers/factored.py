@@ -7,6 +7,7 @@ in double precision (A. Bjorck, Numerical Methods for Least Squares Problems, 19
 lost so many pixels that this fails are said to be hard, and `plenocli.solvers.spectral.demultiplex` does them.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -80,10 +81,10 @@ class Sums:
     hard: np.ndarray
 
 
-def factor(response, which=None):
+def factor(response, which=None, threads=1):
     """Factored responses (pixel, band), or (..., pixel, band) at the places `which` (a tuple of index arrays, None: all, flattened).
 
-    NaN in any band masks a pixel.
+    NaN in any band masks a pixel. The result does not depend on `threads`.
     """
     if response.ndim == 2:
         response, which = response[None], (np.zeros(1, int),)
@@ -94,7 +95,8 @@ def factor(response, which=None):
     q, r = np.empty((total, bands, count), np.float32), np.empty((total, bands, bands))
     used = np.empty((total, count), bool)
     step = max(1, FACTOR_NUMBERS // (count * bands))
-    for first in range(0, total, step):
+
+    def work(first):
         part = slice(first, first + step)
         f = np.ascontiguousarray(np.swapaxes(response[tuple(w[part] for w in which)], -1, -2), float)
         good = np.isfinite(f).all(axis=1)
@@ -102,6 +104,14 @@ def factor(response, which=None):
             f = np.where(good[:, None], f, 0)
         used[part] = (f != 0).any(axis=1)
         q[part], r[part] = _orthogonal(f)
+
+    firsts = range(0, total, step)
+    if threads == 1 or len(firsts) < 2:
+        for first in firsts:
+            work(first)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, firsts))
     singular = np.linalg.svd(r, compute_uv=False)
     return Factored(q, r, None if used.all() else used, singular[:, -1] > singular[:, 0] / LARGEST_CONDITION)
 

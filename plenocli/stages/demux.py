@@ -34,7 +34,7 @@ def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".ex
     the same time; they share one calibration, and results are written one at a time.
     """
     batch = plan_batch(captures, output, suffix, "spectra are", overwrite=overwrite, inputs=[*captures, calibration, settings.reference])
-    job = Demultiplexer(calibration, settings, overwrite, command) if batch.todo else None  # a broken calibration ends the run here, before any capture
+    job = Demultiplexer(calibration, settings, overwrite, command, min(workers, len(batch.todo))) if batch.todo else None  # a broken calibration ends the run here, before any capture
     _say_what_is_old(batch, calibration, settings)
     return summarise(batch, outcomes(batch, job and job.demux, job and job.write, workers))
 
@@ -78,14 +78,14 @@ def _recipe_of(target):
 class Demultiplexer:
     """What any number of captures need: calibration read and factored, white reference demultiplexed, once."""
 
-    def __init__(self, calibration, settings, overwrite, command):
+    def __init__(self, calibration, settings, overwrite, command, threads=1):
         from plenocli.artefacts import describe_inputs
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
         self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
         found = read_response(calibration)
         self.prior = light_prior(found)
-        self.calibration, self._lock = replace(found, white=None).prepare(), threading.Lock()
+        self.calibration, self._lock = replace(found, white=None, threads=threads).prepare(), threading.Lock()
         self.reference = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._plain_method())[0]

@@ -14,7 +14,7 @@ LIT = 1024  # lenslets whose white tells the light
 
 @dataclass(frozen=True)
 class Response:
-    """A calibration as demux uses it (arrays as in the calibration artefact)."""
+    """A calibration as demux uses it (arrays as in the calibration artefact). threads: for factoring it."""
 
     response: np.ndarray
     variance: np.ndarray | None
@@ -31,6 +31,7 @@ class Response:
     exposure: float | None
     gain: float | None
     read_variance: float
+    threads: int = 1
 
     @property
     def shared(self):
@@ -62,7 +63,7 @@ class Response:
         """plenocli.solvers.factored.Factored of the valid lenslets."""
         from plenocli.solvers.factored import factor
 
-        return factor(self.response, None if self.shared else self.sites)
+        return factor(self.response, None if self.shared else self.sites, self.threads)
 
     @cached_property
     def reference(self):

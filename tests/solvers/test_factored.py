@@ -118,6 +118,14 @@ def test_factors_give_the_response_back(condition):
     assert factored.sound.all() and factored.used is None
 
 
+def test_threads_change_nothing(monkeypatch):
+    monkeypatch.setattr(factored_module, "FACTOR_NUMBERS", 2000)
+    f = np.random.default_rng(2).uniform(size=(60, 50, 3))
+    one, four = factor(f), factor(f, threads=4)
+    np.testing.assert_array_equal(one.q, four.q)
+    np.testing.assert_array_equal(one.r, four.r)
+
+
 def test_a_response_that_cannot_tell_bands_apart_gives_nothing():
     f = np.ones((30, 2)) * np.arange(30)[:, None]
     factored = factor(f)

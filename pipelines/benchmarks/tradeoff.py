@@ -71,7 +71,7 @@ def reference(camera, model, window, superpixels, folder):
     """
     import numpy as np
 
-    key = hashlib.sha256(json.dumps([camera.text, model, window, superpixels, 3]).encode()).hexdigest()[:20]
+    key = hashlib.sha256(json.dumps([camera.text, model, window, superpixels, 3 if window is None else 4]).encode()).hexdigest()[:20]
     path = folder / f"{key}.npz"
     if path.exists():
         with np.load(path) as kept:
@@ -96,10 +96,17 @@ def _image_points(camera):
 
 
 def _pixel_nodes(camera, window):
-    """Nodes per pixel for 1e-10: fringes from opposite ends of the coherent window (or of one lenslet)."""
+    """Nodes per pixel for fringes from opposite ends of the coherent window (or of one lenslet), to 1e-10; where lenslets hold many
+    diffraction cells, of lenslets up to five apart: those further apart make too little of them (1e-7 of a column)."""
     wavelength, sensor = camera.light.wavelengths[0], camera.sensor
     cell = camera.lenslet_array.pitch * sensor.pixel_pitch / (wavelength * sensor.distance)
-    return math.ceil(1.7 * cell + 9 if window is None else 1.7 * cell * (2 * window + 1) + 5)
+    across = 2 * window + 1 if window is not None else 1
+    return math.ceil(1.7 * cell + 9 if window is None else 1.7 * cell * (across if _cells(camera) < 15 else min(across, 5)) + 5)
+
+
+def _cells(camera):
+    """Diffraction cells of a lenslet: its pitch over wavelength times F-number."""
+    return camera.lenslet_array.pitch * camera.main_lens.aperture_diameter / (camera.light.wavelengths[0] * camera.lenslet_array.distance)
 
 
 def _fresnel_columns(camera, window, superpixels):
@@ -118,6 +125,18 @@ def exact_rows(camera):
     """Pixel rows of the own superpixel that the exact sum is compared on: it costs seconds a row and lenslet."""
     count = camera.sensor.pixels_per_lenslet[0]
     return sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
+
+
+def exact_window(camera, most, evaluations=1e10):
+    """Lenslets either side that the exact sum affords: as many as `most`, at least one, for so many values of the kernel a point."""
+    array, sensor = camera.lenslet_array, camera.sensor
+    turns = array.pitch / camera.light.wavelengths[0] * (array.pitch / sensor.distance + camera.main_lens.aperture_diameter / array.distance)
+    nodes = 20 * math.ceil(2 * math.pi * turns / 36)
+    for window in range(most, 1, -1):
+        fine = _pixel_nodes(camera, window) ** 2 * len(exact_rows(camera)) * sensor.pixels_per_lenslet[1]
+        if (2 * window + 1) ** 2 * fine * nodes**2 <= evaluations:
+            return window
+    return 1
 
 
 def _exact_columns(camera, window, superpixels):
@@ -234,7 +253,7 @@ def measure(case, camera, model, window, folder):
     if model == "exact":
         own = blocks[:, reach.index((0, 0))].reshape(len(blocks), *camera.sensor.pixels_per_lenslet)
         blocks, reach = own[:, exact_rows(camera)], [(0, 0)]
-        window = None if window is None else 1
+        window = None if window is None else exact_window(camera, window)
     truth, change = reference(camera, model, window, reach, folder / "reference")
     errors = [float(np.linalg.norm(b.ravel() - t.ravel()) / np.linalg.norm(t)) for b, t in zip(blocks, truth)]
     case |= {"errors": errors, "achieved": max(errors), "reference_change": change, "reference": model}
@@ -247,8 +266,7 @@ def window_of(camera, scope):
         return None
     blur = abs(1 / camera.object.distance + 1 / camera.lenslet_array.distance - 1 / camera.main_lens.focal_length)
     blur *= camera.main_lens.aperture_diameter * camera.lenslet_array.distance / camera.lenslet_array.pitch
-    cells = camera.lenslet_array.pitch * camera.main_lens.aperture_diameter / (camera.light.wavelengths[0] * camera.lenslet_array.distance)
-    return math.ceil(blur / 2) + (4 if cells > 150 else 6 if cells > 60 else 10)
+    return math.ceil(blur / 2) + (4 if _cells(camera) > 150 else 6 if _cells(camera) > 60 else 10)
 
 
 def sweep(names, accuracies, model, scope, run, others=True):

@@ -18,18 +18,20 @@ class Noise:
     source: str
 
 
-def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, lattice="auto", cfa=None, near=None, overwrite=False, command=""):
+def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=None, shared=False, denoise=False, lattice="auto", cfa=None, near=None, overwrite=False, command=""):
     """Calibrate and write `output`; returns a summary dict.
 
     whites, darks: paths. bands: (wavelength m, path) pairs, several a band allowed. radiances: (wavelength m, relative
     radiance of that source) pairs, 1 where not given. camera: TOML for gain and read noise. shared: one F for all
-    lenslets. cfa: colour filter array of PNG and TIFF mosaics (default: the camera's, else mono). near: (row, column) px close
+    lenslets; denoise: take off noise by what the lenslets' responses have in common. cfa: colour filter array of PNG and TIFF mosaics (default: the camera's, else mono). near: (row, column) px close
     to any superpixel's centre (see find_grid). Errors: InputError for files, NumericsError where there is no lattice or no light.
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.sensor.frames import make_dark, merge
 
+    if denoise and shared:
+        raise UsageError("--denoise and --shared exclude each other: a shared response is an average already")
     bands = sorted(bands, key=lambda pair: pair[0])
     roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
     check_output(output, overwrite=overwrite, inputs=[*whites, *darks, camera, *(path for _, path in bands)], suffixes=(".h5",))
@@ -56,7 +58,8 @@ def run_calibrate(output, *, whites, darks=(), bands=(), radiances=(), camera=No
     data["dark/mean"] = dark.mean.astype(np.float32)
     merged = {w: merge([e.values for e in group], [e.seconds for e in group], dark, group[0].white, reference) for w, group in band_frames.items()}
     if merged:
-        _response(data, attrs, merged, dict(radiances), bad, noise, dark.variance, shared, grid, white[0].cfa)
+        shares = {w: np.mean([1.0 if e.seconds is None or reference is None else e.seconds / reference for e in group]) for w, group in band_frames.items()}
+        _response(data, attrs, merged, shares, dict(radiances), bad, noise, dark.variance, shared, grid, white[0].cfa, denoise)
     _add_attrs(attrs, white[0], dark, noise, reference)
     report = _report(grid, attrs, data, whites, noise)
     write_artefact(output, Artefact("calibration", data, attrs, Provenance(command, describe_inputs(roles), None, description.text if description else "")), overwrite=overwrite)
@@ -150,8 +153,11 @@ def _mean(cells):
         return (np.where(known, cells, 0).sum(axis=0, dtype=float) / known.sum(axis=0)).astype(np.float32)
 
 
-def _response(data, attrs, merged, radiances, bad, noise, dark_variance, shared, grid, cfa):
-    """F-hat: each band's signal over the radiance of its source, with its variance (pixel, band), mean over lenslets."""
+def _response(data, attrs, merged, shares, radiances, bad, noise, dark_variance, shared, grid, cfa, denoise=False):
+    """F-hat: each band's signal over the radiance of its source, with its variance (pixel, band), mean over lenslets.
+
+    shares: exposure of one frame of each band over the reference exposure.
+    """
     from plenocli.sensor.superpixel import extract
     from plenocli.solvers.spectral import calibration_bias, choose_pixels, column_angles, condition_number
 
@@ -173,25 +179,40 @@ def _response(data, attrs, merged, radiances, bad, noise, dark_variance, shared,
         times = extract(weight.astype(np.float32), origin, window)
         response[..., k] = cells / np.float32(energy[k])
         if noise.gain is not None:
-            single = (noise.gain * np.clip(cells[valid], 0, None) + noise.read_variance) / times[valid] + dark_variance
+            # read noise comes once a frame, however short: a share of the reference exposure each
+            single = (noise.gain * np.clip(cells[valid], 0, None) + noise.read_variance / shares[wavelength]) / times[valid] + dark_variance
             variance[:, k] = _mean(single) / energy[k] ** 2
     response[~valid] = np.nan
     if shared:
         response = _mean(response[valid])
         variance = variance / valid.sum()
     sample = response if shared else response[valid]
+    notes = ()
+    if denoise:
+        variance, notes = _cleaned(response, variance, valid, origin % 2 @ [2, 1] if cfa != "mono" else np.zeros(valid.shape, int))
+        sample = response[valid]
     condition = condition_number(sample)
     angles = np.atleast_3d(column_angles(sample)).reshape(-1, len(merged), len(merged))
     between = angles[(slice(None), *np.triu_indices(len(merged), 1))]
     middle = sample if shared else _mean(sample)
     data |= {"response/F": response, "response/wavelength": np.array(list(merged)), "response/energy": energy}
     attrs["response"] = dict(condition=float(np.median(condition)), angles=[[float(a) for a in row] for row in np.median(angles, axis=0)], single_pixel=[int(p) for p in choose_pixels(middle)],
-                             notes=f"smallest angle between two columns of F {between.min():.2f} deg" if between.size else "one band")
+                             notes="; ".join([f"smallest angle between two columns of F {between.min():.2f} deg" if between.size else "one band", *notes]))
     if noise.gain is not None:
         data["response/covariance"] = variance
         some = sample if shared else sample[:: max(1, len(sample) // 32)]
         bias = np.atleast_3d(calibration_bias(some, variance)).reshape(-1, len(merged), len(merged))
         attrs["response"]["bias"] = [float(v) for v in np.median(np.diagonal(bias, axis1=-2, axis2=-1), axis=0)]
+
+
+def _cleaned(response, variance, valid, phase):
+    """Take noise off the response (in place); (variance of what is left, notes). NumericsError where the noise is not known."""
+    from plenocli.solvers.lowrank import low_rank
+
+    if not np.isfinite(variance).all(axis=0).any():
+        raise NumericsError("the noise of the captures is not known, and so not what stands out of it", fix="give --camera, or two frames of a scene, or leave --denoise out")
+    response[valid], left, rank = low_rank(response[valid], variance, phase[valid])
+    return variance * left, (f"denoised to rank {rank}: {left:.1%} of the noise variance left",)
 
 
 def _check_shared(grid, origin, valid, cfa):

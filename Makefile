@@ -45,8 +45,10 @@ spatial: $(READY) ## section 3-2 of the paper at full size: every reconstruction
 spatial-250um: $(READY) ## the same with 250 um lenslets, f/4.4 and 4.8 um pixels
 	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/spatial-250um CONFIG=sample_configs/seed_spatial_250um.toml
 
-spectral: $(READY) ## section 3-1 of the paper: calibrate from narrow-band captures, demultiplex a ColorChecker
-	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/spectral CONFIG=sample_configs/seed_spectral.toml
+spectral: $(READY) ## section 3-1 of the paper, for an achromat and for a singlet: predicted and measured response, every estimator
+	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/spectral/achromat CONFIG=sample_configs/seed_spectral.toml
+	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/spectral/singlet CONFIG=sample_configs/seed_spectral_singlet.toml
+	$(BIN)/plenocli report $(RUNS)/spectral -o $(RUNS)/spectral/report.html --overwrite
 
 dslr: $(READY) ## the spectral experiment with a Bayer sensor
 	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/dslr CONFIG=sample_configs/dslr.toml

@@ -5,23 +5,29 @@ CONFIG ?= sample_configs/seed_spectral.toml
 BANDS ?= 450nm 540nm 570nm 650nm
 LONG ?= 10ms
 SHORT ?= 2.5ms
-METHODS ?= pinv single-pixel
+METHODS ?= pinv wls lmmse nnls single-pixel
 SUPERPIXELS ?= 3x3
+PHOTO ?= skimage:astronaut
 
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 RAW := $(RUN)/raw
 EXPOSURES := long short
 SIM = $(P) capture-sim $(CONFIG) --pif $(RUN)/pif.h5 --overwrite
+# the response measured from narrow-band captures, and the one predicted from CONFIG
+RESPONSES := measured predicted
 # named one by one, so that make keeps them and makes them again when they are missing
-SPECTRA := $(foreach m,$(METHODS),$(foreach e,$(EXPOSURES),$(RUN)/spectra/chart-$e-$m.h5 $(RUN)/spectra/white-$e-$m.h5))
+spectra = $(foreach m,$(METHODS),$(RUN)/spectra/$(1)/$(2)-$m.h5)
+SPECTRA := $(foreach r,$(RESPONSES),$(foreach e,$(EXPOSURES),$(call spectra,$r,chart-$e) $(call spectra,$r,white-$e))) $(foreach m,$(filter pinv single-pixel,$(METHODS)),$(RUN)/spectra/measured/photo-$m.h5)
 
 all: $(RUN)/report.html
 .PHONY: all
 
-# every wavelength that white light brings, once for all captures
+# every wavelength that white light brings, once for all captures; large, and gone when they are made
 $(RUN)/pif.h5: $(CONFIG) | $(RUN)
 	$(P) simulate-pif $< --model fresnel --spectral-step auto --superpixels $(SUPERPIXELS) --accuracy 1e-3 -o $@ --overwrite
+.INTERMEDIATE: $(RUN)/pif.h5
+.SECONDARY: $(RESPONSES:%=$(RUN)/spectra/%/) $(RAW)/
 
 $(RAW)/white.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target white --exposure $(LONG) --seed 1 -o $@
@@ -38,23 +44,37 @@ $(RAW)/white-long.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target white --exposure $(LONG) --seed 6 -o $@
 $(RAW)/white-short.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target white --exposure $(SHORT) --seed 7 -o $@
+# the paper's Fig. 8: a photograph at the short exposure
+$(RAW)/photo.dng: $(RUN)/pif.h5 | $(RAW)/
+	$(SIM) --scene $(PHOTO) --exposure $(SHORT) --seed 8 -o $@
 
 BAND_FILES := $(BANDS:%=$(RAW)/band-%.dng)
-$(RUN)/calibration.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
+$(RUN)/measured.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
 	$(P) calibrate --white $(RAW)/white.dng --dark $(RAW)/dark.dng $(foreach b,$(BANDS),--band $b=$(RAW)/band-$b.dng) -o $@ --overwrite
+$(RUN)/predicted.h5: $(CONFIG) | $(RUN)
+	$(P) simulate-response $< $(BANDS:%=--wavelength %) --exposure $(LONG) -o $@ --overwrite
+$(RUN)/predicted-by-rays.h5: $(CONFIG) | $(RUN)
+	$(P) simulate-response $< $(BANDS:%=--wavelength %) --exposure $(LONG) --model ray -o $@ --overwrite
+$(RUN)/score-response.json: $(RUN)/predicted.h5 $(RUN)/predicted-by-rays.h5 $(RUN)/measured.h5
+	$(P) score $(RUN)/predicted.h5 $(RUN)/predicted-by-rays.h5 --truth $(RUN)/measured.h5 -o $@ --overwrite
 
 define DEMUX
-$(RUN)/spectra/%-$(1).h5: $(RAW)/%.dng $(RAW)/white.dng $(RUN)/calibration.h5 | $(RUN)/spectra/
-	$(P) demux $$< --calibration $(RUN)/calibration.h5 --method $(1) --reference $(RAW)/white.dng -o $$@ --overwrite
-$(RUN)/score-%-$(1).json: $(RUN)/spectra/chart-%-$(1).h5 $(RUN)/spectra/white-%-$(1).h5
-	$(P) score $$< --truth colorchecker --patches colorchecker --white $(RUN)/spectra/white-$$*-$(1).h5 -o $$@ --overwrite
+$(RUN)/spectra/$(1)/%-$(2).h5: $(RAW)/%.dng $(RAW)/white.dng $(RUN)/$(1).h5 | $(RUN)/spectra/$(1)/
+	$(P) demux $$< --calibration $(RUN)/$(1).h5 --method $(2) --reference $(RAW)/white.dng -o $$@ --overwrite
 endef
-$(foreach m,$(METHODS),$(eval $(call DEMUX,$m)))
+$(foreach r,$(RESPONSES),$(foreach m,$(METHODS),$(eval $(call DEMUX,$r,$m))))
+
+# all estimators in one table; the truth is what the filters let through of the chart, width, leak and all
+define SCORE
+$(RUN)/score-$(1)-%.json: $(call spectra,$(1),chart-%) $(call spectra,$(1),white-%) $(CONFIG)
+	$(P) score $(call spectra,$(1),chart-$$*) --truth colorchecker --camera $(CONFIG) --patches colorchecker $(foreach m,$(METHODS),--white $(RUN)/spectra/$(1)/white-$$*-$m.h5) -o $$@ --overwrite
+endef
+$(foreach r,$(RESPONSES),$(eval $(call SCORE,$r)))
 
 # the paper's figure of a spectral image opens in any OpenEXR viewer
-$(RUN)/chart.exr: $(RAW)/chart-long.dng $(RUN)/calibration.h5
-	$(P) demux $< --calibration $(RUN)/calibration.h5 --method pinv --reference $(RAW)/white.dng -o $@ --overwrite
+$(RUN)/chart.exr: $(RAW)/chart-long.dng $(RUN)/measured.h5
+	$(P) demux $< --calibration $(RUN)/measured.h5 --method pinv --reference $(RAW)/white.dng -o $@ --overwrite
 
-SCORES := $(foreach m,$(METHODS),$(foreach e,$(EXPOSURES),$(RUN)/score-$e-$m.json))
+SCORES := $(foreach r,$(RESPONSES),$(foreach e,$(EXPOSURES),$(RUN)/score-$r-$e.json)) $(RUN)/score-response.json
 $(RUN)/report.html: $(SCORES) $(SPECTRA) $(RUN)/chart.exr
 	$(P) report $(RUN) -o $@ --overwrite

@@ -91,7 +91,8 @@ def filters_picture(camera):
         pupil.set(xlim=(-1.05 * half, 1.05 * half), ylim=(1.05 * half, -1.05 * half), aspect="equal", xlabel="pupil [mm]", title="filters [nm]")
         for letter, curve in zip(letters, curves, strict=True):
             through.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
-            through.annotate("sensor" if len(letters) == 1 else letter, (wavelengths[np.argmax(curve)] * 1e9, curve.max()), ha="center", va="bottom", fontsize=7.5)
+            top = np.argmax(curve) if np.ptp(curve) else len(curve) // 8
+            through.annotate("sensor" if len(letters) == 1 else letter, (wavelengths[top] * 1e9, curve[top]), ha="center", va="bottom", fontsize=7.5)
         through.set(xlim=(400, 700), ylim=(0, 1.05), xlabel="wavelength [nm]", title="transmittance, and quantum efficiency of the sensor")
         through.grid(True)
     return made.png

@@ -220,8 +220,9 @@ def _spectral(page, run, scores):
         _agreement(page, run, file)
     scored = {digest for file in scores for digest in file.sources.values()}
     _bands_alone(page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)])
+    described = set()
     for file in calibrations:
-        _calibration(page, file)
+        _calibration(page, file, described)
     sources = {digest for file in (*calibrations, *spectra) for digest in file.sources.values()}
     captures = [f for f in run.of_kind("capture") if f.digest in sources]
     # one of each sort before a second of any: the pipelines name files by what they show
@@ -276,7 +277,8 @@ def _bands_alone(page, files):
         page.figure(band_pictures(result.values, result.wavelengths, result.quantity or "value"), f"{file.name}: one value a lenslet and band; not scored.")
 
 
-def _calibration(page, file):
+def _calibration(page, file, described):
+    """One calibration; `described` holds the cameras whose filters are on the page already."""
     from plenocli.report.figures import calibration_figures
 
     artefact = file.artefact()
@@ -287,7 +289,10 @@ def _calibration(page, file):
         (grid, "lattice", "lattice"), (grid, "pitch", "pitch, rows and columns [px]"), (grid, "angle", "rotation [deg]"), (grid, "rms", "rms distance from the lattice [px]"),
         (grid, "lenslets", "lenslets"), (response, "condition", "median condition number of F")) if name in of]
     page.table(["", ""], rows, text=True)
-    _add(page, [*_filters(artefact), *calibration_figures(artefact)])
+    if artefact.provenance.config not in described:
+        described.add(artefact.provenance.config)
+        _add(page, _filters(artefact))
+    _add(page, calibration_figures(artefact))
 
 
 def _filters(artefact):

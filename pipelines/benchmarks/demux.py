@@ -28,6 +28,7 @@ import numpy as np  # noqa: E402
 
 SIZE = (4000, 6000)
 EXPOSURE = 0.01
+SHIFT = (0.3, -0.2)  # px, of the capture called moved
 BANDS = ("450nm", "540nm", "570nm", "650nm")
 KINDS = {"shared": "one F for all lenslets", "each": "an F for every lenslet"}
 
@@ -59,8 +60,7 @@ def main():
 
 def make(run):
     """The captures and both calibrations, if they are not there."""
-    shot = run / "shot.dng"
-    if not shot.exists():
+    if not (run / "moved.dng").exists():
         captures(run)
     for kind in KINDS:
         target = run / f"{kind}.h5"
@@ -77,26 +77,30 @@ def captures(run):
     from plenocli.sensor.noise import SensorModel
 
     camera = load_camera(ROOT / "sample_configs" / "dslr.toml").replace(**{"lenslet_array.count": (2, 2)})
-    light = np.stack([superpixel(camera, f"mono:{band}") for band in BANDS])
+    light, moved = (np.stack(part) for part in zip(*(superpixel(camera, f"mono:{band}") for band in BANDS)))
     shape = light.shape[1:]
     count = [n // p for n, p in zip(SIZE, shape)]
-    light *= 0.8 * camera.sensor.full_well / light.sum(axis=0).max()
+    light, moved = (part * 0.8 * camera.sensor.full_well / light.sum(axis=0).max() for part in (light, moved))
     model, rng = SensorModel.from_camera(camera), np.random.default_rng(0)
     reflectance = surfaces(np.array([float(b[:-2]) * 1e-9 for b in BANDS]))
     patches = reflectance[rng.integers(len(reflectance), size=(count[0] // 8 + 1, count[1] // 8 + 1))]
     scene = patches.repeat(8, axis=0).repeat(8, axis=1)[:count[0], :count[1]]
-    shots = {"white": np.ones(4), "dark": np.zeros(4), **{f"band-{b}": np.eye(4)[k] for k, b in enumerate(BANDS)}, "shot": scene}
+    shots = {"white": np.ones(4), "dark": np.zeros(4), **{f"band-{b}": np.eye(4)[k] for k, b in enumerate(BANDS)}, "shot": scene, "moved": scene}
     for name, radiance in shots.items():
+        if (run / f"{name}.dng").exists():
+            continue
         electrons = np.zeros(SIZE)
         top, left = ((n - c * p) // 4 * 2 for n, c, p in zip(SIZE, count, shape))
-        picture = np.einsum("rcb,byx->rycx", np.broadcast_to(radiance, (*count, 4)), light, optimize=True)
+        picture = np.einsum("rcb,byx->rycx", np.broadcast_to(radiance, (*count, 4)), moved if name == "moved" else light, optimize=True)
         electrons[top:top + count[0] * shape[0], left:left + count[1] * shape[1]] = picture.reshape(count[0] * shape[0], -1)
         levels = dict(cfa=camera.sensor.cfa, black=camera.sensor.black_level, white=model.white_level, exposure_s=EXPOSURE)
         write_dng(run / f"{name}.dng", model.expose(electrons, rng), **levels, xmp_json={"gain_e_per_dn": 1 / camera.sensor.gain}, overwrite=True)
 
 
 def superpixel(camera, target):
-    """Light (rows, columns) of one superpixel on the mosaic for a uniform object, as capture-sim carries it."""
+    """Light (rows, columns) of one superpixel on the mosaic for a uniform object, as capture-sim carries it, and moved by SHIFT."""
+    from scipy.ndimage import shift
+
     from plenocli.sensor.cfa import cfa_map
     from plenocli.stages.capture_sim import Settings, _carry, _source
 
@@ -104,7 +108,9 @@ def superpixel(camera, target):
     (letters, _), whites, _ = _carry(camera, *_source(camera, settings, None), settings, None)
     shape = camera.sensor.pixels_per_lenslet
     where = cfa_map(shape, camera.sensor.cfa)
-    return sum(np.where(where == letter, plane.reshape(shape), 0.0) for letter, plane in zip(letters, whites))
+    planes = [plane.reshape(shape) for plane in whites]
+    moved = [np.maximum(shift(plane, SHIFT, order=5), 0) for plane in planes]
+    return tuple(sum(np.where(where == letter, plane, 0.0) for letter, plane in zip(letters, part)) for part in (planes, moved))
 
 
 # --- measurements -------------------------------------------------------------------------------------------------------
@@ -157,10 +163,13 @@ def measure(run, kind, rounds):
         found = clock.time("demux", lambda: worker.estimate(exposure, shot))
         clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
         clock.time("write", lambda: worker.write((found, describe_inputs({"capture": shot})), shot, run / "shot.exr"))
+    elsewhere = read_exposure(run / "moved.dng", cfa=worker.calibration.cfa)
+    for _ in range(2):
+        away = clock.time("demux, moved", lambda: worker.estimate(elsewhere, run / "moved.dng"))
     parts = clock.medians()
     ratio = sorted(d / max(e, 1e-9) for d, e in zip(clock.cpu["demux"], clock.cpu["decode"]))
     return {"seconds": parts, "ratio": float(np.median(ratio)), "ratios": ratio, "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "method": found.method, "load": os.getloadavg()[0]}
+            "method": found.method, "corrected": away.record["corrected"], "shift": away.record["shift_px"], "load": os.getloadavg()[0]}
 
 
 def replace(worker, name, value):
@@ -175,6 +184,7 @@ def show(kind, found):
     print(f"{KINDS[kind]} (method {found['method']}, load {found['load']:.1f}):")
     for name, (cpu, wall) in found["seconds"].items():
         print(f"  {name:22s} {cpu:7.3f} s CPU {wall:7.3f} s wall")
+    print(f"  the moved capture: corrected {', '.join(found['corrected'])}, by {found['shift'][0]:.4f} and {found['shift'][1]:.4f} px for {SHIFT}")
     print(f"  demux / decode {found['ratio']:.2f} (rounds {', '.join(f'{r:.2f}' for r in found['ratios'])}); peak {found['peak_mib']:.0f} MiB")
 
 

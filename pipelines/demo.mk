@@ -11,7 +11,7 @@ spatial:
 	$(SUB) $(HERE)spatial.mk RUN=$(RUN)/spatial CONFIG=sample_configs/demo_spatial.toml ITERATIONS=6
 
 spectral:
-	$(SUB) $(HERE)spectral.mk RUN=$(RUN)/spectral CONFIG=sample_configs/demo_spectral.toml
+	$(SUB) $(HERE)spectral.mk RUN=$(RUN)/spectral CONFIG=sample_configs/demo_spectral.toml METHODS="pinv single-pixel"
 
 $(RUN)/report.html: spatial spectral
 	@if [ ! -e $@ ] || [ $(RUN)/spatial/report.html -nt $@ ] || [ $(RUN)/spectral/report.html -nt $@ ]; then \

@@ -63,7 +63,7 @@ CAPTURE = Schema("capture", 1, "One exposure of a plenoptic camera, simulated or
     _NOTES)},
     plots={"capture": ("mosaic", ())}, default=("capture",))
 
-CALIBRATION = Schema("calibration", 1, "Lenslet grid, white and dark levels and measured response of a camera.", (
+CALIBRATION = Schema("calibration", 1, "Lenslet grid, white and dark levels and response of a camera, measured or predicted.", (
     Field("grid/centre", "lenslet_row lenslet_column 2", "f", "px", "centre of each superpixel, row then column", maskable=True),
     Field("grid/valid", "lenslet_row lenslet_column", "b", "1", "superpixel lies wholly on the sensor and is lit"),
     Field("grid/residual", "lenslet_row lenslet_column", "f", "px", "distance of the measured centre from the lattice",

@@ -127,7 +127,7 @@ def exact_rows(camera):
     return sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
 
 
-def exact_window(camera, most, evaluations=1e10):
+def exact_window(camera, most, evaluations=2e9):
     """Lenslets either side that the exact sum affords: as many as `most`, at least one, for so many values of the kernel a point."""
     array, sensor = camera.lenslet_array, camera.sensor
     turns = array.pitch / camera.light.wavelengths[0] * (array.pitch / sensor.distance + camera.main_lens.aperture_diameter / array.distance)

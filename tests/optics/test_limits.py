@@ -10,6 +10,7 @@ from plenocli.config import load_camera
 from plenocli.optics.diagnose import describe
 from plenocli.optics.geometry import geometry
 from plenocli.optics.psf import sampled_field
+from plenocli.optics.quadrature import band_rule
 from tests.optics.cameras import WAVELENGTH, pif_builder, pupil_conjugate, small_camera, system_matrix
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 from tests.reference.kernel import coherent_kernel
@@ -62,8 +63,7 @@ def test_field_on_the_sensor_is_the_kernel_with_its_phases():
     camera = small_camera(main_lens__aperture_shape="square", object__samples_per_lenslet=(5, 5), **BENT)
     builder = pif_builder(camera, WAVELENGTH, accuracy=1e-8, dtype=np.float64, **ISOLATED)
     assert builder.notes["separable_terms"] == 1
-    count = builder.plan.bands[0].pixel_nodes
-    t, w = roots_legendre(count)
+    t, w = band_rule(builder.plan.bands[0].pixel_nodes, builder.plan.bands[0].pixel_rule)
     sensor = (1e-6 * t[:, None] + (np.arange(13) - 6) * 2e-6).ravel()
     distances, lenses = square_system(camera, (0,))
     start, k = object_points(camera), 2 * np.pi / WAVELENGTH

@@ -27,6 +27,9 @@ HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "
 number of penalised atoms in use, |Phi - previous Phi|_F over kept atoms, mean and largest |cosine| of two columns of
 A Phi (kept atoms), largest relative duality gap, relative residual of the dictionary step's normal equations."""
 
+SYNTHESIS_WEIGHT = 4.0
+"""Patches an atom that the learnt atoms are worth against the regression of those that paint."""
+
 _DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION, _DRAW_POWER, _DRAW_SYNTHESIS = range(5)
 
 
@@ -171,17 +174,22 @@ class Learner:
         for name, value in zip(HISTORY, values):
             after.history[name].append(value)
 
-    def synthesis(self, state):
-        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X - Phi C|^2 over a fresh batch.
+    def synthesis(self, state, batches=4):
+        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X - Phi' C|^2 + e |Phi' - Phi|^2.
 
-        They only paint; the coding keeps the learnt atoms. Ridge and constant atom as in the dictionary step.
+        They only paint; the coding keeps the learnt atoms. An l1 code is biased towards zero and knows nothing of what the sensor does
+        not see; the regression makes up for both. `batches` fresh batches; e pulls towards the learnt atoms as strongly as
+        SYNTHESIS_WEIGHT patches an atom would, each with the median power of a coefficient.
         """
         rng = np.random.default_rng([self.settings.seed, _DRAW_SYNTHESIS, state.iteration])
-        patches = draw_patches(self.training, self.object_shape, self.settings.batch, rng)
-        code = self.code(state.atoms, self.measure(patches, rng)[0])
-        gram, right = _moments(patches, code.c)
-        gram[np.diag_indices_from(gram)] += _ridge(gram)
-        return np.linalg.solve(gram, right.T).T
+        gram, right = 0.0, 0.0
+        for _ in range(batches):
+            patches = draw_patches(self.training, self.object_shape, self.settings.batch, rng)
+            part = _moments(patches, self.code(state.atoms, self.measure(patches, rng)[0]).c)
+            gram, right = gram + part[0] / batches, right + part[1] / batches
+        weight = SYNTHESIS_WEIGHT * self.settings.atoms / (batches * self.settings.batch)
+        ridge = max(weight * np.median(np.diag(gram)[1:]), _ridge(gram))
+        return state.atoms + np.linalg.solve(gram + ridge * np.eye(len(gram)), (right - state.atoms @ gram).T).T
 
     def _refit(self, patches, c, atoms):
         """Zero-mean atoms (point, atom - 1) of the dictionary step, and the relative residual of its normal equations."""

@@ -137,15 +137,18 @@ def test_directions_below_the_noise_are_left_out(setting):
 
 
 def test_synthesis_is_the_regression_of_patches_on_their_codes(setting):
-    machine = learner(setting, batch=400)
+    machine = learner(setting, batch=200)
     state = run(machine, machine.start(), 2)
-    paint = machine.synthesis(state)
-    rng = np.random.default_rng([3, dictionary._DRAW_SYNTHESIS, 2])
-    patches = draw_patches(machine.training, SHAPE, 400, rng)
-    c = machine.code(state.atoms, machine.measure(patches, rng)[0]).c
-    best = np.linalg.lstsq(c.T, patches.T, rcond=None)[0].T
-    errors = [np.sum((patches - phi @ c) ** 2) for phi in (best, paint, state.atoms)]
-    assert errors[0] <= errors[1] < 1.001 * errors[0] and errors[1] < errors[2]
+    paint = machine.synthesis(state, batches=2)
+    rng, patches, codes = np.random.default_rng([3, dictionary._DRAW_SYNTHESIS, 2]), [], []
+    for _ in range(2):
+        patches.append(draw_patches(machine.training, SHAPE, 200, rng))
+        codes.append(machine.code(state.atoms, machine.measure(patches[-1], rng)[0]).c)
+    x, c = np.concatenate(patches, axis=1), np.concatenate(codes, axis=1)
+    pull = 4 * 40 * np.median(np.sum(c[1:] ** 2, axis=1)) / 400  # of all 400 patches together
+    stacked = np.concatenate([c, np.sqrt(pull) * np.eye(40)], axis=1), np.concatenate([x, np.sqrt(pull) * state.atoms], axis=1)
+    np.testing.assert_allclose(paint, np.linalg.lstsq(stacked[0].T, stacked[1].T, rcond=None)[0].T, atol=1e-8)
+    assert np.sum((x - paint @ c) ** 2) < np.sum((x - state.atoms @ c) ** 2)
 
 
 def test_path_of_lambda_is_what_single_values_give(setting):

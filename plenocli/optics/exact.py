@@ -115,7 +115,7 @@ def cost(camera, view, band, shape, double):
     places = range(0 if even else -reach, reach + 1)
     lines = band.pixel_nodes * max(view.pixel_shape)
     terms = expected_terms(view, band.terms, band.cut, parabolic) * (0.2 if even and camera.main_lens.aperture_shape == "square" else 1.0)
-    sketch, products = 1.05 / FILL * terms + 8, expected_products(view, terms, lit, parabolic)
+    sketch, products = 1.12 / FILL * terms + 8, expected_products(view, terms, lit, parabolic)
     nodes, rate, item = band.sensor_count or lines, 2 if double else 1, 16 if double else 8
     rows = [nodes * ((points + 1) // 2 if even and s == 0 else points) for s in places]
     tables = [(a, b) for a in range(len(rows)) for b in range(len(rows)) if b <= a or not even]
@@ -324,7 +324,7 @@ class ExactSquareLenslets:
 
     def _first_guess(self):
         """Columns of the first sketch, from the rank expected."""
-        return int(1.05 / FILL * expected_terms(self.geometry, self._field.terms, self.band.cut, self._parabolic)) + 8
+        return int(1.12 / FILL * expected_terms(self.geometry, self._field.terms, self.band.cut, self._parabolic)) + 8
 
     def _to_pixels(self, factor, s, axis):
         """(sensor nodes x points, terms) to (points, pixel nodes, terms)."""

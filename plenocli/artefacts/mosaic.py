@@ -58,7 +58,7 @@ def read_mosaic(path, *, cfa=None, mem_limit=None):
         found = Mosaic(**read_raw(path, mem_limit=mem_limit), source="dng" if kind == "tiff" and path.suffix.lower() == ".dng" else "raw")
     if cfa is not None and found.cfa != cfa:
         raise InputError(f"has the colour filter array {found.cfa}, not {cfa}", path, "leave the option out; the file knows it")
-    if not np.isfinite(found.values).all():
+    if found.values.dtype.kind == "f" and not np.isfinite(found.values).all():
         raise InputError(f"holds {int((~np.isfinite(found.values)).sum())} values that are NaN or infinite", path, "make it again")
     return found
 

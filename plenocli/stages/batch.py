@@ -71,17 +71,15 @@ def outcomes(batch, work, write, workers=1):
 
     work(capture) runs in up to `workers` threads, which share what it holds; write(what it returned, capture, target) runs in
     this one, so that there is one writer, at once, so that a run that is killed loses no finished result. Not many more
-    results than workers are held. Linear algebra keeps to one thread each.
+    results than workers are held.
     """
     if workers == 1 or len(batch.todo) < 2:
         yield from one_by_one(batch, lambda capture, target: write(work(capture), capture, target))
         return
     from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
-    from threadpoolctl import threadpool_limits
-
     waiting, running = iter(batch.todo), {}
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(min(workers, len(batch.todo))) as pool, bar(None, len(batch.todo), "captures") as progress:
+    with ThreadPoolExecutor(min(workers, len(batch.todo))) as pool, bar(None, len(batch.todo), "captures") as progress:
         try:
             for _ in range(len(batch.todo)):
                 for job in islice(waiting, workers + 1 - len(running)):

@@ -33,10 +33,15 @@ def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".ex
     and an error is raised at the end, with the exit code of the worst. workers: captures that are read and demultiplexed at
     the same time; they share one calibration, and results are written one at a time.
     """
+    import scipy.linalg.blas  # noqa: F401  a library of its own, which the limit below reaches only once it is loaded
+    from threadpoolctl import threadpool_limits
+
     batch = plan_batch(captures, output, suffix, "spectra are", overwrite=overwrite, inputs=[*captures, calibration, settings.reference])
-    job = Demultiplexer(calibration, settings, overwrite, command, min(workers, len(batch.todo))) if batch.todo else None  # a broken calibration ends the run here, before any capture
-    _say_what_is_old(batch, calibration, settings)
-    return summarise(batch, outcomes(batch, job and job.demux, job and job.write, workers))
+    with threadpool_limits(1, "blas"):  # captures are what runs side by side, and the bytes must not depend on how many
+        # a broken calibration ends the run here, before any capture
+        job = Demultiplexer(calibration, settings, overwrite, command, min(workers, len(batch.todo))) if batch.todo else None
+        _say_what_is_old(batch, calibration, settings)
+        return summarise(batch, outcomes(batch, job and job.demux, job and job.write, workers))
 
 
 def _say_what_is_old(batch, calibration, settings):

@@ -33,8 +33,8 @@ demo: $(READY) ## both experiments at a small size, with pictures: runs/demo/rep
 tiny: $(READY) ## every stage once on the smallest camera, in seconds
 	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/tiny CONFIG=sample_configs/tiny.toml ITERATIONS=3 BATCH=256
 
-test: $(READY) ## all tests but the slow ones
-	$(VENV)/bin/python -m pytest
+test: $(READY) ## all tests but the slow ones, one process a core
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal
 
 test-slow: $(READY) ## the slow tests too
 	$(VENV)/bin/python -m pytest -m ""

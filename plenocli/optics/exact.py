@@ -152,7 +152,8 @@ class ExactSquareLenslets:
         self._offsets = self._interval_list()
         extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
         self._extent = extent
-        self._residuals = Residuals([o for o, _ in self._offsets.values()], [c for _, c in self._offsets.values()], max(extent), half,
+        weights = [share * self._amplitude(s, m) for (s, m), (_, share) in self._offsets.items()]
+        self._residuals = Residuals([o for o, _ in self._offsets.values()], weights, max(extent), half,
                                     geometry.z3, geometry.k, None if self._parabolic else geometry.f2, band.cut / 3)
         self._number = {key: i for i, key in enumerate(self._offsets)}
         self._local, self._sheets = {}, {}
@@ -211,6 +212,17 @@ class ExactSquareLenslets:
             values = self._field.evaluate(self._x + m * g.D2 - points[:, None], axis).transpose(0, 2, 1)
             total = total + (values * self._w) @ values.conj().transpose(0, 2, 1)
         return np.concatenate([total, total[:len(g.points(axis)) - len(points)][::-1]])
+
+    def _amplitude(self, s, m):
+        """Fourth root of the light of a mean point that enters the lenslets m along one axis: two such factors bound what enters one."""
+        if m == s:
+            return 1.0
+        most = 0.0
+        for axis in (0, 1):
+            points = self._points(s, axis)
+            power = np.abs(self._field.evaluate(self._x[:, None] + m * self.geometry.D2 - points, axis)) ** 2 @ field_norms(self._field, 1 - axis) ** 2
+            most = max(most, float(self._w @ power @ self._emphasis(s, axis) ** 2) / len(points))
+        return min(1.0, most**0.25)
 
     def _emphasis(self, s, axis):
         """Weights of the points in the compression: those at the lenslet's edge lose light and split it, so that the same error

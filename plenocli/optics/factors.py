@@ -11,7 +11,7 @@ pixel before it leaves it.
 
 import numpy as np
 
-WORK_BYTES = 3 << 18
+WORK_BYTES = 3 << 17
 """Size of the product before it is squared: about what a core's own cache holds beside the factors."""
 
 
@@ -61,7 +61,7 @@ class Factors:
         """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part, node, pixel column)) real."""
         (py, px), p = self.pixel_shape, self.pixel_nodes
         lines = np.einsum("nqk,nqk->nk", parts, parts)
-        return lines.reshape(len(parts), py, 2 * p, px).sum(axis=2)
+        return np.einsum("nyqx->nyx", lines.reshape(len(parts), py, 2 * p, px))
 
     def _right(self, factor):
         """(node, term) complex as the right-hand side of a real product: (term x (real, imaginary), (real, imaginary) x node)."""

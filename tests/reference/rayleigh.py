@@ -32,11 +32,14 @@ def amplitude(name, s2):
     return {"uniform-pupil": 1 / (1 - s2), "aplanatic": (1 - s2) ** -0.25, "uniform-sine": np.ones_like(s2)}[name]
 
 
-def pupil_directions(camera, density=1.0, wavelength=None):
-    """Direction cosines and weights d^2 s a(s)/N of a round or square pupil: (sy, sx, complex weight), N so that the light is 1."""
+def pupil_directions(camera, density=1.0, wavelength=None, reach=3.0):
+    """Direction cosines and weights d^2 s a(s)/N of a round or square pupil: (sy, sx, complex weight), N so that the light is 1.
+
+    reach: lenslet pitches between an image point and the places where its field is wanted.
+    """
     lens, z = camera.main_lens, camera.lenslet_array.distance
     k, radius, pitch = 2 * np.pi / (wavelength or camera.light.wavelengths[0]), lens.aperture_diameter / 2, camera.lenslet_array.pitch
-    rate = density * k / z * 3 * pitch
+    rate = density * k / z * reach * pitch
     if lens.aperture_shape == "square":
         p, w = nodes(-radius, radius, rate)
         y, x, weight = np.repeat(p, len(p)), np.tile(p, len(p)), np.outer(w, w).ravel()
@@ -109,7 +112,7 @@ def column_energies(camera, wavelength, image_points, lenslets, centre, *, rows=
     if rows is not None:
         chosen = (np.asarray(rows)[:, None] * pixel_nodes + np.arange(pixel_nodes)).ravel()
         v, wv = v[chosen], wv[chosen]
-    directions = pupil_directions(camera, density, wavelength)
+    directions = pupil_directions(camera, density, wavelength, 1.5 * (1 + max(abs(n) for pair in lenslets for n in pair)))
     total = np.zeros((len(image_points), len(v), len(u)), complex)
     for row, column in lenslets:
         cy, cx = row * array.pitch, column * array.pitch

@@ -78,6 +78,24 @@ def test_a_broken_camera_leaves_nothing_behind(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("glass", ["none", "N-BK7"])
+def test_demultiplexing_beats_single_pixel_in_every_band_by_the_measured_and_by_the_predicted_response(tmp_path, glass):
+    text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
+    (tmp_path / "camera.toml").write_text(text.replace('glass = "none" ', f'glass = "{glass}" ').replace("[3, 3]", "[12, 12]"))
+    variables = [f"RUN={tmp_path}/run", f"CONFIG={tmp_path}/camera.toml", "METHODS=pinv single-pixel"]
+    lines = make("spectral", *variables)
+    assert {"simulate-pif", "simulate-response", "capture-sim", "calibrate", "demux", "score", "report"} == set(stages(lines))
+    for response in ("measured", "predicted"):
+        for exposure in ("long", "short"):
+            found, single = (r["metrics"] for r in json.loads((tmp_path / "run" / f"score-{response}-{exposure}.json").read_text())["results"])
+            assert all(a < 0.5 * b for a, b in zip(found["six_patch_rmse_per_band"], single["six_patch_rmse_per_band"], strict=True))
+            assert found["snr_over_single_pixel_db"] > 12
+    waves, rays = (r["metrics"] for r in json.loads((tmp_path / "run" / "score-response.json").read_text())["results"])
+    assert max(waves["response_error_per_band"]) < 0.04 < min(rays["response_error_per_band"])
+    assert not (tmp_path / "run" / "pif.h5").exists() and stages(make("spectral", *variables)) == []
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("glass", ["none", "N-BK7"])  # an achromat, and a singlet with 2 % of chromatic focal shift
 def test_a_chart_is_measured_and_seen_through_the_camera(tmp_path, glass):
     from tests.reference.chart import paint_folder

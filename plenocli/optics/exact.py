@@ -52,7 +52,7 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     cut = CUT * accuracy
     terms = expected_terms(view, base.terms, cut, True)
-    if terms > 1.2 * FILL * MAX_SKETCH:
+    if terms > FILL * MAX_SKETCH:
         raise NumericsError(f"the exact field has about {terms:.0f} separable terms, more than {int(FILL * MAX_SKETCH)}", "model",
                             "ask for a looser accuracy or the paraxial model")
     return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * cut)}, cut=cut, sensor_count=count)

@@ -174,6 +174,7 @@ def test_starts_are_seeded_and_differ(setting, initial):
 
 def test_scale_of_the_matrix_does_not_matter(setting):
     svd, pictures = setting
-    louder = linear.Svd(svd.u, 1000 * svd.s, svd.vt)
+    # a power of two, so that rounding is the same too
+    louder = linear.Svd(svd.u, 1024 * svd.s, svd.vt)
     one, other = (learner((s, pictures), tol=1e-8).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
-    assert one == pytest.approx(other, abs=0.05)
+    assert one == pytest.approx(other, abs=1e-3)

@@ -73,7 +73,7 @@ def test_small_lambda_goes_by_the_factored_form(lam):
     primal = np.sum(residual**2, axis=0) + lam * np.abs(c).sum(axis=0)
     t = np.clip(np.sum(residual * y, axis=0) / np.sum(residual**2, axis=0), *(sign * threshold / np.abs(d.T @ residual).max(axis=0) for sign in (-1, 1)))
     gap = 1 - (2 * t * np.sum(residual * y, axis=0) - t**2 * np.sum(residual**2, axis=0)) / primal
-    assert gap.max() <= 1e-6 and np.all(np.abs(gap - code.gap) < 1e-7)
+    assert gap.max() <= 1e-6 and np.all(np.abs(gap - code.gap) < 3e-7)
     assert (code.factored > 0) == (lam < 1e-7)
 
 

@@ -12,6 +12,9 @@ RUNS ?= runs
 BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
+# the demo takes all cores unless -j says how many
+CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
+ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
 .PHONY: help env demo test test-slow spatial spatial-250um spectral dslr colorchecker raw dictionary bench-sparse tiny tradeoff bench-pif clean
 
@@ -28,7 +31,7 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(READY) ## both experiments at a small size, with pictures: runs/demo/report.html
-	$(PIPELINE) pipelines/demo.mk RUN=$(RUNS)/demo
+	$(PIPELINE) pipelines/demo.mk $(ALL_CORES) RUN=$(RUNS)/demo
 
 tiny: $(READY) ## every stage once on the smallest camera, in seconds
 	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/tiny CONFIG=sample_configs/tiny.toml ITERATIONS=3 BATCH=256

@@ -12,11 +12,8 @@ ifndef DATA
 $(error say where the captures are: DATA=folder)
 endif
 
-include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
+include $(dir $(lastword $(MAKEFILE_LIST)))spectral_captures.mk
 
-RAW := $(RUN)/raw
-EXPOSURES := long short
-SIM = $(P) capture-sim $(CONFIG) --pif $(RUN)/pif.h5 --overwrite
 SCORES := $(EXPOSURES:%=$(RUN)/score-%.json)
 
 all: $(RUN)/report.html
@@ -26,24 +23,11 @@ all: $(RUN)/report.html
 $(RUN)/chart.h5 $(RUN)/chart.json &: $(shell find $(DATA) -type f) | $(RUN)
 	$(P) colorchecker $(DATA) --cfa $(CFA) --measures $(RUN)/chart.json -o $(RUN)/chart.h5 --overwrite
 
-$(RUN)/pif.h5: $(CONFIG) | $(RUN)
-	$(P) simulate-pif $< --model fresnel --spectral-step auto --superpixels $(SUPERPIXELS) --accuracy 1e-3 -o $@ --overwrite
-$(RAW)/white.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(LONG) --seed 1 -o $@
-$(RAW)/dark.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target dark --exposure $(LONG) --seed 2 -o $@
-$(RAW)/band-%.dng: $(CONFIG) | $(RAW)/
-	$(P) capture-sim $(CONFIG) --model fresnel --accuracy 1e-3 --target mono:$* --superpixels $(SUPERPIXELS) --exposure $(LONG) --seed 3 -o $@ --overwrite
 $(RAW)/chart-long.dng: $(RUN)/pif.h5 $(RUN)/chart.h5 | $(RAW)/
 	$(SIM) --scene $(RUN)/chart.h5 --exposure $(LONG) --seed 4 -o $@
 $(RAW)/chart-short.dng: $(RUN)/pif.h5 $(RUN)/chart.h5 | $(RAW)/
 	$(SIM) --scene $(RUN)/chart.h5 --exposure $(SHORT) --seed 5 -o $@
-$(RAW)/white-long.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(LONG) --seed 6 -o $@
-$(RAW)/white-short.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(SHORT) --seed 7 -o $@
 
-BAND_FILES := $(BANDS:%=$(RAW)/band-%.dng)
 $(RUN)/calibration.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
 	$(P) calibrate --white $(RAW)/white.dng --dark $(RAW)/dark.dng $(foreach b,$(BANDS),--band $b=$(RAW)/band-$b.dng) -o $@ --overwrite
 

@@ -9,11 +9,8 @@ METHODS ?= pinv wls lmmse nnls single-pixel
 SUPERPIXELS ?= 3x3
 PHOTO ?= skimage:astronaut
 
-include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
+include $(dir $(lastword $(MAKEFILE_LIST)))spectral_captures.mk
 
-RAW := $(RUN)/raw
-EXPOSURES := long short
-SIM = $(P) capture-sim $(CONFIG) --pif $(RUN)/pif.h5 --overwrite
 # the response measured from narrow-band captures, and the one predicted from CONFIG
 RESPONSES := measured predicted
 # named one by one, so that make keeps them and makes them again when they are missing
@@ -23,32 +20,18 @@ SPECTRA := $(foreach r,$(RESPONSES),$(foreach e,$(EXPOSURES),$(call spectra,$r,c
 all: $(RUN)/report.html
 .PHONY: all
 
-# every wavelength that white light brings, once for all captures; large, and gone when they are made
-$(RUN)/pif.h5: $(CONFIG) | $(RUN)
-	$(P) simulate-pif $< --model fresnel --spectral-step auto --superpixels $(SUPERPIXELS) --accuracy 1e-3 -o $@ --overwrite
+# large, and gone when the captures are made
 .INTERMEDIATE: $(RUN)/pif.h5
 .SECONDARY: $(RESPONSES:%=$(RUN)/spectra/%/) $(RAW)/
 
-$(RAW)/white.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(LONG) --seed 1 -o $@
-$(RAW)/dark.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target dark --exposure $(LONG) --seed 2 -o $@
-$(RAW)/band-%.dng: $(CONFIG) | $(RAW)/
-	$(P) capture-sim $(CONFIG) --model fresnel --accuracy 1e-3 --target mono:$* --superpixels $(SUPERPIXELS) --exposure $(LONG) --seed 3 -o $@ --overwrite
 $(RAW)/chart-long.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target colorchecker --exposure $(LONG) --seed 4 -o $@
 $(RAW)/chart-short.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --target colorchecker --exposure $(SHORT) --seed 5 -o $@
-# another white object at each exposure, for the SNR: over its lenslets, the reference divided out
-$(RAW)/white-long.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(LONG) --seed 6 -o $@
-$(RAW)/white-short.dng: $(RUN)/pif.h5 | $(RAW)/
-	$(SIM) --target white --exposure $(SHORT) --seed 7 -o $@
 # the paper's Fig. 8: a photograph at the short exposure
 $(RAW)/photo.dng: $(RUN)/pif.h5 | $(RAW)/
 	$(SIM) --scene $(PHOTO) --exposure $(SHORT) --seed 8 -o $@
 
-BAND_FILES := $(BANDS:%=$(RAW)/band-%.dng)
 $(RUN)/measured.h5: $(RAW)/white.dng $(RAW)/dark.dng $(BAND_FILES)
 	$(P) calibrate --white $(RAW)/white.dng --dark $(RAW)/dark.dng $(foreach b,$(BANDS),--band $b=$(RAW)/band-$b.dng) -o $@ --overwrite
 $(RUN)/predicted.h5: $(CONFIG) | $(RUN)

@@ -9,7 +9,7 @@ from plenocli.accuracy.needs import seen_wavelengths, sensor_noise, visible_accu
 from plenocli.accuracy.rates import NOMINAL, product_rate
 from plenocli.accuracy.rungs import RUNGS
 from plenocli.errors import NumericsError, UsageError
-from plenocli.optics.bands import MAX_NODES, spectral_error, spectral_nodes
+from plenocli.optics.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
 from plenocli.optics.geometry import geometry, lenslet_shift
 from plenocli.optics.plan import PifPlan, blur_ring, coherent_window, predicted_outside, window_error
 
@@ -174,11 +174,11 @@ def _band_nodes(request, rung, ring):
         return 0, 0.0
     view = request.views[0]
     window = None if ring == 0 else coherent_window(view, request.grid, ring)
-    for count in range(1, MAX_NODES + 1):
-        error = spectral_error(view, request.band, count, window)
-        if error <= BAND_SHARE * request.accuracy:
-            break
-    return count, error
+    try:
+        count = node_count(view, request.band, BAND_SHARE * request.accuracy, window)
+    except NumericsError:
+        count = MAX_NODES
+    return count, spectral_error(view, request.band, count, window)
 
 
 def _sized(request, rung, ring, split, nodes):

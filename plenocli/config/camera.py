@@ -399,14 +399,19 @@ def read_text(path, what):
 
 def parse_camera(text, where="camera"):
     """A Camera from TOML text; ConfigError lists every violation with its path."""
+    return parse_toml(text, where, Camera)
+
+
+def parse_toml(text, where, model):
+    """What the pydantic class `model` makes of TOML text; ConfigError lists every violation with its path."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", where, "mend the line") from None
     try:
-        return Camera.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
-        raise violations(error, where) from None
+        raise violations(error, where, model) from None
 
 
 def violations(error, where, model=Camera):

@@ -19,13 +19,12 @@
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PlainValidator, ValidationError, WithJsonSchema, model_validator
+from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
-from plenocli.config.camera import Length, Section, Wavelength, quantity, read_text, violations
+from plenocli.config.camera import Length, Section, Wavelength, parse_toml, quantity, read_text
 from plenocli.config.units import LENGTHS, UnitError, format_length, parse_length
 from plenocli.errors import ConfigError
 from plenocli.optics.glass import AIR, Medium, medium
@@ -169,14 +168,7 @@ def load_lens(path):
 
 def parse_lens(text, where="lens"):
     """A Prescription from TOML text; ConfigError lists every violation with its path."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where, "mend the line") from None
-    try:
-        return LensFile.model_validate(data).prescription()
-    except ValidationError as error:
-        raise violations(error, where, LensFile) from None
+    return parse_toml(text, where, LensFile).prescription()
 
 
 # --- writing -----------------------------------------------------------------------------------------------------------

@@ -1,14 +1,12 @@
 """What a scene requires of the camera model: depth, spectrum, extent and noise, read from TOML."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from plenocli.config.camera import Length, Section, Wavelength, quantity, read_text, violations
+from plenocli.config.camera import Length, Section, Wavelength, parse_toml, quantity, read_text
 from plenocli.config.units import parse_decibel
-from plenocli.errors import ConfigError
 
 Decibel = quantity(parse_decibel, "40 dB", -100.0, 300.0, lambda value: f"{value:g} dB")
 Count = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
@@ -40,11 +38,4 @@ class Scene(Section):
 def load_scene(path):
     """Read and check a scene description; InputError where the file cannot be read, ConfigError for what it says."""
     path = Path(path)
-    try:
-        data = tomllib.loads(read_text(path, "scene"))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", path, "mend the line") from None
-    try:
-        return Scene.model_validate(data)
-    except ValidationError as error:
-        raise violations(error, path, Scene) from None
+    return parse_toml(read_text(path, "scene"), path, Scene)

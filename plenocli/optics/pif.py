@@ -151,6 +151,7 @@ class PifBuilder:
         entered = self._lenslets.incident(*(a.ravel() for a in np.indices((oy, ox)))).reshape(oy, ox)
 
         def work(start, stop):
+            """Point columns start to stop, all the rows that no symmetry gives, into planes and share."""
             count = stop if turn else rows
             j, i = (a.ravel() for a in np.meshgrid(np.arange(start, stop), np.arange(count), indexing="ij"))
             images = np.empty((len(i), *self.pixel_shape), self.dtype)

@@ -86,6 +86,7 @@ def spline_matrix(count, shift, degree=DEGREE, derivative=False):
     kernel = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
 
     def weights(position, order):
+        """Coefficients of the B-spline (position..., count) that its value, or derivative for order 1, at `position` (px) takes."""
         first = np.floor(position).astype(int) - half + 1
         taps = first[..., None] + np.arange(2 * half)
         value = np.nan_to_num((kernel.derivative() if order else kernel)(position[..., None] - taps))

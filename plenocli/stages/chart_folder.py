@@ -83,17 +83,22 @@ def _read(path, cfa, shape):
 
 def _labels(path, found, shape, folder):
     """(path, map): the one asked for, or the map of this size whose patches are each in one piece."""
-    paths = [Path(path)] if path else [p for p in found if "label" in p.name.lower() and p.suffix.lower() in (".png", ".tif", ".tiff")]
+    likely = [p for p in found if "label" in p.name.lower() and p.suffix.lower() in (".png", ".tif", ".tiff")]
+    return _first(path, likely, lambda one: _label_map(one, shape), "label map of the chart", folder, "give one with --labels: 0 nothing, 1 to 24 the patches row by row")
+
+
+def _first(path, likely, read, what, folder, fix):
+    """(path, read(path)) of the file asked for, or of the first of the `likely` ones that can be read; InputError where there is none."""
     faults = []
-    for one in paths:
+    for one in [Path(path)] if path else likely:
         try:
-            return one, _label_map(one, shape)
+            return one, read(one)
         except InputError as error:
             faults.append(error)
     if path:
         raise faults[0]
     said = f": {faults[0].what} ({Path(faults[0].where).name})" if faults else ""
-    raise InputError(f"holds no label map of the chart{said}", folder, "give one with --labels: 0 nothing, 1 to 24 the patches row by row")
+    raise InputError(f"holds no {what}{said}", folder, fix)
 
 
 def _label_map(path, shape):
@@ -116,17 +121,8 @@ def _label_map(path, shape):
 
 def _spectra(path, found, folder):
     """(path, (wavelengths m, patches (24, n), filters)) from the first table that has them all."""
-    paths = [Path(path)] if path else [p for p in found if p.suffix.lower() == ".csv"]
-    faults = []
-    for one in paths:
-        try:
-            return one, _table(one)
-        except InputError as error:
-            faults.append(error)
-    if path:
-        raise faults[0]
-    said = f": {faults[0].what} ({Path(faults[0].where).name})" if faults else ""
-    raise InputError(f"holds no table of the patches' spectra{said}", folder, "give one with --spectra: wavelength in nm, then a column a patch")
+    likely = [p for p in found if p.suffix.lower() == ".csv"]
+    return _first(path, likely, _table, "table of the patches' spectra", folder, "give one with --spectra: wavelength in nm, then a column a patch")
 
 
 def _table(path):

@@ -193,6 +193,7 @@ class _Optics:
         return self.camera.replace(**{"object.samples_per_lenslet": tuple(max(n, least) for n in self.camera.object.samples_per_lenslet)})
 
     def notes(self, bands):
+        """What the response's notes record: model, share of light from a lenslet's own field by band, rays against waves (relative L2)."""
         from plenocli.optics.response import own_light, uniform_response, valid_for
 
         found = {"source": "predicted", "model": self.model if self.plan is None else self.plan.model, "closed_form": self.closed, "own_field": self.settings.own_field,

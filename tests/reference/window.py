@@ -15,20 +15,23 @@ def column_energies(camera, wavelength, image_point, window, superpixels, *, pix
     image_point: (y, x) m on the array; window: lenslets |m| <= window of both axes act coherently (None: each superpixel's own
     lenslet alone); superpixels: list of (row, column); extra: factor on all node counts but those of pixels.
     """
+    return energies(camera, wavelength, [image_point], window, superpixels, pixel_nodes=pixel_nodes, extra=extra)[0]
+
+
+def energies(camera, wavelength, image_points, window, superpixels, *, pixel_nodes=8, extra=1.0):
+    """As column_energies, of several points: a list of dicts."""
     rule = _Rule(camera, wavelength, window, superpixels, pixel_nodes, extra)
     weights = pupil_weights(camera, rule.pupil)
-    kernels = {}
-    for axis in (0, 1):
-        for s in sorted({place[axis] for place in superpixels}):
-            key = (image_point[axis], s, camera.sensor.pixels_per_lenslet[axis])
-            if key not in kernels:
-                kernels[key] = rule.kernel(*key)
-    found = {}
     rows, columns = camera.sensor.pixels_per_lenslet
-    for sy, sx in superpixels:
-        field = kernels[image_point[0], sy, rows] @ weights @ kernels[image_point[1], sx, columns].T
-        energy = np.abs(field) ** 2
-        found[sy, sx] = energy.reshape(rows, pixel_nodes, columns, pixel_nodes).sum(axis=(1, 3))
+    ways = {(s, n): rule.way(s, n) for axis, n in enumerate((rows, columns)) for s in sorted({place[axis] for place in superpixels})}
+    found = []
+    for y, x in image_points:
+        left = {sy: (ways[sy, rows] * rule.entering(y)) @ weights for sy in sorted({place[0] for place in superpixels})}
+        blocks = {}
+        for sy, sx in superpixels:
+            energy = np.abs(left[sy] @ (ways[sx, columns] * rule.entering(x)).T) ** 2
+            blocks[sy, sx] = energy.reshape(rows, pixel_nodes, columns, pixel_nodes).sum(axis=(1, 3))
+        found.append(blocks)
     return found
 
 
@@ -49,16 +52,19 @@ class _Rule:
     def count(self, phase):
         return int(np.ceil(self.extra * (phase / 2 + 3 * np.cbrt(phase) + 12)))
 
-    def kernel(self, place, s, pixels):
-        """From pupil nodes to the sensor nodes of superpixel s, for a point imaged at `place`, weights of pixels included as roots."""
+    def entering(self, place):
+        """Phases at the pupil nodes of light from a point imaged at `place`, the lens included."""
+        x = self.radius * roots_legendre(self.pupil)[0]
+        return np.exp(0.5j * self.k * ((x + self.z1 / self.z2 * place) ** 2 / self.z1 - x**2 / self.f1))
+
+    def way(self, s, pixels):
+        """From pupil nodes to the sensor nodes of superpixel s, weights of pixels included as roots."""
         k, sensor = self.k, self.camera.sensor
         t, w = roots_legendre(self.pixel_nodes)
         active = sensor.pixel_pitch * np.sqrt(sensor.pixel_fill_factor)
         pixel = s * self.D2 * (1 + self.z3 / self.z2) + (np.arange(pixels) - (pixels - 1) / 2) * sensor.pixel_pitch
         v = (pixel[:, None] + active / 2 * t).ravel()
         x = self.radius * roots_legendre(self.pupil)[0]
-        source = -self.z1 / self.z2 * place
-        entering = np.exp(0.5j * k * ((x - source) ** 2 / self.z1 - x**2 / self.f1))
         total = np.zeros((len(v), len(x)), complex)
         for m in [s] if self.window is None else range(-self.window, self.window + 1):
             far = np.abs(v - m * self.D2 * (1 + self.z3 / self.z2)).max() / self.z3
@@ -69,7 +75,7 @@ class _Rule:
             leaving = self.half * weight * np.exp(-0.5j * k * local**2 / self.f2)
             total += (np.exp(0.5j * k / self.z3 * (v[:, None] - u) ** 2) * leaving) @ np.exp(0.5j * k / self.z2 * (u[:, None] - x) ** 2)
         scale = np.sqrt(np.tile(active / 2 * w, pixels)) / (self.wavelength * np.sqrt(self.z2 * self.z3))
-        return scale[:, None] * total * entering
+        return scale[:, None] * total
 
 
 def pupil_weights(camera, count):

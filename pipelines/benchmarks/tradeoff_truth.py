@@ -1,0 +1,283 @@
+"""The cameras of the measured trade of accuracy against time, and three of their columns by brute force, kept as files.
+
+The columns are those of the points at the corner, at the middle of an edge and at the centre of a lenslet. Paraxial sums take
+every pixel of every superpixel. Exact ones, in which every node of the lenslets sends its wave to every node of the sensor,
+take as many pixels of the own superpixel, spread over it, as they can afford. Nothing here shares code with plenocli.optics.
+"""
+
+import hashlib
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from plenocli.config import load_camera  # noqa: E402
+from tests.reference import rayleigh  # noqa: E402
+from tests.reference.fresnel import sensor_nodes  # noqa: E402
+from tests.reference.window import _disc, _Rule, energies  # noqa: E402
+
+WAVES, FLOPS = 5e7, 2e10
+"""Values of the exact kernel, and operations in products, a second of one core: to say beforehand how long the sums take."""
+AFFORDED = 5e9
+"""Values of the exact kernel that a camera's columns may take."""
+FEW = 12
+"""Pixels that an exact column is compared on at the least."""
+SMALL = {"object.samples_per_lenslet": (16, 16)}
+CAMERAS = {
+    "seed_spatial": ("seed_spatial", {}),
+    "f/2.2": ("seed_spatial_250um", SMALL | {"main_lens.aperture_diameter": 50e-3, "lenslet_array.focal_length": 0.55e-3, "sensor.distance": 0.55e-3,
+                                             "lenslet_array.pitch": 249.6e-6 / (1 + 0.55 / 110)}),
+    "f/4.4": ("seed_spatial_250um", {}),
+    "f/22": ("seed_spatial_250um", SMALL | {"main_lens.aperture_diameter": 5e-3, "lenslet_array.focal_length": 5.5e-3, "sensor.distance": 5.5e-3,
+                                            "lenslet_array.pitch": 249.6e-6 / (1 + 5.5 / 110)}),
+    "400 nm": ("seed_spatial_250um", SMALL | {"light.wavelengths": (400e-9,), "light.design_wavelength": 400e-9}),
+    "10 um LWIR": ("seed_spatial_250um", SMALL | {"light.wavelengths": (10e-6,), "light.design_wavelength": 10e-6}),
+    "3-pixel lenslets": ("seed_spatial_250um", SMALL | {"lenslet_array.pitch": 14.4e-6 / (1 + 63.36e-6 / 110e-3), "lenslet_array.focal_length": 63.36e-6,
+                                                        "sensor.distance": 63.36e-6, "sensor.pixels_per_lenslet": (3, 3)}),
+    "20 um pixels": ("seed_spatial_250um", SMALL | {"sensor.pixel_pitch": 20.8e-6, "sensor.pixels_per_lenslet": (12, 12)}),
+    "defocus 1 pitch": ("seed_spatial", SMALL | {"blur": 1}),
+    "defocus 5 pitches": ("seed_spatial", SMALL | {"blur": 5, "object.samples_per_lenslet": (10, 10)}),
+}
+"""Name: (sample configuration, keys changed to SI values; `blur` is the geometric blur in lenslet pitches)."""
+
+
+def camera_of(name):
+    """The camera of a row of the table."""
+    sample, changes = CAMERAS[name]
+    camera, changes = load_camera(ROOT / "sample_configs" / f"{sample}.toml"), dict(changes)
+    blur = changes.pop("blur", None)
+    if blur:
+        lens, array = camera.main_lens, camera.lenslet_array
+        eps = blur * array.pitch / (lens.aperture_diameter * array.distance)
+        changes["object.distance"] = 1 / (1 / lens.focal_length - 1 / array.distance + eps)
+    return camera.replace(**changes)
+
+
+def places(camera):
+    """Flat indices of the points compared: corner, middle, centre."""
+    rows, columns = camera.object.samples_per_lenslet
+    return [0, int(rows * 0.08) * columns + int(columns * 0.43), rows // 2 * columns + columns // 2]
+
+
+def cells(camera):
+    """Diffraction cells of a lenslet: its pitch over wavelength times F-number."""
+    return camera.lenslet_array.pitch * camera.main_lens.aperture_diameter / (camera.light.wavelengths[0] * camera.lenslet_array.distance)
+
+
+def blur(camera):
+    """Geometric blur of a point in lenslet pitches."""
+    defocus = abs(1 / camera.object.distance + 1 / camera.lenslet_array.distance - 1 / camera.main_lens.focal_length)
+    return defocus * camera.main_lens.aperture_diameter * camera.lenslet_array.distance / camera.lenslet_array.pitch
+
+
+def wide_window(camera):
+    """Lenslets either side of the object's own that count as all there are: what is beyond changes columns by about 1e-6."""
+    count = cells(camera)
+    return math.ceil(blur(camera) / 2) + (3 if count > 150 else 4 if count > 110 else 6 if count > 60 else 10)
+
+
+class Truth:
+    """Columns by brute force of one camera: `columns()` and `change()`, how far they are from those with every lenslet there is.
+
+    model: fresnel or exact; window: lenslets either side whose fields add, or None for isolated lenslets; superpixels: list of
+    (row, column), of which the exact model has the own one only; folder: where results are kept, by `key`.
+    """
+
+    def __init__(self, camera, model, window, superpixels, folder):
+        self.camera, self.model, self.window, self.folder = camera, model, window, folder
+        self.superpixels = [(0, 0)] if model == "exact" else superpixels
+        self.rows, self.columns_of_pixels = self._pixels()
+        parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4]
+        if model == "exact" and self.columns_of_pixels is not None:
+            parts.append([self.rows, self.columns_of_pixels])
+        self.key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
+
+    def pick(self, blocks, reach):
+        """What of a matrix's columns, (point, superpixel, pixel) with superpixels `reach`, is compared: (point, number)."""
+        blocks = np.stack([blocks[:, reach.index(place)] for place in self.superpixels], axis=1)
+        if self.model == "exact":
+            blocks = blocks.reshape(len(blocks), *self.camera.sensor.pixels_per_lenslet)[:, self.rows]
+            blocks = blocks if self.columns_of_pixels is None else blocks[:, :, self.columns_of_pixels]
+        return blocks.reshape(len(blocks), -1)
+
+    @property
+    def path(self):
+        return self.folder / f"{self.key}.npz"
+
+    def affordable(self):
+        """Whether at least a few pixels can be summed."""
+        return self.model == "fresnel" or self.columns_of_pixels is None or len(self.rows) * len(self.columns_of_pixels) >= FEW
+
+    def seconds(self):
+        """Seconds of one core that `columns` and `change` will take, 0 for kept ones."""
+        if self.path.exists():
+            return 0.0
+        if self.model == "exact":
+            count = len(self.rows) * len(self.columns_of_pixels or range(self.camera.sensor.pixels_per_lenslet[1]))
+            return 5 + self._values_per_pixel() * count / WAVES + sum(other.seconds() for other in self._others())
+        camera, reach = self.camera, {place[0] for place in self.superpixels}
+        rule = _Rule(camera, camera.light.wavelengths[0], self.window, self.superpixels, self._pixel_nodes(), 1.0)
+        lines, lit = camera.sensor.pixels_per_lenslet[0] * self._pixel_nodes(), 1 if self.window is None else 2 * self.window + 1
+        lenslet = rule.count(rule.half * rule.k * ((2 * (self.window or 0) + 1) * rule.D2 / rule.z3 + rule.radius / rule.z2))
+        products = 8 * lines * rule.pupil * (len(reach) * (lit * lenslet + 3 * rule.pupil) + 3 * len(self.superpixels) * lines)
+        return 1 + products / FLOPS + sum(other.seconds() for other in self._others())
+
+    def columns(self):
+        """(point, number): energies in the order of `pick`."""
+        if not self.path.exists():
+            found = self._exact() if self.model == "exact" else self._fresnel()
+            self.folder.mkdir(parents=True, exist_ok=True)
+            np.savez(self.path, columns=found, change=self._measured_change(found))
+        with np.load(self.path) as kept:
+            return kept["columns"].reshape(3, -1)
+
+    def change(self):
+        """Relative change of the worst column when the window grows."""
+        self.columns()
+        with np.load(self.path) as kept:
+            return float(kept["change"])
+
+    def _measured_change(self, found):
+        if self.window is None:
+            return 0.0
+        # the exact sum affords few lenslets: what those further out do is taken from the paraxial model
+        near, *far = (truth.columns() for truth in self._others())
+        far = far[0] if far else found[:, self.superpixels.index((0, 0))].reshape(3, -1)
+        return float(max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(far, near)))
+
+    def _others(self):
+        """Own superpixels with fewer lenslets (and with all, where these are not at hand): the difference is the change."""
+        if self.window is None:
+            return []
+        windows = (self.window, wide_window(self.camera)) if self.model == "exact" else (self.window - 2,)
+        return [Plain(self.camera, "fresnel", window, [(0, 0)], self.folder) for window in windows]
+
+    def _pixel_nodes(self):
+        """Nodes per pixel for fringes from opposite ends of the coherent window (or of one lenslet), to 1e-10; where lenslets hold
+        many diffraction cells, of lenslets up to five apart: those further apart make too little of them (1e-7 of a column)."""
+        camera, sensor = self.camera, self.camera.sensor
+        cell = camera.lenslet_array.pitch * sensor.pixel_pitch / (camera.light.wavelengths[0] * sensor.distance)
+        if self.window is None:
+            return math.ceil(1.7 * cell + 9)
+        across = 2 * self.window + 1
+        return math.ceil(1.7 * cell * (across if cells(camera) < 15 else min(across, 5)) + 5)
+
+    def _image_points(self):
+        rows, columns = self.camera.object.samples_per_lenslet
+        pitch = self.camera.lenslet_array.pitch
+        return [((q // columns - (rows - 1) / 2) * pitch / rows, (q % columns - (columns - 1) / 2) * pitch / columns) for q in places(self.camera)]
+
+    # paraxial
+
+    def _fresnel(self):
+        found = energies(self.camera, self.camera.light.wavelengths[0], self._image_points(), self.window, self.superpixels,
+                         pixel_nodes=self._pixel_nodes())
+        return np.array([[blocks[place] for place in self.superpixels] for blocks in found])
+
+    # exact
+
+    def _pixels(self):
+        """(rows, columns) of the pixels compared; columns None: all of them."""
+        count, across = self.camera.sensor.pixels_per_lenslet
+        rows = sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
+        if self.model != "exact":
+            return rows, None
+        most = int(AFFORDED / self._values_per_pixel() / len(rows))
+        return (rows, None) if most >= across else (rows, sorted({int(across * (i + 0.5) / most) for i in range(most)}))
+
+    def _values_per_pixel(self):
+        """Values of the kernel that one pixel takes, all lenslets together."""
+        far = self.window or 0
+        own = [len(self._lenslet_nodes(m)[0]) for m in range(-far, far + 1)]
+        return self._pixel_nodes() ** 2 * sum(own) ** 2
+
+    def _lenslet_nodes(self, m):
+        """Positions from the middle of the lenslet m off the axis, and weights, that resolve lens, pupil and way to the superpixel."""
+        camera, array = self.camera, self.camera.lenslet_array
+        half, reach = array.pitch * array.fill_factor / 2, camera.sensor.pixel_pitch * max(camera.sensor.pixels_per_lenslet) / 2
+        edge = np.linspace(-half, half, 41)
+        d = edge - np.array([[-reach], [reach]]) + m * array.pitch
+        bend = edge / array.focal_length if array.profile == "parabolic" else edge / np.hypot(edge, array.focal_length)
+        ways = np.abs(d / np.hypot(d, camera.sensor.distance) - bend).max()
+        k = 2 * np.pi / camera.light.wavelengths[0]
+        return rayleigh.nodes(-half, half, k * (1.1 * ways + camera.main_lens.aperture_diameter / (2 * array.distance)))
+
+    def _exact(self):
+        camera, array, sensor = self.camera, self.camera.lenslet_array, self.camera.sensor
+        k, nodes = 2 * np.pi / camera.light.wavelengths[0], self._pixel_nodes()
+        (v, wv), (u, wu) = sensor_nodes((0, 0), sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch * math.sqrt(sensor.pixel_fill_factor), nodes)
+        across = self.columns_of_pixels or list(range(sensor.pixels_per_lenslet[1]))
+        (v, wv), (u, wu) = ([a[(np.asarray(chosen)[:, None] * nodes + np.arange(nodes)).ravel()] for a in pair]
+                            for pair, chosen in (((v, wv), self.rows), ((u, wu), across)))
+        far, total = self.window or 0, 0
+        wave = self._main_lens((far + 1.5) * array.pitch)
+        for row in range(-far, far + 1):
+            for column in range(-far, far + 1):
+                (y, wy), (x, wx) = self._lenslet_nodes(row), self._lenslet_nodes(column)
+                lens = rayleigh.lens_phase(array.profile, array.focal_length, y, x, k) * wy[:, None] * wx
+                y, x = y + row * array.pitch, x + column * array.pitch
+                fields = np.array([wave(point, y, x) for point in self._image_points()])
+                total = total + rayleigh.rayleigh_sum(fields * lens, y, x, v, u, sensor.distance, k)
+        energy = np.abs(total) ** 2 * wv[:, None] * wu
+        return energy.reshape(3, len(self.rows), nodes, len(across), nodes).sum(axis=(2, 4))
+
+    def _main_lens(self, reach):
+        """Field on the array, function of (image point, y, x), up to `reach` (m) from the image point: the same sum over direction
+        cosines as rayleigh.field_on_array, with weights that part the axes of the round pupil."""
+        lens, z = self.camera.main_lens, self.camera.lenslet_array.distance
+        k, radius = 2 * np.pi / self.camera.light.wavelengths[0], lens.aperture_diameter / 2
+        rim = radius / math.hypot(z, radius)
+        defocus = blur(self.camera) * self.camera.lenslet_array.pitch / z
+        count = int(1.1 * k * rim * (reach + defocus * z) + 60)
+        t, w = np.polynomial.legendre.leggauss(count)
+        weight = rim**2 * (_disc(count, 1.0, t, w) if lens.aperture_shape == "circle" else np.outer(w, w))
+        s2 = rim**2 * (t[:, None] ** 2 + t**2)
+        weight, shape = weight.astype(complex), rayleigh.amplitude(lens.apodisation, s2)
+        norm = math.sqrt(float((weight.real * shape**2).sum()))
+        if defocus:
+            eps = 1 / self.camera.object.distance + 1 / z - 1 / lens.focal_length
+            image, r2 = 1 / (1 / z - eps), z * z * s2 / (1 - s2)
+            weight = weight * np.exp(1j * k * ((np.sqrt(z * z + r2) - z) - np.sign(image) * (np.sqrt(image**2 + r2) - abs(image))))
+        weight = weight * shape / norm
+
+        def field(point, y, x):
+            down, right = np.exp(-1j * k * rim * np.outer(y - point[0], t)), np.exp(-1j * k * rim * np.outer(t, x - point[1]))
+            return down @ weight @ right * k / (2 * np.pi) * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
+
+        return field
+
+
+class Plain(Truth):
+    """A Truth whose own change is not asked for."""
+
+    def _others(self):
+        return []
+
+    def _measured_change(self, found):
+        return 0.0
+
+
+def truth_for(camera, model, window, superpixels, accuracy, folder):
+    """The Truth against which a matrix of `accuracy` with a coherent `window` (None: isolated) is held.
+
+    Paraxial: every lenslet there is. Exact: the fewest lenslets that leave out a tenth of the accuracy (as the paraxial model
+    has it), or as many as can be afforded; None where not even the nearest can.
+    """
+    if window is None or model == "fresnel":
+        return Truth(camera, model, None if window is None else wide_window(camera), superpixels, folder)
+    affordable = [t for t in (Truth(camera, model, w, superpixels, folder) for w in range(1, wide_window(camera) + 1)) if t.affordable()]
+    if not affordable:
+        return None
+    wide = Plain(camera, "fresnel", wide_window(camera), [(0, 0)], folder)
+    for truth in affordable:
+        near = Plain(camera, "fresnel", truth.window, [(0, 0)], folder)
+        change = max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(wide.columns(), near.columns()))
+        if change < 0.1 * accuracy:
+            return truth
+    return affordable[-1]
+

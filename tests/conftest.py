@@ -5,6 +5,10 @@ from pathlib import Path
 import pytest
 
 
+def pytest_addoption(parser):
+    parser.addoption("--campaign", action="store_true", help="run the fault campaigns in full (make faults), not a seeded share of them")
+
+
 @pytest.fixture(scope="session")
 def shared_data():
     """Folder of real RAW, plenoptic and spectral data beside the project; tests that need it skip without it."""

@@ -26,7 +26,7 @@ _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose
 def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip"):
     """Write float32 channels (name -> (row, column) array, all of one shape) and text attributes (name -> str).
 
-    Everything is read back by name before the file takes its place. Same input, same bytes.
+    Everything is read back and compared before the file takes its place. Same input, same bytes.
     Raises ValueError (a bug of the caller: shapes, names), UsageError, OutputError.
     """
     planes, attrs = _checked(channels, attrs or {}, compression)
@@ -46,7 +46,7 @@ def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip")
         closed = output.close()
         if not (written and closed):
             raise OutputError(f"OpenEXR could not write all of it ({oiio_error(output)})", path, "free some space; nothing was changed")
-        _verify_header(path, partial, names, attrs, compression)
+        _verify(path, partial, pixels, names, attrs, compression)
 
 
 def read_exr(path, *, mem_limit=None):
@@ -127,19 +127,24 @@ def _digest(planes, attrs):
     return digest.hexdigest()
 
 
-def _verify_header(path, partial, names, attrs, compression):
-    """OpenImageIO drops or changes what it cannot store without an error: compare."""
+def _verify(path, partial, pixels, names, attrs, compression):
+    """Compare the file with what went in: OpenImageIO drops what it cannot store, and misses a disk that gets full, without an error."""
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(str(partial))
     if source is None:
         raise OutputError(f"cannot be read back ({oiio_error(None)})", path, "free some space; nothing was changed")
     spec = source.spec()
-    back = {a.name: a.value for a in spec.extra_attribs}
-    source.close()
+    back, stored = {a.name: a.value for a in spec.extra_attribs}, list(spec.channelnames)
     wrong = [name for name, value in (attrs | {"compression": compression}).items() if back.get(name) != value]
-    if sorted(spec.channelnames) != sorted(names) or wrong or spec.format.basetype != oiio.FLOAT:
+    if sorted(stored) != sorted(names) or wrong or spec.format.basetype != oiio.FLOAT:
         raise OutputError(f"EXR does not keep {wrong or 'the channel names'}", path, "use other names")
+    found = source.read_image("float")
+    trouble = oiio_error(source)
+    source.close()
+    order = [stored.index(name) for name in names]
+    if found is None or trouble or not np.array_equal(found.reshape(pixels.shape)[..., order].view(np.uint32), pixels.view(np.uint32)):
+        raise OutputError(f"does not hold what was written ({trouble or 'other values'})", path, "free some space; nothing was changed")
 
 
 # --- reading -----------------------------------------------------------------------------------------------------------

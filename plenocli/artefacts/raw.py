@@ -72,6 +72,8 @@ def _from_child(path, limit, timeout_s):
         done = subprocess.run(command, capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL, env={**os.environ, **single})
     except subprocess.TimeoutExpired as error:
         raise InputError(f"LibRaw did not finish within {timeout_s:g} s", path, _FIX) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: no process could be started for LibRaw ({error.strerror})", path, "close other programs, and try again") from error
     line, newline, pixels = done.stdout.partition(b"\n")
     if done.returncode != 0 or not newline:
         if done.returncode < 0:

@@ -1,0 +1,65 @@
+"""Commands of plenocli run by the thousand, each in a process of its own, with a fault of choice.
+
+A server process imports plenocli once and forks a child for each command: a crash, a hang or a kill stays in the child.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+SERVER = Path(__file__).with_name("server.py")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """code: exit status, or minus the signal; text: stdout and stderr; seconds of wall time; grown: bytes of peak memory above the server's."""
+
+    code: int
+    text: str
+    seconds: float
+    grown: int
+    fired: bool
+    hung: bool
+
+
+class Runner:
+    """`run` a command line; use as a context manager."""
+
+    def __init__(self):
+        environment = os.environ | {"PYTHONPATH": str(SERVER.parents[2])}
+        self._server = subprocess.Popen([sys.executable, str(SERVER)], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._server.stdin.close()
+        self._server.stdout.close()
+        self._server.wait()
+
+    def run(self, arguments, cwd, *, limit=60.0, kill_after=None, fault=None, environment=None):
+        """The Outcome of `plenocli ARGUMENTS` in the folder cwd.
+
+        limit: s, then it counts as hung and is killed. kill_after: s, then SIGKILL. fault: see server.py.
+        """
+        request = {"arguments": [str(a) for a in arguments], "cwd": str(cwd), "limit": limit, "kill_after": kill_after, "fault": fault, "environment": environment or {}}
+        self._server.stdin.write(json.dumps(request) + "\n")
+        self._server.stdin.flush()
+        answer = self._server.stdout.readline()
+        if not answer:
+            raise RuntimeError("the server of the fault tests ended")
+        return Outcome(**json.loads(answer))
+
+
+def tree(folder):
+    """Relative path -> bytes of every file below a folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+
+
+def is_clean_refusal(outcome, code, *words):
+    """Whether a command ended with `code` (or one of several) and one message that names every word, without a traceback."""
+    codes = code if isinstance(code, tuple) else (code,)
+    return outcome.code in codes and "Traceback" not in outcome.text and "internal error" not in outcome.text and all(w in outcome.text for w in words)

@@ -1,0 +1,168 @@
+"""Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line. See harness.py.
+
+A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, "lasting": whether all later
+calls fail too}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "short"},
+writes that take only a part.
+"""
+
+import errno
+import fcntl
+import importlib
+import json
+import os
+import pkgutil
+import resource
+import select
+import signal
+import sys
+import time
+
+WRITERS = ("write", "pwrite", "writev", "pwritev")
+
+
+def main():
+    """Serve until stdin ends."""
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    _import_everything()
+    channel = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        channel.write(json.dumps(_serve(json.loads(line))) + "\n")
+        channel.flush()
+
+
+def _import_everything():
+    import plenocli
+
+    for module in pkgutil.walk_packages(plenocli.__path__, "plenocli."):
+        if not module.name.endswith(("__main__", "raw_child")):
+            importlib.import_module(module.name)
+    import h5py, numpy, OpenImageIO, scipy.linalg, scipy.ndimage, scipy.optimize  # noqa: E401, F401
+
+
+def _serve(request):
+    # a pipe takes the messages: a limit of file sizes does not hold for it
+    (heard, said), (noticed, fired) = os.pipe(), os.pipe()
+    fcntl.fcntl(said, fcntl.F_SETPIPE_SZ, 1 << 20)
+    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+    child = os.fork()
+    if child == 0:
+        _child(request, said, fired)
+    os.setpgid(child, child)
+    handle = os.pidfd_open(child)
+    limit = request["kill_after"] if request["kill_after"] is not None else request["limit"]
+    ended = bool(select.select([handle], [], [], limit)[0])
+    if not ended:
+        os.killpg(child, signal.SIGKILL)
+    _, status, usage = os.wait4(child, 0)
+    answer = {"code": os.waitstatus_to_exitcode(status), "text": _drain(heard, said).decode("utf-8", "replace"), "seconds": time.perf_counter() - start,
+              "grown": max(0, usage.ru_maxrss - before) * 1024, "fired": bool(_drain(noticed, fired)), "hung": not ended and request["kill_after"] is None}
+    os.close(handle)
+    return answer
+
+
+def _drain(reader, writer):
+    """What is in a pipe; closes it."""
+    os.set_blocking(reader, False)
+    os.close(writer)
+    parts = []
+    try:
+        while part := os.read(reader, 1 << 20):
+            parts.append(part)
+    except BlockingIOError:  # a grandchild still holds the other end
+        pass
+    os.close(reader)
+    return b"".join(parts)
+
+
+def _child(request, said, fired):
+    code = 99
+    try:
+        os.chdir(request["cwd"])
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        os.environ.update(request["environment"])
+        if request["fault"]:
+            _arm(request["fault"], fired)
+        import warnings
+
+        warnings.simplefilter("error", RuntimeWarning)
+        from plenocli.cli.main import run
+
+        code = run(request["arguments"])
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def _arm(fault, fired):
+    """Make the nth call of a function fail, before the command starts."""
+    number = getattr(errno, fault.get("error", "ENOSPC"))
+    if fault["call"] == "bytes":
+        return _arm_bytes(fault["nth"], number, fired)
+    if fault["call"] == "filesize":
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (fault["nth"], resource.RLIM_INFINITY))
+        return _real_write(fired, b"x")
+    if fault["call"] == "short":
+        return _arm_short(fired)
+    real, seen = getattr(os, fault["call"]), 0
+
+    def failing(*arguments, **named):
+        nonlocal seen
+        if fault["call"] in WRITERS and _is_console(arguments[0]):
+            return real(*arguments, **named)
+        seen += 1
+        if seen == fault["nth"] or (fault.get("lasting") and seen > fault["nth"]):
+            _real_write(fired, b"x")
+            raise OSError(number, os.strerror(number))
+        return real(*arguments, **named)
+
+    setattr(os, fault["call"], failing)
+
+
+_real_write = os.write
+
+
+def _is_console(descriptor):
+    return descriptor in (1, 2)
+
+
+def _arm_bytes(room, number, fired):
+    """A disk with room for so many bytes: short writes up to the last byte, then the error."""
+    left = room
+    for name in ("write", "pwrite"):
+        real = getattr(os, name)
+
+        def full(descriptor, view, *rest, real=real):
+            nonlocal left
+            if _is_console(descriptor):
+                return real(descriptor, view, *rest)
+            if left <= 0 and len(view):
+                _real_write(fired, b"x")
+                raise OSError(number, os.strerror(number))
+            written = real(descriptor, memoryview(view).cast("B")[:left], *rest)
+            left -= written
+            return written
+
+        setattr(os, name, full)
+
+
+def _arm_short(fired):
+    """Every write takes 1 to 7000 bytes only."""
+    for name in ("write", "pwrite"):
+        real, count = getattr(os, name), [0]
+
+        def short(descriptor, view, *rest, real=real, count=count):
+            count[0] += 1
+            if _is_console(descriptor):
+                return real(descriptor, view, *rest)
+            _real_write(fired, b"x")
+            return real(descriptor, memoryview(view).cast("B")[:1 + count[0] * 997 % 7000], *rest)
+
+        setattr(os, name, short)
+
+
+if __name__ == "__main__":
+    main()

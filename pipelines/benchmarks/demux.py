@@ -65,7 +65,7 @@ def make(run):
     for kind in KINDS:
         target = run / f"{kind}.h5"
         if not target.exists():
-            words = [f"--band={b}={run / f'band-{b}.dng'}" for b in BANDS] + (["--shared"] if kind == "shared" else [])
+            words = [f"--band={b}={run / f'band-{b}.dng'}" for b in BANDS] + [f"--response={'shared' if kind == 'shared' else 'own'}"]
             plenocli("calibrate", f"--white={run / 'white.dng'}", f"--dark={run / 'dark.dng'}", *words, "-o", str(target), "--overwrite")
 
 

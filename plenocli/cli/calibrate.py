@@ -13,8 +13,7 @@ from plenocli.cli import options
 @click.option("--band", "bands", multiple=True, type=options.Pair("FILE", Path), help="White target under narrow-band light, such as 450nm=band450.dng. Repeatable, also within a band.")
 @click.option("--band-radiance", "radiances", multiple=True, type=options.Pair("NUMBER", options.positive), help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.")
 @click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
-@click.option("--shared", is_flag=True, help="One F for all lenslets (whole-pixel pitch only) instead of one each.")
-@click.option("--denoise", is_flag=True, help="Take noise off F by what the lenslets have in common (low rank): with a hundred lenslets one capture a band does what four do.")
+@click.option("--response", type=click.Choice(["auto", "shared", "own", "low-rank"]), default="auto", show_default=True, help="One F shared by all lenslets, an F of its own for each, or own ones without the noise that stands out of what they have in common (with a hundred lenslets one capture a band then does what four do). auto: shared where the data cannot tell lenslets apart, else own.")
 @click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
 @click.option("--centre", "near", type=(float, float), default=None, metavar="ROW COLUMN", help="A pixel near the centre of any superpixel; needed only where filters in the pupil draw lines as dark as the superpixels' borders.")
 @click.option("--cfa", type=click.Choice(["mono", "RGGB", "BGGR", "GRBG", "GBRG"]), help="Colour filter array of PNG and TIFF mosaics, which cannot say it; default the camera's, else mono.")
@@ -34,7 +33,7 @@ def command(ctx, output, as_json, radiances, **settings):
       plenocli calibrate --white white.png --dark dark.png -o grid.h5
       plenocli calibrate --white w1.NEF --white w2.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF -o cal.h5
       plenocli calibrate --white white.dng --band 450nm=450.dng --band-radiance 450nm=0.8 --camera camera.toml -o cal.h5
-      plenocli calibrate --white w.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF --denoise -o cal.h5
+      plenocli calibrate --white w.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF --response low-rank -o cal.h5
     """
     from plenocli.stages.calibrate import run_calibrate
 

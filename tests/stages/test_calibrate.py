@@ -27,11 +27,11 @@ def cell(leak=0.05):
     return 10000 * edge[..., None] * ((1 - 3 * leak) * own + leak * (1 - own))
 
 
-def electrons(radiance, response=None):
-    """Mean electrons of the whole sensor (a dark frame of BORDER px around) for radiances (ROWS, COLUMNS, band) or (band,)."""
-    response = cell() if response is None else response
-    radiance = np.broadcast_to(radiance, (ROWS, COLUMNS, 4))
-    tiles = np.einsum("rcb,yxb->rycx", radiance, response).reshape(ROWS * PITCH, COLUMNS * PITCH)
+def electrons(radiance, gains=1.0):
+    """Mean electrons of the whole sensor (a dark frame of BORDER px around) for radiances (ROWS, COLUMNS, band) or (band,)
+    behind lenslets of transmission `gains` (ROWS, COLUMNS, 1)."""
+    radiance = gains * np.broadcast_to(radiance, (ROWS, COLUMNS, 4))
+    tiles = np.einsum("rcb,yxb->rycx", radiance, cell()).reshape(ROWS * PITCH, COLUMNS * PITCH)
     return np.pad(tiles, BORDER)
 
 
@@ -71,7 +71,7 @@ def files(tmp_path_factory):
 @pytest.fixture(scope="module")
 def calibration(files):
     path = files["folder"] / "calibration.h5"
-    report = run_calibrate(path, whites=files["white"], darks=files["dark"], bands=files["bands"], radiances=[(540e-9, 0.5)])
+    report = run_calibrate(path, whites=files["white"], darks=files["dark"], bands=files["bands"], radiances=[(540e-9, 0.5)], response="own")
     return path, report
 
 
@@ -114,11 +114,31 @@ def test_flat_field_peaks_at_one_and_white_is_kept(calibration):
 
 def test_shared_response_is_the_mean_and_better_known(files, calibration):
     path = files["folder"] / "shared.h5"
-    run_calibrate(path, whites=files["white"], darks=files["dark"], bands=files["bands"], radiances=[(540e-9, 0.5)], shared=True)
+    run_calibrate(path, whites=files["white"], darks=files["dark"], bands=files["bands"], radiances=[(540e-9, 0.5)], response="shared")
     one, own = read_artefact(path, "calibration").data, read_artefact(calibration[0], "calibration").data
     assert one["response/F"].shape == (PITCH * PITCH, 4)
     np.testing.assert_allclose(one["response/F"], own["response/F"][own["grid/valid"]].mean(axis=0), rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(one["response/covariance"] * ROWS * COLUMNS, own["response/covariance"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("spread, kind", [(0.0005, "shared"), (0.01, "own")])
+def test_lenslets_share_a_response_where_one_noisy_capture_a_band_cannot_tell_them_apart(files, tmp_path, capsys, spread, kind):
+    gains = 1 + spread * np.random.default_rng(11).standard_normal((ROWS, COLUMNS, 1))
+    shots = [(w, save(tmp_path / f"b{k}.h5", electrons(narrow(k), gains), 60 + k)) for k, w in enumerate(BANDS)]
+    captures = [save(tmp_path / f"s{i}.h5", electrons(LIGHT * files["reflectance"], gains), 70 + i) for i in range(4)]
+    error, found = {}, {}
+    for how in ("auto", "shared", "own"):
+        line = ["calibrate", *(f"--white={p}" for p in files["white"]), *(f"--dark={p}" for p in files["dark"]), *(f"--band={w * 1e9:g}nm={p}" for w, p in shots)]
+        assert run([*line, "-o", str(tmp_path / f"{how}.h5"), *([f"--response={how}"] if how != "auto" else [])]) == 0
+        said = capsys.readouterr().out
+        found[how] = read_artefact(tmp_path / f"{how}.h5", "calibration")
+        values = [next(demux(p, tmp_path / f"{how}.h5", tmp_path / f"{how}-{p.name}", "wls", register="off")) for p in captures]
+        error[how] = np.sqrt(np.mean((np.mean(values, axis=0) - LIGHT * files["reflectance"]) ** 2))  # four captures: what F costs is left
+    notes = found["auto"].attrs["response"]["notes"]
+    assert notes["response"] == kind and found["auto"].data["response/F"].ndim == (2 if kind == "shared" else 4)
+    assert ("one F for 99 lenslets" if kind == "shared" else "F of its own for each of 99") in found["auto"].attrs["response"]["notes"]["text"]
+    assert f"{notes['excess']:.3g} times what noise explains" in notes["text"]
+    assert error["auto"] < 1.05 * min(error.values()) and max(error.values()) > 1.3 * error["auto"]
 
 
 def demux(path, calibration, target, method, **settings):
@@ -183,7 +203,7 @@ def test_bayer_mosaic_is_part_of_the_response(tmp_path):
     error = np.moveaxis(data["spectra/value"], 0, -1) - truth
     assert np.sqrt((error**2).mean()) < 0.004 and (error / np.moveaxis(data["spectra/sigma"], 0, -1)).std() == pytest.approx(1, abs=0.2)
     with pytest.raises(NumericsError, match="no F serves them all"):
-        run_calibrate(tmp_path / "x.h5", whites=[white], darks=[dark], bands=bands, shared=True)
+        run_calibrate(tmp_path / "x.h5", whites=[white], darks=[dark], bands=bands, response="shared")
 
 
 def test_white_alone_gives_a_grid(files, tmp_path, capsys):

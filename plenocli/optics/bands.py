@@ -95,6 +95,7 @@ class CombinedBands:
     def __init__(self, makers, weights):
         self.makers, self.weights = list(makers), [float(w) for w in weights]
         self.symmetry = tuple(all(flags) for flags in zip(*(m.symmetry for m in self.makers)))
+        self.shared_axis = getattr(self.makers[0], "shared_axis", 1)
         notes = [m.notes for m in self.makers]
         self.notes = notes[0] | {key: max(n[key] for n in notes) for key in ("separable_terms", "field_tail")} | {"band_nodes": len(self.makers)}
         if all(hasattr(m, "superpixel") for m in self.makers):

@@ -190,8 +190,9 @@ class PifBuilder:
             keep &= j < (columns + 1) // 2
         if self.symmetry[2]:
             keep &= i <= j if self.symmetry[0] == self.symmetry[1] else keep
-        flat = (i * columns + j)[keep]
-        return flat[np.argsort(flat % columns, kind="stable")]
+        # points whose work a maker shares stand together
+        flat, shared = (i * columns + j)[keep], getattr(self._lenslets, "shared_axis", 1)
+        return flat[np.argsort(flat % columns if shared else flat // columns, kind="stable")]
 
     def _orbit(self, points, images):
         """(points, images) and their mirror images under the symmetry; images: (point, sy, sx, py, px)."""

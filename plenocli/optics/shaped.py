@@ -81,6 +81,7 @@ class ShapedLenslets:
         self.field = separable_field(camera, geometry, band.half, plan.tolerance)
         self.symmetry, self.notes = self.field.symmetry, {"separable_terms": self.field.terms, "field_tail": self.field.tail}
         self.cut = chords(geometry.lenslet_shape, geometry.lenslet_width, _slope(camera, geometry, plan.superpixels, band.window), plan.tolerance / 30)
+        self.shared_axis = 1 - self.cut.axis
         self._sites = geometry.places(plan.superpixels)
         self._products = {} if self.window is None else {None: geometry.neighbourhood(self.window)}
         if self.window is None:

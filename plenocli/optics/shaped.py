@@ -286,26 +286,29 @@ def cost(camera, view, band, shape, double):
     """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
     seconds (what does not scale with them, one core) and bytes (beyond the result).
 
-    Counted from the node rules, without the points that symmetry gives; within 0.55 to 1.35 of 48 process times of square lenslets,
-    isolated and joined.
+    Counted from the node rules, without the points that symmetry gives; factors fitted to process times, part by part
+    (docs/model.md, "The dial").
     """
     grid = grid_of(shape[1])
-    cut = chords(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), 1e-7)
+    cut = chords(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), band.sampling / 60 or 1e-7)
     products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
-    nodes = [n * band.pixel_nodes for n in view.pixel_shape]
+    nodes, rough = [n * band.pixel_nodes for n in view.pixel_shape], 2 if double else 1
     points, across, along = distinct(camera, view, shape)[0], nodes[1 - cut.axis], nodes[cut.axis]
-    lanes = min(points, view.object_shape[1 - cut.axis] if points == shape[3] else (view.object_shape[1 - cut.axis] + 1) // 2)
+    # columns come in about eight blocks, at whose borders a line of points is begun anew
+    lanes = min(points, 8 + (view.object_shape[1 - cut.axis] if points == shape[3] else (view.object_shape[1 - cut.axis] + 1) // 2))
     scan = sum(cut.at.size * len(p[cut.axis]) for p in products)
     chord = sum(sum(x.size for x, _ in cut.pieces) * len(p[1 - cut.axis]) for p in products)
+    count, terms = len(cut.at) * len(products), band.terms
     places = len({place[1 - cut.axis] for place in view.places(grid)}) if band.window is not None else shape[1]
-    hop = scan * across * along * shape[1] * (0.5 if shape[1] == 1 else 1.0)
-    operations = 10.0 * (points * (places * scan * band.terms * across + hop) + lanes * places * chord * band.terms * across)
-    squares = points * shape[1] * along * across * (8e-9 if double else 4e-9)
-    guard = 3e-8 * points * scan * band.terms
-    kernels = 7e-8 * (places * chord * across + (places if len(products) > 1 or band.window is not None else 1) * scan * along)
-    written = math.prod(shape[1:]) * 3e-8 + points * shape[1] * 1.5e-4
+    operations = 8.0 * (1.4 * lanes * places * chord * terms * across + points * places * scan * terms * across
+                        + 0.8 * points * scan * across * along * shape[1] + 0.3 * points * scan * terms**2)
+    passes = rough * (6.7e-9 * places * across * (lanes * count * terms + points * scan) + 2.6e-9 * points * shape[1] * across * along
+                      + 1.1e-8 * lanes * count * terms**2) + lanes * (2e-4 * places + 1.5e-4 * shape[1] + 4e-4)
+    tables = (lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms) + view.object_shape[cut.axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
+              + 9e-8 * places * (chord * across + scan * along))
+    written = math.prod(shape[1:]) * 3e-8
     size_ = 16 if double else 8
-    heights = size_ * view.object_shape[cut.axis] * scan * band.terms * (1 if band.window is not None else shape[1])
-    spread = size_ * len(cut.at) * len(products) * band.terms * across
-    return {"operations": operations, "seconds": squares + guard + kernels + written + field_seconds(camera, view, band) + 0.015,
+    heights = size_ * view.object_shape[cut.axis] * scan * terms * (1 if band.window is not None else shape[1])
+    spread = size_ * count * terms * across
+    return {"operations": operations, "seconds": passes + tables + written + field_seconds(camera, view, band) + 0.015,
             "bytes": int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25)}

@@ -51,3 +51,18 @@ def test_expected_terms_are_those_found(half_pitches, tolerance):
     half = half_pitches * view.D2 / 2
     found = separable_field(camera, view, half, tolerance).terms
     assert abs(expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance) - found) <= 2 + 0.1 * found
+
+
+@pytest.mark.parametrize("shape, lattice", [("circle", "square"), ("hexagon", "hexagonal")])
+def test_chords_are_shared_by_the_points_of_a_line(shape, lattice):
+    """What the cost of the triple product counts on: blocks of columns begin a line of points anew at their borders only."""
+    camera = small_camera().replace(**{"lenslet_array.aperture_shape": shape, "lenslet_array.lattice": lattice, "lenslet_array.fill_factor": 0.9,
+                                       "object.samples_per_lenslet": (9, 7), "main_lens.aberrations": ({"noll": 7, "coefficient": 30e-9},)})
+    plan = plan_pif(camera, model="fresnel", accuracy=1e-2, superpixels=(1, 1), coherent_ring=0)
+    assert plan.rung == "fresnel, triple product"
+    builder, begun, blocks = PifBuilder(camera, plan.bands[0].wavelength, plan), [], []
+    spread, columns = builder._lenslets._spread, builder._lenslets.columns
+    builder._lenslets._spread = lambda product, across, index: begun.append(index) or spread(product, across, index)
+    builder._lenslets.columns = lambda *block: blocks.append(len(block[0])) or columns(*block)
+    builder.fill(np.empty(plan.shape[1:]))
+    assert len(blocks) > 4 and len(begun) <= len(set(begun)) + len(blocks)

@@ -7,22 +7,65 @@ import numpy as np
 
 from plenocli.sensor.registration import Smooth, _parity
 
+NODES = 1 / 16
+"""px between displacements for which pictures are moved, where lenslets have many: the rest is first order, good to 2e-4 of the peak."""
+KEPT = 64
+"""Displacements whose pictures are kept."""
+
 
 class Moved:
     """Responses (R, C, pixel, band) whose light is displaced by `rest` (R, C, 2) px within windows that went from `before` to `after`
-    (R, C, 2). response: of the calibration, (pixel, band) or (R, C, pixel, band); gains: of the mosaic's colours.
-    `moved[rows, columns]` makes (lenslet, pixel, band)."""
+    (R, C, 2) by whole periods of the mosaic. response: of the calibration, (pixel, band) or (R, C, pixel, band). reference:
+    plenocli.sensor.registration.Reference of it. `moved[rows, columns]` makes (lenslet, pixel, band).
+
+    What lenslets have in common is moved, and its change added to each lenslet's own response: a spline would spread the noise of
+    single responses, magnified where a colour is weak, and what a lenslet has alone is as good as its noise or belongs to the pixels.
+    """
 
     ndim = 4
 
-    def __init__(self, response, before, after, rest, window, cfa, gains):
+    def __init__(self, response, before, after, rest, reference):
         self.shape = (*before.shape[:2], *response.shape[-2:])
-        self._response, self._before, self._after, self._rest = response, before, after, np.round(rest, 4)  # 1e-4 px is nothing, and few values are quick
-        self._kind = window, cfa, gains
+        self._response, self._before, self._after, self._rest, self._reference = response, before, after, np.round(rest, 4), reference
+        self._even = bool(np.ptp(self._rest.reshape(-1, 2), axis=0).max() == 0)
+        self._made = {}
 
     def __getitem__(self, places):
-        own = self._response[places] if self._response.ndim > 2 else np.broadcast_to(self._response, (len(places[0]), *self._response.shape))
-        return Smooth(own, self._before[places], *self._kind).at(self._after[places], self._rest[places])
+        shared = self._response.ndim == 2
+        own = np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])) if shared else self._response[places]
+        out = np.array(own)
+        rest, kinds = self._rest[places], self._reference.kinds(self._before[places])
+        nodes = rest if self._even else np.rint(rest / NODES) * NODES
+        groups, which = np.unique(np.column_stack([kinds, nodes]), axis=0, return_inverse=True)
+        for k, (kind, *node) in enumerate(groups):
+            some = np.flatnonzero(which.ravel() == k)
+            pictures, lost, basis = self._change(int(kind), tuple(node), places, some[0])
+            c = np.ones((len(some), 1), np.float32) if basis is None else basis.coefficients(own[some])
+            step = (rest[some] - node).astype(np.float32)
+            change = np.concatenate([c, c * step[:, :1], c * step[:, 1:]], axis=1) @ pictures.reshape(len(pictures), -1)
+            part = own[some] + change.reshape(-1, *self.shape[2:])
+            part[:, lost] = np.nan
+            out[some] = part
+        return out
+
+    def _change(self, kind, node, places, one):
+        """(what a displacement by `node` changes in the common pictures and its derivatives (3 rank, pixel, band), which pixels (pixel,)
+        cannot be told after it, the Basis or None)."""
+        if (kind, node) not in self._made:
+            if len(self._made) >= KEPT:
+                self._made.clear()
+            reference = self._reference
+            basis = None if reference.shared else reference.bases[kind]
+            pictures = self._response[None] if basis is None else basis.pictures
+            typical = self._response[None] if basis is None else basis.mixed(basis.middle[None].astype(np.float32))
+            before, after = (np.array([o[places][one]]) for o in (self._before, self._after))
+            shift = np.array([node])
+            settings = reference.window, reference.cfa, reference.gains
+            parts = Smooth(pictures, before.repeat(len(pictures), axis=0), *settings).at(after.repeat(len(pictures), axis=0), shift, derivatives=True, sharp=False)
+            seen = Smooth(typical, before, *settings).at(after, shift)[0]
+            parts[0] = parts[0] - pictures
+            self._made[kind, node] = np.nan_to_num(np.concatenate(parts)), ~np.isfinite(seen).all(axis=-1), basis
+        return self._made[kind, node]
 
 
 class Widened:

@@ -18,6 +18,7 @@ REACH = 4  # px: how far the search for a whole-pixel displacement goes
 DEGREE = 5
 SAMPLE = 48  # lenslets that tell the motion; the answer is far better known than it needs to be
 GAIN_PIXELS = 30_000  # that tell the gains of a mosaic's colours
+EXACT = 1e-3  # of a band's peak: what a response without a variance is taken to be known to
 WEAK = 0.02  # of a band's best colour: a colour with less response is filled in from its neighbours before interpolation
 UNSURE = 0.02  # of a band's peak: pixels whose interpolated response may be off by more take no part
 SIGNIFICANT = 4.0  # standard deviations
@@ -171,6 +172,17 @@ class Smooth:
         """Gains (lenslet, band, h, w) of the colours under windows at `origin` (lenslet, 2); the number 1 without a mosaic."""
         return np.float32(1) if self._tiles is None else self._tiles[_parity(origin)]
 
+    def noise(self, variance, before, after, shift):
+        """Variance (pixel, band) of a response that `at` moved from windows at `before` to `after` (2,) by shift (2,) px; variance
+        (pixel, band): its own. A pixel that takes its value from a weak colour takes its noise, which was magnified, too."""
+        h, w = self.window
+        planes = np.nan_to_num(variance).T.reshape(-1, h, w).astype(np.float32)
+        gains = [np.broadcast_to(self.gain(np.asarray(one)[None]), (1, *planes.shape))[0] for one in (before, after)]
+        strong = gains[0] > WEAK
+        planes = _filled(np.where(strong, planes / np.maximum(gains[0], WEAK) ** 2, 0), strong)
+        rows, columns = (spline_matrix(n, shift[k]) ** 2 for k, n in enumerate((h, w)))
+        return ((rows @ planes @ columns.T) * gains[1] ** 2).reshape(len(planes), -1).T
+
     def _sure(self, shift):
         """Mask (lenslet, h, w) of pixels whose spline is good: a sixth difference shows what a spline cannot know.
 
@@ -304,10 +316,10 @@ def own_pixels(window):
 
 class Reference:
     """What registration needs of a calibration, whatever the capture: where lenslets are, and smooth responses of a few of them,
-    made when first asked for. Arguments as find_motion; shape (rows, columns) of the sensor.
+    made when first asked for. Arguments as find_motion; shape (rows, columns) of the sensor; variance (pixel, band) of the response.
     """
 
-    def __init__(self, response, origin, window, centres, cfa, shape, sample=SAMPLE):
+    def __init__(self, response, origin, window, centres, cfa, shape, variance=None, sample=SAMPLE):
         from plenocli.sensor.superpixel import inside
 
         self.window, self.cfa, self.sample = tuple(window), cfa, sample
@@ -319,11 +331,33 @@ class Reference:
         place = tuple(place.T)
         self.origin, self.centres = origin[place], centres[place]
         self.shared = response.ndim == 2
+        self.bases, self.variance = None, variance
         self._response = np.asarray(response[None] if self.shared else response[place], np.float32)
+        if not self.shared and len(self.origin):
+            self._response = self._clean(self._response)
         corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)
         self.middle, self.extremes = corners.mean(axis=0), np.array([[f(corners[:, 0]), g(corners[:, 1])] for f in (np.min, np.max) for g in (np.min, np.max)])
         self._smooth, self._still = {}, {}
         self._lock = threading.Lock()
+
+    def _clean(self, response):
+        """Responses without most of their noise, which would draw a motion towards none; `bases` of what they have in common by the
+        colours under their windows, and what is left of the variance."""
+        from plenocli.solvers.lowrank import common
+
+        kinds, known = self.kinds(self.origin), np.isfinite(response)
+        variance = self.variance if self.variance is not None else np.broadcast_to((EXACT * np.nanmax(response, axis=(0, 1))) ** 2, response.shape[1:])
+        self.bases = {int(kind): common(response[kinds == kind], variance) for kind in np.unique(kinds)}
+        out = np.empty_like(response)
+        for kind, basis in self.bases.items():
+            out[kinds == kind] = basis.mixed(basis.coefficients(response[kinds == kind]))
+        if self.variance is not None:
+            self.variance = self.variance * max(basis.left for basis in self.bases.values())
+        return np.where(known, out, np.float32(np.nan))
+
+    def kinds(self, origin):
+        """Which colours (lenslet,) windows at `origin` (lenslet, 2) begin on, an index into PARITIES; 0 without a mosaic."""
+        return _parity(origin) if self.cfa != "mono" else np.zeros(len(origin), int)
 
     @cached_property
     def gains(self):
@@ -375,12 +409,12 @@ def find_motion(signal, response, origin, window, centres, cfa="mono", noise=Non
     centres (R, C, 2) px. noise: (gain, read variance) of the signal, None: unknown, all pixels weigh the same. response_variance
     (pixel, band): of the response itself, None: taken as exact. Displacements beyond REACH px are not found.
     """
-    return motion_since(Reference(response, origin, window, centres, cfa, signal.shape, sample), signal, noise, response_variance)
+    return motion_since(Reference(response, origin, window, centres, cfa, signal.shape, response_variance, sample), signal, noise)
 
 
-def motion_since(reference, signal, noise=None, response_variance=None):
+def motion_since(reference, signal, noise=None):
     """As find_motion, for any number of captures with one Reference."""
-    data = _Sample(reference, signal, noise, response_variance)
+    data = _Sample(reference, signal, noise)
     if data.count < 3:
         return None
     first = data.fit(np.zeros(2))
@@ -395,7 +429,7 @@ def motion_since(reference, signal, noise=None, response_variance=None):
 class _Sample:
     """The lenslets that tell the motion: bright, whole and spread over the array."""
 
-    def __init__(self, reference, signal, noise, response_variance):
+    def __init__(self, reference, signal, noise):
         from plenocli.sensor.superpixel import extract
 
         values = extract(signal, reference.origin[:, None], reference.window)[:, 0]
@@ -407,7 +441,7 @@ class _Sample:
         bright = np.flatnonzero(level > 0.25 * np.percentile(level, 90)) if len(level) else np.zeros(0, int)
         self.which = bright[_spread(len(bright), reference.sample)]
         self.reference, self.count, self.signal, self.window, self.noise = reference, len(self.which), signal, reference.window, noise
-        self.spread = None if response_variance is None else np.nan_to_num(response_variance)
+        self.spread = None if reference.variance is None else np.nan_to_num(reference.variance)
         self.origin, self.centres = reference.origin[self.which], reference.centres[self.which]
         self.middle, self.extremes = reference.middle, reference.extremes
 

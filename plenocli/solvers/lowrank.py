@@ -5,6 +5,8 @@ matrix of rank six or so below noise of full rank (docs/model.md, "The response 
 shrunk as Gavish and Donoho (2017) find it optimal for white noise of known size: nothing is tuned.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 BLOCK = 1024
@@ -38,8 +40,43 @@ def low_rank(response, variance, groups=None):
     return out, float(left), max(ranks)
 
 
-def _cleaned(response, variance):
-    """low_rank of one block: (response, share left, rank)."""
+@dataclass(frozen=True)
+class Basis:
+    """What responses have in common: pictures (rank, pixel, band) of which each is a mixture, dual (rank, pixel * band), whose
+    products with a response are its coefficients, middle (rank,): mean coefficients, and the share of a response's noise variance
+    that is left in its mixture. NaN in pictures: no response knows it."""
+
+    pictures: np.ndarray
+    dual: np.ndarray
+    middle: np.ndarray
+    left: float
+
+    def coefficients(self, response):
+        """(lenslet, rank) of responses (lenslet, pixel, band); NaN counts as nothing."""
+        return np.nan_to_num(response).reshape(len(response), -1) @ self.dual.T
+
+    def mixed(self, coefficients):
+        """Responses (lenslet, pixel, band) of coefficients (lenslet, rank)."""
+        return (coefficients @ self.pictures.reshape(len(self.pictures), -1)).reshape(-1, *self.pictures.shape[1:])
+
+
+def common(response, variance):
+    """The Basis of responses (lenslet, pixel, band): what stands out of noise of variance (pixel, band); all of it where they are few."""
+    matrix, known, scale, _, use = _whitened(response, variance)
+    m, n = matrix.shape
+    filled = np.where(known, matrix, _level(matrix, known))
+    squares, vectors = _decomposed(filled)
+    keep = squares > ((np.sqrt(m) + np.sqrt(n)) ** 2 * EDGE if m >= LEAST else 1e-9 * squares[-1])
+    keep[-1] = True
+    unit = (vectors[:, keep] / np.sqrt(np.maximum(squares[keep], 1e-30))).T.astype(np.float32) @ filled
+    pictures, dual = np.full((len(unit), use.size), np.nan, np.float32), np.zeros((len(unit), use.size), np.float32)
+    pictures[:, use], dual[:, use] = unit * scale, unit / scale
+    found = Basis(pictures.reshape(-1, *response.shape[1:]), dual, np.zeros(len(unit)), min(1.0, int(keep.sum()) * (1 / m + 1 / n)))
+    return replace(found, middle=found.coefficients(response).mean(axis=0))
+
+
+def _whitened(response, variance):
+    """(matrix (lenslet, entry) whose noise has unit variance, which are known, scale by entry, by lenslet, entries used)."""
     count = len(response)
     matrix = response.reshape(count, -1)
     known = np.isfinite(matrix)
@@ -49,13 +86,27 @@ def _cleaned(response, variance):
     # shot noise goes with a lenslet's light
     light = np.where(known, matrix * scale, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     rows = np.sqrt(np.clip(light / max(float(light.mean()), 1e-30), 0.05, None)).astype(np.float32)[:, None]
-    matrix = matrix / rows
-    middle = np.where(known, matrix, 0).sum(axis=0) / known.sum(axis=0)
-    filled = np.where(known, matrix, rows * middle)
+    return matrix / rows, known, scale, rows, use
+
+
+def _level(matrix, known):
+    """What an entry is on average."""
+    return np.where(known, matrix, 0).sum(axis=0) / known.sum(axis=0)
+
+
+def _decomposed(matrix):
+    """Squared singular values, ascending, and left vectors."""
+    return np.linalg.eigh((matrix @ matrix.T).astype(float))
+
+
+def _cleaned(response, variance):
+    """low_rank of one block: (response, share left, rank)."""
+    matrix, known, scale, rows, use = _whitened(response, variance)
+    filled = np.where(known, matrix, _level(matrix, known))
     for _ in range(1 if known.all() else FILLS):
         found, rank, left = _shrunk(filled)
         filled = np.where(known, matrix, found)
-    out = response.reshape(count, -1).copy()
+    out = response.reshape(len(response), -1).copy()
     out[:, use] = np.where(known, found * rows * scale, np.nan)
     return out.reshape(response.shape), left, rank
 
@@ -66,7 +117,7 @@ def _shrunk(matrix):
     A singular value s above the noise's edge becomes sqrt((s^2 - m - n)^2 - 4 m n)/s; the others vanish.
     """
     m, n = matrix.shape
-    squares, vectors = np.linalg.eigh((matrix @ matrix.T).astype(float))
+    squares, vectors = _decomposed(matrix)
     keep = squares > (np.sqrt(m) + np.sqrt(n)) ** 2 * EDGE
     if not keep.any():
         return np.zeros_like(matrix), 0, 0.0

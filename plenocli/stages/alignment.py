@@ -30,7 +30,7 @@ def align(calibration, signal, noise, mode, path, levels=True):
     c = calibration
     if mode == "off":
         return c, signal, None, None
-    motion = motion_since(c.reference, signal, noise, c.variance)
+    motion = motion_since(c.reference, signal, noise)
     if motion is None:
         if mode == "on":
             raise NumericsError("cannot be registered: fewer than three lenslets hold light", path, "expose longer, or use --register off")
@@ -56,7 +56,7 @@ def align(calibration, signal, noise, mode, path, levels=True):
 
 
 def _moved(c, motion):
-    """The calibration with windows moved by whole pixels and responses by what is left."""
+    """The calibration with windows moved by whole pixels (whole periods of a colour mosaic) and responses by what is left."""
     from plenocli.sensor.moved import Moved
     from plenocli.sensor.registration import Smooth
 
@@ -64,25 +64,25 @@ def _moved(c, motion):
     shifts[c.sites] = motion.at(c.centres[c.sites])
     here, corners, gains = shifts[c.sites], c.origin[c.sites], c.reference.gains
     together = c.shared and np.ptp(here, axis=0).max() < ALIKE and not np.ptp(corners % 2, axis=0).any()
-    whole = np.rint(shifts).astype(int)
-    if together or c.cfa == "mono":
-        whole[c.sites] = np.rint(here.mean(axis=0) if together else motion.at(motion.middle))
-    origin = c.origin + whole
-    variance = _carried(c, Smooth.of(None, c.window, c.cfa, gains), origin)
+    period = 1 if c.cfa == "mono" else 2
+    whole = np.zeros(shifts.shape, int)
+    whole[c.sites] = period * np.rint((here.mean(axis=0) if together else motion.at(motion.middle) if c.cfa == "mono" else here) / period)
+    origin, rest = c.origin + whole, shifts - whole
+    variance = _carried(c, Smooth.of(None, c.window, c.cfa, gains), corners[0], rest[c.sites].mean(axis=0))
     if together:
         smooth = Smooth(c.response[None], corners[:1], c.window, c.cfa, gains)
-        rest = here.mean(axis=0, keepdims=True) - whole[c.sites][:1]
-        return replace(c, response=smooth.at(origin[c.sites][:1], rest)[0], origin=origin, variance=variance)
-    return replace(c, response=Moved(c.response, c.origin, origin, shifts - whole, c.window, c.cfa, gains), origin=origin, variance=variance)
+        return replace(c, response=smooth.at(origin[c.sites][:1], rest[c.sites].mean(axis=0, keepdims=True))[0], origin=origin, variance=variance)
+    return replace(c, response=Moved(c.response, c.origin, origin, rest, c.reference), origin=origin, variance=variance)
 
 
-def _carried(c, smooth, origin):
-    """Variance of the moved response (pixel, band): a pixel that takes its value from a weak colour takes its noise too."""
-    if c.variance is None or c.cfa == "mono":
-        return c.variance
-    some = tuple(part[:: max(1, len(part) // 64)] for part in c.sites)
-    before, after = ((smooth.gain(one[some]) ** 2).mean(axis=0).reshape(c.variance.shape[::-1]).T for one in (c.origin, origin))
-    return np.where(before > 0, c.variance * after / np.maximum(before, 1e-6), c.variance)
+def _carried(c, smooth, corner, shift):
+    """Variance of the moved response (pixel, band): that of one for all is moved with it; that of own ones stays, and what is left of it
+    in the pictures that they have in common comes on top."""
+    if c.variance is None:
+        return None
+    if c.shared:
+        return smooth.noise(c.variance, corner, corner, shift)
+    return c.variance + smooth.noise(c.reference.variance, corner, corner, shift)
 
 
 def _record(motion, corrected):

@@ -71,7 +71,7 @@ class Response:
         from plenocli.sensor.registration import Reference
 
         origin = np.where(self.valid[..., None], self.origin, -(2**20))
-        return Reference(self.response, origin, self.window, self.centres, self.cfa, self.dark.mean.shape)
+        return Reference(self.response, origin, self.window, self.centres, self.cfa, self.dark.mean.shape, self.variance)
 
     @cached_property
     def sample(self):

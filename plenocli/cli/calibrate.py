@@ -15,7 +15,7 @@ from plenocli.cli import options
 @click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
 @click.option("--response", type=click.Choice(["auto", "shared", "own", "low-rank"]), default="auto", show_default=True, help="One F shared by all lenslets, an F of its own for each, or own ones without the noise that stands out of what they have in common (with a hundred lenslets one capture a band then does what four do). auto: shared where the data cannot tell lenslets apart, else own.")
 @click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
-@click.option("--centre", "near", type=(float, float), default=None, metavar="ROW COLUMN", help="A pixel near the centre of any superpixel; needed only where filters in the pupil draw lines as dark as the superpixels' borders.")
+@click.option("--centre", "near", type=(options.NON_NEGATIVE, options.NON_NEGATIVE), default=None, metavar="ROW COLUMN", help="A pixel near the centre of any superpixel; needed only where filters in the pupil draw lines as dark as the superpixels' borders.")
 @click.option("--cfa", type=click.Choice(["mono", "RGGB", "BGGR", "GRBG", "GBRG"]), help="Colour filter array of PNG and TIFF mosaics, which cannot say it; default the camera's, else mono.")
 @options.output
 @options.overwrite

@@ -48,7 +48,7 @@ def positive(text):
     return POSITIVE.convert(text, None, None)
 
 
-FRACTION = click.FloatRange(0.0, 1.0, min_open=True)
+FRACTION = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30, 1.0))
 
 
 class Grid(click.ParamType):
@@ -114,7 +114,7 @@ class Ring(click.ParamType):
         if value == "auto" or isinstance(value, int):
             return value
         if not value.isdigit() or int(value) > 20:
-            self.fail(f"{value!r} is not auto or a whole number from 0 to 20", param, ctx)
+            self.fail(f"{value!r} is not auto or a whole number from 0 to 20, such as 1", param, ctx)
         return int(value)
 
 

@@ -27,7 +27,7 @@ def _parse(text, units, what, example):
     scale = units[unit]
     value = float(f"{number}e{round(math.log10(scale))}") if scale < 1 and "e" not in number.lower() else float(number) * scale
     if not math.isfinite(value):
-        raise UnitError(f"{text!r} is too large for a {what}")
+        raise UnitError(f"{text!r} is too large for a {what} such as {example!r}")
     return value
 
 
@@ -66,9 +66,9 @@ def parse_number(text):
     try:
         value = float(text)
     except (TypeError, ValueError):
-        raise UnitError(f"{text!r} is no number") from None
+        raise UnitError(f"{text!r} is no number; write for example 0.5") from None
     if not math.isfinite(value):
-        raise UnitError(f"{text!r} is not a finite number")
+        raise UnitError(f"{text!r} is not a finite number; write for example 0.5")
     return value
 
 

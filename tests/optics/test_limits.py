@@ -14,6 +14,7 @@ from plenocli.optics.quadrature import band_rule
 from tests.optics.cameras import WAVELENGTH, pif_builder, pupil_conjugate, small_camera, system_matrix
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 from tests.reference.kernel import coherent_kernel
+from tests.reference.rayleigh import pixel_energies as rayleigh_energies
 
 ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
 BENT = {"object__distance": 0.53, "sensor__distance": 225e-6}
@@ -208,6 +209,20 @@ def test_light_missing_from_a_lenslet_is_with_its_neighbours():
     neighbours = together - blocks[1][own]
     assert neighbours[0] == pytest.approx(1 - blocks[1][own, 0], rel=0.02) and blocks[1][own, 0] > alone[0] + 0.15
     assert neighbours[1] == pytest.approx(airy[:, 1].sum() - airy[own, 1], rel=0.12)
+
+
+def test_exact_fields_out_of_focus_are_as_fine_as_those_in_focus():
+    """One lenslet gets a twentieth of the light of a point blurred over five: what is cut is measured against that, at the
+    point in the middle, where the disc's rings meet, above all."""
+    camera = load_camera(Path(__file__).resolve().parents[2] / "sample_configs" / "seed_spatial.toml")
+    lens, array = camera.main_lens, camera.lenslet_array
+    defocus = 5 * array.pitch / (lens.aperture_diameter * array.distance)
+    camera = camera.replace(**{"object.distance": 1 / (1 / lens.focal_length - 1 / array.distance + defocus), "object.samples_per_lenslet": (10, 10)})
+    place = (0.05 * array.pitch, 0.05 * array.pitch)
+    truth = rayleigh_energies(camera, WAVELENGTH, place, [(0, 0)], (0, 0), rows=[18], pixel_nodes=10, density=1.2)
+    for accuracy in (1e-4, 1e-5):
+        column = system_matrix(camera, model="exact", accuracy=accuracy, **ISOLATED).A[0, 0, :, 55].reshape(52, 52)[[18]]
+        assert np.linalg.norm(column - truth) < accuracy * np.linalg.norm(truth)
 
 
 # cameras drawn at random

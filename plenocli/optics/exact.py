@@ -48,7 +48,7 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     """
     base = size_band(view, grid, ring, accuracy, tolerance)
     phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
-    count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4))
+    count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4 + 2 * max(0.0, -math.log10(accuracy) - 5)))
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)

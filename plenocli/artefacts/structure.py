@@ -26,6 +26,8 @@ def survey(path, file, limit):
     while stack:
         name, group, depth = stack.pop()
         _check_attributes(path, group, f"/{name}")
+        if name and not len(group):
+            raise InputError(f"'/{name}' is a group without data", path, _FIX)
         for link in sorted(group):
             child = f"{name}/{_text(path, link)}".lstrip("/")
             _check_link(path, group, link, child)

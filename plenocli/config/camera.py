@@ -383,6 +383,11 @@ def load_camera(path):
     return parse_camera(read_text(Path(path), "camera"), path)
 
 
+_NAME = r"""(?:"[^"\n]*"|'[^'\n]*'|[\w-]+)"""
+_DEEP_KEY = re.compile(rf"^\s*\[{{0,2}}\s*{_NAME}(?:\s*\.\s*{_NAME}){{20}}", re.MULTILINE)
+_MOST_LINES = 40
+
+
 def read_text(path, what):
     """The text of the TOML file of a `what` (camera, scene); InputError where it cannot be read."""
     try:
@@ -404,10 +409,14 @@ def parse_camera(text, where="camera"):
 
 def parse_toml(text, where, model):
     """What the pydantic class `model` makes of TOML text; ConfigError lists every violation with its path."""
+    if _DEEP_KEY.search(text):  # the standard parser takes time as the square of the depth
+        raise ConfigError("is nested too deep", where, "mend the line")
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where, "mend the line") from None
+    except RecursionError:
+        raise ConfigError("is nested too deep", where, "mend the line") from None
+    except ValueError as error:  # also a number with too many digits
+        raise ConfigError(f"is not TOML: {_short(str(error))}", where, "mend the line") from None
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -416,9 +425,16 @@ def parse_toml(text, where, model):
 
 def violations(error, where, model=Camera):
     """The ConfigError that lists everything a pydantic ValidationError found."""
-    lines = [_sentence(e, model) for e in error.errors()]
+    lines = [_short(_sentence(e, model)) for e in error.errors()]
     count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
+    if len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = ["..."]
     return ConfigError(f"{count}\n  " + "\n  ".join(lines), where)
+
+
+def _short(text):
+    """A message that quotes what may be a megabyte, in a few lines."""
+    return text if len(text) <= 400 else f"{text[:200]} ... {text[-150:]}"
 
 
 def camera_schema():

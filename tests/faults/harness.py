@@ -15,11 +15,12 @@ SERVER = Path(__file__).with_name("server.py")
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: exit status, or minus the signal; text: stdout and stderr; seconds of wall time; grown: bytes of peak memory above the server's."""
+    """code: exit status, or minus the signal; text: stdout and stderr; seconds of wall time; cpu: of processor time; grown: bytes of peak memory above the server's."""
 
     code: int
     text: str
     seconds: float
+    cpu: float
     grown: int
     fired: bool
     hung: bool

@@ -55,7 +55,7 @@ def _serve(request):
     if not ended:
         os.killpg(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    answer = {"code": os.waitstatus_to_exitcode(status), "text": _drain(heard, said).decode("utf-8", "replace"), "seconds": time.perf_counter() - start,
+    answer = {"code": os.waitstatus_to_exitcode(status), "text": _drain(heard, said).decode("utf-8", "replace"), "seconds": time.perf_counter() - start, "cpu": usage.ru_utime + usage.ru_stime,
               "grown": max(0, usage.ru_maxrss - before) * 1024, "fired": bool(_drain(noticed, fired)), "hung": not ended and request["kill_after"] is None}
     os.close(handle)
     return answer

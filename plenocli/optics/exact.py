@@ -19,12 +19,12 @@ import numpy as np
 from plenocli.errors import NumericsError
 from plenocli.optics.debye import spherical_field
 from plenocli.optics.factors import Factors
+from plenocli.optics.pairs import Interval, Pair, Way
 from plenocli.optics.plan import BandPlan, distinct, grid_of, is_symmetric, size_band
 from plenocli.optics.product import FILL, MAX_SKETCH, Product
-from plenocli.optics.psf import legendre, separable_field
+from plenocli.optics.psf import legendre, psf_nodes, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
-from plenocli.optics.residual import Residuals, path
 
 CUT, CUT_EFFECT = 0.42, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.5 to 2.3)."""
@@ -148,27 +148,16 @@ class ExactSquareLenslets:
         self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, geometry.mirrors(plan.superpixels)))
         alike = geometry.pixel_shape[0] == geometry.pixel_shape[1] and geometry.object_shape[0] == geometry.object_shape[1]
         self._turn = alike and self.symmetry[2]
-        t, w = gauss(band.lenslet_nodes)
-        half = geometry.lenslet_width / 2
-        self._x, self._w = half * t, half * w
-        self._offsets = self._interval_list()
-        extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
-        self._extent = extent
-        weights = [share * self._amplitude(s, m) for (s, m), (_, share) in self._offsets.items()]
-        self._residuals = Residuals([o for o, _ in self._offsets.values()], weights, max(extent), half,
-                                    geometry.z3, geometry.k, None if self._parabolic else geometry.f2, band.cut / 3)
-        self._number = {key: i for i, key in enumerate(self._offsets)}
-        self._local, self._sheets = {}, {}
-        grams = [self._gram(axis) for axis in (0, 1)]
-        self._entering = (grams[0].reshape(len(grams[0]), -1) @ grams[1].reshape(len(grams[1]), -1).T).real
-        self._kept = self._strong_terms()
-        self._tables, ranks = {}, []
+        self._extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
+        self._ways, self._intervals = {}, {}
+        self._entering = self._light()
+        self._tables, counts = {}, []
         for sy, sx in self._pairs():
-            self._tables[sy, sx] = self._compressed(sy, sx)
-            ranks.append(self._tables[sy, sx].high.shape[3])
-        self._local, self._sheets = {}, {}
-        self.notes = {"separable_terms": max(ranks), "field_tail": self._field.tail, "psf_terms": self._field.terms,
-                      "residual_terms": max(len(a) for a in self._residuals.core.values()), "products": max(len(r) for r, _ in self._kept.values())}
+            self._tables[sy, sx], products = self._compressed(sy, sx)
+            counts.append(products)
+        self._intervals = {}
+        self.notes = {"separable_terms": max(t.high.shape[3] for t in self._tables.values()), "field_tail": self._field.tail,
+                      "psf_terms": self._field.terms, "products": max(counts)}
 
     # which lenslets light which superpixels
 
@@ -178,21 +167,7 @@ class ExactSquareLenslets:
     def _lenslets(self, s, axis):
         """Lenslets along one axis whose light is followed to superpixel s."""
         window = self.band.window
-        return [m for m in lit_lenslets(self._reach(axis), window) if window is not None or m == s]
-
-    def _interval_list(self):
-        """{(s, m): (displacement of the superpixel's centre from the lenslet's, share of the amplitude)}."""
-        g = self.geometry
-        cells = g.D2**2 / (g.wavelength * g.z3)
-        found = {}
-        for axis in (0, 1):
-            for s in range(-self._reach(axis), self._reach(axis) + 1):
-                if s < 0 and self.symmetry[axis]:
-                    continue
-                for m in self._lenslets(s, axis):
-                    share = 1.0 if m == s else min(1.0, math.sqrt(1 / (cells * abs(m - s))))
-                    found[s, m] = (s * g.superpixel_pitch - m * g.D2, share)
-        return found
+        return [s] if window is None else lit_lenslets(self._reach(axis), window)
 
     def _pairs(self):
         """Superpixels (rows, columns) whose tables are made; the others' follow by symmetry."""
@@ -204,137 +179,77 @@ class ExactSquareLenslets:
         turned = self._turn and sy < sx
         return (sx, sy, True) if turned else (sy, sx, False)
 
-    # the factors of one axis
-
-    def _gram(self, axis):
-        """(point, term, term): overlaps of the terms of h over the lenslets."""
-        g, total = self.geometry, 0
-        points = self._points(0, axis)
-        for m in lit_lenslets(self._reach(axis), self.band.window):
-            values = self._field.evaluate(self._x + m * g.D2 - points[:, None], axis).transpose(0, 2, 1)
-            total = total + (values * self._w) @ values.conj().transpose(0, 2, 1)
-        return np.concatenate([total, total[:len(g.points(axis)) - len(points)][::-1]])
-
-    def _amplitude(self, s, m):
-        """Fourth root of the light of a mean point that enters the lenslets m along one axis: two such factors bound what enters one."""
-        if m == s:
-            return 1.0
-        most = 0.0
-        for axis in (0, 1):
-            points = self._points(s, axis)
-            power = np.abs(self._field.evaluate(self._x[:, None] + m * self.geometry.D2 - points, axis)) ** 2 @ field_norms(self._field, 1 - axis) ** 2
-            most = max(most, float(self._w @ power @ self._emphasis(s, axis) ** 2) / len(points))
-        return min(1.0, most**0.25)
-
-    def _emphasis(self, s, axis):
-        """Weights of the points in the compression: those at the lenslet's edge lose light and split it, so that the same error
-        would be a larger share of their columns."""
-        g = self.geometry
-        edge = (g.D2 / 2 - np.abs(self._points(s, axis))) * g.D1 / (g.wavelength * g.z2)
-        return 1 + EDGE * np.exp(-edge)
+    # one axis
 
     def _points(self, s, axis):
         """Object points (m, on the array) along one axis that are computed for superpixel s; the others mirror them."""
         points = self.geometry.points(axis)
         return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
 
-    def _nodes(self, s, axis):
-        """Sensor positions (m, from the centre of superpixel s) of the field, and the roots of their weights."""
-        if self.band.sensor_count:
-            t, w = gauss(self.band.sensor_count)
-            return self._extent[axis] * t, np.sqrt(self._extent[axis] * w)
-        u, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-        return u.ravel(), np.sqrt(w.ravel())
-
-    def _strong_terms(self):
-        """{(s, m, axis): (r, i)}: which terms of each X are made; what the others carry together is a quarter of the cut."""
-        intervals = [(s, m, axis) for axis in (0, 1) for s, m in self._offsets if s <= self._reach(axis) and m in self._lenslets(s, axis)]
-        norms = {key: self._mean_norms(*key) for key in intervals}
-        strength = dict.fromkeys(intervals, 0.0)
-        for one in intervals:
-            for other in intervals:
-                if one[2] == 0 and other[2] == 1:
-                    c = np.abs(self._residuals.core[self._number[one[:2]], self._number[other[:2]]]) ** 2
-                    t = np.abs(self._local_terms(*one).coefficients(0) @ self._local_terms(*other).coefficients(1).T) ** 2
-                    t *= np.outer(norms[one], norms[other])
-                    strength[one] = np.maximum(strength[one], np.outer(c.sum(axis=1), t.sum(axis=1)))
-                    strength[other] = np.maximum(strength[other], np.outer(c.sum(axis=0), t.sum(axis=0)))
-        kept = {}
-        for key, power in strength.items():
-            order = np.argsort(power, axis=None)
-            weak = np.cumsum(power.ravel()[order]) <= (self.band.cut / 4) ** 2 / len(self._lenslets(key[0], key[2]))
-            keep = np.ones(power.size, bool)
-            keep[order[weak]] = False
-            kept[key] = np.nonzero(keep.reshape(power.shape))
-        return kept
-
-    def _mean_norms(self, s, m, axis):
-        """Mean square over the points of what each e_i has on lenslet m, times the share of it that reaches superpixel s."""
-        points = self._points(s, axis)
-        values = self._local_terms(s, m, axis).evaluate(m * self.geometry.D2 + self._x[:, None] - points, axis)
-        power = np.einsum("xpi,x,p->i", np.abs(values) ** 2, self._w, self._emphasis(s, axis) ** 2) / len(points)
-        return power * self._offsets[s, m][1] ** 2
-
-    def _sheet(self, s, axis):
-        """X of superpixel s along one axis: list of (m, (sensor nodes x points, terms) array)."""
-        axis = 0 if self._turn else axis
-        if (s, axis) in self._sheets:
-            return self._sheets[s, axis]
-        g, k = self.geometry, self.geometry.k
-        u, root = self._nodes(s, axis)
-        points, x = self._points(s, axis), self._x
-        sheets = []
-        for m in self._lenslets(s, axis):
-            d = self._offsets[s, m][0] + u[:, None] - x
-            place = m * g.D2 + x
-            phase = path(d, g.z3) - path(u, g.z3)[:, None] + place**2 / (2 * g.z2)
-            phase = phase - (x * x / (2 * g.f2) if self._parabolic else path(x, g.f2))
-            wave = (root[:, None] * self._w / math.sqrt(g.wavelength * g.z3)) * np.exp(1j * k * phase)
-            values = self._local_terms(s, m, axis).evaluate(place[:, None] - points, axis) * self._emphasis(s, axis)[:, None]
-            values = values.astype(self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype)
-            kept_r, kept_i = self._kept[s, m, axis]
-            sheet = np.empty((len(u), len(points), len(kept_r)), self.dtype)
-            for r, term in enumerate(self._residuals.functions(self._number[s, m], u, x)):
-                some = np.flatnonzero(kept_r == r)
-                if len(some):
-                    flat = values[:, :, kept_i[some]].reshape(len(x), -1)
-                    sheet[:, :, some[0]:some[-1] + 1] = _times((wave * term).astype(self.dtype), flat).reshape(len(u), len(points), -1)
-            sheets.append((m, sheet.reshape(len(u) * len(points), -1)))
-        self._sheets[s, axis] = sheets
-        return sheets
-
-    def _local_terms(self, s, m, axis):
-        key = (s, m, axis)
-        if key not in self._local:
-            g, share = self.geometry, self._offsets[s, m][1]
-            if self.band.window is None and (not self._turn or self._field.signs is not None):
-                self._local[key] = AllTerms(self._field, self._turn)
+    def _way(self, s, axis):
+        """The Way to superpixel s. Points at the lenslet's edge lose light and split it, so that the same error would be a larger
+        share of their columns: they weigh more."""
+        if (s, axis) not in self._ways:
+            g = self.geometry
+            if self.band.sensor_count:
+                t, w = gauss(self.band.sensor_count)
+                u, w = self._extent[axis] * t, self._extent[axis] * w
             else:
-                reach = self._x[-1] + np.abs(g.points(axis)).max()
-                low, high = max(m * g.D2 - reach, -self.band.half), min(m * g.D2 + reach, self.band.half)
-                self._local[key] = LocalTerms(self._field, axis, low, high, self.band.cut / 3 / share)
-        return self._local[key]
+                u, w = (a.ravel() for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule))
+            points = self._points(s, axis)
+            edge = (g.D2 / 2 - np.abs(points)) * g.D1 / (g.wavelength * g.z2)
+            self._ways[s, axis] = Way(u, np.sqrt(w), points, 1 + EDGE * np.exp(-edge))
+        return self._ways[s, axis]
+
+    def _interval(self, s, m, axis):
+        axis = 0 if self._turn else axis
+        if (s, m, axis) not in self._intervals:
+            self._intervals[s, m, axis] = Interval(self.geometry, self._field, axis, s, m, self._way(s, axis), self._parabolic,
+                                                   self.band.cut / 3, self.dtype)
+        return self._intervals[s, m, axis]
+
+    def _light(self):
+        """Share of the light of a point (row, column) that enters the lenslets of the neighbourhood."""
+        grams = [self._gram(axis) for axis in (0, 1)]
+        return (grams[0].reshape(len(grams[0]), -1) @ grams[1].reshape(len(grams[1]), -1).T).real
+
+    def _gram(self, axis):
+        """(point, term, term): overlaps of the terms of h over the lenslets."""
+        g, total, points = self.geometry, 0, self._points(0, axis)
+        half = g.lenslet_width / 2
+        t, w = gauss(psf_nodes(g, half))
+        for m in lit_lenslets(self._reach(axis), self.band.window):
+            values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis).transpose(0, 2, 1)
+            total = total + (values * (half * w)) @ values.conj().transpose(0, 2, 1)
+        return np.concatenate([total, total[:len(g.points(axis)) - len(points)][::-1]])
 
     # products of two axes
 
-    def _couplings(self, sy, sx, left, right):
-        """{(a, b): K_ab} for the terms kept on sheets a, b of the two axes."""
-        found, second = {}, 0 if self._turn else 1
-        for a, (m, _) in enumerate(left):
-            for b, (n, _) in enumerate(right):
-                (r, i), (s, j) = self._kept[sy, m, 0], self._kept[sx, n, second]
-                core = self._residuals.core[self._number[sy, m], self._number[sx, n]]
-                terms = self._local_terms(sy, m, 0).coefficients(0) @ self._local_terms(sx, n, second).coefficients(1).T
-                found[a, b] = (core[r[:, None], s] * terms[i[:, None], j]).astype(self.dtype)
-        return found
-
     def _compressed(self, sy, sx):
-        """Factors of superpixel (sy, sx)."""
-        left, right = self._sheet(sy, 0), self._sheet(sx, 1)
-        product = Product([x for _, x in left], [x for _, x in right], self._couplings(sy, sx, left, right), self._turn and sy == sx)
+        """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
+        cut, symmetric = self.band.cut, self._turn and sy == sx
+        pairs = {(m, n): Pair(self._interval(sy, m, 0), self._interval(sx, n, 1), symmetric and m == n == sy)
+                 for m in self._lenslets(sy, 0) for n in self._lenslets(sx, 1) if not symmetric or m <= n}
+        order = sorted(pairs, key=lambda key: pairs[key].weight)
+        total = np.cumsum([pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order])
+        kept = [key for key, power in zip(order, total) if power > (cut / 4) ** 2] or order[-1:]
+        left, right, couplings = [], [], {}
+        for m, n in kept:
+            pair, first = pairs[m, n], len(left)
+            x, y, coupling = pair.factors(max(self._extent), cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept)))
+            if symmetric and not pair.symmetric:  # the lenslet mirrored by the diagonal brings the transpose
+                left += [x, y]
+                half = coupling if m != n else coupling / 2
+                couplings |= {(first, first + 1): half, (first + 1, first): half.T}
+            else:
+                left, right = [*left, x], [*right, y]
+                couplings[first, first] = coupling
+        right = left if symmetric else right
+        product = Product(left, right, couplings, symmetric)
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
-        high, wide = product.factors(self.band.cut * math.sqrt(count), self._first_guess())
-        return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes)
+        high, wide = product.factors(cut * math.sqrt(count), self._first_guess())
+        products = max(len(c) for c in couplings.values())
+        return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes), products
 
     def _first_guess(self):
         """Columns of the first sketch, from the rank expected."""
@@ -342,9 +257,9 @@ class ExactSquareLenslets:
 
     def _to_pixels(self, factor, s, axis):
         """(sensor nodes x points, terms) to (points, pixel nodes, terms)."""
-        u, root = self._nodes(s, axis)
+        way = self._way(s, axis)
+        u, root, points = way.u, way.root, len(way.points)
         factor = factor.reshape(len(u), -1)
-        points = len(self._points(s, axis))
         if self.band.sensor_count:
             v, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
             t, wt = gauss(len(u))
@@ -354,7 +269,7 @@ class ExactSquareLenslets:
             real = factor.real.dtype
             factor = (matrix.astype(real) @ factor.view(real)).view(factor.dtype)
         factor = factor.reshape(len(factor), points, -1).transpose(1, 0, 2)
-        return factor / self._emphasis(s, axis).astype(factor.real.dtype)[:, None, None]
+        return factor / way.emphasis.astype(factor.real.dtype)[:, None, None]
 
     # what the builder asks for
 
@@ -385,59 +300,3 @@ class ExactSquareLenslets:
                 images = np.empty((len(some), *self.geometry.pixel_shape), out.dtype)
                 table.superpixel(0, 0, shape[0] - 1 - rows[some] if fy else rows[some], shape[1] - 1 - columns[some] if fx else columns[some], images)
                 out[some] = images[:, :: -1 if fy else 1, :: -1 if fx else 1]
-
-
-class AllTerms:
-    """The terms of h as they are, with the methods of LocalTerms; for `turn` those of the rows serve the columns too."""
-
-    def __init__(self, field, turn):
-        self._field, self._turn = field, turn
-
-    def coefficients(self, axis):
-        return np.diag(self._field.signs) if axis and self._turn else np.eye(self._field.terms)
-
-    def evaluate(self, d, axis):
-        return self._field.evaluate(d, axis)
-
-
-class LocalTerms:
-    """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at `tolerance` of the whole field."""
-
-    def __init__(self, field, axis, low, high, tolerance):
-        self.middle, self.half = (low + high) / 2, (high - low) / 2
-        count = max(8, int(len(field.rows) * (2 if field.even else 1) * self.half / field.half) + 24)
-        t, w = gauss(count)
-        root = np.sqrt(self.half * w)[:, None]
-        values = [root * field.evaluate(self.middle + self.half * t, a) for a in (0, 1)]
-        # the partner of a term has the norm sqrt(s), which weighs it
-        u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
-        tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
-        basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
-        self._mixing = [basis.conj().T @ v for v in values]
-        degrees = np.arange(count)
-        self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))
-
-    def coefficients(self, axis):
-        """(i, term): the terms of h along `axis` in this basis."""
-        return self._mixing[axis]
-
-    def evaluate(self, d, axis):
-        """e_i at d (m): d.shape + (i,), the same for both axes."""
-        t = (np.asarray(d, float).ravel() - self.middle) / self.half
-        return (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
-
-
-def field_norms(field, axis):
-    """Root energy of each term of h along one axis: (terms,)."""
-    coefficients = field.columns if axis else field.rows
-    degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
-    return np.sqrt((np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half)
-
-
-def _times(kernel, values):
-    """kernel @ values for a complex kernel and real or complex values of the same precision."""
-    if np.iscomplexobj(values):
-        return kernel @ values
-    out = np.empty((len(kernel), values.shape[1]), kernel.dtype)
-    out.real, out.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ values, 2)
-    return out

@@ -15,7 +15,7 @@ MAX_SKETCH = 2500
 
 
 class Product:
-    """left, right: lists of X_a (rows, terms) and X_b (columns, terms); couplings: {(a, b): K_ab}; symmetric: whether M^T = M,
+    """left, right: lists of X_a (rows, terms) and X_b (columns, terms); couplings: {(a, b): K_ab}, at least one for each factor; symmetric: whether M^T = M,
     with the same factors on both sides."""
 
     def __init__(self, left, right, couplings, symmetric):
@@ -26,8 +26,8 @@ class Product:
     def _through(self, side, blocks):
         """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t) for this side's (0 left, 1 right)."""
         if side == 0:
-            return [sum(self.couplings[a, b] @ y for b, y in enumerate(blocks)) for a in range(len(self.left))]
-        return [sum(self.couplings[a, b].T @ y for a, y in enumerate(blocks)) for b in range(len(self.right))]
+            return [sum(k @ blocks[b] for (i, b), k in self.couplings.items() if i == a) for a in range(len(self.left))]
+        return [sum(k.T @ blocks[a] for (a, i), k in self.couplings.items() if i == b) for b in range(len(self.right))]
 
     def _sketch(self, side, count):
         """`count` random combinations of the columns of M (side 0) or of M^T (1), every one of which goes into one of them."""

@@ -11,7 +11,7 @@ from plenocli.optics import exact, product
 from plenocli.optics.exact import fresnel_model_error
 from plenocli.optics.geometry import geometry
 from plenocli.optics.pif import PifBuilder
-from plenocli.optics.residual import Residuals, ell, kappa
+from plenocli.optics.residual import Residual, ell, kappa, path, split
 from tests.optics.cameras import WAVELENGTH, small_camera
 from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, pupil_directions
 
@@ -156,29 +156,43 @@ def test_main_lens_against_spherical_waves():
     assert np.linalg.norm(whole - debye) < 1e-3 * np.linalg.norm(whole)
 
 
-def test_residual_functions_reproduce_the_kernel():
-    k, z, half, offsets = 2 * np.pi / WAVELENGTH, 65e-6, 13e-6, [0.0, 26e-6]
-    residuals = Residuals(offsets, [1.0, 0.3], half, half, z, k, z, 1e-7)
+@pytest.mark.parametrize("place", [(0, 0), (1, 0), (-1, 1), (2, 2)], ids=str)
+def test_residual_functions_reproduce_the_kernel(place):
+    k, z, half = 2 * np.pi / WAVELENGTH, 65e-6, 13e-6
+    centre = tuple(26e-6 * n for n in place)
+    residual = Residual(centre, half, half, z, k, z, 1e-7, symmetric=place[0] == place[1])
     rng = np.random.default_rng(3)
     u, x, v, y = rng.uniform(-half, half, (4, 30))
-    for a, b in ((0, 0), (0, 1), (1, 1)):
-        left, right = residuals.functions(a, v, y), residuals.functions(b, u, x)
-        found = np.tensordot(np.tensordot(left, residuals.core[a, b], (0, 0)), right, 1)
-        d, e = offsets[a] + v[:, None] - y, offsets[b] + u[:, None] - x
-        true = kappa(d[:, :, None, None], e, z, k) * ell(y[None, :, None, None], x[None, None, None, :], z, k)
-        assert np.abs(found - true).max() < 1e-5
+    left, right = residual.functions(0, v, y), residual.functions(1, u, x)
+    found = np.tensordot(np.tensordot(left, residual.core, (0, 0)), right, 1)
+    d, e = centre[0] + v[:, None] - y, centre[1] + u[:, None] - x
+    true = kappa(d[:, :, None, None], e, z, k, centre) * ell(y[None, :, None, None], x[None, None, None, :], z, k)
+    assert np.abs(found - true).max() < 1e-5
 
 
-def test_residual_is_what_the_paths_leave():
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (2e-5, 0.0), (-3e-5, 4e-5)], ids=str)
+def test_residual_is_what_the_paths_leave(centre):
     k, z = 2 * np.pi / WAVELENGTH, 65e-6
     dy, dx = np.random.default_rng(4).uniform(-4e-5, 4e-5, (2, 50))
     side = np.sqrt(z * z + dy**2 + dx**2)
     kernel = z / (1j * WAVELENGTH * side**2) * (1 + 1j / (k * side)) * np.exp(1j * k * (side - z))
-    separable = np.exp(1j * k * (np.sqrt(z * z + dy**2) - z + np.sqrt(z * z + dx**2) - z)) / (1j * WAVELENGTH * z)
-    assert np.allclose(kernel, separable * kappa(dy, dx, z, k), rtol=1e-9)
+    separable = np.exp(1j * k * (path(dy, z, *centre) + path(dx, z, *centre[::-1]))) / (1j * WAVELENGTH * z)
+    assert np.allclose(kernel, separable * kappa(dy, dx, z, k, centre), rtol=1e-9)
+    # nothing is left along the lines through the centre but the amplitude
+    assert np.allclose(np.angle(kappa(dy, centre[1], z, k, centre) / (1 + 1j / (k * np.sqrt(z * z + dy**2 + centre[1] ** 2)))), 0, atol=1e-9)
     lens = np.exp(-1j * k * (np.sqrt(z * z + dy**2 + dx**2) - z))
     axes = np.exp(-1j * k * (np.sqrt(z * z + dy**2) - z + np.sqrt(z * z + dx**2) - z))
     assert np.allclose(lens, axes * ell(dy, dx, z, k), rtol=1e-9)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_a_matrix_split_into_its_strong_parts(symmetric):
+    rng = np.random.default_rng(8)
+    matrix = (rng.normal(size=(20, 20)) + 1j * rng.normal(size=(20, 20))) * np.exp(-0.7 * np.add.outer(np.arange(20), np.arange(20)))
+    matrix = matrix + matrix.T if symmetric else matrix
+    left, core, right = split(matrix, 1e-3, symmetric)
+    assert np.linalg.norm(left @ core @ right.T - matrix) < 1.5e-3 and len(core) < 15
+    assert np.allclose(left.conj().T @ left, np.eye(len(core))) and (not symmetric or right is left)
 
 
 def _random_product(rng, rows, terms, decay):

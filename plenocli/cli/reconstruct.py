@@ -4,17 +4,17 @@ import click
 
 from plenocli.cli import options
 
-METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionary")
+METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionary", "tv", "pnp")
 
 
 @click.command("reconstruct", short_help="Recover the picture behind each lenslet from captures.")
 @options.input_path("captures", nargs=-1, required=True)
 @click.option("--pif", type=options.FILE, help="System matrix A (from simulate-pif).")
 @click.option("--calibration", type=options.FILE, help="Lenslet grid and white reference of a real camera (from calibrate).")
-@click.option("--method", type=click.Choice(METHODS), default="auto", show_default=True, help="auto: dictionary if one is given, else lmmse.")
+@click.option("--method", type=click.Choice(METHODS), default="auto", show_default=True, help="auto: the best of lmmse, pnp and (where one is given) dictionary on pieces of training photographs at the capture's noise.")
 @click.option("--dictionary", type=options.FILE, help="Dictionary for --method dictionary (from learn-dict).")
-@click.option("--overlap", type=click.Choice(["1", "3"]), default="1", show_default=True, help="Superpixels looked at for each block: its own, or 3x3.")
-@click.option("--training", multiple=True, metavar="IMAGE", help="Photograph or skimage:NAME for the statistics of lmmse. Repeatable; default those of scikit-image, without the astronaut.")
+@click.option("--overlap", type=click.Choice(["1", "3"]), help="Superpixels looked at for each block: its own, or 3x3; default 3x3 where the pif holds neighbours. tv and pnp see the whole sensor.")
+@click.option("--training", multiple=True, metavar="IMAGE", help="Photograph or skimage:NAME for the statistics of lmmse and the trial of auto. Repeatable; default those of scikit-image, without the astronaut.")
 @click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")
 @click.option("--noise-sigma", type=options.POSITIVE, help="Standard deviation of the noise, relative like A x; default what the capture says, else estimated.")
 @click.option("--alpha", type=options.NON_NEGATIVE, help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.")
@@ -46,7 +46,7 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, overwrite,
     """
     from plenocli.stages.reconstruct import Settings, run_reconstruct
 
-    report = run_reconstruct(captures, output, Settings(overlap=int(overlap), **settings), pif=pif, calibration=calibration, suffix=f".{suffix}",
+    report = run_reconstruct(captures, output, Settings(overlap=overlap and int(overlap), **settings), pif=pif, calibration=calibration, suffix=f".{suffix}",
                              overwrite=overwrite, command=options.command_line(ctx))
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]

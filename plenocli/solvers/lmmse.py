@@ -1,48 +1,107 @@
-"""Linear minimum mean square error (Wiener) reconstruction with the statistics of natural images."""
+"""Linear minimum mean square error (Wiener) reconstruction with the statistics of natural images.
+
+One covariance does not describe a photograph: sky and foliage differ a hundredfold in variance. So the second-order model
+is a Gaussian scale mixture (Portilla, Strela, Wainwright, Simoncelli, IEEE Trans. Image Processing 12 (2003) 1338): every
+lenslet's field has its own brightness, about which nothing is assumed, and its own contrast, the square root of a scale
+that multiplies the covariance and is estimated from the lenslet's own data.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+SCALES = np.geomspace(1e-3, 30, 60)
+"""Scales of the covariance that are tried."""
+
+ROUNDS = 10
+"""Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
+
 
 @dataclass(frozen=True)
 class Lmmse:
-    """x = mean + gain (y - A mean), and the error it expects: mean (point,), seen A mean (pixel,), gain (point, pixel),
-    sigma (point,) predicted standard deviation of the error, in the units of x."""
+    """Everything that `prepare` works out once. uniform (pixel,): A times a field of ones; mean (point,), variance (point,): of
+    a field about its brightness; analysis (k, pixel), offset (k,): y to uncorrelated coordinates; power (k,): their variance
+    at scale 1; gain (point, k): back to the field; sigma: of a pixel."""
 
+    uniform: np.ndarray
     mean: np.ndarray
-    seen: np.ndarray
+    offset: np.ndarray
+    analysis: np.ndarray
+    power: np.ndarray
     gain: np.ndarray
-    sigma: np.ndarray
+    variance: np.ndarray
+    sigma: float
 
-    def apply(self, y):
-        """(pixel, signal) -> (point, signal)."""
-        return self.mean[:, None] + self.gain @ (y - self.seen[:, None])
+    def apply(self, y, scale=1.0):
+        """(pixel, signal) -> (point, signal), with the covariance times `scale`, a number or one a signal."""
+        level, w = self._coordinates(y)
+        return level + self.mean[:, None] + self.gain @ (w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:])))
+
+    def adaptive(self, y):
+        """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the estimates and their predicted
+        standard deviations (point, signal), the scales (signal,)."""
+        scale = self.scales(self._coordinates(y)[1])
+        left = self.gain**2 @ (1 / (self.power[:, None] + self.sigma**2 / scale))
+        left = scale * np.maximum(self.variance[:, None] - left, 0)
+        return self.apply(y, scale), np.sqrt(left + self.sigma**2 / (self.uniform @ self.uniform)), scale
+
+    def seen(self):
+        """Share of each point's variance about the brightness of its field that the superpixel determines at scale 1, (point,)."""
+        determined = self.gain**2 @ (1 / (self.power + self.sigma**2))
+        return np.clip(determined / np.maximum(self.variance, np.finfo(float).tiny), 0, 1)
+
+    def _coordinates(self, y):
+        """Brightness (signal,) and uncorrelated coordinates (k, signal) of y (pixel, signal)."""
+        return self.uniform @ y / (self.uniform @ self.uniform), self.analysis @ y - self.offset[:, None]
+
+    def scales(self, w):
+        """The scale of each signal from its coordinates w (k, signal): the posterior mean of its logarithm.
+
+        Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the mean and the deviation
+        (at least 0.2) that make all signals together most likely; one signal alone says little where noise is strong.
+        """
+        expected = np.outer(SCALES, self.power) + self.sigma**2
+        likelihood = -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
+        likelihood = np.exp(likelihood - likelihood.max(axis=0))
+        logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
+        for _ in range(ROUNDS):
+            posterior = likelihood * prior[:, None]
+            posterior /= posterior.sum(axis=0)
+            prior = posterior.mean(axis=1)
+            middle = prior @ logs
+            spread = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
+            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * spread**2)), 1e-30)
+        return np.exp(logs @ posterior)
 
 
-def prepare(svd, mean, covariance, sigma, *, floor=None):
-    """The LMMSE estimator for y = A x + n, x ~ (mean, covariance), n white with standard deviation `sigma`.
+def prepare(svd, mean, covariance, sigma):
+    """The LMMSE estimator for y = A x + n, n white with standard deviation `sigma`, x = level + t with any level and t of
+    the given statistics at an unknown scale.
 
-    x = mean + C A^T (A C A^T + sigma^2 I)^-1 (y - A mean), worked out in the singular directions of A (`svd`) that matter:
-    one whose signal can nowhere exceed a thousandth of the noise (s^2 largest eigenvalue of C < 1e-6 sigma^2) is left
-    out; `floor` sets the least relative singular value instead.  sigma > 0.  Source: Berkner et al. 2013 gives least
-    squares only; this is the linear optimum under the same second-order model (Kay, Estimation Theory, 1993, section 12.3).
+    svd: of A.  mean (point,), covariance (point, point): of fields of natural photographs; their brightness is taken out
+    here, as the superpixel measures it: level(x) = u^T A x / u^T u with u = A 1. What is left of y, (I - u u^T/u^T u) y,
+    depends on t alone, and  t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A m)  is worked out in the eigenvectors of
+    the signal's covariance: of directions of A whose signal is below 0.3 % of the noise, and of eigenvectors below 1 % of
+    it, nothing is kept.  sigma > 0.  Source: Kay, Estimation Theory, 1993, section 12.3, for one scale.
     """
-    from scipy.linalg import cho_factor, cho_solve
-
     from plenocli.errors import NumericsError
 
     if not sigma > 0:
         raise NumericsError(f"LMMSE needs a positive noise level, not {sigma}", fix="give --noise-sigma, or use --method tikhonov")
-    if floor is None:
-        largest = np.max(np.sum(np.abs(covariance), axis=1))
-        used = max(1, int(np.count_nonzero(svd.s**2 * largest > 1e-6 * sigma**2)))
-    else:
-        used = svd.rank(floor)
-    seen = svd.s[:used, None] * svd.vt[:used]
+    uniform = svd.u @ (svd.s * svd.vt.sum(axis=1))
+    weight = svd.vt.T @ (svd.s * (svd.u.T @ uniform)) / (uniform @ uniform)
+    mean = mean - weight @ mean
+    pulled = covariance @ weight
+    covariance = covariance - pulled - pulled[:, None] + weight @ pulled
+    strength = svd.s**2 * np.einsum("ij,ij->i", svd.vt @ covariance, svd.vt)
+    used = np.flatnonzero(strength > 1e-5 * sigma**2)
+    seen = svd.s[used, None] * svd.vt[used]
     cross = covariance @ seen.T
     data = seen @ cross
-    data[np.diag_indices(used)] += sigma**2
-    gain = cho_solve(cho_factor(data, lower=True), cross.T).T
-    variance = np.diag(covariance) - np.einsum("ij,ij->i", gain, cross)
-    return Lmmse(mean, svd.u[:, :used] @ (seen @ mean), gain @ svd.u[:, :used].T, np.sqrt(np.maximum(variance, 0)))
+    power, vectors = np.linalg.eigh((data + data.T) / 2)
+    kept = power > 1e-4 * sigma**2
+    power, vectors = power[kept], vectors[:, kept]
+    analysis = vectors.T @ svd.u[:, used].T
+    along = analysis @ uniform / (uniform @ uniform)
+    return Lmmse(uniform, mean, vectors.T @ (seen @ mean), analysis - along[:, None] * uniform, power, cross @ vectors,
+                 np.diag(covariance).copy(), float(sigma))

@@ -6,6 +6,7 @@ import numpy as np
 
 from plenocli.errors import InputError, NumericsError
 from plenocli.stages.progress import note
+from plenocli.operators import to_blocks, to_plane
 from plenocli.solvers.overlap import by_lenslet
 from plenocli.stages.seeds import stream
 from plenocli.stages.training import at_scales, read_training
@@ -15,6 +16,14 @@ PATCHES_A_POINT = 6
 
 
 NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
+WHOLE = ("pnp", "tv")
+"""Methods that reconstruct all lenslets together."""
+TRIALS, TRIAL_SIDE = 5, 3
+"""Held pieces of training pictures, of so many lenslets a side, on which `auto` tries its candidates."""
+MARGIN = 0.05
+"""dB by which a method must be better in the trial to be taken instead of lmmse."""
+SLOW = 2000
+"""Lenslets from which on the time of whole-picture methods is told beforehand."""
 MISFIT = 1.5
 """Estimated noise over the capture's own from which on the estimate is believed."""
 
@@ -25,6 +34,7 @@ class Estimators:
     def __init__(self, system, settings):
         self.system, self.settings, self._cache = system, settings, {}
         self.coupled = len(system.offsets) > 1
+        self.overlap = settings.overlap or (3 if self.coupled else 1)
 
     @cached_property
     def svd(self):
@@ -37,15 +47,23 @@ class Estimators:
 
         truth (like x): chooses the weight of tikhonov or tsvd with hindsight.
         """
-        method, reason = self._method()
-        report = {"method": method, "reason": reason, "overlap": self.settings.overlap}
-        if self.settings.overlap == 3 and not self.coupled and method != "lmmse":
+        report = {"method": self.settings.method, "reason": "asked for"}
+        if self.settings.method == "auto":
+            report |= self._choose(data)
+        return *self._run(report["method"], data, truth, report), report
+
+    def _run(self, method, data, truth, report):
+        """(x, sigma or None) by one method; its parameters go to the report."""
+        if method in WHOLE:
+            return self._whole(method, data, report)
+        report["overlap"] = self.overlap
+        if self.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
-        if method == "lmmse" and self.settings.overlap == 3:
-            return *self._jointly(data, report), report
+        if method == "lmmse" and self.overlap == 3:
+            return self._jointly(data, report)
         hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
-        if not self._takes_neighbours():
-            return *self._by_lenslet(method, data, data.y, hidden, report), report
+        if not self._takes_neighbours(method):
+            return self._by_lenslet(method, data, data.y, hidden, report)
         x, _ = self._jointly(data, {})
         inner = (slice(1, -1), slice(1, -1))
         if min(data.y.shape[:2]) > 2:
@@ -53,15 +71,93 @@ class Estimators:
             x[inner], _ = self._by_lenslet(method, data, y, None if truth is None else truth[inner].reshape(-1, truth.shape[2]).T, report)
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
-        return x, None, report
+        return x, None
+
+    def _choose(self, data):
+        """{"method", "reason", "trial_db"} for this noise: the best of the candidates on pieces of photographs, seen by this camera.
+
+        What is compared is measured, not promised: TRIALS pieces of training pictures are captured by the own block with the
+        noise of this capture, relative to the signal, and reconstructed by each candidate. lmmse has seen these pictures in
+        its covariance, so that a method that wins wins in earnest.
+        """
+        candidates = ["lmmse", "pnp", *(["dictionary"] if self.settings.dictionary is not None else [])]
+        sigma = self._joint_noise(data, {}) if self.coupled else self._noise(data, data.y, {})
+        relative = float(f"{sigma / max(np.sqrt(np.mean(np.square(data.y))), np.finfo(float).tiny):.1e}")
+        key = ("trial", relative, data.scene)
+        if key not in self._cache:
+            self._cache[key] = self._trial(candidates, relative, data.scene)
+        quality = self._cache[key]
+        if not quality:
+            return {"method": "lmmse", "reason": "the training pictures are too small for a trial of others"}
+        best = max(quality, key=quality.get)
+        best = best if quality[best] > quality["lmmse"] + MARGIN else "lmmse"
+        told = ", ".join(f"{m} {q:.1f} dB" for m, q in quality.items())
+        if best in WHOLE and data.y.shape[0] * data.y.shape[1] > SLOW:
+            note(f"{best} of {data.y.shape[0] * data.y.shape[1]} lenslets takes about {data.y.shape[0] * data.y.shape[1] * self.system.own.shape[1] * 1e-4 / 60:.0f} minutes of CPU; --method lmmse takes seconds")
+        return {"method": best, "reason": f"best on pieces of training photographs at this noise ({told})", "trial_db": quality}
+
+    def _trial(self, candidates, relative, scene):
+        """Mean PSNR (dB) of each candidate over the pieces, {} where no picture is large enough."""
+        from dataclasses import replace
+
+        from plenocli.solvers.natural import draw_patches
+
+        shape = self.system.object_shape
+        side = tuple(TRIAL_SIDE * n for n in shape)
+        large = [p for p in self._training(scene) if p.shape[0] >= side[0] and p.shape[1] >= side[1]]
+        if not large:
+            return {}
+        rng = stream(self.settings.seed, "trial")
+        pieces = draw_patches(large, side, TRIALS, rng).T.reshape(TRIALS, *side)
+        truth = to_blocks(np.concatenate(list(pieces), axis=1), shape)
+        y = truth @ self.system.own.T
+        sigma = relative * float(np.sqrt(np.mean(y**2)))
+        y += sigma * rng.standard_normal(y.shape)
+        alone = Estimators(replace(self.system, blocks=self.system.own[None], offsets=np.zeros((1, 2), int)), replace(self.settings, noise_sigma=sigma, overlap=1))
+        alone.svd, alone._cache = self.svd, self._cache
+        data = type("Trial", (), dict(y=y, sigma=sigma, scene=scene))
+        quality = {}
+        for method in candidates:
+            error = np.square(alone._run(method, data, None, {})[0] - truth).reshape(TRIAL_SIDE, TRIALS, -1).mean(axis=(0, 2))
+            quality[method] = float(np.mean(-10 * np.log10(np.maximum(error, 1e-12))))
+        return quality
+
+    def _whole(self, method, data, report):
+        """(x, sigma) of a method that sees the whole picture, neighbours' light included; sigma is that of LMMSE, an upper estimate."""
+        from plenocli.solvers import wholesensor
+        from plenocli.solvers.denoise import block_matching
+
+        if self.coupled:
+            first, _ = self._jointly(data, report)
+            x, spread = self._adaptive(report["noise_sigma"], data.scene, self._own_light(data.y, first))
+        else:
+            sigma = self._noise(data, data.y, report)
+            x, spread = self._adaptive(sigma, data.scene, data.y)
+        error = float(np.sqrt(np.mean(np.square(spread))))
+        system = self.system
+        term = wholesensor.DataTerm(self.svd, system.blocks, system.offsets, system.object_shape, data.y, report["noise_sigma"], 2 * error)
+        start = to_plane(x, system.object_shape)
+        report["start"] = f"lmmse, which expects an error of {error:.3g}"
+        if method == "tv":
+            picture = wholesensor.total_variation(term, start, error)
+            report["rule"] = "isotropic total variation, weight by the error that lmmse expects"
+        else:
+            taus = wholesensor.schedule(error)
+            picture = wholesensor.plug_and_play(term, start, block_matching, taus)
+            report["rule"] = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
+        return to_blocks(picture, system.object_shape), spread
+
+    def _adaptive(self, sigma, scene, y):
+        """(x, sigma) of LMMSE per lenslet, like y (lenslet_row, lenslet_column, pixel)."""
+        rows, columns = y.shape[:2]
+        x, spread, _ = self._lmmse(sigma, scene).adaptive(y.reshape(rows * columns, -1).T)
+        return x.T.reshape(rows, columns, -1), spread.T.reshape(rows, columns, -1)
 
     def _by_lenslet(self, method, data, y, truth, report):
         """(x, sigma or None) of superpixels y (lenslet_row, lenslet_column, pixel), each by itself."""
         sigma = self._noise(data, y, report) if method in NOISY else None
         if method == "lmmse":
-            estimator = self._lmmse(sigma, data.scene)
-            x = by_lenslet(estimator.apply, y)
-            return x, np.broadcast_to(estimator.sigma, x.shape)
+            return self._adaptive(sigma, data.scene, y)
         return by_lenslet(self._solver(method, y, sigma, truth, report), y), None
 
     def _jointly(self, data, report):
@@ -97,14 +193,6 @@ class Estimators:
         setup = {"block-mean": self._block_mean, "tikhonov": self._tikhonov, "tsvd": self._tsvd, "nnls": self._nnls, "dictionary": self._dictionary}[method]
         return setup(y.reshape(-1, y.shape[2]).T, sigma, truth, report)
 
-    def _method(self):
-        asked = self.settings.method
-        if asked != "auto":
-            return asked, "asked for"
-        if self.settings.dictionary is not None:
-            return "dictionary", "a dictionary was given"
-        return "lmmse", "the best of the linear methods, with its own error estimate"
-
     def _noise(self, data, y, report):
         """Standard deviation of what in y is not A x: given, the capture's own, or estimated; the report says which.
 
@@ -126,8 +214,8 @@ class Estimators:
         report |= {"noise_sigma": sigma, "noise_source": "from the capture"}
         return sigma
 
-    def _takes_neighbours(self):
-        return self.coupled and self.settings.overlap == 3 and self._method()[0] != "block-mean"
+    def _takes_neighbours(self, method=None):
+        return self.coupled and self.overlap == 3 and (method or self.settings.method) != "block-mean"
 
     def _stray(self, y):
         """The neighbours' light, from the block means: enough to estimate the noise."""

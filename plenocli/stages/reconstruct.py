@@ -20,7 +20,7 @@ class Settings:
     """Options of the command. noise_sigma in units of A x; alpha in units of A's squared singular values; lam as in learn-dict."""
 
     method: str = "auto"
-    overlap: int = 1
+    overlap: int | None = None
     dictionary: Path | None = None
     training: tuple = ()
     truth: Path | None = None

@@ -66,20 +66,44 @@ def test_useless_matrices_are_refused():
             linear.decompose(bad)
 
 
-def test_lmmse_is_the_textbook_formula(system):
+@pytest.mark.parametrize("scale", [1.0, 0.02, np.linspace(0.1, 2, 200)])
+def test_lmmse_is_the_textbook_formula(system, scale):
     a, _, y = system
     root = np.random.default_rng(1).standard_normal((36, 36)) / 6
     c, mean = root @ root.T, np.linspace(0, 1, 36)
     estimator = lmmse.prepare(linear.decompose(a), mean, c, 1e-3)
-    gain = c @ a.T @ np.linalg.inv(a @ c @ a.T + 1e-6 * np.eye(60))
-    np.testing.assert_allclose(estimator.apply(y), mean[:, None] + gain @ (y - (a @ mean)[:, None]), atol=1e-4)
-    np.testing.assert_allclose(estimator.sigma**2, np.diag(c - gain @ a @ c), rtol=1e-4)
+    found = estimator.apply(y, scale)
+    for k in (0, 77, 199):
+        loose = np.broadcast_to(scale, 200)[k] * c + 1e6  # a brightness about which nothing is known
+        gain = loose @ a.T @ np.linalg.inv(a @ loose @ a.T + 1e-6 * np.eye(60))
+        np.testing.assert_allclose(found[:, k], mean + gain @ (y[:, k] - a @ mean), atol=5e-3)
 
 
-def test_lmmse_predicts_its_own_error(system):
-    a, x, y = system
+def test_lmmse_finds_the_contrast_of_each_signal(system):
+    a, x, _ = system
+    rng = np.random.default_rng(6)
+    scale = 10 ** rng.uniform(-2, 1, 200)
+    x = x * np.sqrt(scale) + rng.random(200)
+    y = a @ x + 1e-3 * rng.standard_normal((60, 200))
     estimator = lmmse.prepare(linear.decompose(a), np.zeros(36), np.eye(36), 1e-3)
-    assert np.sqrt(np.mean((estimator.apply(y) - x) ** 2)) == pytest.approx(np.sqrt(np.mean(estimator.sigma**2)), rel=0.03)
+    found, sigma, scales = estimator.adaptive(y)
+    error = lambda e: np.sqrt(np.mean((e - x) ** 2 / scale))  # noqa: E731
+    assert np.sqrt(np.mean(np.log(scales / scale) ** 2)) < 0.45  # 20 coordinates know a variance to 0.32
+    assert error(found) < 1.01 * error(estimator.apply(y, scale)) and error(found) < 0.98 * error(estimator.apply(y))
+    assert np.sqrt(np.mean(sigma**2 / scale)) == pytest.approx(error(found), rel=0.08)
+    dark = estimator.adaptive(np.zeros((60, 3)))[0]
+    np.testing.assert_allclose(dark, 0, atol=1e-12)
+
+
+def test_lmmse_says_what_it_sees(system):
+    a, _, _ = system
+    perfect = lmmse.prepare(linear.decompose(np.eye(9)), np.zeros(9), np.eye(9), 1e-3)
+    np.testing.assert_allclose(perfect.seen(), 1, atol=1e-5)
+    blind = np.eye(9)
+    blind[4:] = 0
+    blind[8, 8] = 1e-9
+    seen = lmmse.prepare(linear.decompose(blind), np.zeros(9), np.eye(9), 1e-3).seen()
+    assert seen[:4].min() > 0.7 and seen[4:].max() < 0.3
     with pytest.raises(NumericsError, match="noise"):
         lmmse.prepare(linear.decompose(a), np.zeros(36), np.eye(36), 0.0)
 

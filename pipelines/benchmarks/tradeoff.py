@@ -70,7 +70,7 @@ def forced(name):
 def code(rung):
     """Digest of the code that computes a rung: its modules without comments, docstrings and planning laws."""
     files = ["pif", "geometry", "psf", "pupil", "quadrature", "relay", "factors"]
-    files += {"rays": ["rays"], "fresnel, low rank": ["square"], "fresnel, triple product": ["shaped"]}.get(rung, ["exact", "residual", "debye", "product"])
+    files += {"rays": ["rays"], "fresnel, low rank": ["square"], "fresnel, triple product": ["shaped"]}.get(rung, ["exact", "pairs", "residual", "debye", "product"])
     parts = []
     for file in files:
         path = ROOT / "plenocli" / "optics" / f"{file}.py"
@@ -192,7 +192,7 @@ def run_case(run, case, budget, race):
              "reference_change": found["change"], "estimated_seconds": chosen.seconds(lambda double: found["rates"][double]), "others": []}
     for other in others if race else ():
         # what serves is timed unless it is hopeless; what is thought too coarse, only if it would have been faster
-        limit = min(budget, 10 * max(chosen.seconds(), 0.01) if other.error <= case["accuracy"] else chosen.seconds())
+        limit = min(budget, 4 * max(chosen.seconds(), 0.01) if other.error <= case["accuracy"] else chosen.seconds())
         if other.seconds() <= limit:
             again = measured(run, case, other, truth)
             if "errors" in again:

@@ -138,6 +138,7 @@ DICTIONARY = Schema("dictionary", 1, "Dictionary of object patches learnt for on
 IMAGE = Schema("image", 1, "Reconstructed picture, linear.", (
     Field("image/value", "row column | band row column", "f", "1", "relative radiance"),
     Field("image/sigma", "row column | band row column", "f", "1", "predicted standard deviation", optional=True, minimum=0),
+    Field("image/seen", "object_row object_column", "f", "1", "share of each object point of a lenslet that the sensor tells apart at the capture's noise; 0 in the null space", optional=True, minimum=0),
     Field("image/wavelength", "band", "f", "m", "band centres", optional=True, minimum=0, ascending=True),
 ), attrs={"image": (
     Attr("method", "text", "", "how it was computed"), Attr("parameters", "json", "", "settings of the method"),

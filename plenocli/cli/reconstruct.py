@@ -51,7 +51,8 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, overwrite,
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
         rule = f", {one['rule']}" if "rule" in one else ""
-        line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative"
+        seen = f", {one['seen']['share']:.0%} of the object seen" if "seen" in one else ""
+        line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
     else:
         line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"
     options.summary(report, as_json, line)

@@ -90,8 +90,11 @@ def spectra_figures(result, name, lenslets=None):
             (lenslet_spectra(result.values, result.sigma, result.wavelengths, quantity, lenslets), "Spectra of single lenslets, with one standard deviation where it is known.")]
 
 
-def image_figures(result, name):
-    """One picture without truth."""
+def image_figures(result, name, seen=None):
+    """One picture without truth, and where it is known what of each lenslet's object the sensor sees, (object_row, object_column)."""
     from plenocli.report.pictures import picture
 
-    return [(picture(result.values, name), f"{name}{': ' + result.method if result.method else ''}; no truth to compare with.")]
+    figures = [(picture(result.values, name), f"{name}{': ' + result.method if result.method else ''}; no truth to compare with.")]
+    if seen is not None:
+        figures.append((picture(seen, "seen"), f"What the sensor tells apart of the object under a lenslet: {seen.mean():.0%} of its directions; black lies in the null space."))
+    return figures

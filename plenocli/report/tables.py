@@ -37,6 +37,7 @@ LABELS = {
     "noise_relative": ("noise of the capture, relative", ""),
     "model_error_relative": ("error of the model, relative", ""),
     "limited_by": ("limited by", ""),
+    "seen_share": ("share of the object seen", ""),
     "coherence_raw": ("coherence, raw", ""),
     "coherence_candes_romberg": ("coherence, Candes-Romberg", ""),
     "coherence_effective": ("coherence of A Phi, largest", ""),

@@ -57,6 +57,16 @@ def estimate_noise(svd, y):
     return float(np.sqrt(np.sum(residual**2) / (left * y.shape[1])))
 
 
+def resolution(svd, sigma, contrast):
+    """Diagonal (point,) of A^T A (A^T A + (sigma/contrast)^2)^-1: 1 where noise sigma lets a point be seen apart, 0 in the null space.
+
+    contrast: standard deviation of a point about its surroundings; points are taken to be independent, as the sensor cannot
+    know better. The mean is the share of the object's directions that the sensor sees.
+    """
+    share = svd.s**2 / (svd.s**2 + (sigma / contrast) ** 2) if sigma > 0 else (svd.s > 1e-14 * svd.s[0]).astype(float)
+    return np.einsum("kj,k,kj->j", svd.vt, share, svd.vt)
+
+
 def tikhonov(svd, z, alpha):
     """argmin |y - Ax|^2 + alpha |x|^2, (point, signal), from z = U^T y (k, signal); alpha in units of s^2."""
     return svd.vt.T @ ((svd.s / (svd.s**2 + alpha))[:, None] * z)

@@ -11,7 +11,7 @@ import numpy as np
 
 from plenocli.operators import BlockToeplitz, to_blocks, to_plane
 
-FROM, TO, ROUNDS = 2.0, 0.1, 8
+FROM, TO, ROUNDS = 6.0, 0.1, 10
 """Plug and play: first and last tau over the error that is expected at the start, and rounds in between; chosen on validation
 scenes (docs/model.md)."""
 TV_WEIGHT, TV_ROUNDS = 1.0, 20

@@ -24,6 +24,8 @@ MARGIN = 0.05
 """dB by which a method must be better in the trial to be taken instead of lmmse."""
 SLOW = 2000
 """Lenslets from which on the time of whole-picture methods is told beforehand."""
+CONTRAST = 0.1
+"""What a point of a photograph differs from its lenslet's brightness, standard deviation: the measure of what noise hides."""
 MISFIT = 1.5
 """Estimated noise over the capture's own from which on the estimate is believed."""
 
@@ -51,6 +53,20 @@ class Estimators:
         if self.settings.method == "auto":
             report |= self._choose(data)
         return *self._run(report["method"], data, truth, report), report
+
+    def seen(self, sigma):
+        """(map, report): what of an object the own superpixel tells apart at noise `sigma`, points (row, column) from 0 (in the null
+        space) to 1; its mean, the directions that stand above the noise, and whether an object and itself turned look alike."""
+        from plenocli.optics.diagnose import SYMMETRY_WARNING, symmetry_defect
+        from plenocli.solvers.linear import resolution
+
+        share = resolution(self.svd, sigma, CONTRAST)
+        report = {"share": float(share.mean()), "directions": int(np.count_nonzero(self.svd.s * CONTRAST > sigma)), "points": len(share)}
+        if symmetry_defect(self.system.own) < SYMMETRY_WARNING:
+            report["symmetric"] = True
+            note("half of the object cannot be seen: object points opposite each other about the lenslet's axis give the same superpixel, and only their sum is "
+                 "measured (move the sensor out of the pupil's conjugate plane)")
+        return share.reshape(self.system.object_shape), report
 
     def _run(self, method, data, truth, report):
         """(x, sigma or None) by one method; its parameters go to the report."""

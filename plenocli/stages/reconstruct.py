@@ -71,17 +71,21 @@ def _check_options(settings, pif, calibration):
 def _one(capture, target, settings, estimators, calibration, overwrite, origin):
     """Reconstruct and write one capture; returns its report."""
     if estimators is None:
-        picture, sigma, report = _white_normalised(capture, calibration), None, {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
+        picture, sigma, seen, report = _white_normalised(capture, calibration), None, None, {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
     else:
         data = read_superpixels(capture, estimators.system, calibration, settings.mem_limit)
         blocks, spread, report = estimators.solve(data, _truth(settings.truth, estimators.system.object_shape, data.y.shape[:2]))
         picture = to_plane(blocks, estimators.system.object_shape)
         sigma = None if spread is None else to_plane(spread, estimators.system.object_shape)
         report |= _limits(data, estimators.system, report)
+        noise = report.get("noise_sigma") or data.sigma
+        seen = None
+        if noise:
+            seen, report["seen"] = estimators.seen(noise)
     negative = float(np.mean(picture < 0))
     if settings.clip:
         picture = np.maximum(picture, 0)
-    _write(target, picture, sigma, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
+    _write(target, picture, sigma, seen, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
     return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": negative, "clipped": settings.clip}
 
 
@@ -138,7 +142,7 @@ def _white_normalised(capture, calibration):
     return np.where(lost, 0, value)
 
 
-def _write(target, picture, sigma, report, clipped, settings, estimators, capture, origin, overwrite):
+def _write(target, picture, sigma, seen, report, clipped, settings, estimators, capture, origin, overwrite):
     from plenocli.artefacts import Artefact, Provenance, describe_inputs, provenance_texts, write_artefact, write_exr
 
     inputs = describe_inputs({"capture": capture, "pif": origin["pif"], "calibration": origin["calibration"], "dictionary": settings.dictionary,
@@ -148,7 +152,7 @@ def _write(target, picture, sigma, report, clipped, settings, estimators, captur
         channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
         write_exr(target, channels, {"method": report["method"]} | provenance_texts(provenance), overwrite=overwrite)
         return
-    data = {"image/value": picture} | ({} if sigma is None else {"image/sigma": sigma})
+    data = {"image/value": picture} | {f"image/{name}": values for name, values in (("sigma", sigma), ("seen", seen)) if values is not None}
     attrs = {"method": report["method"], "parameters": {k: v for k, v in report.items() if k != "method"}, "clipped": clipped}
     if estimators is not None:
         attrs["notes"] = {"block": list(estimators.system.object_shape)}

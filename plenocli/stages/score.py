@@ -23,7 +23,7 @@ GROUPS = {
     "classification": ("classification_accuracy", "nearest_patch_accuracy"),
     "single-pixel": ("rmse_over_single_pixel", "six_patch_rmse_over_single_pixel", "delta_e_over_single_pixel", "snr_over_single_pixel_db"),
     "response": ("response_gain_per_band", "response_error_per_band", "response_error_lenslet_per_band", "response_pixel_per_band", "response_leak"),
-    "limits": ("noise_relative", "model_error_relative", "limited_by"),
+    "limits": ("noise_relative", "model_error_relative", "limited_by", "seen_share"),
     "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
     "coherence": (
         "coherence_raw", "coherence_candes_romberg", "coherence_effective", "coherence_effective_mean", "welch_bound",
@@ -148,6 +148,9 @@ def _score_one(path, context):
     limits = result.attrs.get("parameters", {}).get("limits") if isinstance(result.attrs.get("parameters"), dict) else None
     if limits:
         entry["metrics"] |= {"noise_relative": limits["noise"], "model_error_relative": limits["model_error"], "limited_by": limits["limited_by"]}
+    seen = result.attrs.get("parameters", {}).get("seen") if isinstance(result.attrs.get("parameters"), dict) else None
+    if seen:
+        entry["metrics"]["seen_share"] = seen["share"]
     if context.sensor_snr is not None:
         entry["metrics"]["snr_sensor_db"] = context.sensor_snr
     return entry, picture

@@ -117,7 +117,7 @@ def _image(path, artefact, choice):
     from plenocli.report.figures import image_figures
     from plenocli.stages.score_inputs import read_result
 
-    return image_figures(read_result(path, mem_limit=choice.mem_limit), path.name)
+    return image_figures(read_result(path, mem_limit=choice.mem_limit), path.name, None if artefact is None else artefact.data.get("image/seen"))
 
 
 _FIGURES = {"pif": _pif, "capture": _capture, "calibration": _calibration, "dictionary": _dictionary, "spectra": _spectra, "image": _image}

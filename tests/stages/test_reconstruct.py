@@ -90,6 +90,37 @@ def test_lmmse_says_how_sure_it_is(single):
     assert parameters["noise_source"] == "from the capture"
 
 
+def test_what_cannot_be_seen_is_told(single, tmp_path, capsys):
+    folder, truth = single
+    image = reconstruct(folder, "--method", "tikhonov", output="seen.h5")
+    seen, told = image.data["image/seen"], image.attrs["image"]["parameters"]["seen"]
+    a, ratio = matrices(False)[0][0], (image.attrs["image"]["parameters"]["noise_sigma"] / 0.1) ** 2
+    expected = np.diag(np.linalg.solve(a.T @ a + ratio * np.eye(N * N), a.T @ a))
+    np.testing.assert_allclose(seen, expected.reshape(N, N), atol=1e-6)
+    assert told["share"] == pytest.approx(expected.mean(), abs=1e-6) and 0 < told["directions"] <= N * N and "symmetric" not in told
+    louder = tmp_path / "louder"
+    louder.mkdir()
+    make_files(louder, noise=30.0)
+    assert reconstruct(louder, "--method", "tikhonov").data["image/seen"].mean() < seen.mean() - 0.05
+    a = a + a[:, ::-1]  # an object and itself turned by 180 degrees look alike
+    pif = read_artefact(folder / "pif.h5", "pif")
+    pif.data["pif/A"] = a[None, None]
+    write_artefact(louder / "pif.h5", pif, overwrite=True)
+    image = reconstruct(louder, "--method", "tikhonov")
+    assert image.attrs["image"]["parameters"]["seen"]["symmetric"] and image.data["image/seen"].mean() <= 0.5 and "half of the object" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("noise", [60.0, 20.0])
+def test_auto_tries_and_tells(tmp_path, noise):
+    truth = make_files(tmp_path, noise=noise)
+    images = {m: reconstruct(tmp_path, "--method", m) for m in ("auto", "lmmse", "pnp", "tv")}
+    quality = {m: psnr(i.data["image/value"], truth) for m, i in images.items()}
+    parameters = images["auto"].attrs["image"]["parameters"]
+    assert set(parameters["trial_db"]) == {"lmmse", "pnp"} and "photographs at this noise" in parameters["reason"]
+    assert quality["auto"] >= quality["lmmse"] - 0.05 and quality["auto"] in (quality["lmmse"], quality["pnp"]), quality
+    assert quality["pnp"] > quality["lmmse"] - 0.3 and quality["tv"] > quality["lmmse"] - 1.5, quality
+
+
 def test_unknown_noise_is_estimated_and_said(tmp_path, capsys):
     make_files(tmp_path, noise_sigma=None)
     parameters = reconstruct(tmp_path, "--method", "tikhonov").attrs["image"]["parameters"]

@@ -98,7 +98,8 @@ class Estimators:
         """
         candidates = ["lmmse", "pnp", *(["dictionary"] if self.settings.dictionary is not None else [])]
         sigma = self._joint_noise(data, {}) if self.coupled else self._noise(data, data.y, {})
-        relative = float(f"{sigma / max(np.sqrt(np.mean(np.square(data.y))), np.finfo(float).tiny):.1e}")
+        loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)  # an empty capture is all noise
+        relative = float(f"{sigma / loudness:.1e}")
         key = ("trial", relative, data.scene)
         if key not in self._cache:
             self._cache[key] = self._trial(candidates, relative, data.scene)

@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test faults test-slow spatial spatial-250um spectral dslr colorchecker raw dictionary bench-sparse tiny tradeoff bench-pif clean
+.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw dictionary bench-sparse tiny tradeoff bench-pif clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,6 +38,10 @@ tiny: $(READY) ## every stage once on the smallest camera, in seconds
 
 test: $(READY) ## all tests but the slow ones, one process a core
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal
+
+extremes: $(READY) ## errors of the solvers against the condition of the matrix; cameras and captures at the edges
+	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/solvers/test_extremes.py tests/faults/test_cameras.py
 
 faults: $(READY) ## the fault campaigns in full: 12,000 damaged files, kills, full disks, bombs (hours)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults

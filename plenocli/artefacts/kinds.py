@@ -145,4 +145,20 @@ IMAGE = Schema("image", 1, "Reconstructed picture, linear.", (
     Attr("clipped", "number", "1", "share of points set to zero because they came out negative"), _NOTES)},
     plots={"image": ("value", ("sigma",))}, default=("image",))
 
-SCHEMAS = {schema.kind: schema for schema in (PIF, PIF_INDEX, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE)}
+SWEEP = Schema("sweep", 1, "Points of a design space, what each gave, and which of them no other beats.", (
+    Field("sweep/parameter", "point parameter", "f", "see parameters", "value of each key that varies; for one with choices its place in their list", maskable=True),
+    Field("sweep/metric", "point metric", "f", "see metrics", "figures of each point; NaN where there is none", optional=True, maskable=True),
+    Field("sweep/status", "point", "i", "1", "exit code that the stages would have given: 0 done, 2 no such camera, 5 numerically impossible", minimum=0),
+    Field("sweep/front", "point", "b", "1", "no other point is at least as good in all objectives and better in one"),
+    Field("sweep/key", "point", "S", "", "SHA-256 of all that a point's figures depend on"),
+), attrs={"sweep": (
+    Attr("chain", "text", "", "stages that each point went through: spatial or spectral"),
+    Attr("parameters", "json", "", "columns of parameter: key, unit, and choices where it has no number"),
+    Attr("metrics", "json", "", "columns of metric: name and meaning"),
+    Attr("objectives", "json", "", "what the front compares: pairs of a metric or key, and max or min"),
+    Attr("reasons", "json", "", "point -> why a stage refused it"),
+    Attr("notes", "json", "", "point -> what the stages said beside their results"),
+    Attr("description", "json", "", "the sweep file"))},
+    plots={"sweep": ("metric", ())}, default=("sweep",))
+
+SCHEMAS = {schema.kind: schema for schema in (PIF, PIF_INDEX, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE, SWEEP)}

@@ -18,10 +18,11 @@ from plenocli.config import REFERENCE_REFLECTANCE
 @options.file_type("exr", "h5")
 @options.output
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, captures, output, calibration, suffix, workers, overwrite, as_json, **settings):
+def command(ctx, captures, output, calibration, suffix, workers, scheduler, overwrite, as_json, **settings):
     """Demultiplex CAPTURE...: x = F b + noise is solved for the band radiances b of every lenslet, with standard deviations.
 
     OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each. Finished ones are skipped on
@@ -31,11 +32,12 @@ def command(ctx, captures, output, calibration, suffix, workers, overwrite, as_j
     Examples:
       plenocli demux chart.NEF --calibration cal.h5 --reference white.NEF -o chart.exr
       plenocli demux captures/*.NEF --calibration cal.h5 --method wls --workers 2 -o spectra/
+      plenocli demux captures/*.NEF --calibration cal.h5 --scheduler tcp://10.0.0.1:8786 -o spectra/
       plenocli demux chart.dng --calibration cal.h5 --method single-pixel -o chart.h5
     """
     from plenocli.stages.demux import Settings, run_demux
 
-    report = run_demux(captures, output, calibration=calibration, settings=Settings(**settings), suffix=f".{suffix}", workers=workers,
+    report = run_demux(captures, output, calibration=calibration, settings=Settings(**settings), suffix=f".{suffix}", workers=workers, scheduler=scheduler,
                        overwrite=overwrite, command=options.command_line(ctx))
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]

@@ -21,6 +21,8 @@ COMMANDS = (
     "reconstruct",
     "score",
     "report",
+    "sweep",
+    "optimise",
     "colorchecker",
     "show",
     "inspect",

@@ -140,6 +140,7 @@ overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it ex
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
 workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
+scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler instead, such as tcp://10.0.0.1:8786, or the file it wrote; the results are the same.")
 mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
 
 
@@ -170,7 +171,7 @@ def command_line(ctx):
     return " ".join(words)
 
 
-_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report", "measures"}
+_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report", "measures", "scheduler", "plot"}
 """How a file was made, not what it holds: the same inputs give the same bytes whatever these say."""
 
 

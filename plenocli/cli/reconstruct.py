@@ -26,11 +26,12 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @options.output
 @options.seed
 @options.workers
+@options.scheduler
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, captures, output, pif, calibration, suffix, overlap, overwrite, as_json, **settings):
+def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler, overwrite, as_json, **settings):
     """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet, relative to white.
 
     OUT is an image .h5 (with the predicted standard deviation for lmmse) or .exr; with several captures a folder with one
@@ -42,12 +43,13 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, overwrite,
       plenocli reconstruct capture.h5 --pif pif.h5 -o picture.h5
       plenocli reconstruct capture.h5 --pif pif-3x3.h5 --method lmmse --overlap 3 -o picture.h5
       plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary d.h5 -o picture.exr
+      plenocli reconstruct shots/*.h5 --pif pif.h5 --workers 2 -o pictures/
       plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
     """
     from plenocli.stages.reconstruct import Settings, run_reconstruct
 
     report = run_reconstruct(captures, output, Settings(overlap=overlap and int(overlap), **settings), pif=pif, calibration=calibration, suffix=f".{suffix}",
-                             overwrite=overwrite, command=options.command_line(ctx))
+                             scheduler=scheduler, overwrite=overwrite, command=options.command_line(ctx))
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
         rule = f", {one['rule']}" if "rule" in one else ""

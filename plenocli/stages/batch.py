@@ -2,11 +2,11 @@
 
 import os
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 from plenocli.errors import OutputError, PlenoError, UsageError
 from plenocli.stages.progress import bar, note
+from plenocli.stages.scheduler import absolute, attempt, run_all
 
 
 @dataclass(frozen=True)
@@ -52,44 +52,16 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
     return Batch(output, True, jobs, [job for job in jobs if overwrite or not job[1].exists()])
 
 
-def attempt(work, *arguments):
-    """What `work(*arguments)` returns, or the PlenoError that it raises."""
-    try:
-        return work(*arguments)
-    except PlenoError as error:
-        return error
-
-
-def one_by_one(batch, work):
-    """(capture, report or PlenoError) of every job to do, in this process."""
-    for capture, target in bar(batch.todo, len(batch.todo), "captures"):
-        yield capture, attempt(work, capture, target)
-
-
-def outcomes(batch, work, write, workers=1):
+def outcomes(batch, pool, work, write):
     """(capture, report or PlenoError) of every job to do, as they end.
 
-    work(capture) runs in up to `workers` threads, which share what it holds; write(what it returned, capture, target) runs in
-    this one, so that there is one writer, at once, so that a run that is killed loses no finished result. Not many more
-    results than workers are held.
+    work(capture) runs in `pool` (stages.scheduler), write(what it returned, capture, target) in this process, so that there is
+    one writer, at once, so that a run that is killed loses no finished result. Not many more results than workers are held.
     """
-    if workers == 1 or len(batch.todo) < 2:
-        yield from one_by_one(batch, lambda capture, target: write(work(capture), capture, target))
-        return
-    from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-
-    waiting, running = iter(batch.todo), {}
-    with ThreadPoolExecutor(min(workers, len(batch.todo))) as pool, bar(None, len(batch.todo), "captures") as progress:
-        try:
-            for _ in range(len(batch.todo)):
-                for job in islice(waiting, workers + 1 - len(running)):
-                    running[pool.submit(work, job[0])] = job
-                ended = next(iter(wait(running, return_when=FIRST_COMPLETED).done))
-                capture, target = running.pop(ended)
-                yield capture, attempt(lambda: write(ended.result(), capture, target))
-                progress.update()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    with bar(None, len(batch.todo), "captures") as progress:
+        for (capture, target), done in run_all(pool, ((job, work, absolute(job[0]) if pool.far else job[0]) for job in batch.todo)):
+            yield capture, done if isinstance(done, PlenoError) else attempt(write, done, capture, target)
+            progress.update()
 
 
 def summarise(batch, outcomes):

@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from plenocli.errors import InputError, NumericsError
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.mosaics import read_exposure
 from plenocli.stages.progress import note
+from plenocli.stages.scheduler import absolute, open_pool
 from plenocli.stages.radiance import estimate, light_prior, read_response, readout
 
 
@@ -25,13 +27,14 @@ class Settings:
     register: str = "auto"
 
 
-def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".exr", workers=1, overwrite=False, command=""):
+def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".exr", workers=1, scheduler=None, overwrite=False, command=""):
     """Demultiplex every capture; returns a summary dict.
 
     One capture gives the file `output` (.exr or .h5), several a folder with one file each, named after the capture;
     finished ones are skipped unless overwrite. A capture that fails does not stop the others: its message is printed
     and an error is raised at the end, with the exit code of the worst. workers: captures that are read and demultiplexed at
-    the same time; they share one calibration, and results are written one at a time.
+    the same time, in threads; they share one calibration, and results are written one at a time. scheduler: a Dask cluster that
+    demultiplexes them instead (stages.scheduler).
     """
     import scipy.linalg.blas  # noqa: F401  a library of its own, which the limit below reaches only once it is loaded
     from threadpoolctl import threadpool_limits
@@ -41,7 +44,11 @@ def run_demux(captures, output, *, calibration, settings=Settings(), suffix=".ex
         # a broken calibration ends the run here, before any capture
         job = Demultiplexer(calibration, settings, overwrite, command, min(workers, len(batch.todo))) if batch.todo else None
         _say_what_is_old(batch, calibration, settings)
-        return summarise(batch, outcomes(batch, job and job.demux, job and job.write, workers))
+        if not batch.todo:
+            return summarise(batch, ())
+        work = job.demux if scheduler is None else partial(demux_elsewhere, (absolute(calibration), replace(settings, reference=absolute(settings.reference)), tuple(i["sha256"] for i in job.inputs.values())))
+        with open_pool(min(workers, len(batch.todo)), scheduler, threads=True) as pool:
+            return summarise(batch, outcomes(batch, pool, work, job.write))
 
 
 def _say_what_is_old(batch, calibration, settings):
@@ -78,6 +85,17 @@ def _recipe_of(target):
         return _recipe(inputs, parameters["asked"], parameters["registration"] is None)
     except (InputError, KeyError, TypeError, ValueError):
         return None
+
+
+@lru_cache(maxsize=1)
+def _demultiplexer(recipe):
+    return Demultiplexer(*recipe[:2], False, "")
+
+
+def demux_elsewhere(recipe, capture):
+    """Demultiplexer.demux of a capture in a process of its own, which reads the calibration once. recipe: calibration, settings, and
+    digests that tell them from others of the same name."""
+    return _demultiplexer(recipe).demux(capture)
 
 
 class Demultiplexer:

@@ -1,15 +1,34 @@
 """Progress on stderr, only where a person watches, and notes that are always worth a line."""
 
+import contextlib
+import contextvars
 import sys
+
+_EAR = contextvars.ContextVar("ear", default=None)
 
 
 def bar(iterable, total=None, label=""):
-    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere."""
+    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, and while `heard` listens."""
     from tqdm import tqdm
 
-    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None, leave=False)
+    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None if _EAR.get() is None else True, leave=False)
 
 
 def note(text):
     """One line for the person who started the command: expectations, warnings, choices made."""
-    print(f"plenocli: {text}", file=sys.stderr)
+    ear = _EAR.get()
+    if ear is not None:
+        ear.append(text)
+    else:
+        print(f"plenocli: {text}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def heard():
+    """Yield a list that takes the notes of this thread while the block lasts, instead of stderr."""
+    ear = []
+    token = _EAR.set(ear)
+    try:
+        yield ear
+    finally:
+        _EAR.reset(token)

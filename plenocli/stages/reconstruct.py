@@ -1,15 +1,18 @@
 """reconstruct: the picture in front of the camera from a capture, per lenslet or with the neighbours."""
 
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
 from plenocli.operators import to_blocks, to_plane
-from plenocli.stages.batch import one_by_one, plan_batch, summarise
+from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.estimators import Estimators
 from plenocli.stages.progress import note
+from plenocli.stages.scheduler import Here, absolute, open_pool
 from plenocli.stages.superpixels import calibrated, read_superpixels
 from plenocli.stages.systems import read_system
 from plenocli.stages.training import files_of
@@ -35,22 +38,67 @@ class Settings:
     mem_limit: int | None = None
 
 
-def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, suffix=".h5", overwrite=False, command=""):
-    """Reconstruct every capture; returns a summary dict.
+@dataclass(frozen=True)
+class Recipe:
+    """All that the picture of a capture depends on beside it; digests tell files from others of the same name."""
+
+    settings: Settings
+    pif: Path | None
+    calibration: Path | None
+    digests: tuple
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A picture (row, column), its standard deviation and what is seen of a block, or None, the report, the share of it below zero,
+    points of a block or None."""
+
+    picture: np.ndarray
+    sigma: np.ndarray | None
+    seen: np.ndarray | None
+    report: dict
+    negative: float
+    block: tuple | None
+
+
+def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, suffix=".h5", scheduler=None, overwrite=False, command=""):
+    """Reconstruct every capture; returns a summary dict. Several go to settings.workers processes, or to the Dask cluster of
+    `scheduler` (stages.scheduler).
 
     One capture gives the file `output` (.h5 or .exr), several a folder with one file each; finished ones are skipped unless
     overwrite. One that fails does not stop the others; an error with the worst exit code follows at the end.
     """
+    from plenocli.artefacts import describe_inputs
+
     _check_options(settings, pif, calibration)
     inputs = [*captures, pif, calibration, settings.dictionary, settings.truth, *(files_of(settings.training) or ())]
     batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
-    estimators = Estimators(read_system(pif, settings.mem_limit), settings) if pif and batch.todo else None
-    origin = dict(command=command, pif=pif, calibration=calibration)
+    if not batch.todo:
+        return summarise(batch, ())
+    several = batch.several or scheduler is not None
+    files = describe_inputs({"pif": pif, "calibration": calibration, "dictionary": settings.dictionary})
+    recipe = Recipe(replace(settings, workers=1) if several else settings, pif, calibration, tuple(f["sha256"] for f in files.values()))
 
-    def work(capture, target):
-        return _one(capture, target, settings, estimators, calibration, overwrite, origin)
+    if scheduler is not None:
+        named = replace(recipe.settings, dictionary=absolute(settings.dictionary), truth=absolute(settings.truth), training=tuple(map(absolute, settings.training)))
+        recipe = replace(recipe, settings=named, pif=absolute(pif), calibration=absolute(calibration))
 
-    return summarise(batch, one_by_one(batch, work))
+    def write(solved, capture, target):
+        return _write(target, solved, settings, capture, dict(command=command, pif=pif, calibration=calibration), overwrite)
+
+    try:
+        if pif:  # a broken one ends the run here, before any capture
+            _estimators(recipe) if scheduler is None and (settings.workers == 1 or not several) else read_system(pif, settings.mem_limit)
+        # one capture alone may use all cores for its linear algebra
+        with open_pool(min(settings.workers, len(batch.todo)), scheduler) if several else nullcontext(Here()) as pool:
+            return summarise(batch, outcomes(batch, pool, partial(reconstruct_capture, recipe), write))
+    finally:
+        _estimators.cache_clear()
+
+
+@lru_cache(maxsize=1)
+def _estimators(recipe):
+    return Estimators(read_system(recipe.pif, recipe.settings.mem_limit), recipe.settings)
 
 
 def _check_options(settings, pif, calibration):
@@ -68,25 +116,22 @@ def _check_options(settings, pif, calibration):
             raise UsageError(f"--{option} means nothing to --method {settings.method}", fix=f"leave it out, or use --method {methods[-1]}")
 
 
-def _one(capture, target, settings, estimators, calibration, overwrite, origin):
-    """Reconstruct and write one capture; returns its report."""
-    if estimators is None:
-        picture, sigma, seen, report = _white_normalised(capture, calibration), None, None, {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
+def reconstruct_capture(recipe, capture):
+    """The Solved of one capture; what many captures need is made once a process."""
+    settings, block, sigma, seen = recipe.settings, None, None, None
+    if recipe.pif is None:
+        picture, report = _white_normalised(capture, recipe.calibration), {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
     else:
-        data = read_superpixels(capture, estimators.system, calibration, settings.mem_limit)
-        blocks, spread, report = estimators.solve(data, _truth(settings.truth, estimators.system.object_shape, data.y.shape[:2]))
-        picture = to_plane(blocks, estimators.system.object_shape)
-        sigma = None if spread is None else to_plane(spread, estimators.system.object_shape)
+        estimators = _estimators(recipe)
+        data, block = read_superpixels(capture, estimators.system, recipe.calibration, settings.mem_limit), estimators.system.object_shape
+        blocks, spread, report = estimators.solve(data, _truth(settings.truth, block, data.y.shape[:2]))
+        picture, sigma = to_plane(blocks, block), None if spread is None else to_plane(spread, block)
         report |= _limits(data, estimators.system, report)
         noise = report.get("noise_sigma") or data.sigma
-        seen = None
         if noise:
             seen, report["seen"] = estimators.seen(noise)
     negative = float(np.mean(picture < 0))
-    if settings.clip:
-        picture = np.maximum(picture, 0)
-    _write(target, picture, sigma, seen, report, negative if settings.clip else 0.0, settings, estimators, capture, origin, overwrite)
-    return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": negative, "clipped": settings.clip}
+    return Solved(np.maximum(picture, 0) if settings.clip else picture, sigma, seen, report, negative, block)
 
 
 def _limits(data, system, report):
@@ -142,18 +187,21 @@ def _white_normalised(capture, calibration):
     return np.where(lost, 0, value)
 
 
-def _write(target, picture, sigma, seen, report, clipped, settings, estimators, capture, origin, overwrite):
+def _write(target, solved, settings, capture, origin, overwrite):
+    """Write one picture; returns its report."""
     from plenocli.artefacts import Artefact, Provenance, describe_inputs, provenance_texts, write_artefact, write_exr
 
+    picture, sigma, report = solved.picture, solved.sigma, solved.report
     inputs = describe_inputs({"capture": capture, "pif": origin["pif"], "calibration": origin["calibration"], "dictionary": settings.dictionary,
                               "truth": settings.truth, "training": files_of(settings.training)})
     provenance = Provenance(origin["command"], inputs, settings.seed)
     if target.suffix == ".exr":
         channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
         write_exr(target, channels, {"method": report["method"]} | provenance_texts(provenance), overwrite=overwrite)
-        return
-    data = {"image/value": picture} | {f"image/{name}": values for name, values in (("sigma", sigma), ("seen", seen)) if values is not None}
-    attrs = {"method": report["method"], "parameters": {k: v for k, v in report.items() if k != "method"}, "clipped": clipped}
-    if estimators is not None:
-        attrs["notes"] = {"block": list(estimators.system.object_shape)}
-    write_artefact(target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite)
+    else:
+        data = {"image/value": picture} | {f"image/{name}": values for name, values in (("sigma", sigma), ("seen", solved.seen)) if values is not None}
+        attrs = {"method": report["method"], "parameters": {k: v for k, v in report.items() if k != "method"}, "clipped": solved.negative if settings.clip else 0.0}
+        if solved.block is not None:
+            attrs["notes"] = {"block": list(solved.block)}
+        write_artefact(target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite)
+    return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": solved.negative, "clipped": settings.clip}

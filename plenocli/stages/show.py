@@ -120,7 +120,13 @@ def _image(path, artefact, choice):
     return image_figures(read_result(path, mem_limit=choice.mem_limit), path.name, None if artefact is None else artefact.data.get("image/seen"))
 
 
-_FIGURES = {"pif": _pif, "capture": _capture, "calibration": _calibration, "dictionary": _dictionary, "spectra": _spectra, "image": _image}
+def _sweep(path, artefact, choice):
+    from plenocli.report.front import front_figures
+
+    return front_figures(artefact)
+
+
+_FIGURES = {"pif": _pif, "capture": _capture, "calibration": _calibration, "dictionary": _dictionary, "spectra": _spectra, "image": _image, "sweep": _sweep}
 
 
 def _compared(files, truth, mem_limit):

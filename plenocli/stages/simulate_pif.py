@@ -137,6 +137,7 @@ def _summary(output, pif, found, plan):
     return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
             "wavelengths": pif.wavelength.tolist(), "model": plan.model, "rung": plan.rung, "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
             "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],
+            "bytes": plan.bytes, "nominal_seconds": next(c for c in plan.candidates if c.why is None).seconds(),
             "quartic_phase_rad": pif.notes["quartic_phase_rad"], "warnings": [*plan.warnings, *found["warnings"]], **keep}
 
 

@@ -54,6 +54,8 @@ def _make_files(folder, steps, runner):
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
         assert outcome.code == 0, (name, outcome.text)
     _write_shards(folder)
+    (folder / "sweep.toml").write_text('camera = "camera.toml"\n[vary]\n"main_lens.f_number" = [7, 8]\n[simulate-pif]\nsuperpixels = "1x1"\ncoherent-ring = 0\n[reconstruct]\nmethod = "block-mean"\n')
+    assert runner.run(["sweep", "sweep.toml", "-o", "sweep.h5"], folder, limit=120).code == 0
     (folder / "done").touch()
 
 

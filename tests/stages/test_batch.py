@@ -14,6 +14,7 @@ from plenocli.artefacts import Artefact, write_artefact
 from plenocli.errors import InputError, PlenoError
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.calibrate import run_calibrate
+from plenocli.stages.scheduler import open_pool
 from plenocli.stages.demux import Settings, run_demux
 
 PITCH, COUNT, FILES = 12, 9, 14
@@ -118,7 +119,8 @@ def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
         held.remove(capture)
         return int(capture.stem)
 
-    ended = list(outcomes(batch, work, write, 2))
+    with open_pool(2, threads=True) as pool:
+        ended = list(outcomes(batch, pool, work, write))
     assert len(ended) == 12 and most[0] <= 4
     with pytest.raises(PlenoError, match="1 of 12 captures failed: 07.x"):
         summarise(batch, ended)
@@ -129,5 +131,5 @@ def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
 def test_a_fault_of_ours_ends_the_batch_with_its_traceback(tmp_path):
     captures = [tmp_path / f"{i}.x" for i in range(4)]
     batch = plan_batch(captures, tmp_path / "out", ".h5", "numbers are", overwrite=False, inputs=captures)
-    with pytest.raises(ZeroDivisionError):
-        list(outcomes(batch, lambda capture: 1 / 0, lambda *_: None, 2))
+    with pytest.raises(ZeroDivisionError), open_pool(2, threads=True) as pool:
+        list(outcomes(batch, pool, lambda capture: 1 / 0, lambda *_: None))

@@ -1,0 +1,295 @@
+"""Sweeps: the table against the stages run by hand, the front against its definition, kills, workers, bad cameras, resuming."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import read_artefact
+from plenocli.cli.sections import read_options
+from plenocli.config.sweep import number
+from plenocli.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
+from plenocli.stages import chain
+from plenocli.stages.sweep import lines, run_sweep
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SMALL = """
+camera = "camera.toml"
+[vary]
+"main_lens.f_number" = [6, 8]
+"sensor.pixels_per_lenslet" = [[7, 7], [9, 9]]
+"capture-sim.snr" = ["30 dB", "50 dB"]
+[follow]
+"lenslet_array.superpixel_pitch" = "sensor.pixels_per_lenslet.0 * sensor.pixel_pitch"
+[simulate-pif]
+model = "fresnel"
+superpixels = "1x1"
+coherent-ring = 0
+accuracy = 1e-2
+[capture-sim]
+scene = "skimage:coins"
+[reconstruct]
+method = "tikhonov"
+[front]
+psnr_db = "max"
+sensor_pixels = "min"
+"""
+
+
+def camera_text():
+    """A camera smaller than tiny.toml."""
+    text = (ROOT / "sample_configs" / "tiny.toml").read_text()
+    for old, new in [("[8, 8]", "[4, 4]"), ("[13, 13]", "[9, 9]"), ('"26 um"', '"18 um"'), ('"208 um"', '"144 um"'), ("[5, 5]", "[3, 3]")]:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def described(folder, text=SMALL):
+    (folder / "camera.toml").write_text(camera_text())
+    (folder / "sweep.toml").write_text(text)
+    return folder / "sweep.toml"
+
+
+def sweep(path, output, **options):
+    return run_sweep(path, output, read_options=read_options, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """(sweep file, table, summary) of a sweep that nobody interrupted, in one process."""
+    folder = tmp_path_factory.mktemp("sweep")
+    path = described(folder)
+    return path, folder / "whole.h5", sweep(path, folder / "whole.h5")
+
+
+def same(table, other):
+    return table.read_bytes() == other.read_bytes() and table.with_suffix(".csv").read_bytes() == other.with_suffix(".csv").read_bytes()
+
+
+def journal(table):
+    return [json.loads(line.split(" ", 1)[1]) for line in (table.with_suffix(".parts") / "points.jsonl").read_text().splitlines()]
+
+
+def test_the_table_holds_what_the_stages_say_by_hand(whole, tmp_path):
+    """One point of it, through the command line's own stages with files between them."""
+    from plenocli.cli.main import run
+
+    path, table, _ = whole
+    artefact = read_artefact(table, "sweep")
+    attrs, data = artefact.attrs["sweep"], artefact.data
+    text = camera_text().replace("f_number = 8", "f_number = 6").replace("[9, 9]", "[7, 7]").replace('"18 um"', '"14 um"')
+    (tmp_path / "c.toml").write_text(text)
+    pif, capture, image, score = (str(tmp_path / name) for name in ("pif.h5", "capture.h5", "image.h5", "score.json"))
+    assert run(["simulate-pif", str(tmp_path / "c.toml"), "--model", "fresnel", "--superpixels", "1x1", "--coherent-ring", "0", "--accuracy", "1e-2", "-o", pif]) == 0
+    assert run(["capture-sim", str(tmp_path / "c.toml"), "--pif", pif, "--scene", "skimage:coins", "--snr", "50dB", "-o", capture]) == 0
+    assert run(["reconstruct", capture, "--pif", pif, "--method", "tikhonov", "-o", image]) == 0
+    assert run(["score", image, "--truth", capture, "-o", score]) == 0
+    metrics = json.loads(Path(score).read_text())["metrics"]
+    names = [m["name"] for m in attrs["metrics"]]
+    row = next(i for i in range(8) if data["sweep/parameter"][i].tolist() == [6.0, 0.0, 50.0])
+    assert attrs["parameters"] == [{"key": "main_lens.f_number", "unit": ""}, {"key": "sensor.pixels_per_lenslet", "unit": "", "choices": [[7, 7], [9, 9]]},
+                                   {"key": "capture-sim.snr", "unit": "dB"}]
+    for name in ("psnr_db", "ssim", "rmse"):
+        assert data["sweep/metric"][row, names.index(name)] == metrics[name]
+    assert data["sweep/metric"][row, names.index("sensor_pixels")] == 9 * 49
+    assert data["sweep/metric"][row, names.index("matrix_bytes")] == 49 * 16 * 4
+    assert data["sweep/metric"][row, names.index("lenslet_field_m")] == pytest.approx(14e-6 / (1 + 144e-6 / 55e-3) * 10, rel=1e-6)
+
+
+def test_the_front_is_what_brute_force_finds(whole):
+    path, table, report = whole
+    with open(table.with_suffix(".csv"), newline="") as file:
+        rows = list(csv.DictReader(file))
+    figures = [(float(r["psnr_db"]), -float(r["sensor_pixels"])) for r in rows]
+    expected = [i for i, a in enumerate(figures) if not any(all(x >= y for x, y in zip(b, a)) and b != a for b in figures)]
+    assert [i for i, r in enumerate(rows) if r["front"] == "1"] == expected
+    assert sorted(entry["point"] for entry in report["front"]) == expected and 0 < len(expected) < len(rows)
+    assert np.flatnonzero(read_artefact(table, "sweep").data["sweep/front"]).tolist() == expected
+    assert f"{len(expected)} on the front of psnr_db max, sensor_pixels min" in lines(report)
+
+
+def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
+    from plenocli.stages import simulate_pif
+
+    calls = []
+    real = simulate_pif.run_simulate_pif
+    monkeypatch.setattr(simulate_pif, "run_simulate_pif", lambda *a, **k: calls.append(1) or real(*a, **k))
+    report = sweep(described(tmp_path), tmp_path / "out.h5")
+    assert report["computed"] == 8 and len(calls) == 4  # two signal-to-noise ratios share each camera's matrix
+    assert same(tmp_path / "out.h5", whole[1])
+    assert not list((tmp_path / "out.parts").rglob("*.h5")), "matrices go when they have served"
+    # more values: only those are computed; a finished sweep again: nothing
+    described(tmp_path, SMALL.replace('"50 dB"', '"50 dB", "60 dB"'))
+    assert sweep(tmp_path / "sweep.toml", tmp_path / "out.h5", overwrite=True)["computed"] == 4
+    assert sweep(described(tmp_path), tmp_path / "out.h5", overwrite=True)["computed"] == 0
+    assert same(tmp_path / "out.h5", whole[1])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
+    path, table, _ = whole
+    out, rng = tmp_path / "whole.h5", np.random.default_rng(seed)
+    command = [sys.executable, "-m", "plenocli", "sweep", str(path), "-o", str(out), "--workers", str(1 + seed)]
+    child = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True)
+    kept, wanted, deadline = tmp_path / "whole.parts" / "points.jsonl", int(rng.integers(2, 8)), time.monotonic() + 300
+    while child.poll() is None and time.monotonic() < deadline and (not kept.exists() or kept.read_bytes().count(b"\n") < wanted):
+        time.sleep(0.002)
+    os.killpg(child.pid, signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL and not out.exists()
+    with open(kept, "ab") as file:
+        file.write(b"0123456789abcdef {torn")
+    before = len({key for key, record in journal_lines(kept) if "status" in record})
+    assert sweep(path, out)["computed"] == 8 - before
+    assert same(out, table)
+    assert [p.name for p in (tmp_path / "whole.parts").iterdir()] == ["points.jsonl"]
+
+
+def journal_lines(path):
+    return [json.loads(line.split(" ", 1)[1]) for line in path.read_text().splitlines() if line.endswith("]")]
+
+
+def test_two_processes_give_the_same_bytes(whole, tmp_path):
+    report = sweep(whole[0], tmp_path / "two.h5", workers=2)
+    assert report["computed"] == 8 and same(tmp_path / "two.h5", whole[1])
+
+
+def test_cameras_that_are_refused_are_rows_with_the_reason(tmp_path):
+    text = SMALL.replace('"main_lens.f_number" = [6, 8]', '"main_lens.f_number" = [6, 8000]').replace("[7, 7], [9, 9]", "[9, 9], [9, 10]").replace('["30 dB", "50 dB"]', '["50 dB"]')
+    report = sweep(described(tmp_path, text), tmp_path / "out.h5")
+    artefact = read_artefact(tmp_path / "out.h5", "sweep")
+    reasons = artefact.attrs["sweep"]["reasons"]
+    assert artefact.data["sweep/status"].tolist() == [0, 2, 2, 2] and report["refused"] == 3
+    assert "f_number" in reasons["2"] and "superpixel pitch is 9.0000 pixels, not 9 x 10" in reasons["1"] and str(tmp_path) not in str(reasons)
+    metric = artefact.data["sweep/metric"]
+    assert np.isfinite(metric[0]).all() and np.isnan(metric[1:]).all() and artefact.data["sweep/front"].tolist() == [True, False, False, False]
+    again = tmp_path / "again.h5"
+    sweep(tmp_path / "sweep.toml", again, workers=2)
+    assert same(again, tmp_path / "out.h5")
+
+
+def test_a_matrix_that_is_refused_refuses_its_points(tmp_path):
+    report_text = SMALL.replace("accuracy = 1e-2", "accuracy = 1e-12").replace("[6, 8]", "[6]")
+    with pytest.raises(PlenoError, match="none of 4 points could be computed") as caught:
+        sweep(described(tmp_path, report_text), tmp_path / "out.h5")
+    assert caught.value.exit_code == 5
+    artefact = read_artefact(tmp_path / "out.h5", "sweep")
+    assert artefact.data["sweep/status"].tolist() == [5] * 4 and "1e-12" in artefact.attrs["sweep"]["reasons"]["3"]
+
+
+@pytest.mark.parametrize(("old", "new", "error", "said"), [
+    ('method = "tikhonov"', 'methd = "tikhonov"', UsageError, "reconstruct.methd: unknown option; did you mean method?"),
+    ('method = "tikhonov"', 'method = "tikhonof"', UsageError, "reconstruct.method"),
+    ('coherent-ring = 0', 'coherent-ring = true', UsageError, "simulate-pif.coherent-ring"),
+    ('"50 dB"', '"50"', UsageError, "capture-sim.snr"),
+    ('[reconstruct]\nmethod = "tikhonov"', '[demux]\nmethod = "pinv"', ConfigError, "demux is no stage of the spatial chain"),
+    ('psnr_db = "max"', 'psnr = "max"', ConfigError, "did you mean psnr_db?"),
+    ('camera = "camera.toml"', 'camera = "nowhere.toml"', InputError, "nowhere.toml"),
+])
+def test_mistakes_in_the_file_end_the_run_before_any_work(tmp_path, old, new, error, said):
+    assert old in SMALL
+    with pytest.raises(error) as caught:
+        sweep(described(tmp_path, SMALL.replace(old, new)), tmp_path / "out.h5")
+    assert said in str(caught.value) and not list(tmp_path.glob("out*"))
+
+
+def test_outputs_are_guarded(whole, tmp_path):
+    path, table, _ = whole
+    with pytest.raises(UsageError, match="exists already"):
+        sweep(path, table)
+    (tmp_path / "mine.csv").write_text("precious")
+    with pytest.raises(UsageError, match="exists already"):
+        sweep(path, tmp_path / "mine.h5")
+    assert (tmp_path / "mine.csv").read_text() == "precious"
+    with pytest.raises(OutputError):
+        sweep(path, tmp_path / "no" / "where.h5")
+    with pytest.raises(OutputError, match="another run"):
+        from plenocli.stages.journal import Journal
+
+        (tmp_path / "held.parts").mkdir()
+        held = Journal(tmp_path / "held.parts" / "points.jsonl")
+        try:
+            sweep(path, tmp_path / "held.h5")
+        finally:
+            held.close()
+
+
+def test_damaged_lines_of_the_journal_are_computed_again(whole, tmp_path):
+    path, table, _ = whole
+    parts = tmp_path / "whole.parts"
+    parts.mkdir()
+    content = (table.with_suffix(".parts") / "points.jsonl").read_bytes().splitlines(keepends=True)
+    points = [i for i, line in enumerate(content) if b'"status"' in line]
+    content[points[2]] = content[points[2]].replace(b'"psnr_db": ', b'"psnr_db": 9', 1)
+    (parts / "points.jsonl").write_bytes(b"".join(content))
+    assert sweep(path, tmp_path / "whole.h5")["computed"] == 1 and same(tmp_path / "whole.h5", table)
+
+
+def test_keys_follow_what_figures_depend_on_and_nothing_else(tmp_path):
+    from plenocli.config import parse_camera
+
+    camera = parse_camera(camera_text())
+    task = chain.task_of("spatial", camera, {"capture-sim": {"snr_db": 50.0}}, 0)
+    key = chain.point_key(task, {})
+
+    def matrix(c, options=None):
+        return chain.matrix_key(chain.task_of("spatial", c, {"simulate-pif": options or {}}, 0), c, {})
+
+    for change in ({"sensor.full_well": 9000.0}, {"sensor.bits": 10}, {"lenslet_array.count": (4, 3)}, {"object.distance": 0.6}):
+        assert chain.point_key(chain.task_of("spatial", camera.replace(**change), {"capture-sim": {"snr_db": 50.0}}, 0), {}) != key
+    assert chain.point_key(chain.task_of("spatial", camera, {"capture-sim": {"snr_db": 50.0}}, 1), {}) != key
+    assert matrix(camera.replace(**{"sensor.bits": 10, "lenslet_array.count": (4, 3)})) == matrix(camera)
+    assert matrix(camera.replace(**{"sensor.full_well": 9000.0})) != matrix(camera), "noise decides how exact is exact enough"
+    asked = {"accuracy": 1e-2}
+    assert matrix(camera.replace(**{"sensor.full_well": 9000.0}), asked) == matrix(camera, asked) != matrix(camera)
+    assert matrix(camera.replace(**{"object.distance": 0.6})) != matrix(camera)
+
+
+def test_files_count_by_what_they_hold_not_by_where_they_lie(tmp_path):
+    import OpenImageIO as oiio
+
+    def run(folder, level, text=SMALL):
+        folder.mkdir()
+        picture = np.tile(np.linspace(0, level, 24, dtype=np.float32), (24, 1))
+        image = oiio.ImageBuf(oiio.ImageSpec(24, 24, 1, "uint8"))
+        image.set_pixels(oiio.ROI(0, 24, 0, 24), picture[..., None])
+        assert image.write(str(folder / "scene.png"))
+        text = text.replace('"skimage:coins"', '"scene.png"').replace("[6, 8]", "[6]").replace("[[7, 7], [9, 9]]", "[[7, 7]]").replace('["30 dB", "50 dB"]', '["50 dB"]')
+        sweep(described(folder, text), folder / "out.h5")
+        return read_artefact(folder / "out.h5", "sweep").data["sweep/key"].tolist()
+
+    first = run(tmp_path / "a", 1.0)
+    assert run(tmp_path / "b", 1.0) == first and run(tmp_path / "c", 0.5) != first
+
+
+@pytest.mark.slow
+def test_a_spectral_sweep_with_predicted_and_with_measured_responses(tmp_path):
+    text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text().replace("[20, 30]", "[12, 18]")
+    (tmp_path / "camera.toml").write_text(text)
+    body = ('camera = "camera.toml"\n[vary]\n"filter_array.filters.*.fwhm" = ["40 nm", "60 nm"]\n[simulate-pif]\nmodel = "fresnel"\naccuracy = 1e-2\n'
+            '[front]\nsix_patch_rmse = "min"\nspectral_angle_deg = "min"\n')
+    found = {}
+    for name, section in (("predicted", ""), ("measured", "[calibrate]\nshared = true\n")):
+        (tmp_path / "sweep.toml").write_text(body + section)
+        sweep(tmp_path / "sweep.toml", tmp_path / f"{name}.h5")
+        artefact = read_artefact(tmp_path / f"{name}.h5", "sweep")
+        column = [m["name"] for m in artefact.attrs["sweep"]["metrics"]].index("six_patch_rmse")
+        assert not artefact.data["sweep/status"].any()
+        found[name] = artefact.data["sweep/metric"][:, column]
+    assert (found["measured"] < 0.05).all() and (found["predicted"] < 0.05).all() and not np.array_equal(found["measured"], found["predicted"])
+
+
+def test_values_are_written_as_given_and_read_as_numbers(whole):
+    with open(whole[1].with_suffix(".csv"), newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {r["capture-sim.snr"] for r in rows} == {"30 dB", "50 dB"} and {r["sensor.pixels_per_lenslet"] for r in rows} == {"[7, 7]", "[9, 9]"}
+    values = read_artefact(whole[1], "sweep").data["sweep/parameter"]
+    assert [number(r["capture-sim.snr"]) for r in rows] == values[:, 2].tolist()

@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw dictionary bench-sparse tiny tradeoff bench-pif clean
+.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse tiny tradeoff bench-pif clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -72,6 +72,9 @@ raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. 
 
 tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (hours)
 	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff
+
+sweep: $(READY) ## a design space in one command: the examples of sample_configs/sweeps, tables and fronts in runs/sweep
+	$(PIPELINE) pipelines/sweep.mk RUN=$(RUNS)/sweep WORKERS=$(CORES)
 
 dictionary: $(READY) ## Algorithm 1 at the paper's size, 20 iterations: a line for each, the history as a plot
 	$(PIPELINE) pipelines/dictionary.mk RUN=$(RUNS)/dictionary

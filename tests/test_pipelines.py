@@ -114,3 +114,15 @@ def test_a_chart_is_measured_and_seen_through_the_camera(tmp_path, glass):
 
 def test_the_chart_pipeline_asks_for_its_captures():
     assert make("colorchecker", check=False) == []
+
+
+def test_a_sweep_is_made_once_and_again_where_its_file_changed(tmp_path):
+    (tmp_path / "camera.toml").write_text((ROOT / "sample_configs" / "tiny.toml").read_text().replace("[5, 5]", "[2, 2]"))
+    text = 'camera = "camera.toml"\n[vary]\n"capture-sim.snr" = ["40 dB"]\n[simulate-pif]\nmodel = "fresnel"\nsuperpixels = "1x1"\naccuracy = 1e-2\n[reconstruct]\nmethod = "tikhonov"\n'
+    (tmp_path / "small.toml").write_text(text)
+    variables = [f"RUN={tmp_path}/run", f"SWEEPS={tmp_path}/small.toml"]
+    assert stages(make("sweep", *variables)) == ["sweep"] and stages(make("sweep", *variables)) == []
+    assert {p.name for p in (tmp_path / "run").iterdir()} == {"small.h5", "small.csv", "small.png", "small.parts"}
+    (tmp_path / "small.toml").write_text(text.replace('"40 dB"', '"40 dB", "50 dB"'))
+    os.utime(tmp_path / "small.toml", (4e9, 4e9))
+    assert "2 points, 1 computed now" in "\n".join(make("sweep", *variables))

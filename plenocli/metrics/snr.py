@@ -9,6 +9,8 @@ DEFINITIONS = {
     "snr_predicted_db": "20 log10(estimate / predicted standard deviation), band by band: what the noise model promises "
     "before any repetition, taken at the root mean square of the prediction; the noise of calibration and white reference counts, "
     "which frames over time share: it may lie some dB below their capture SNR",
+    "snr_capture_mean_db": "mean of snr_capture_db over the bands",
+    "snr_predicted_mean_db": "mean of snr_predicted_db over the bands",
     "snr_over_single_pixel_db": "snr_capture_mean_db less that of the result of single pixel extraction",
     "snr_sensor_db": "10 log10(mean(y^2) / sigma^2) of the capture: the noise level of a simulation (60 dB in Berkner et al. "
     "2013); the mean square of y, not its variance, is the signal",

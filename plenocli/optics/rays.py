@@ -151,7 +151,7 @@ class RayLenslets:
         # both axes run through the pupil the same way, so that their signs cancel
         step = 1 if self._joined else 2
         areas = np.diff(np.diff(self._below(y[:, :, None], x[:, None, :]), axis=1)[:, ::step], axis=2)
-        return areas[:, :, ::step]
+        return np.maximum(areas[:, :, ::step], 0)  # differences of nearly equal areas round to below 0
 
 
 def _lit(edges):

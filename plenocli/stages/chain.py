@@ -46,6 +46,8 @@ def task_of(chain, camera, options, seed):
         capture |= {"scene": "skimage:astronaut"} if chain == "spatial" else {"target": "colorchecker"}
     if chain == "spectral" and "wavelengths" not in settings["simulate-pif"]:
         settings["simulate-pif"].setdefault("spectral_step", "auto")
+    if chain == "spatial":
+        settings["reconstruct"].setdefault("method", "lmmse")  # auto would try several methods at every point
     for stage in ("capture-sim", "reconstruct"):
         settings.get(stage, {}).setdefault("seed", seed)
     return {"chain": chain, "camera": camera.text, "settings": settings}

@@ -1,5 +1,6 @@
 """The geometric rung: closed areas against counting, rays traced one by one, and the wave model as the wavelength falls."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -160,3 +161,15 @@ def test_waves_tend_to_rays(distance):
         errors.append(np.abs(rays - wave).sum() / wave.sum())
         assert 0.1 < error_bound(camera, view) / (np.linalg.norm(rays - wave) / np.linalg.norm(wave)) < 10
     assert errors[1] < 0.75 * errors[0] and errors[2] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("f_number", [11, 12])
+def test_no_pixel_has_less_than_no_light(f_number):
+    """Where the pupil's image is smaller than the superpixel most pixels are dark: differences of equal areas, which round."""
+    from plenocli.accuracy import system_matrix
+    from plenocli.config import load_camera
+
+    camera = load_camera(Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml")
+    camera = camera.replace(**{"main_lens.aperture_diameter": 0.055 / f_number, "sensor.pixels_per_lenslet": (9, 9), "lenslet_array.pitch": 18e-6 / (1 + 208e-6 / 55e-3)})
+    matrix = system_matrix(camera, model="ray", superpixels=(1, 1)).A
+    assert matrix.min() == 0 and matrix.max() > 0

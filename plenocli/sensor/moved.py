@@ -31,21 +31,22 @@ class Moved:
         self._made = {}
 
     def __getitem__(self, places):
-        shared = self._response.ndim == 2
-        own = np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])) if shared else self._response[places]
-        out = np.array(own)
+        out = self._response[places] if self._response.ndim > 2 else np.array(np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])))
         rest, kinds = self._rest[places], self._reference.kinds(self._before[places])
         nodes = rest if self._even else np.rint(rest / NODES) * NODES
         groups, which = np.unique(np.column_stack([kinds, nodes]), axis=0, return_inverse=True)
         for k, (kind, *node) in enumerate(groups):
             some = np.flatnonzero(which.ravel() == k)
             pictures, lost, basis = self._change(int(kind), tuple(node), places, some[0])
-            c = np.ones((len(some), 1), np.float32) if basis is None else basis.coefficients(own[some])
+            part = out if len(groups) == 1 else out[some]
+            c = np.ones((len(some), 1), np.float32) if basis is None else basis.coefficients(part)
             step = (rest[some] - node).astype(np.float32)
-            change = np.concatenate([c, c * step[:, :1], c * step[:, 1:]], axis=1) @ pictures.reshape(len(pictures), -1)
-            part = own[some] + change.reshape(-1, *self.shape[2:])
+            if step.any():
+                c = np.concatenate([c, c * step[:, :1], c * step[:, 1:]], axis=1)
+            part += (c @ pictures[: c.shape[1]].reshape(c.shape[1], -1)).reshape(part.shape)
             part[:, lost] = np.nan
-            out[some] = part
+            if part is not out:
+                out[some] = part
         return out
 
     def _change(self, kind, node, places, one):

@@ -77,15 +77,14 @@ class _Cutter:
         origin, readout = self.origin[part], self.readout
         at = origin[:, 0], origin[:, 1]
         raw = self.raw[at].reshape(-1, self.count)
-        light = raw.astype(np.float32)
         if self.mean is None:
-            light -= self._of(self.level, origin)
+            mean = self._of(self.level, origin)
         else:
             mean = self.mean(part)
             if self.growth is not None:  # as Dark.at
                 level = self._of(self.level, origin)
                 mean = level + (mean - level) * self.growth
-            light -= mean
+        light = np.subtract(raw, mean, dtype=np.float32, casting="same_kind")
         if readout.scale != 1.0:
             light *= np.float32(readout.scale)
         if readout.offset:

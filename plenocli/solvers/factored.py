@@ -8,7 +8,7 @@ lost so many pixels that this fails are said to be hard, and `plenocli.solvers.s
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -16,17 +16,19 @@ import numpy as np
 from plenocli.solvers.spectral import LARGEST_CONDITION
 
 BLOCK_NUMBERS = 90_000, 45_000  # pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
+COMPILED_NUMBERS = 360_000  # of a block that is compiled, where only a superpixel must stay there and calls cost more
 COMPILED_FROM = 4_000_000  # pixels from which importing numba pays
-FACTOR_NUMBERS = 1_000_000
+FACTOR_NUMBERS = 250_000
+STREAMED_NUMBERS = 6_000_000  # pixels whose factors are held at a time where none are kept
 HARD = 1e-3  # least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
 
 
 @dataclass(frozen=True)
 class Factored:
     """q (lenslet or 1, band, pixel) float32 and r (lenslet or 1, band, band) of F = Q R. used (lenslet or 1, pixel): known in
-    every band, None where all are; sound (lenslet or 1): condition number below 1e10."""
+    every band, None where all are; sound (lenslet or 1): condition number below 1e10. q is None where sums were made already."""
 
-    q: np.ndarray
+    q: np.ndarray | None
     r: np.ndarray
     used: np.ndarray | None
     sound: np.ndarray
@@ -34,7 +36,7 @@ class Factored:
     @property
     def shared(self):
         """Whether one response serves all lenslets."""
-        return len(self.q) == 1
+        return len(self.r) == 1
 
     @cached_property
     def inverse(self):
@@ -154,7 +156,7 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
     kernel = None if factored.shared or variance is None or radiance is not None or doubt is not None else _kernel(total * factored.q.shape[-1])
-    step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.q.shape[-1])
+    step = max(1, (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS) // factored.q.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
         x = cut(part)
@@ -162,6 +164,23 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
             x = x if kernel is None else cut(part)
             _block(factored, basis, part, x, variance, None if radiance is None else radiance[part], out)
     return out
+
+
+def stream(response, which, cut, **settings):
+    """(Factored without q, Sums) of the superpixels at `which`, as collect(factor(response, which), ...), which never holds all
+    of Q: for responses that serve one capture. Arguments as theirs."""
+    total = len(which[0])
+    step = max(1, STREAMED_NUMBERS // response.shape[-2])
+    factors, sums = [], []
+    for first in range(0, total, step):
+        part = slice(first, min(first + step, total))
+        own = settings | ({"radiance": settings["radiance"][part]} if settings.get("radiance") is not None else {})
+        factored = factor(response, tuple(w[part] for w in which))
+        sums.append(collect(factored, lambda inner: cut(slice(first + inner.start, first + inner.stop)), part.stop - first, **own))
+        factors.append((factored.r, factored.sound))
+    r, sound = (np.concatenate(parts) for parts in zip(*factors))
+    joined = (None if getattr(sums[0], one.name) is None else np.concatenate([getattr(s, one.name) for s in sums]) for one in fields(Sums))
+    return Factored(None, r, None, sound), Sums(*joined)
 
 
 def _kernel(pixels):
@@ -183,7 +202,6 @@ def _compiled(kernel, factored, part, x, variance, out):
     kernel(factored.q[part], factored.inverse[part], x, np.float32(variance.gain), variance.read, known, sandwich, out.plain[part], out.normal[part], out.right[part],
            out.spread[part] if sandwich else out.normal[part], out.chi[part])
     return not np.isnan(out.plain[part]).any()
-
 
 
 

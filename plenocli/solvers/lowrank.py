@@ -53,7 +53,11 @@ class Basis:
 
     def coefficients(self, response):
         """(lenslet, rank) of responses (lenslet, pixel, band); NaN counts as nothing."""
-        return np.nan_to_num(response).reshape(len(response), -1) @ self.dual.T
+        found = response.reshape(len(response), -1) @ self.dual.T
+        lost = np.isnan(found).any(axis=1)
+        if lost.any():
+            found[lost] = np.nan_to_num(response[lost]).reshape(int(lost.sum()), -1) @ self.dual.T
+        return found
 
     def mixed(self, coefficients):
         """Responses (lenslet, pixel, band) of coefficients (lenslet, rank)."""

@@ -38,6 +38,11 @@ class Response:
         """Whether one F serves all lenslets."""
         return self.response.ndim == 2
 
+    @property
+    def passing(self):
+        """Whether the response is made lenslet by lenslet for one capture (plenocli.sensor.moved), and never held whole."""
+        return not isinstance(self.response, np.ndarray)
+
     @cached_property
     def sites(self):
         """Row and column indices of the valid lenslets, which results below are ordered by."""
@@ -81,7 +86,9 @@ class Response:
     @cached_property
     def sampled(self):
         """`factored` of the sample."""
-        return self.factored.some(self.sample)
+        from plenocli.solvers.factored import factor
+
+        return factor(self.response, tuple(part[self.sample] for part in self.sites)) if self.passing else self.factored.some(self.sample)
 
     @cached_property
     def sampled_pixels(self):
@@ -108,13 +115,6 @@ class Response:
         """Make now what all captures need and several threads would make at once; returns itself."""
         self.levels, self.reference.gains
         return self
-
-    def keep(self, factored):
-        """Make what only captures that did not move need, or let go of the largest part of it."""
-        if factored:
-            self.factored, self.sampled, self.sampled_pixels
-        else:
-            self.__dict__.pop("factored", None)
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ class _Job:
         self.bands, self.unknowns = len(self.c.wavelengths), self.whole.response.shape[-1]
         self.total = len(self.c.sites[0])
         self.sample = self.c.sample
-        self.factored = self.whole.factored
+        self.factored = None if self.whole.passing else self.whole.factored
         if isinstance(self.values, np.ndarray):
             own = self.values[self.c.sites]
             self.cut = lambda which: np.array(own[which], np.float32)  # lenslets by their index or a slice, free to be overwritten
@@ -274,14 +274,23 @@ class _Job:
 
     def collect(self, which=None, **settings):
         """Sums of all lenslets, or those of an index array."""
-        from plenocli.solvers.factored import collect
+        from plenocli.solvers.factored import collect, stream
 
+        if which is None and self.whole.passing:
+            self.factored, sums = stream(self.whole.response, self.whole.sites, self.cut, **settings)
+            return sums
         if which is None:
             return collect(self.factored, self.cut, self.total, **settings)
         return collect(self._some(which), lambda part: self.cut(which[part]), len(which), **settings)
 
     def _some(self, which):
-        return self.factored if which is None else self.whole.sampled if which is self.sample else self.factored.some(which)
+        if which is None or which is self.sample:
+            return self.factored if which is None else self.whole.sampled
+        if not self.whole.passing:
+            return self.factored.some(which)
+        from plenocli.solvers.factored import factor
+
+        return factor(self.whole.response, tuple(part[which] for part in self.whole.sites))
 
     def weighted(self, which=None, sandwich=True):
         """Sums weighted by the noise that is expected."""
@@ -339,8 +348,7 @@ class _Job:
 
     def _radiance(self, sums, which=None):
         """Plain radiances (lenslet, band) of the calibration's bands."""
-        inverse = self.factored.inverse
-        b = ((inverse if len(inverse) == 1 or which is None else inverse[which]) @ sums.plain[..., None])[..., 0][:, : self.bands]
+        b = (self._some(which).inverse @ sums.plain[..., None])[..., 0][:, : self.bands]
         return np.where(sums.hard[:, None], np.nan, b)
 
     def _single_pixel_error(self, radiance):

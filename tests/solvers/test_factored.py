@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import plenocli.solvers.factored as factored_module
-from plenocli.solvers.factored import answer, collect, factor
+from plenocli.solvers.factored import answer, collect, factor, stream
 from plenocli.solvers.spectral import demultiplex, noise_variance
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
@@ -131,3 +131,21 @@ def test_a_response_that_cannot_tell_bands_apart_gives_nothing():
     factored = factor(f)
     sums = collect(factored, lambda part: np.ones((3, 30), np.float32)[part], 3)
     assert not factored.sound[0] and np.isnan(answer(factored, sums, "pinv", None, False)[0]).all()
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_sums_made_in_passing_are_those_of_all_factors_at_once(case, monkeypatch, known):
+    response, values, rng = case
+    response = np.broadcast_to(response, (LENSLETS, PIXELS, BANDS))
+    values[rng.uniform(size=values.shape) < 0.02] = np.nan
+    monkeypatch.setattr(factored_module, "STREAMED_NUMBERS", 17 * PIXELS)
+    radiance = rng.uniform(0, 1, (LENSLETS, BANDS)) if known else None
+    settings = dict(noise=(GAIN, READ), sandwich=True, radiance=radiance)
+    whole = factor(response)
+    expected = collect(whole, lambda part: values[part].copy(), LENSLETS, **settings)
+    passing, sums = stream(response, (np.arange(LENSLETS),), lambda part: values[part].copy(), **settings)
+    for method in ("pinv", "wls", "lmmse"):
+        for ours, theirs in zip(answer(passing, sums, method, PRIOR), answer(whole, expected, method, PRIOR), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    np.testing.assert_array_equal(sums.count, expected.count)
+    np.testing.assert_allclose(sums.chi, expected.chi, rtol=1e-6)

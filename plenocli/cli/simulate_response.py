@@ -40,6 +40,7 @@ def command(ctx, camera, output, grid, overwrite, as_json, **settings):
     if report["smallest_angle_deg"] is not None:
         line += f", smallest angle between two columns {report['smallest_angle_deg']:.2f} deg"
     line += "; light from a lenslet's own field " + ", ".join(f"{share:.0%}" for share in report["own_light"])
+    line += f"; taken to be known to {max(report['error']):.0%}"
     if "rays_against_waves" in report:
         line += "; rays differ from waves by " + ", ".join(f"{share:.1%}" for share in report["rays_against_waves"])
     options.summary(report, as_json, line)

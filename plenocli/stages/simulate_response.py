@@ -9,6 +9,10 @@ from plenocli.stages.capture_sim import WHITE_LEVEL
 from plenocli.stages.progress import bar, note
 
 
+WAVES_ERR = 0.02
+"""What F by waves is taken to be known to, relative (L2) in every band: how far closed form and summed system matrices agree."""
+RAYS_ERR = 0.12
+"""The same for F by rays, where there is nothing by waves beside it."""
 DARK = 1e-12
 """Share of an object point's light on the brightest pixel that is none at all."""
 
@@ -75,8 +79,12 @@ def run_simulate_response(camera_path, output, settings, *, grid=None, overwrite
         white = _electrons(camera, _white(camera, settings), optics, places, settings)
         data, attrs = _ideal(camera, places, white, settings)
     shared = len(places.shifts) == 1
-    data |= {"response/F": response[0] if shared else _spread(response, places), "response/wavelength": np.array(bands)}
-    attrs["response"] |= _conditions(response[_commonest(places)]) | {"notes": optics.notes(bands)}
+    notes = optics.notes(bands)
+    # what a description leaves out is spread evenly over the superpixel: it is not known where it lies
+    known = np.array(notes["error"]) * np.sqrt(np.mean(response.astype(float) ** 2, axis=(0, 1)))
+    data |= {"response/F": response[0] if shared else _spread(response, places), "response/wavelength": np.array(bands),
+             "response/covariance": np.tile(known**2, (response.shape[1], 1))}
+    attrs["response"] |= _conditions(response[_commonest(places)]) | {"notes": notes}
     provenance = Provenance(command, describe_inputs(camera_files(camera_path, camera) | {"grid": grid}), None, camera.text, optics.record())
     write_artefact(output, Artefact("calibration", data, attrs, provenance), overwrite=overwrite)
     return _report(output, attrs, places, bands, optics)
@@ -193,7 +201,8 @@ class _Optics:
         return self.camera.replace(**{"object.samples_per_lenslet": tuple(max(n, least) for n in self.camera.object.samples_per_lenslet)})
 
     def notes(self, bands):
-        """What the response's notes record: model, share of light from a lenslet's own field by band, rays against waves (relative L2)."""
+        """What the response's notes record: model, share of light from a lenslet's own field by band, rays against waves (relative L2)
+        where both are there, and what F is taken to be known to."""
         from plenocli.optics.response import own_light, uniform_response, valid_for
 
         found = {"source": "predicted", "model": self.model if self.plan is None else self.plan.model, "closed_form": self.closed, "own_field": self.settings.own_field,
@@ -201,7 +210,8 @@ class _Optics:
         if valid_for(self.camera, "fresnel") is None:
             pairs = [[uniform_response(self.camera, w, model)[0] for model in ("ray", "fresnel")] for w in bands]
             found["rays_against_waves"] = [float(np.linalg.norm(ray - wave) / np.linalg.norm(wave)) for ray, wave in pairs]
-        return found
+        apart = found.get("rays_against_waves", [RAYS_ERR] * len(bands)) if found["model"] == "ray" else np.zeros(len(bands))
+        return found | {"error": [float(np.hypot(WAVES_ERR, one)) for one in apart]}
 
     def record(self):
         from plenocli.stages.simulate_pif import accuracy_record

@@ -12,6 +12,7 @@ from plenocli.cli import options
 @options.seed
 @options.workers
 @options.scheduler
+@options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context

@@ -77,6 +77,19 @@ def _panel(axes, columns, x, y, colour, ahead, objectives):
     axes.grid(True)
 
 
+def front_rows(artefact):
+    """(header, rows) of the designs on the front: their number, what varies, the objectives; as text, best first in the first objective."""
+    attrs = artefact.attrs["sweep"]
+    columns, data = _columns(artefact), artefact.data
+    words = {p["key"]: [p["choices"][int(i)] if np.isfinite(i) else "" for i in data["sweep/parameter"][:, k]] for k, p in enumerate(attrs["parameters"]) if "choices" in p}
+    keys = [p["key"] for p in attrs["parameters"]]
+    aims = [(name, way) for name, way in attrs["objectives"] if name in columns]
+    shown = [*keys, *(name for name, _ in aims if name not in keys)]
+    order = sorted(np.flatnonzero(data["sweep/front"]), key=lambda i: -columns[aims[0][0]][1][i] if aims[0][1] == "max" else columns[aims[0][0]][1][i])
+    rows = [[str(i), *(str(words[name][i]) if name in words else f"{columns[name][1][i]:.6g}" for name in shown)] for i in order]
+    return ["design", *(name if name in words else columns[name][0] for name in shown)], rows
+
+
 def front_figures(artefact):
     """[(PNG, caption)] of a sweep, for `show` and the report."""
     attrs = artefact.attrs["sweep"]

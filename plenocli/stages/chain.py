@@ -8,6 +8,8 @@ nominal rates; the time that was measured stands apart.
 import contextlib
 import hashlib
 import json
+import os
+import socket
 import tempfile
 import time
 from pathlib import Path
@@ -87,8 +89,16 @@ def _digest(value, files):
     return hashlib.sha256(json.dumps([__version__, content(value)], sort_keys=True).encode()).hexdigest()
 
 
+def _require_files(task):
+    """OutputError where this process does not see what the task names: then it is not the design that is at fault."""
+    for path in (*task.get("files", ()), *([task["matrix"]] if task.get("matrix") else ())):
+        if not os.path.isfile(path):
+            raise OutputError(f"{socket.gethostname()} does not see this file", path, "workers need the same files under the same names: put them on a file system that all share")
+
+
 def run_matrix(task):
     """The system matrix of a task: {"content": bytes of the artefact, "info": its cost and what simulate-pif said}. PlenoError."""
+    _require_files(task)
     with _folder(task) as folder, heard() as notes:
         try:
             info = _simulate_pif(task, folder)
@@ -100,17 +110,20 @@ def run_matrix(task):
 def run_point(task):
     """The figures of a task: {"status": exit code, "reason", "metrics": name -> number, "notes", "seconds"}.
 
-    task["matrix"]: where the system matrix lies already, with task["info"] about it, or None. A camera or an option that a stage
+    task["matrix"]: where the system matrix lies already, with task["info"] about it, or None; "files": what else is read;
+    "scratch": folder for files, or None; "mem_limit": bytes. A camera or an option that a stage
     refuses is a result like any other; what keeps files from being written is raised (OutputError).
     """
     start = time.process_time()
+    _require_files(task)
     with _folder(task) as folder, heard() as notes:
         try:
             if task.get("matrix") is None:
                 info, pif = _simulate_pif(task, folder), folder / "pif.h5"
             else:
                 info, pif = task["info"], Path(task["matrix"])
-            metrics = {"spatial": _spatial, "spectral": _spectral}[task["chain"]](task["settings"], folder, pif)
+            settings = {stage: values | _memory(task) if stage in ("capture-sim", "reconstruct") else values for stage, values in task["settings"].items()}
+            metrics = {"spatial": _spatial, "spectral": _spectral}[task["chain"]](settings, folder, pif)
             found = {"status": 0, "reason": "", "metrics": _design(folder / "camera.toml", info) | metrics}
         except OutputError:
             raise
@@ -143,8 +156,12 @@ def _without(folder, texts):
 def _simulate_pif(task, folder):
     from plenocli.stages.simulate_pif import Settings, run_simulate_pif
 
-    report = run_simulate_pif(folder / "camera.toml", folder / "pif.h5", _settings(Settings, task["settings"]["simulate-pif"]))
+    report = run_simulate_pif(folder / "camera.toml", folder / "pif.h5", _settings(Settings, task["settings"]["simulate-pif"] | _memory(task)))
     return {"matrix_seconds": report["nominal_seconds"], "matrix_bytes": report["bytes"]}
+
+
+def _memory(task):
+    return {"mem_limit": task["mem_limit"]} if task.get("mem_limit") else {}
 
 
 def _settings(kind, values):

@@ -12,7 +12,7 @@ from plenocli.stages.scheduler import open_pool
 from plenocli.stages.sweep import _finish, _kept, _objectives, open_space
 
 
-def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, workers=1, scheduler=None, plot=None, overwrite=False, command=""):
+def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, workers=1, scheduler=None, mem_limit=None, plot=None, overwrite=False, command=""):
     """Try `trials` points of the space in the sweep file at `path`, `batch` at a time, and write the table as run_sweep does; returns its summary.
 
     ConfigError where nothing varies freely (design = "list"), UsageError where Optuna is missing; else as run_sweep.
@@ -26,7 +26,7 @@ def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, wor
         for start in range(0, trials, batch):
             asked = [_ask(study, space) for _ in range(min(batch, trials - start))]
             found = [space.row(start + i, point) for i, (_, point) in enumerate(asked)]
-            computed += store.evaluate(found, pool, local=scheduler is None, label=f"points {start + 1} to {start + len(asked)} of {trials}")
+            computed += store.evaluate(found, pool, list(space.files), mem_limit, label=f"points {start + 1} to {start + len(asked)} of {trials}")
             for (trial, _), row in zip(asked, found):
                 _tell(study, trial, row, objectives)
                 rows.setdefault(row.key, row)

@@ -28,7 +28,7 @@ def run_report(folder, output, *, title=None, overwrite=False):
     page.cards(_headlines(spatial, spectral))
     for name, problem in run.unreadable:
         page.warning(f"{name} could not be read: it {problem}.")
-    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral)]
+    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral), _designs(page, run)]
     _files(page, run)
     publish(output, page.render().encode(), overwrite=overwrite)
     return {"output": str(output), "files": len(run.files), "unreadable": [name for name, _ in run.unreadable], "scores": len(scores),
@@ -151,6 +151,25 @@ def _capture(page, run, file):
     if centres is None and calibration is not None:
         centres = calibration.artefact().data["grid/centre"]
     _add(page, capture_figures(mosaic, file.name, centres))
+
+
+def _designs(page, run):
+    """The section about sweeps; returns its name, or None where there are none."""
+    from plenocli.report.front import front_figures, front_rows
+
+    found = run.of_kind("sweep")
+    if not found:
+        return None
+    page.section("Design space", "Many cameras carried through the stages. A design is on the front if no other is at least as good in everything that was asked for, and better in one.")
+    for file in found:
+        page.heading(file.name.removesuffix(".h5"), file.command)
+        artefact = file.artefact()
+        if artefact.data["sweep/front"].any():
+            _add(page, front_figures(artefact))
+            page.table(*front_rows(artefact), text=True)
+        else:
+            page.warning(f"{file.name}: no design has all figures of the front; `plenocli inspect` shows the reasons.")
+    return "Design space"
 
 
 def _add(page, figures):

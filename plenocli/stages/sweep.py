@@ -130,12 +130,12 @@ def open_space(path, read_options, seed=0):
     return Space(path, sweep, axes, chain, base, camera_path, read_options, seed)
 
 
-def run_sweep(path, output, *, read_options, seed=0, workers=1, scheduler=None, plot=None, overwrite=False, command=""):
+def run_sweep(path, output, *, read_options, seed=0, workers=1, scheduler=None, mem_limit=None, plot=None, overwrite=False, command=""):
     """Carry every point of the design through the chain and write the table `output` (.h5), the same as .csv, and perhaps the
     front as a picture; returns a summary dict.
 
     Finished points lie in the folder OUT.parts and are never computed again, whatever ended the run. A point that a stage refuses
-    is a row with the reason. workers, scheduler: see stages.scheduler. Errors: as open_space; UsageError for the front,
+    is a row with the reason. workers, scheduler: see stages.scheduler; mem_limit: bytes that a stage may plan for, in each of them. Errors: as open_space; UsageError for the front,
     OutputError where nothing can be written or a worker was lost.
     """
     from plenocli.config.sweep import points
@@ -144,7 +144,7 @@ def run_sweep(path, output, *, read_options, seed=0, workers=1, scheduler=None, 
     rows = [space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, seed))]
     objectives = _objectives(space, rows)
     with _kept(output, plot, overwrite, [path, space.camera_path]) as store, open_pool(workers, scheduler) as pool:
-        computed = store.evaluate(rows, pool, local=scheduler is None)
+        computed = store.evaluate(rows, pool, list(space.files), mem_limit)
         return _finish(space, rows, objectives, store, computed, command)
 
 
@@ -191,21 +191,23 @@ class Store:
         shutil.rmtree(self.folder / "scratch", ignore_errors=True)
         self.journal.close()
 
-    def evaluate(self, rows, pool, *, local=True, label="points"):
+    def evaluate(self, rows, pool, files=(), mem_limit=None, label="points"):
         """Give every row its result, from the journal or through `pool`; returns the number of points computed.
 
-        Rows of one content key are computed once, a matrix that several need is computed once, before them. OutputError at the
-        end where a worker was lost: all others are done then.
+        Rows of one content key are computed once, a matrix that several need is computed once, before them. files: what tasks
+        read; mem_limit: as run_sweep; what was refused under another limit is tried again. OutputError at the end where a worker was lost: all others are done then.
         """
         todo = {}
         for row in rows:
-            if row.task is not None and row.key not in self.journal.records and row.key not in todo:
+            known = self.journal.records.get(row.key)
+            if row.task is not None and row.key not in todo and (known is None or (known["status"] == 5 and known.get("mem_limit") != mem_limit)):
                 todo[row.key] = row
         groups = {}
         for row in todo.values():
             groups.setdefault(row.matrix, []).append(row)
         with bar(None, len(todo), label) as progress:
-            lost = _Work(self, groups, pool, str((self.folder / "scratch").resolve()) if local else None).run(progress)
+            scratch = None if pool.far else str((self.folder / "scratch").resolve())
+            lost = _Work(self, groups, pool, {"scratch": scratch, "files": list(files), "mem_limit": mem_limit}).run(progress)
         if lost:
             raise OutputError(f"{len(lost)} of {len(todo)} points have no result: {lost[0]}", self.output, "the others are kept; run the command again")
         for row in rows:
@@ -217,8 +219,8 @@ class Store:
 class _Work:
     """Points through a pool, those of one matrix after it; at most as many matrices lie on the disk as are in use."""
 
-    def __init__(self, store, groups, pool, scratch):
-        self.store, self.pool, self.scratch = store, pool, scratch
+    def __init__(self, store, groups, pool, surroundings):
+        self.store, self.pool, self.surroundings = store, pool, surroundings
         self.groups, self.waiting, self.ready = {key: list(rows) for key, rows in groups.items()}, deque(groups), deque()
         self.left = {key: len(rows) for key, rows in groups.items()}
         self.lost, self.running = [], 0
@@ -252,13 +254,13 @@ class _Work:
         if info is not None and path.is_file():
             self._points(key, str(path.resolve()), info)
         elif len(rows) > 1:
-            self.ready.append((("matrix", key, None), run_matrix, rows[0].task | {"scratch": self.scratch}))
+            self.ready.append((("matrix", key, None), run_matrix, rows[0].task | self.surroundings))
         else:
             self._points(key, None, None)
 
     def _points(self, key, path, info):
         for row in self.groups[key]:
-            self.ready.append((("point", key, row), run_point, row.task | {"matrix": path, "info": info, "scratch": self.scratch}))
+            self.ready.append((("point", key, row), run_point, row.task | self.surroundings | {"matrix": path, "info": info}))
 
     def _matrix(self, key, result):
         """Keep a matrix and make its points ready, or refuse them all; returns how many were refused."""
@@ -276,7 +278,7 @@ class _Work:
     def _done(self, key, row, result):
         if isinstance(result, PlenoError):
             result = refused(result)
-        self.store.journal.add(row.key, result)
+        self.store.journal.add(row.key, result | {"mem_limit": self.surroundings["mem_limit"]})
         self.left[key] -= 1
         if not self.left[key]:
             self._path(key).unlink(missing_ok=True)
@@ -365,7 +367,7 @@ def _finish(space, rows, objectives, store, computed, command):
         raise _CLASSES[worst.result["status"]](f"none of {len(rows)} points could be computed; the first: {rows[0].result['reason']}", space.path, f"{store.output} holds all reasons")
     best = sorted(np.flatnonzero(ahead), key=lambda i: tuple(-m[i] if way == "max" else m[i] for m, way in zip(merit, objectives.values())))
     shown = [{"point": rows[i].number, **{name: float(m[i]) for name, m in zip(objectives, merit) if name not in keys}, **rows[i].point} for i in best]
-    return {"output": str(store.output), "points": len(rows), "computed": computed, "refused": len(reasons), "with_remarks": len(remarks), "objectives": objectives,
+    return {"output": str(store.output), "points": len(rows), "computed": computed, "refused": len(reasons), "with_remarks": len(remarks), "first_reason": next(iter(reasons.values()), ""), "first_remark": next(iter(remarks.values()), [""])[0], "objectives": objectives,
             "front": shown, "cpu_seconds": sum(row.result["seconds"] for row in rows)} | ({} if store.plot is None else {"plot": str(store.plot)})
 
 
@@ -404,8 +406,9 @@ def lines(report):
     """What run_sweep did, for people: a sentence, and the front as a table, at most twenty rows of it."""
     aims = ", ".join(f"{name} {way}" for name, way in report["objectives"].items())
     text = [f"{report['output']}: {report['points']} points, {report['computed']} computed now, {report['refused']} refused; {len(report['front'])} on the front of {aims}"]
-    if report["with_remarks"]:
-        text.append(f"  stages had remarks on {report['with_remarks']} points: `plenocli inspect {report['output']}` shows them")
+    for count, what, said in ((report["refused"], "refused", report["first_reason"]), (report["with_remarks"], "with remarks of the stages", report["first_remark"])):
+        if count:
+            text.append(f"  {count} {what}, the first: {' '.join(said.split())[:200]}")
     if report["front"]:
         heads = list(report["front"][0])
         cells = [heads] + [[f"{v:.6g}" if isinstance(v, float) else str(v) for v in (entry.get(h, "") for h in heads)] for entry in report["front"][:20]]

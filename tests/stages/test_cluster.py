@@ -98,8 +98,7 @@ def test_a_cluster_gives_the_same_bytes_and_loses_nothing_with_a_worker(cluster,
 
 
 def test_captures_go_to_the_cluster_and_come_back_the_same(cluster, tmp_path, monkeypatch):
-    known, start = cluster
-    start()
+    known, _ = cluster
     wait_for(known, 1)
     monkeypatch.chdir(tmp_path)  # names relative to where this process is
     bands = [f"{nm}nm={capture(Path(f'b{nm}.h5'), np.eye(2)[k], k)}" for k, nm in enumerate((480, 620))]

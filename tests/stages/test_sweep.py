@@ -134,11 +134,11 @@ def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
     assert same(tmp_path / "out.h5", whole[1])
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 6))])
 def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
     path, table, _ = whole
     out, rng = tmp_path / "whole.h5", np.random.default_rng(seed)
-    command = [sys.executable, "-m", "plenocli", "sweep", str(path), "-o", str(out), "--workers", str(1 + seed)]
+    command = [sys.executable, "-m", "plenocli", "sweep", str(path), "-o", str(out), "--workers", str(1 + seed % 2)]
     child = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True)
     kept, wanted, deadline = tmp_path / "whole.parts" / "points.jsonl", int(rng.integers(2, 8)), time.monotonic() + 300
     while child.poll() is None and time.monotonic() < deadline and (not kept.exists() or kept.read_bytes().count(b"\n") < wanted):
@@ -268,6 +268,42 @@ def test_files_count_by_what_they_hold_not_by_where_they_lie(tmp_path):
 
     first = run(tmp_path / "a", 1.0)
     assert run(tmp_path / "b", 1.0) == first and run(tmp_path / "c", 0.5) != first
+
+
+def test_memory_that_does_not_suffice_is_no_verdict_for_good(tmp_path):
+    path = described(tmp_path, SMALL.replace("[6, 8]", "[6]").replace("[[7, 7], [9, 9]]", "[[7, 7]]"))
+    with pytest.raises(PlenoError, match="none of 2 points") as caught:
+        sweep(path, tmp_path / "out.h5", mem_limit=1000)
+    assert caught.value.exit_code == 5
+    report = sweep(path, tmp_path / "out.h5", overwrite=True)
+    assert report["computed"] == 2 and report["refused"] == 0
+
+
+def test_files_that_a_worker_does_not_see_are_no_verdict_on_the_design(tmp_path):
+    from plenocli.config import parse_camera
+
+    task = chain.task_of("spatial", parse_camera(camera_text()), {}, 0)
+    for missing in ({"matrix": str(tmp_path / "gone.h5"), "info": {}}, {"files": [str(tmp_path / "gone.png")]}):
+        with pytest.raises(OutputError, match="does not see this file"):
+            chain.run_point(task | missing)
+
+
+def test_show_and_report_draw_the_front(whole, tmp_path):
+    import shutil
+
+    from plenocli.stages.report import run_report
+    from plenocli.stages.show import run_show
+
+    ahead = int(read_artefact(whole[1], "sweep").data["sweep/front"].sum())
+    assert f"8 designs, 0 of them refused; {ahead} that no other beats" in run_show([whole[1]], tmp_path / "front.png")["captions"][0]
+    assert (tmp_path / "front.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "run").mkdir()
+    shutil.copy(whole[1], tmp_path / "run" / "lenslets.h5")
+    assert run_report(tmp_path / "run", tmp_path / "r.html")["sections"] == ["Design space"]
+    page = (tmp_path / "r.html").read_text()
+    with open(whole[1].with_suffix(".csv"), newline="") as file:
+        best = [r for r in csv.DictReader(file) if r["front"] == "1"]
+    assert all(f"<td>{r['point']}</td>" in page and f"{float(r['psnr_db']):.6g}" in page for r in best)
 
 
 @pytest.mark.slow

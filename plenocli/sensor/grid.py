@@ -241,19 +241,51 @@ def _dark_lines(image, model, index, pitch, axis):
     grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)[..., :: 1 if axis == 0 else -1]
     vectors = np.stack([model.at(chosen + step / 2) - model.at(chosen - step / 2) for step in np.eye(2)], axis=1)
     where = model.at(chosen)[:, None, None] + np.einsum("abk,nkd->nabd", grid, vectors)
-    near = np.clip(np.rint(where).astype(int), 0, np.array(image.shape) - 1)
-    profile = image[near[..., 0], near[..., 1]].mean(axis=(0, 2), dtype=float)
+    profile = _between(image, where).mean(axis=(0, 2), dtype=float)
     kernel = np.ones(max(1, bins // 24)) / max(1, bins // 24)
     smooth = np.convolve(np.tile(profile, 3), kernel, "same")[bins : 2 * bins]
     depth = smooth.max() - smooth
-    local = (depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max())
+    peaks = np.flatnonzero((depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max()))
     lines = []
-    for peak in np.flatnonzero(local):
-        away = (along - along[peak] + 0.5) % 1 - 0.5
-        close = np.abs(away) < 0.1
-        weight = np.clip(depth[close] - 0.5 * depth[peak], 0, None)
-        lines.append((along[peak] + (away[close] * weight).sum() / weight.sum() - 0.5, float(depth[peak])))
+    for peak in peaks:
+        others = np.abs((along[peaks] - along[peak] + 0.5) % 1 - 0.5)
+        reach = min(0.2, others[others > 0].min(initial=0.4) / 2)
+        lines.append((along[peak] + _line(along, profile, along[peak], reach) - 0.5, float(depth[peak])))
     return lines
+
+
+def _between(image, where):
+    """Values of `image` at places (..., 2) px by linear interpolation, those outside at the border."""
+    where = np.clip(where, 0, np.array(image.shape) - 1)
+    low = np.minimum(where.astype(int), np.array(image.shape) - 2)
+    down, right = np.moveaxis((where - low).astype(np.float32), -1, 0)
+    i, j = np.moveaxis(low, -1, 0)
+    above = image[i, j] * (1 - right) + image[i, j + 1] * right
+    return above * (1 - down) + (image[i + 1, j] * (1 - right) + image[i + 1, j + 1] * right) * down
+
+
+def _line(along, profile, start, reach):
+    """Middle of the dark line at `start` less `start`, cells: midway between two blurred edges, each of its own side's brightness.
+
+    The darkest place itself, or the centre of the darkness, lies nearer to the dimmer side: a quarter of a pixel between a filter
+    that passes much and one that passes little.
+    """
+    from scipy.optimize import least_squares
+    from scipy.special import erf
+
+    away = (along - start + 0.5) % 1 - 0.5
+    close = np.abs(away) < reach
+    x, y = away[close], profile[close]
+    sides = [y[x < -0.5 * reach].mean(), y[x > 0.5 * reach].mean()]
+    scale = max(*sides, 1e-30)
+
+    def miss(p):
+        middle, half, blur, left, right = p
+        return (left * (1 - erf((x - middle + half) / blur)) + right * (1 + erf((x - middle - half) / blur))) / 2 - y / scale
+
+    found = least_squares(miss, [0.0, 0.25 * reach, 0.25 * reach, sides[0] / scale, sides[1] / scale],
+                          bounds=([-reach / 2, 0, 0.02 * reach, 0, 0], [reach / 2, reach, reach, 3, 3]), x_scale=[reach, reach, reach, 1, 1])
+    return float(found.x[0])
 
 
 def _index_at(model, position):

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from plenocli.errors import InputError, NumericsError
 from plenocli.sensor import distortion, lattice
 from plenocli.sensor.grid import find_grid
+from tests.reference.prototype import superpixels
 
 
 def make_white(kind, pitch, angle, shape, *, seed=0, vignetting=0.0, falloff=0.0, noise=0.0, spot="disc", bend=0.0, phase=(0.31, -0.17)):
@@ -173,6 +174,23 @@ def test_filters_in_the_pupil_do_not_split_superpixels(gap, border):
     assert grid.valid.all() and grid.centres.shape == (12, 15, 2)
     index = np.stack(np.meshgrid(np.arange(12), np.arange(15), indexing="ij"), axis=-1)
     np.testing.assert_allclose(grid.centres, 24 * index + 11.5, atol=0.8)
+
+
+@pytest.mark.parametrize("pitch, side, blur", [(15.0, 13.1, 0.6), (24.3, 21.0, 0.9), (52.0, 45.4, 2.0)])
+@pytest.mark.parametrize("light", [(0.4, 0.6, 1.0, 0.45), (1.0, 0.3, 0.5, 0.8)])
+def test_filters_of_unlike_brightness_do_not_draw_the_grid_to_the_dimmer(pitch, side, blur, light):
+    count, window = (5, 7), int(pitch) + 8
+    mean = np.zeros([int(n * pitch) + 12 for n in count])
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1)
+    centres = (index + 0.5) * pitch + 5.3
+    for centre in centres.reshape(-1, 2):
+        first = np.rint(centre - (window - 1) / 2).astype(int).clip(0, np.array(mean.shape) - window)
+        cells = superpixels(centre - first - (window - 1) / 2, pixels=window, side=side, gap=0.05 * pitch, blur=blur, fall=0.1, pitch=pitch)
+        mean[first[0] : first[0] + window, first[1] : first[1] + window] += (3000 * cells @ light).reshape(window, window)
+    grid = find_grid(np.random.default_rng(1).poisson(mean))
+    assert grid.valid.all() and grid.centres.shape == (*count, 2)
+    np.testing.assert_allclose(grid.centres.mean(axis=(0, 1)), centres.mean(axis=(0, 1)), atol=0.06)
+    np.testing.assert_allclose(grid.centres, centres, atol=0.1)
 
 
 def test_a_hint_settles_what_the_picture_cannot():

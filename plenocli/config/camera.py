@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError, WithJsonSchema, model_validator
 
 from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
 from plenocli.errors import ConfigError, InputError
@@ -96,6 +96,20 @@ class Aberration(Section):
     coefficient: SignedLength
 
 
+def _known_glass(name):
+    from plenocli.optics.glass import medium
+
+    try:
+        if name.lower() != "none":
+            medium(name)
+    except ConfigError as error:
+        raise ValueError(f"{error.what}; {error.fix}") from None
+    return name
+
+
+Glass = Annotated[str, AfterValidator(_known_glass)]
+
+
 class MainLens(Section):
     """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files with values on a square
     grid of cells over the square of side aperture_diameter: rows in the sense of the sensor's rows, downwards, looking
@@ -113,7 +127,7 @@ class MainLens(Section):
     aperture_shape: Literal["circle", "square", "annulus", "image"] | None = None
     aperture_image: FileName | None = None
     obscuration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    glass: str = "none"
+    glass: Glass = "none"
     aberrations: tuple[Aberration, ...] = ()
     apodisation: Literal["aplanatic", "uniform-pupil", "uniform-sine"] = "aplanatic"
     wavefront: FileName | None = None
@@ -160,7 +174,7 @@ class LensletArray(Section):
     pitch: Length | None = None
     superpixel_pitch: Length | None = None
     focal_length: Length
-    glass: str = "none"
+    glass: Glass = "none"
     lattice: Literal["square", "hexagonal"] = "square"
     aperture_shape: Literal["square", "circle", "hexagon"] | None = None
     fill_factor: Unit = 1.0
@@ -270,6 +284,19 @@ class FilterArray(Section):
         return self
 
 
+def _check_range(section, glass, wavelengths):
+    """ValueError where a glass is not described at one of the wavelengths (m)."""
+    from plenocli.optics.glass import medium
+
+    if glass.lower() == "none":
+        return
+    try:
+        for wavelength in wavelengths:
+            medium(glass).index(wavelength)
+    except ConfigError as error:
+        raise ValueError(f"{section}.glass: {error.what}; {error.fix}") from None
+
+
 class Camera(Section):
     """A plenoptic camera in SI units; every default and alternative is resolved when it is made."""
 
@@ -292,6 +319,8 @@ class Camera(Section):
         if light.design_wavelength is None:
             middle = light.wavelengths[len(light.wavelengths) // 2]
             self.__dict__["light"] = light.model_copy(update={"design_wavelength": middle})
+        for section in ("main_lens", "lenslet_array"):
+            _check_range(section, getattr(self, section).glass, (self.light.design_wavelength, *light.wavelengths))
         if cells is not None:
             side = lens.aperture_diameter * (1 if lens.aperture_shape == "square" else math.sqrt(0.5))
             if cells.size is None:

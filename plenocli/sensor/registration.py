@@ -316,7 +316,11 @@ def own_pixels(window):
 
 class Reference:
     """What registration needs of a calibration, whatever the capture: where lenslets are, and smooth responses of a few of them,
-    made when first asked for. Arguments as find_motion; shape (rows, columns) of the sensor; variance (pixel, band) of the response.
+    made when first asked for.
+
+    response (R, C, pixel, band), or (pixel, band) for all; origin (R, C, 2) first pixels of the windows (h, w), those of lenslets
+    without response far outside; centres (R, C, 2) px; shape (rows, columns) of the sensor; variance (pixel, band) of the response,
+    None: known to EXACT. sample: lenslets that tell a motion.
     """
 
     def __init__(self, response, origin, window, centres, cfa, shape, variance=None, sample=SAMPLE):
@@ -401,19 +405,12 @@ def _spread(count, wanted):
     return np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)) if count else np.zeros(0, int)
 
 
-def find_motion(signal, response, origin, window, centres, cfa="mono", noise=None, response_variance=None, sample=SAMPLE):
+def motion_since(reference, signal, noise=None):
     """Motion of the lenslets of a capture since their calibration; None where fewer than three lenslets show it.
 
-    signal (rows, columns), or a plenocli.sensor.readout.Readout: dark removed, NaN where saturated. response (R, C, pixel, band),
-    or (pixel, band) for all; origin (R, C, 2) first pixels of the windows, those of lenslets without response far outside;
-    centres (R, C, 2) px. noise: (gain, read variance) of the signal, None: unknown, all pixels weigh the same. response_variance
-    (pixel, band): of the response itself, None: taken as exact. Displacements beyond REACH px are not found.
+    signal (rows, columns), or a plenocli.sensor.readout.Readout: dark removed, NaN where saturated. noise: (gain, read variance) of
+    the signal, None: unknown, all pixels weigh the same. Displacements beyond REACH px are not found.
     """
-    return motion_since(Reference(response, origin, window, centres, cfa, signal.shape, response_variance, sample), signal, noise)
-
-
-def motion_since(reference, signal, noise=None):
-    """As find_motion, for any number of captures with one Reference."""
     data = _Sample(reference, signal, noise)
     if data.count < 3:
         return None

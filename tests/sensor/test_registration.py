@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from plenocli.sensor.registration import Smooth, find_motion, spline_matrix
+from plenocli.sensor.registration import Reference, Smooth, motion_since, spline_matrix
 from plenocli.sensor.superpixel import extract
 from plenocli.solvers.spectral import demultiplex
 from tests.reference.prototype import superpixels
@@ -40,6 +40,10 @@ def calibrated(cfa="mono", **kind):
     return np.stack([extract(band, ORIGIN, (PITCH, PITCH)) for band in bands], axis=-1)
 
 
+def find_motion(signal, response, cfa="mono", noise=None):
+    return motion_since(Reference(response, ORIGIN, (PITCH, PITCH), CENTRES, cfa, signal.shape), signal, noise)
+
+
 @pytest.fixture(scope="module", params=["mono", "GRBG"])
 def camera(request):
     return request.param, calibrated(request.param)
@@ -69,7 +73,7 @@ def test_a_moved_array_is_found_and_costs_nothing_after_registration(camera, tru
     cfa, response = camera
     still = error(capture(truth, 0.0, 5, cfa=cfa), response, truth)
     signal = capture(truth, shift, 6, cfa=cfa)
-    motion = find_motion(signal, response, ORIGIN, (PITCH, PITCH), CENTRES, cfa, NOISE)
+    motion = find_motion(signal, response, cfa, NOISE)
     np.testing.assert_allclose(motion.shift, shift, atol=0.01)
     assert motion.moved and motion.after < 4 < motion.before
     assert error(signal, response, truth) > 3 * still
@@ -78,14 +82,14 @@ def test_a_moved_array_is_found_and_costs_nothing_after_registration(camera, tru
 
 def test_a_capture_that_did_not_move_is_left_alone(camera, truth):
     cfa, response = camera
-    motion = find_motion(capture(truth, 0.0, 7, cfa=cfa), response, ORIGIN, (PITCH, PITCH), CENTRES, cfa, NOISE)
+    motion = find_motion(capture(truth, 0.0, 7, cfa=cfa), response, cfa, NOISE)
     assert not motion.moved and not motion.lifted and not motion.strayed
     assert motion.after == pytest.approx(1, abs=0.3)
 
 
 def test_standard_deviations_of_the_motion_are_what_repeated_captures_show(truth):
     response = calibrated()
-    found = [find_motion(capture(truth, 0.25, 20 + i, offset=3.0, exposure=0.1), response, ORIGIN, (PITCH, PITCH), CENTRES, "mono", (NOISE[0] / 0.1, NOISE[1] / 0.01)) for i in range(8)]
+    found = [find_motion(capture(truth, 0.25, 20 + i, offset=3.0, exposure=0.1), response, "mono", (NOISE[0] / 0.1, NOISE[1] / 0.01)) for i in range(8)]
     for axis in (0, 1):
         values = np.array([m.shift[axis] for m in found])
         assert 0.4 < values.std(ddof=1) / np.mean([m.sigma[axis] for m in found]) < 1.8  # 8 draws
@@ -98,7 +102,7 @@ def test_rotation_and_stretch_of_the_array(truth):
     turn, stretch = 1.2e-3, 4e-4
     matrix = np.array([[stretch, -turn], [turn, stretch]])
     shifts = (CENTRES - CENTRES.mean(axis=(0, 1))) @ matrix.T
-    motion = find_motion(capture(truth, shifts, 8), calibrated(), ORIGIN, (PITCH, PITCH), CENTRES, "mono", NOISE)
+    motion = find_motion(capture(truth, shifts, 8), calibrated(), "mono", NOISE)
     np.testing.assert_allclose(motion.matrix, matrix, atol=4e-5)
     assert motion.rotation == pytest.approx(turn, rel=0.03)
     assert motion.reach == pytest.approx(np.linalg.norm(shifts, axis=-1).max(), rel=0.03)
@@ -107,18 +111,18 @@ def test_rotation_and_stretch_of_the_array(truth):
 @pytest.mark.parametrize("leak", [0.03, 0.07])
 def test_a_diffuse_leak_of_another_size_is_seen_as_stray_light(truth, leak):
     response = calibrated(kind="diffuse")
-    motion = find_motion(capture(truth, 0.0, 9, kind="diffuse", leak=leak), response, ORIGIN, (PITCH, PITCH), CENTRES, "mono", NOISE)
+    motion = find_motion(capture(truth, 0.0, 9, kind="diffuse", leak=leak), response, "mono", NOISE)
     assert motion.strayed and np.sign(motion.stray) == np.sign(leak - 0.05) and not motion.moved
 
 
 def test_without_noise_figures_the_motion_is_found_too(truth):
-    motion = find_motion(capture(truth, (0.4, -0.2), 10), calibrated(), ORIGIN, (PITCH, PITCH), CENTRES)
+    motion = find_motion(capture(truth, (0.4, -0.2), 10), calibrated())
     np.testing.assert_allclose(motion.shift, (0.4, -0.2), atol=0.01)
     assert motion.moved
 
 
 def test_darkness_tells_no_motion():
-    assert find_motion(np.full((ROWS * PITCH, COLUMNS * PITCH), np.nan), calibrated(), ORIGIN, (PITCH, PITCH), CENTRES) is None
+    assert find_motion(np.full((ROWS * PITCH, COLUMNS * PITCH), np.nan), calibrated()) is None
 
 
 def test_spline_matrices_move_polynomials_exactly_and_know_their_slope():

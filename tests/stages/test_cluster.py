@@ -22,35 +22,35 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """(address, start a worker -> its process)."""
+    """(file that tells the address, workers(n) -> the processes of n workers that are there)."""
+    from distributed import Client
+
     folder = tmp_path_factory.mktemp("dask")
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    started = []
+    known, started = folder / "scheduler.json", []
 
     def start(*arguments):
         with open(folder / f"{len(started)}.log", "wb") as log:
-            process = subprocess.Popen([sys.executable, "-m", "dask", *arguments], stdout=log, stderr=log, env=environment, cwd=folder, start_new_session=True)
-        started.append(process)
-        return process
+            started.append(subprocess.Popen([sys.executable, "-m", "dask", *arguments, "--no-dashboard", "--scheduler-file", str(known)], stdout=log, stderr=log,
+                                            env=environment, cwd=folder, start_new_session=True))
 
-    known = folder / "scheduler.json"
-    start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(known))
+    def workers(count):
+        while len(alive := [p for p in started[1:] if p.poll() is None]) < count:
+            start("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(folder))
+        with Client(scheduler_file=str(known), set_as_default=False) as client:
+            client.wait_for_workers(count, timeout=120)
+        return alive
+
+    start("scheduler", "--host", "127.0.0.1", "--port", "0")
     deadline = time.monotonic() + 120
     while not known.exists() or not known.read_text():
         assert time.monotonic() < deadline and started[0].poll() is None, (folder / "0.log").read_text()
         time.sleep(0.1)
-    yield known, lambda: start("worker", "--scheduler-file", str(known), "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(folder))
+    yield known, workers
     for process in started:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-def wait_for(known, count):
-    from distributed import Client
-
-    with Client(scheduler_file=str(known), set_as_default=False) as client:
-        client.wait_for_workers(count, timeout=120)
 
 
 def described(folder):
@@ -80,11 +80,10 @@ def capture(path, radiance, seed):
 
 
 def test_a_cluster_gives_the_same_bytes_and_loses_nothing_with_a_worker(cluster, tmp_path):
-    known, start = cluster
+    known, workers = cluster
     path = described(tmp_path)
     assert run(["sweep", str(path), "-o", str(tmp_path / "here.h5")]) == 0
-    first, _ = start(), start()
-    wait_for(known, 2)
+    first = workers(2)[0]
     script = (f"from plenocli.cli.main import run; raise SystemExit(run(['sweep', {str(path)!r}, '--scheduler', {str(known)!r}, '-o', {str(tmp_path / 'there.h5')!r}]))")
     with open(tmp_path / "log", "w") as log:
         child = subprocess.Popen([sys.executable, "-c", script], stderr=log, stdout=log, env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])})
@@ -98,8 +97,8 @@ def test_a_cluster_gives_the_same_bytes_and_loses_nothing_with_a_worker(cluster,
 
 
 def test_captures_go_to_the_cluster_and_come_back_the_same(cluster, tmp_path, monkeypatch):
-    known, _ = cluster
-    wait_for(known, 1)
+    known, workers = cluster
+    workers(1)
     monkeypatch.chdir(tmp_path)  # names relative to where this process is
     bands = [f"{nm}nm={capture(Path(f'b{nm}.h5'), np.eye(2)[k], k)}" for k, nm in enumerate((480, 620))]
     assert run(["calibrate", "--white", str(capture(Path("white.h5"), (1, 1), 0)), "--band", bands[0], "--band", bands[1], "-o", "c.h5"]) == 0
@@ -119,8 +118,8 @@ def test_captures_go_to_the_cluster_and_come_back_the_same(cluster, tmp_path, mo
 
 
 def test_one_capture_and_a_bad_one_on_the_cluster(cluster, tmp_path, capsys):
-    known, _ = cluster
-    wait_for(known, 1)
+    known, workers = cluster
+    workers(1)
     described(tmp_path)
     pif, view, bad = (str(tmp_path / name) for name in ("pif.h5", "view.h5", "bad.h5"))
     assert run(["simulate-pif", str(tmp_path / "camera.toml"), "--model", "fresnel", "--superpixels", "1x1", "-o", pif]) == 0
@@ -137,8 +136,8 @@ def test_one_capture_and_a_bad_one_on_the_cluster(cluster, tmp_path, capsys):
 def test_a_worker_of_another_version_is_refused(cluster, monkeypatch, tmp_path):
     from plenocli.stages import scheduler
 
-    known, start = cluster
-    wait_for(known, 1)
+    known, workers = cluster
+    workers(1)
     monkeypatch.setattr(scheduler, "__version__", "9.9.9")
     with scheduler.open_pool(1, str(known)) as pool:
         pool.submit("token", len, "abc")

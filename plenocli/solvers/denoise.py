@@ -25,6 +25,10 @@ def block_matching(picture, sigma, pilot=None):
     matched in the pilot and shrunk by the Wiener factor p^2 / (p^2 + sigma^2) of the pilot's coefficients p.
     """
     picture = np.asarray(picture, float)
+    unit = np.abs(picture).max()  # squares of very large or small values leave single precision
+    if unit == 0:
+        return picture.copy()
+    picture, sigma, pilot = picture / unit, sigma / unit, None if pilot is None else np.asarray(pilot, float) / unit
     patch = min(PATCH, *picture.shape)
     rows, columns = (_corners(n, patch) for n in picture.shape)
     least = min(WINDOW + 1, picture.shape[0] - patch + 1) * min(WINDOW + 1, picture.shape[1] - patch + 1)
@@ -38,7 +42,7 @@ def block_matching(picture, sigma, pilot=None):
         one, two = _filter(source[span], None if pilot is None else guide[span], stacks, patch, sigma)
         total[span] += one
         weight[span] += two
-    return total / weight
+    return unit * total / weight
 
 
 def _corners(length, patch):

@@ -76,3 +76,13 @@ def test_any_shape_and_level(shape):
     np.testing.assert_allclose(level, 0.3, rtol=1e-6)
     picture = np.random.default_rng(0).random(shape)
     np.testing.assert_allclose(denoise.block_matching(picture, 0.0), picture, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 2.0**90])
+def test_the_unit_of_the_picture_does_not_matter(unit):
+    rng = np.random.default_rng(6)
+    picture = rng.random((20, 24))
+    pilot = picture + 0.01 * rng.normal(size=picture.shape)
+    for first, second in ((None, None), (pilot, unit * pilot)):
+        assert denoise.block_matching(unit * picture, unit * 0.1, second) == pytest.approx(unit * denoise.block_matching(picture, 0.1, first), rel=1e-4)
+    assert not denoise.block_matching(np.zeros((9, 9)), 0.1).any()

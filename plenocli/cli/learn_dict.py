@@ -52,6 +52,6 @@ def command(ctx, images, pif, output, resume, overwrite, as_json, **settings):
     report = run_learn_dict(images, output, Settings(**settings), pif=pif, resume=resume, overwrite=overwrite, command=options.command_line(ctx))
     verdict = "above" if report["beats_lmmse"] else "NOT above"
     line = (f"{output}: {report['atoms']} atoms, {report['iterations']} iterations, lambda {report['lambda']:.2e}, held out {report['validation_psnr_db']:.2f} dB, "
-            f"{verdict} LMMSE {report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest {report['coherence']['coherence_effective']:.3f}, "
+            f"averaged over mirror images {report['averaged_psnr_db']:.2f} dB, {verdict} LMMSE {report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest {report['coherence']['coherence_effective']:.3f}, "
             f"mean {report['coherence']['coherence_effective_mean']:.3f}")
     options.summary(report, as_json, line)

@@ -154,10 +154,10 @@ class Learner:
         self._record(after, state, np.concatenate([[False], dead]), float(code.gap.max()), residual)
         return after
 
-    def validate(self, atoms, synthesis=None):
-        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary; `synthesis` atoms paint."""
+    def validate(self, atoms):
+        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
         code = self.code(atoms, self.measured)
-        return float(code.objective.mean()), psnr((atoms if synthesis is None else synthesis) @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+        return float(code.objective.mean()), psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
 
     def validate_path(self, atoms, lams):
         """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda, from the largest down."""
@@ -203,12 +203,32 @@ class Learner:
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
 
 
-def _moments(patches, c):
-    """(C C^T / B, X C^T / B); C is mostly zeros."""
-    from scipy.sparse import csr_array
+def mirror_images(shape):
+    """Permutations (image, point) that mirror an object of `shape` points (rows, columns): 4 of them; 8, with the transposes, of a square one."""
+    index = np.arange(int(np.prod(shape))).reshape(shape)
+    images = [index, index[::-1], index[:, ::-1], index[::-1, ::-1]]
+    return np.stack([i.ravel() for i in images + ([i.T for i in images] if shape[0] == shape[1] else [])])
 
-    sparse = csr_array(c)
-    return (sparse @ sparse.T).toarray() / patches.shape[1], (sparse @ patches.T).T / patches.shape[1]
+
+def averaged(seen, atoms, measured, lam, shape, *, synthesis=None, tol=1e-6, workers=None):
+    """(x (point, signal), worst gap, mean non-zeros): the mean of the estimates by all mirror images of a dictionary.
+
+    seen (row, point), measured (row, signal): matrix and signals, as in `Learner`.  atoms (point, atom), the first free; `synthesis`
+    atoms paint.  A dictionary stands for scenes that may as well be mirrored, so that its images are as good as itself; each errs in its own way, as translates do
+    in cycle spinning (Coifman & Donoho 1995).
+    """
+    paint, total, worst, nonzeros = atoms if synthesis is None else synthesis, 0.0, 0.0, 0.0
+    images = mirror_images(shape)
+    for image in images:
+        code = sparse_code(seen @ atoms[image], measured, lam, free=[0], tol=tol, workers=workers)
+        total = total + paint[image] @ code.c
+        worst, nonzeros = max(worst, float(code.gap.max())), nonzeros + float(np.count_nonzero(code.c[1:], axis=0).mean()) / len(images)
+    return total / len(images), worst, nonzeros
+
+
+def _moments(patches, c):
+    """(C C^T / B, X C^T / B)."""
+    return c @ c.T / patches.shape[1], patches @ c.T / patches.shape[1]
 
 
 def psnr(estimate, truth):
@@ -228,7 +248,7 @@ def dictionary_step(energy, basis, gram, right, delta):
     from plenocli.errors import NumericsError
 
     ridge = _ridge(gram)
-    use, directions = eigh(gram, driver="evr")
+    use, directions = eigh(gram, driver="evd")
     use = np.maximum(use, 0) + ridge
     turned = right @ directions
     inside = basis.T @ turned

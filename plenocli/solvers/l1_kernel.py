@@ -18,7 +18,7 @@ JITTER = 1e-12
 """Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms cannot break the factor. They
 move far along the flat direction, and the line search stops them where one of them reaches zero and leaves."""
 
-JOINING = 32
+JOINING = 48
 """Atoms that join the working set in a pass; at least half as many as are active."""
 
 CAPACITY = 288
@@ -369,6 +369,12 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
     if size > w.x.shape[0]:
         return False, 0.0, 1.0, 0
     _resume(w, gram, index, c[index])
+    if n > 0:  # the coefficients given are a guess: make the best of its atoms before looking at others
+        near = b[index]
+        _subtract(near, w.x, n, w.block, w.local)
+        n = _solve_working_set(w, n, b[index], near, threshold[index], 0.25 * tol)
+        index = w.working[w.local[:n]]
+        _spread(w.x, index, c)
     q = b.copy()
     _subtract(q, w.x, n, gram, index)
     objective, gap = relative_gap(b, q, w.x, index, signal_energy, threshold)

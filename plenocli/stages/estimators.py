@@ -326,21 +326,22 @@ class Estimators:
         return atoms, np.asarray(artefact.data.get("dictionary/synthesis", atoms), float), artefact.attrs["dictionary"]
 
     def _dictionary(self, stacked, sigma, truth, report):
-        from plenocli.solvers.l1 import sparse_code
+        from plenocli.solvers.dictionary import averaged
 
         atoms, paint, attrs = self._learnt
         scale = float(self.svd.s[0])
         learnt = float(attrs["parameters"]["sigma"])
         louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
         lam = self.settings.lam if self.settings.lam is not None else float(attrs["lambda"]) * louder
-        kept = self.svd.rank()
-        seen = (self.svd.s[:kept, None] / scale) * self.svd.vt[:kept] @ atoms
-        report |= {"lambda": lam, "rule": "given" if self.settings.lam is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder:.3g} for more noise"}
+        kept = min(self.svd.rank(), attrs["parameters"].get("directions", len(self.svd.s)))
+        seen = (self.svd.s[:kept, None] / scale) * self.svd.vt[:kept]
+        report |= {"lambda": lam, "rule": "given" if self.settings.lam is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder:.3g} for more noise",
+                   "average": "over the mirror images of the dictionary"}
 
         def solve(y):
-            code = sparse_code(seen, self.svd.compress(y)[:kept] / scale, lam, free=[0])
-            report.update(worst_gap=float(code.gap.max()), nonzeros=float(np.count_nonzero(code.c[1:], axis=0).mean()))
-            return paint @ code.c
+            x, gap, nonzeros = averaged(seen, atoms, self.svd.compress(y)[:kept] / scale, lam, self.system.object_shape, synthesis=paint)
+            report.update(worst_gap=gap, nonzeros=nonzeros)
+            return x
 
         return solve
 

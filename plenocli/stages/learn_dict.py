@@ -72,10 +72,8 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
     for _ in bar(range(settings.iterations - state.iteration), settings.iterations - state.iteration, "iterations"):
         state = machine.step(state)
         _tell(state)
-    summary = _judge(machine, state, svd, training, chosen)
     synthesis = machine.synthesis(state) if settings.synthesis else None
-    if synthesis is not None:
-        summary["synthesis_psnr_db"] = machine.validate(state.atoms, synthesis)[1]
+    summary = _judge(machine, state, synthesis, svd, training, chosen)
     _write(output, state, synthesis, machine, chosen, system, summary, dict(
         command=command, pif=pif, files=files, resume=None, seed=chosen.seed, names=[n for n, _ in training], held=[n for n, _ in held]), overwrite)
     return summary | {"output": str(output)}
@@ -137,9 +135,11 @@ def _tell(state):
          f"coherence mean {last['coherence_mean']:.3f} max {last['coherence_max']:.4f}, gap {last['worst_gap']:.0e}, step residual {last['step_residual']:.0e}")
 
 
-def _judge(machine, state, svd, training, chosen):
-    """Summary: validation PSNR beside LMMSE with statistics of the same training pictures, and coherence."""
+def _judge(machine, state, synthesis, svd, training, chosen):
+    """Summary: validation PSNR of one coding, and of the mean over mirror images that reconstruct takes, beside LMMSE with
+    statistics of the same training pictures; coherence."""
     from plenocli.metrics.coherence import coherence
+    from plenocli.solvers.dictionary import averaged, psnr
     from plenocli.solvers.linear import Svd
     from plenocli.solvers.lmmse import prepare
     from plenocli.solvers.natural import draw_patches, mean_covariance
@@ -149,11 +149,13 @@ def _judge(machine, state, svd, training, chosen):
     kept = len(machine.seen)
     scaled = Svd(np.eye(kept), svd.s[:kept] / machine.scale, svd.vt[:kept])
     linear = prepare(scaled, *mean_covariance(patches), machine.sigma).apply(machine.measured)
-    lmmse = float(-10 * np.log10(max(np.mean((linear - machine.validation) ** 2), np.finfo(float).tiny)))
+    lmmse = psnr(linear, machine.validation)
     objective, quality, nonzeros, gap = machine.validate(state.atoms)
+    mean, _, _ = averaged(machine.seen, state.atoms, machine.measured, chosen.lam, machine.object_shape, synthesis=synthesis, tol=chosen.tol, workers=machine.workers)
+    best = psnr(mean, machine.validation)
     measures = coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)
     return {"iterations": state.iteration, "atoms": state.atoms.shape[1], "batch": chosen.batch, "lambda": chosen.lam, "delta": chosen.delta,
-            "validation_psnr_db": quality, "lmmse_psnr_db": lmmse, "beats_lmmse": bool(quality > lmmse), "nonzeros": nonzeros, "worst_gap": gap,
+            "validation_psnr_db": quality, "averaged_psnr_db": best, "lmmse_psnr_db": lmmse, "beats_lmmse": bool(best > lmmse), "nonzeros": nonzeros, "worst_gap": gap,
             "objective": objective, "dead_share": state.history["dead_share"][-1] if state.iteration else None, "coherence": measures}
 
 
@@ -170,10 +172,10 @@ def _write(output, state, synthesis, machine, chosen, system, summary, origin, o
              "coherence_effective": measures["coherence_effective"], "coherence_average": measures["coherence_effective_mean"],
              "coherence_raw": measures["coherence_raw"], "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
              "coherence_welch": measures["welch_bound"], "coherence": measures,
-             "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "training": sorted({Path(n).name for n in origin["names"]}), "validation": sorted({Path(n).name for n in origin["held"]})},
-             "notes": {k: summary[k] for k in ("validation_psnr_db", "synthesis_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap") if k in summary}}
+             "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "directions": len(machine.seen), "training": sorted({Path(n).name for n in origin["names"]}), "validation": sorted({Path(n).name for n in origin["held"]})},
+             "notes": {k: summary[k] for k in ("validation_psnr_db", "averaged_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap") if k in summary}}
     attrs = {k: v for k, v in attrs.items() if v is not None}
     provenance = Provenance(origin["command"], describe_inputs({"pif": origin["pif"], "image": origin["files"]}), origin["seed"])
     write_artefact(output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite)
     if not summary["beats_lmmse"]:
-        note(f"the dictionary does NOT beat LMMSE on held-out pictures ({summary['validation_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} dB): reconstruct --method lmmse is the better choice")
+        note(f"the dictionary does NOT beat LMMSE on held-out pictures ({summary['averaged_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} dB): reconstruct --method lmmse is the better choice")

@@ -209,7 +209,7 @@ def _dictionary(page, run, file):
     page.table(["", ""], rows, text=True)
     notes = attrs.get("notes")
     if isinstance(notes, dict) and notes.get("beats_lmmse") is False:
-        page.warning(f"This dictionary does not beat LMMSE on held-out pictures ({notes.get('validation_psnr_db', 0):.2f} against "
+        page.warning(f"This dictionary does not beat LMMSE on held-out pictures ({notes.get('averaged_psnr_db', notes.get('validation_psnr_db', 0)):.2f} against "
                      f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead.")
     matrix = next((run.by_digest(d) for d in file.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "pif"), None)
     system = None if matrix is None else own_matrix(matrix.artefact())

@@ -178,3 +178,37 @@ def test_scale_of_the_matrix_does_not_matter(setting):
     louder = linear.Svd(svd.u, 1024 * svd.s, svd.vt)
     one, other = (learner((s, pictures), tol=1e-8).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
     assert one == pytest.approx(other, abs=1e-3)
+
+
+@pytest.mark.parametrize("shape, count", [((5, 6), 4), ((4, 4), 8)])
+def test_mirror_images_are_the_symmetries_of_the_object(shape, count):
+    images = dictionary.mirror_images(shape)
+    assert len({i.tobytes() for i in images}) == len(images) == count
+    rows, columns = np.divmod(np.arange(np.prod(shape)), shape[1])
+    near = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
+    for image in images:  # neighbours stay neighbours, and nothing else does that
+        np.testing.assert_array_equal(near[np.ix_(image, image)], near)
+
+
+def test_average_is_that_of_dictionaries_mirrored_one_by_one(setting):
+    machine = learner(setting)
+    state = run(machine, machine.start(), 2)
+    mean, gap, nonzeros = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE, tol=1e-9)
+    grid, expected, count = state.atoms.reshape(*SHAPE, -1), [], []
+    for axes in ((), (0,), (1,), (0, 1)):
+        atoms = np.flip(grid, axes).reshape(30, -1)
+        c = dictionary.sparse_code(machine.seen @ atoms, machine.measured, 1e-4, free=[0], tol=1e-9).c
+        expected.append(atoms @ c)
+        count.append(np.count_nonzero(c[1:]) / c.shape[1])
+    np.testing.assert_allclose(mean, np.mean(expected, axis=0), atol=1e-6)
+    assert gap <= 1e-8 and nonzeros == pytest.approx(np.mean(count), rel=0.01)
+
+
+def test_average_beats_the_typical_single_estimate(setting):
+    """The error of a mean of equally good estimates is below their mean error."""
+    machine = learner(setting)
+    state = run(machine, machine.start(), 2)
+    single = [dictionary.psnr(state.atoms[i] @ dictionary.sparse_code(machine.seen @ state.atoms[i], machine.measured, 1e-4, free=[0]).c, machine.validation)
+              for i in dictionary.mirror_images(SHAPE)]
+    mean, _, _ = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE)
+    assert dictionary.psnr(mean, machine.validation) > np.mean(single) + 0.1

@@ -261,3 +261,26 @@ def test_bad_arguments():
         l1.sparse_code(np.eye(2), np.array([[1.0], [np.nan]]), 1.0)
     with pytest.raises(ValueError, match="lambda"):
         list(l1.lambda_path(np.eye(2), np.eye(2), [1.0, -1.0]))
+
+
+@pytest.mark.parametrize("weights", [None, np.linspace(0.5, 2, 40)])
+def test_guess_is_mostly_right_and_changes_nothing_but_the_work(weights):
+    d, y = plenoptic_like(signals=200)
+    cold = l1.sparse_code(d, y, 1e-4, weights=weights, tol=1e-9, start=np.zeros((40, 200)))
+    code = l1.sparse_code(d, y, 1e-4, weights=weights, tol=1e-9)
+    assert max(code.gap.max(), cold.gap.max()) <= 1e-8
+    np.testing.assert_allclose(code.objective, cold.objective, rtol=1e-7)
+    problem = l1.prepare(d, y, 1e-4, weights, ())
+    guess = l1._guess(problem, problem.threshold)
+    assert 3 < np.count_nonzero(guess) / 200 < 30
+    chance = np.count_nonzero(cold.c) / cold.c.size / 2
+    assert np.mean(np.sign(guess[guess != 0]) == np.sign(cold.c.T[guess != 0])) > 2 * chance
+
+
+def test_guess_scales_with_the_problem():
+    d, y = plenoptic_like(signals=60)
+    problem, far = l1.prepare(d, y, 1e-4, None, ()), l1.prepare(1e90 * d, 1e60 * y, 1e146, None, ())
+    guess, scaled = l1._guess(problem, problem.threshold), l1._guess(far, far.threshold)
+    np.testing.assert_allclose(1e30 * scaled, guess, rtol=1e-3, atol=1e-3 * np.abs(guess).max())
+    assert not l1._guess(l1.prepare(d, 0 * y, 1e-4, None, ()), problem.threshold).any()
+    assert not l1._guess(l1.prepare(0 * d, y, 1e-4, None, ()), problem.threshold).any()

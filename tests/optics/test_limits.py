@@ -14,6 +14,7 @@ from plenocli.optics.quadrature import band_rule
 from tests.optics.cameras import WAVELENGTH, pif_builder, pupil_conjugate, small_camera, system_matrix
 from tests.reference.fresnel import disc_nodes, pixel_energies, rectangle_nodes
 from tests.reference.kernel import coherent_kernel
+from tests.reference.window import column_energies as window_energies
 from tests.reference.rayleigh import pixel_energies as rayleigh_energies
 
 ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
@@ -223,6 +224,23 @@ def test_exact_fields_out_of_focus_are_as_fine_as_those_in_focus():
     for accuracy in (1e-4, 1e-5):
         column = system_matrix(camera, model="exact", accuracy=accuracy, **ISOLATED).A[0, 0, :, 55].reshape(52, 52)[[18]]
         assert np.linalg.norm(column - truth) < accuracy * np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize("blur", [2, 5])
+def test_pixels_hold_the_fringes_of_all_lenslets_that_a_blurred_point_lights(blur):
+    """Out of focus neighbours are as bright as the own lenslet, and their fringes finer: against as many lenslets in the open."""
+    camera = load_camera(Path(__file__).resolve().parents[2] / "sample_configs" / "seed_spatial.toml")
+    lens, array = camera.main_lens, camera.lenslet_array
+    defocus = blur * array.pitch / (lens.aperture_diameter * array.distance)
+    camera = camera.replace(**{"object.distance": 1 / (1 / lens.focal_length - 1 / array.distance + defocus), "object.samples_per_lenslet": (10, 10)})
+    built = {a: pif_builder(camera, WAVELENGTH, accuracy=a, superpixels=(3, 3), coherent_ring=2) for a in (1e-2, 1e-3, 1e-4)}
+    window, kept = built[1e-4].plan.bands[0].window, [(0, 0), (-1, 0), (-1, -1)]
+    truth = window_energies(camera, WAVELENGTH, (-0.45 * array.pitch, -0.45 * array.pitch), window, kept, pixel_nodes=11)
+    truth = np.array([truth[place].ravel() for place in kept])
+    for accuracy, builder in built.items():
+        column = builder.columns([0])[[4, 1, 0], :, 0]
+        error = np.linalg.norm(column - truth) / np.linalg.norm(truth)
+        assert error < accuracy and error < 2 * builder.plan.split["sampling"]
 
 
 # cameras drawn at random

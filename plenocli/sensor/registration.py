@@ -253,7 +253,7 @@ def _flat_ratios(pictures, sites):
     for k, site in enumerate(sites):
         for band in range(pictures.shape[1]):
             where = site & bright[:, band]
-            if where.sum() > 30:
+            if where.sum() >= 12:
                 out[k, band] = np.median(pictures[:, band][where] / local[:, band][where])
     return out
 

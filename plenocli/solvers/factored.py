@@ -19,7 +19,7 @@ BLOCK_NUMBERS = 90_000, 45_000  # pixels of a block, one basis for all or one ea
 COMPILED_NUMBERS = 360_000  # of a block that is compiled, where only a superpixel must stay there and calls cost more
 COMPILED_FROM = 4_000_000  # pixels from which importing numba pays
 FACTOR_NUMBERS = 250_000
-STREAMED_NUMBERS = 6_000_000  # pixels whose factors are held at a time where none are kept
+STREAMED_NUMBERS = 2_000_000  # pixels whose factors are held at a time where none are kept
 HARD = 1e-3  # least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
 
 
@@ -139,13 +139,13 @@ def _orthogonal(f):
     return q, r
 
 
-def collect(factored, cut, total, noise=None, response_variance=None, radiance=None, doubt=None, sandwich=False):
+def collect(factored, cut, total, noise=None, response_variance=None, radiance=None, doubt=None, sandwich=False, among=None):
     """Sums of `total` superpixels.
 
     cut(part): values (lenslet, pixel) float32 of a slice of them, which may be overwritten; NaN masks a pixel. noise (gain, read
     variance): pixels weigh as 1 / (gain F b + read variance [+ b^2 response_variance (pixel, band)]), b being the plain answer, or
     `radiance` (lenslet, band); None: all weigh 1. doubt (pixel, band): variance of the response that counts in chi alone.
-    sandwich: whether `spread` is wanted.
+    sandwich: whether `spread` is wanted. among: superpixels of which these are a part (None: all).
     """
     bands = factored.r.shape[-1]
     basis = (_One if factored.shared else _Each)(factored)
@@ -155,7 +155,7 @@ def collect(factored, cut, total, noise=None, response_variance=None, radiance=N
                np.empty(square) if sandwich else None, np.zeros(total), np.full(total, factored.q.shape[-1]), np.zeros(total, bool))
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
-    kernel = None if factored.shared or variance is None or radiance is not None or doubt is not None else _kernel(total * factored.q.shape[-1])
+    kernel = None if factored.shared or variance is None or radiance is not None or doubt is not None else _kernel((among or total) * factored.q.shape[-1])
     step = max(1, (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS) // factored.q.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
@@ -176,7 +176,7 @@ def stream(response, which, cut, **settings):
         part = slice(first, min(first + step, total))
         own = settings | ({"radiance": settings["radiance"][part]} if settings.get("radiance") is not None else {})
         factored = factor(response, tuple(w[part] for w in which))
-        sums.append(collect(factored, lambda inner: cut(slice(first + inner.start, first + inner.stop)), part.stop - first, **own))
+        sums.append(collect(factored, lambda inner: cut(slice(first + inner.start, first + inner.stop)), part.stop - first, among=total, **own))
         factors.append((factored.r, factored.sound))
     r, sound = (np.concatenate(parts) for parts in zip(*factors))
     joined = (None if getattr(sums[0], one.name) is None else np.concatenate([getattr(s, one.name) for s in sums]) for one in fields(Sums))

@@ -8,7 +8,7 @@ import click
 from plenocli.errors import UsageError
 
 _OURS = {"output", "overwrite", "as_json", "workers", "scheduler", "mem_limit", "explain", "suffix", "report", "metrics", "scene_out", "pif", "calibration", "truth",
-         "reference", "camera", "grid", "whites", "darks", "bands", "radiances", "patches", "capture", "block"}
+         "reference", "camera", "grid", "whites", "darks", "bands", "radiances", "patches", "capture", "block", "near"}
 """What a chain of stages gives its stages by itself."""
 
 

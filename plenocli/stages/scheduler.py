@@ -179,7 +179,7 @@ class _Executing:
         alone = not self._running
         broken = [future for future in self._running if not future.done() or future.exception() is not None]
         self._suspects.extendleft(reversed([job, *(self._running.pop(future) for future in broken)]))
-        _stop(self._executor)
+        _stop(self._executor, True)
         self._executor = self._start()
         self._deaths = self._deaths + 1 if alone else 0
         if self._deaths < ATTEMPTS:
@@ -189,14 +189,19 @@ class _Executing:
 
     def close(self):
         """Give up what is under way."""
-        _stop(self._executor)
+        for future in self._running:
+            future.cancel()
+        _stop(self._executor, bool(self._running))
 
 
-def _stop(executor):
-    workers = list((getattr(executor, "_processes", None) or {}).values())
-    executor.shutdown(wait=False, **({"cancel_futures": True} if isinstance(executor, (ThreadPoolExecutor, ProcessPoolExecutor)) else {}))
-    for worker in workers:
-        worker.terminate()
+def _stop(executor, busy):
+    """Let an executor go; what it still does is given up."""
+    if isinstance(executor, ProcessPoolExecutor):
+        for worker in list((executor._processes or {}).values()) if busy else ():
+            worker.terminate()
+        executor.shutdown(wait=True, cancel_futures=True)
+    else:  # threads cannot be ended, they run out; a cluster forgets
+        executor.shutdown(wait=False)
 
 
 # --- processes ----------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from plenocli.stages.chain import CHAINS, DESIGN, matrix_key, point_key, refused
 from plenocli.stages.progress import bar, note
 from plenocli.stages.scheduler import Lost, open_pool
 
-FRONTS = {"spatial": {"psnr_db": "max", "sensor_pixels": "min"}, "spectral": {"rmse": "min", "lenslet_field_m": "min"}}
+FRONTS = {"spatial": {"psnr_db": "max", "sensor_pixels": "min"}, "spectral": {"six_patch_rmse": "min", "lenslet_field_m": "min"}}
 """What counts as better where the file does not say."""
 _FILES = ("aperture_image", "wavefront", "prescription")
 _EXTERNAL = ("scene", "dictionary", "training")

@@ -313,7 +313,7 @@ def test_a_spectral_sweep_with_predicted_and_with_measured_responses(tmp_path):
     body = ('camera = "camera.toml"\n[vary]\n"filter_array.filters.*.fwhm" = ["40 nm", "60 nm"]\n[simulate-pif]\nmodel = "fresnel"\naccuracy = 1e-2\n'
             '[front]\nsix_patch_rmse = "min"\nspectral_angle_deg = "min"\n')
     found = {}
-    for name, section in (("predicted", ""), ("measured", "[calibrate]\nshared = true\n")):
+    for name, section in (("predicted", ""), ("measured", "[calibrate]\nresponse = 'shared'\n")):
         (tmp_path / "sweep.toml").write_text(body + section)
         sweep(tmp_path / "sweep.toml", tmp_path / f"{name}.h5")
         artefact = read_artefact(tmp_path / f"{name}.h5", "sweep")

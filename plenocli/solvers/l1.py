@@ -30,7 +30,7 @@ def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, pa
 
     dictionary: D = A Phi, (M, L).  signals: Y, (M, B).  lam > 0.  weights: w_j > 0, (L,), default 1.
     free: columns without penalty (they are projected out exactly, then solved for).  tol: relative duality gap to reach;
-    what was reached is in the result.  Zero columns get a zero coefficient.  start: coefficients (L, B) to begin with (default: guessed by ridge regression where there are as many signals as rows).
+    what was reached is in the result.  Zero columns get a zero coefficient.  start: coefficients (L, B) to begin with (default: guessed by a ridge regression where that pays).
     workers: threads over signals (compiled code only; default all cores); the result does not depend on it.
     """
     problem = prepare(dictionary, signals, lam, weights, free)
@@ -140,6 +140,9 @@ def _active_set(problem, gram, threshold, tol, passes, start, workers):
 GUESSED = 0.7
 """Atoms to begin with, as a share of those that the ridge regression determines (its degrees of freedom)."""
 
+SMALL = 1_000_000
+"""Signals times this must exceed the cube of the rows, or the regression's eigendecomposition costs more than the guess saves."""
+
 
 def _guess(problem, threshold):
     """Coefficients (signal, atom) to begin with: the largest of a ridge regression, half of which stay, with their sign.
@@ -151,7 +154,7 @@ def _guess(problem, threshold):
     count, atoms = problem.b.shape
     c, rows = np.zeros((count, atoms)), problem.d.shape[0]
     unit = np.max(np.abs(problem.d / threshold), initial=0)
-    if count < rows or not (unit > 0 and problem.y.any()):
+    if count * SMALL < rows**3 or not (unit > 0 and problem.y.any()):
         return c
     scaled = problem.d / threshold / unit
     energy, basis = np.linalg.eigh(scaled @ scaled.T)

@@ -70,8 +70,6 @@ class Estimators:
 
     def _run(self, method, data, truth, report):
         """(x, sigma or None) by one method; its parameters go to the report."""
-        if method in WHOLE:
-            return self._whole(method, data, report)
         report["overlap"] = self.overlap
         if self.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
@@ -79,14 +77,16 @@ class Estimators:
             return self._jointly(data, report)
         hidden = None if truth is None else truth.reshape(-1, truth.shape[2]).T
         if not self._takes_neighbours(method):
-            return self._by_lenslet(method, data, data.y, hidden, report)
-        x, _ = self._jointly(data, {})
-        inner = (slice(1, -1), slice(1, -1))
-        if min(data.y.shape[:2]) > 2:
-            y = self._own_light(data.y, x)[inner]
-            x[inner], _ = self._by_lenslet(method, data, y, None if truth is None else truth[inner].reshape(-1, truth.shape[2]).T, report)
+            return self._whole(method, data, data.y, report) if method in WHOLE else self._by_lenslet(method, data, data.y, hidden, report)
+        x, spread = self._jointly(data, {})
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
+        if min(data.y.shape[:2]) <= 2:
+            return x, spread
+        y, inner = self._own_light(data.y, x), (slice(1, -1), slice(1, -1))
+        if method in WHOLE:
+            return self._whole(method, data, y, report, (x, spread))
+        x[inner], _ = self._by_lenslet(method, data, y[inner], None if truth is None else truth[inner].reshape(-1, truth.shape[2]).T, report)
         return x, None
 
     def _choose(self, data):
@@ -139,30 +139,33 @@ class Estimators:
             quality[method] = float(np.mean(-10 * np.log10(np.maximum(error, 1e-12))))
         return quality
 
-    def _whole(self, method, data, report):
-        """(x, sigma) of a method that sees the whole picture, neighbours' light included; sigma is that of LMMSE, an upper estimate."""
+    def _whole(self, method, data, y, report, known=None):
+        """(x, sigma) of a method that sees the whole picture; sigma is that of LMMSE, from which it starts: an upper estimate.
+
+        y: own light, like data.y.  known: (x, sigma) of the estimate that took the neighbours' light away; the border keeps it.
+        """
         from plenocli.solvers import wholesensor
         from plenocli.solvers.denoise import block_matching
 
-        if self.coupled:
-            first, _ = self._jointly(data, report)
-            x, spread = self._adaptive(report["noise_sigma"], data.scene, self._own_light(data.y, first))
-        else:
-            sigma = self._noise(data, data.y, report)
-            x, spread = self._adaptive(sigma, data.scene, data.y)
-        error = float(np.sqrt(np.mean(np.square(spread))))
-        system = self.system
-        term = wholesensor.DataTerm(self.svd, system.blocks, system.offsets, system.object_shape, data.y, report["noise_sigma"], 2 * error)
-        start = to_plane(x, system.object_shape)
+        inner, shape, held = (slice(None), slice(None)), self.system.object_shape, None
+        if known is not None:
+            edge = np.ones(y.shape[:2], bool)
+            inner = (slice(1, -1), slice(1, -1))
+            edge[inner], held = False, (edge, known[0].copy())
+        sigma = self._noise(data, y[inner], report)
+        x, spread = known or (np.empty((*y.shape[:2], self.svd.vt.shape[1])) for _ in "xs")
+        x[inner], spread[inner] = self._adaptive(sigma, data.scene, y[inner])
+        error = float(np.sqrt(np.mean(np.square(spread[inner]))))
         report["start"] = f"lmmse, which expects an error of {error:.3g}"
+        term = wholesensor.DataTerm(self.svd, shape, y, sigma, 2 * error, held)
         if method == "tv":
-            picture = wholesensor.total_variation(term, start, error)
+            picture = wholesensor.total_variation(term, to_plane(x, shape), error)
             report["rule"] = "isotropic total variation, weight by the error that lmmse expects"
         else:
             taus = wholesensor.schedule(error)
-            picture = wholesensor.plug_and_play(term, start, block_matching, taus)
+            picture = wholesensor.plug_and_play(term, to_plane(x, shape), block_matching, taus)
             report["rule"] = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
-        return to_blocks(picture, system.object_shape), spread
+        return to_blocks(picture, shape), spread
 
     def _adaptive(self, sigma, scene, y):
         """(x, sigma) of LMMSE per lenslet, like y (lenslet_row, lenslet_column, pixel)."""

@@ -22,14 +22,12 @@ from plenocli.optics.factors import Factors
 from plenocli.optics.pairs import Interval, Pair, Way
 from plenocli.optics.plan import BandPlan, distinct, grid_of, is_symmetric, size_band
 from plenocli.optics.product import FILL, MAX_SKETCH, Product
-from plenocli.optics.psf import legendre, psf_nodes, separable_field
+from plenocli.optics.psf import edge_emphasis, legendre, psf_nodes, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
 
 CUT, CUT_EFFECT = 0.42, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.5 to 2.3)."""
-EDGE = 2.0
-"""Extra weight of points at a lenslet's edge in the cut."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +185,7 @@ class ExactSquareLenslets:
         return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
 
     def _way(self, s, axis):
-        """The Way to superpixel s. Points at the lenslet's edge lose light and split it, so that the same error would be a larger
-        share of their columns: they weigh more."""
+        """The Way to superpixel s."""
         if (s, axis) not in self._ways:
             g = self.geometry
             if self.band.sensor_count:
@@ -197,8 +194,7 @@ class ExactSquareLenslets:
             else:
                 u, w = (a.ravel() for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule))
             points = self._points(s, axis)
-            edge = (g.D2 / 2 - np.abs(points)) * g.D1 / (g.wavelength * g.z2)
-            self._ways[s, axis] = Way(u, np.sqrt(w), points, 1 + EDGE * np.exp(-edge))
+            self._ways[s, axis] = Way(u, np.sqrt(w), points, edge_emphasis(g, points))
         return self._ways[s, axis]
 
     def _interval(self, s, m, axis):
@@ -233,10 +229,15 @@ class ExactSquareLenslets:
         order = sorted(pairs, key=lambda key: pairs[key].weight)
         total = np.cumsum([pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order])
         kept = [key for key, power in zip(order, total) if power > (cut / 4) ** 2] or order[-1:]
-        left, right, couplings = [], [], {}
+        left, right, couplings, guess = [], [], {}, self._first_guess()
+        count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         for m, n in kept:
             pair, first = pairs[m, n], len(left)
-            x, y, coupling = pair.factors(max(self._extent), cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept)))
+            tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
+            x, y, coupling = pair.factors(max(self._extent), tolerance)
+            if len(coupling) > guess and not pair.symmetric:  # its own rank is far lower
+                x, y = Product([x], [y], {(0, 0): coupling}, False).factors(tolerance / 2 * math.sqrt(count), guess // 3)
+                coupling = np.eye(x.shape[1], dtype=self.dtype)
             if symmetric and not pair.symmetric:  # the lenslet mirrored by the diagonal brings the transpose
                 left += [x, y]
                 half = coupling if m != n else coupling / 2
@@ -246,8 +247,7 @@ class ExactSquareLenslets:
                 couplings[first, first] = coupling
         right = left if symmetric else right
         product = Product(left, right, couplings, symmetric)
-        count = len(self._points(sy, 0)) * len(self._points(sx, 1))
-        high, wide = product.factors(cut * math.sqrt(count), self._first_guess())
+        high, wide = product.factors(cut * math.sqrt(count), guess)
         products = max(len(c) for c in couplings.values())
         return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes), products
 

@@ -51,7 +51,8 @@ class PifBuilder:
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength, plan.pixel_shift), np.dtype(dtype)
         camera = at_wavelength(camera, wavelength)
-        self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
+        with one_thread():
+            self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
         self._sampling = band.sampling
         self.notes = self._lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
@@ -273,11 +274,18 @@ def _complete(planes, share, count):
         share[j + 1:count, j] = share[j, j + 1:count]
 
 
-def spread(parts, work, workers):
-    """work(*part) for all parts on `workers` threads; products of matrices stay on the thread that asks for them."""
+def one_thread():
+    """A context in which products and decompositions of matrices stay on the thread that asks for them: idle threads that wait for
+    the next product cost many times its processor time."""
+    import scipy.linalg  # noqa: F401  its library can be told so only once it is loaded
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1, "blas"):
+    return threadpool_limits(1, "blas")
+
+
+def spread(parts, work, workers):
+    """work(*part) for all parts on `workers` threads."""
+    with one_thread():
         if workers <= 1 or len(parts) < 2:
             for part in parts:
                 work(*part)

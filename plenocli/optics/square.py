@@ -1,14 +1,19 @@
 """Sensor fields behind square lenslets by low-rank factors: the Fresnel rung of separable arrays."""
 
+import math
+from threading import Lock
+
 import numpy as np
 
 from plenocli.optics.factors import Factors
-from plenocli.optics.psf import legendre, psf_nodes, separable_field
+from plenocli.optics.psf import edge_emphasis, legendre, psf_nodes, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lenslet_kernel, lit_lenslets, sensor_nodes
 
 SLAB = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
+NARROW = 1.0
+"""Root-energy cut of a superpixel's factors over that of the spread function."""
 
 
 class SquareLenslets(Factors):
@@ -35,6 +40,41 @@ class SquareLenslets(Factors):
         self._entering = (down @ across.T).real
         self._kernels.clear()
         super().__init__(high, wide, geometry.pixel_shape, band.pixel_nodes, signs)
+        self._cut = NARROW * plan.tolerance if narrows(geometry, band, plan.superpixels, plan.double) else None
+        self._roots, self._narrow, self._lock = {}, (None, None), Lock()
+
+    def superpixel(self, sy, sx, rows, columns, out):
+        """As Factors.superpixel, with no more terms than the light of the neighbourhood needs on this superpixel."""
+        if self._cut is None:
+            return super().superpixel(sy, sx, rows, columns, out)
+        with self._lock:
+            if self._narrow[0] != (sy, sx):
+                self._narrow = (sy, sx), self._narrowed(sy, sx)
+            narrow = self._narrow[1]
+        return narrow.superpixel(0, 0, rows, columns, out)
+
+    def _narrowed(self, sy, sx):
+        """Factors of one superpixel cut at self._cut (root energy of a mean point, points at the lenslet's edge weighing more)."""
+        signs = np.ones(self.high.shape[3]) if self.signs is None else self.signs
+        left, right = self._root(0, sy), self._root(1, sx) * signs
+        u, s, vh = np.linalg.svd(left @ right.T)
+        terms = max(1, int(np.count_nonzero(np.sqrt(np.cumsum(s[::-1] ** 2)[::-1]) > self._cut)))
+        scale = 1 / np.sqrt(s[:terms])
+        # each table through the other's strong directions: exact on these, and nothing small is divided by
+        high = self.high[sy] @ (right.T @ vh[:terms].conj().T * scale).astype(self.dtype)
+        wide = self.wide[sx] @ (signs[:, None] * left.T @ u[:, :terms].conj() * scale).astype(self.dtype)
+        return Factors(high[None], wide[None], self.pixel_shape, self.pixel_nodes)
+
+    def _root(self, axis, s):
+        """R with R^H R the overlaps of the terms on superpixel s for a mean point, on as many of its nodes as tell."""
+        if (axis, s) not in self._roots:
+            step = max(1, self.pixel_nodes // 3)
+            table = (self.wide if axis else self.high)[s][:, step // 2::step] * math.sqrt(step)
+            points = self.geometry.points(axis)
+            weighed = (table * edge_emphasis(self.geometry, points).astype(self._real)[:, None, None]).reshape(-1, table.shape[2]).astype(complex)
+            values, vectors = np.linalg.eigh(weighed.conj().T @ weighed / len(points))
+            self._roots[axis, s] = np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
+        return self._roots[axis, s]
 
     def _axes_agree(self):
         g = self.geometry
@@ -99,6 +139,12 @@ class SquareLenslets(Factors):
     def incident(self, rows, columns):
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
         return self._entering[rows, columns]
+
+
+def narrows(geometry, band, superpixels, double):
+    """Whether superpixels get factors of their own rank: where many columns with many nodes gain by it. In double precision the
+    roots of sums of squares would not know what is that small."""
+    return band.window is not None and not double and max(superpixels) > 1 and band.pixel_nodes * max(geometry.pixel_shape) >= 200
 
 
 def _product(kernel, values, out):

@@ -10,6 +10,7 @@ from plenocli.optics import pif as pif_module
 from plenocli.optics.pif import PifBuilder
 from plenocli.optics.diagnose import describe, singular_values
 from tests.optics.cameras import WAVELENGTH, pif_builder, plan_pif, pupil_conjugate, small_camera, system_matrix
+from tests.reference.window import column_energies
 
 ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
 
@@ -248,3 +249,17 @@ def test_progress_counts_every_column():
     system_matrix(small_camera(), progress=lambda done, total: calls.append((done, total)), **ISOLATED)
     assert calls[-1] == (64, 64)
     assert pif_module.BLOCK_BYTES > 0
+
+
+def test_superpixels_with_factors_of_their_own_rank():
+    """Fewer terms on each superpixel: columns hold against brute force, and weak superpixels have their light."""
+    camera, place = seed_camera(object__samples_per_lenslet=(4, 5)), [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
+    builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1)
+    lenslets, pitch = builder._lenslets, camera.lenslet_array.pitch
+    assert max(lenslets._narrowed(s, 1).high.shape[3] for s in range(3)) < 0.9 * lenslets.high.shape[3]
+    for i, j in ((0, 0), (1, 3)):
+        truth = column_energies(camera, WAVELENGTH, ((i - 1.5) * pitch / 4, (j - 2) * pitch / 5), 2, place, pixel_nodes=9)
+        truth = np.array([truth[s].ravel() for s in place])
+        error = builder.columns([5 * i + j])[:, :, 0] - truth
+        assert np.linalg.norm(error) < 1e-4 * np.linalg.norm(truth)
+        assert (np.linalg.norm(error, axis=1) < 1e-2 * np.linalg.norm(truth, axis=1)).all()

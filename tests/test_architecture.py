@@ -56,10 +56,10 @@ def test_commands_only_parse(path):
     assert not {".".join(name.split(".")[:2]) for name in imported(path)} & banned
 
 
-HEAVY = ("numpy", "scipy", "h5py", "colour", "matplotlib", "pydantic", "skimage", "rawpy", "OpenImageIO", "numba", "tqdm")
+HEAVY = ("numpy", "scipy", "h5py", "colour", "matplotlib", "pydantic", "skimage", "rawpy", "OpenImageIO", "numba", "tqdm", "distributed", "optuna")
 
 
-@pytest.mark.parametrize("command", ["", "simulate-pif", "simulate-response", "capture-sim", "calibrate", "demux", "learn-dict", "reconstruct", "score", "report", "inspect", "lens", "schema"])
+@pytest.mark.parametrize("command", ["", "simulate-pif", "simulate-response", "capture-sim", "calibrate", "demux", "learn-dict", "reconstruct", "score", "report", "sweep", "optimise", "inspect", "lens", "schema"])
 def test_help_imports_nothing_heavy(command):
     code = (
         "import sys; from plenocli.cli.main import run\n"

@@ -475,7 +475,7 @@ def _sentence(error, model):
     """One violation in words: path, what is wrong, and the nearest known key where a key is unknown."""
     path = [str(p) for p in error["loc"]]
     if error["type"] == "extra_forbidden":
-        known = _keys(path[:-1], model)
+        known = known_keys(path[:-1], model)
         near = difflib.get_close_matches(path[-1], known, 1, 0.5)
         hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
         return f"{'.'.join(path)}: unknown key; {hint}"
@@ -485,7 +485,7 @@ def _sentence(error, model):
     return f"{'.'.join(path) or model.__name__.lower()}: {message}"
 
 
-def _keys(path, model):
+def known_keys(path, model):
     """Names that a section knows; `path` as in a pydantic error location."""
     for name in path:
         if name.isdigit() or name not in model.model_fields:

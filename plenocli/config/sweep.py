@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from plenocli.config.camera import Camera, FileName, Section, _keys, parse_toml, read_text
+from plenocli.config.camera import Camera, FileName, Section, known_keys, parse_toml, read_text
 from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
 from plenocli.errors import ConfigError
 
@@ -193,7 +193,7 @@ def unknown_key(key):
     for depth, name in enumerate(path):
         if name.isdigit() or name == "*":
             continue
-        known = _keys(path[:depth], Camera) if depth else [*Camera.model_fields, *STAGES]
+        known = known_keys(path[:depth], Camera) if depth else [*Camera.model_fields, *STAGES]
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.5)
             return f"{key}: unknown key {name}; " + (f"did you mean {'.'.join([*path[:depth], near[0]])}?" if near else f"known here: {', '.join(known)}")

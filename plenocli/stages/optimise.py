@@ -9,7 +9,7 @@ import numpy as np
 
 from plenocli.errors import ConfigError, UsageError
 from plenocli.stages.scheduler import open_pool
-from plenocli.stages.sweep import _finish, _kept, _objectives, open_space
+from plenocli.stages.sweep import finish, objectives_of, open_space, open_store
 
 
 def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, workers=1, scheduler=None, mem_limit=None, plot=None, overwrite=False, command=""):
@@ -20,8 +20,8 @@ def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, wor
     space = open_space(path, read_options, seed)
     if not space.axes:
         raise ConfigError("design = \"list\" leaves nothing to search", path, "give [vary], or use sweep")
-    objectives = _objectives(space, [space.row(0, {key: axis.at(0.0) for key, axis in space.axes.items()})])
-    with _kept(output, plot, overwrite, [path, space.camera_path]) as store, open_pool(workers, scheduler) as pool:
+    objectives = objectives_of(space, [space.row(0, {key: axis.at(0.0) for key, axis in space.axes.items()})])
+    with open_store(output, plot, overwrite, [path, space.camera_path]) as store, open_pool(workers, scheduler) as pool:
         study, rows, computed = _study(objectives, seed), {}, 0
         for start in range(0, trials, batch):
             asked = [_ask(study, space) for _ in range(min(batch, trials - start))]
@@ -32,7 +32,7 @@ def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, wor
                 rows.setdefault(row.key, row)
         for number, row in enumerate(rows.values()):
             row.number = number
-        return _finish(space, list(rows.values()), objectives, store, computed, command)
+        return finish(space, list(rows.values()), objectives, store, computed, command)
 
 
 def _study(objectives, seed):

@@ -142,17 +142,17 @@ def run_sweep(path, output, *, read_options, seed=0, workers=1, scheduler=None, 
 
     space = open_space(path, read_options, seed)
     rows = [space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, seed))]
-    objectives = _objectives(space, rows)
-    with _kept(output, plot, overwrite, [path, space.camera_path]) as store, open_pool(workers, scheduler) as pool:
+    objectives = objectives_of(space, rows)
+    with open_store(output, plot, overwrite, [path, space.camera_path]) as store, open_pool(workers, scheduler) as pool:
         computed = store.evaluate(rows, pool, list(space.files), mem_limit)
-        return _finish(space, rows, objectives, store, computed, command)
+        return finish(space, rows, objectives, store, computed, command)
 
 
 # --- working through points ---------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
-def _kept(output, plot, overwrite, inputs):
+def open_store(output, plot, overwrite, inputs):
     """The Store of results beside `output`, checked before any work."""
     from plenocli.artefacts import check_output
 
@@ -296,7 +296,7 @@ def _definitions():
     return {name: text for module in (quality, spectral, snr, classify) for name, text in module.DEFINITIONS.items()} | DESIGN
 
 
-def _objectives(space, rows):
+def objectives_of(space, rows):
     """Metric or numeric key -> "max" or "min"; ConfigError for a name that no point can have."""
     import difflib
 
@@ -335,7 +335,7 @@ def _columns(space, rows):
             np.array(values, float).reshape(len(values), len(rows)).T, np.array(figures, float).reshape(len(rows), len(order)))
 
 
-def _finish(space, rows, objectives, store, computed, command):
+def finish(space, rows, objectives, store, computed, command):
     """Write table, CSV and picture; returns the summary. The error of the first point is raised where no point worked."""
     from plenocli.artefacts import Artefact, Provenance, describe_inputs, publish, write_artefact
     from plenocli.metrics.pareto import front

@@ -67,7 +67,7 @@ def test_the_same_seed_tries_the_same_points_stopped_or_not(space, tmp_path):
 
 def test_the_search_finds_what_chance_does_not(space, tmp_path, monkeypatch):
     """On a function with a known best, the points tried last lie nearer to it than the first ones."""
-    def figures(store, rows, pool, **options):
+    def figures(store, rows, *surroundings, **options):
         for row in rows:
             f, choice = row.point["main_lens.f_number"], row.point["reconstruct.method"]
             row.result = {"status": 0, "reason": "", "notes": [], "seconds": 0.0, "metrics": {"psnr_db": -abs(f - 7) - (choice == "block-mean")}}

@@ -11,7 +11,7 @@ SEED ?= 3
 
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
-COMMON = $(TRAINING) --pif $(RUN)/pif.h5 $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed $(SEED) $(LEARN)
+COMMON = $(TRAINING) --pif $(RUN)/pif.h5 $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed $(SEED) --synthesis $(LEARN)
 
 all: $(RUN)/report.html
 ablation: $(RUN)/without-delta/report.html

@@ -161,4 +161,17 @@ SWEEP = Schema("sweep", 1, "Points of a design space, what each gave, and which 
     Attr("description", "json", "", "the sweep file"))},
     plots={"sweep": ("metric", ())}, default=("sweep",))
 
-SCHEMAS = {schema.kind: schema for schema in (PIF, PIF_INDEX, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE, SWEEP)}
+LIGHTFIELD = Schema("lightfield", 1, "One capture focused on several planes, its depth, and its views through parts of the pupil.", (
+    Field("refocus/value", "plane point_row point_column", "f", "1", "radiance relative to white, `step` points a lenslet pitch", maskable=True),
+    Field("refocus/slope", "plane", "f", "1", "px that a plane's picture moves for each px of view; 0 is focused on the lenslets", ascending=True),
+    Field("refocus/distance", "plane", "f", "m", "of each plane in front of the main lens; NaN beyond infinity", optional=True, maskable=True),
+    Field("refocus/sharpness", "plane", "f", "1", "mean square gradient of each picture", minimum=0),
+    Field("depth/slope", "row column", "f", "1", "slope at which the views agree best, one point a lenslet pitch", optional=True, maskable=True),
+    Field("depth/distance", "row column", "f", "m", "the same as a distance", optional=True, maskable=True),
+    Field("depth/confidence", "row column", "f", "1", "0 where all slopes agree alike, towards 1 where one stands out", optional=True, minimum=0),
+    Field("views/value", "view_row view_column row column", "f", "1", "picture through each part of the pupil", optional=True, maskable=True),
+), attrs={"refocus": (
+    Attr("pitch", "number", "px", "lenslet spacing"), Attr("step", "number", "1", "points of a picture per pitch"), Attr("pupil", "number", "px", "width of the pupil's image"), _NOTES)},
+    plots={"refocus": ("value", ())}, default=("refocus",))
+
+SCHEMAS = {schema.kind: schema for schema in (PIF, PIF_INDEX, CAPTURE, CALIBRATION, SPECTRA, DICTIONARY, IMAGE, SWEEP, LIGHTFIELD)}

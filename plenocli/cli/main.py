@@ -19,6 +19,7 @@ COMMANDS = (
     "demux",
     "learn-dict",
     "reconstruct",
+    "refocus",
     "score",
     "report",
     "sweep",

@@ -126,7 +126,13 @@ def _sweep(path, artefact, choice):
     return front_figures(artefact)
 
 
-_FIGURES = {"pif": _pif, "capture": _capture, "calibration": _calibration, "dictionary": _dictionary, "spectra": _spectra, "image": _image, "sweep": _sweep}
+def _lightfield(path, artefact, choice):
+    from plenocli.report.planes import lightfield_figures
+
+    return lightfield_figures(artefact)
+
+
+_FIGURES = {"pif": _pif, "capture": _capture, "calibration": _calibration, "dictionary": _dictionary, "spectra": _spectra, "image": _image, "sweep": _sweep, "lightfield": _lightfield}
 
 
 def _compared(files, truth, mem_limit):

@@ -48,6 +48,8 @@ def senseless(kind):
         return ("", "abc", "1.5", "nan", "inf", "5nm", low, *high)
     if type(kind).__name__ == "Lambda":
         return ("", "abc", "-1", "0", "nan", "inf", "5nm")
+    if type(kind).__name__ == "_Slope":
+        return ("", "abc", "nan", "inf", "1e9", "5nm")
     if kind.name == "angle":
         return ("", "abc", "5", "5nm", "nan", "nandeg", "1e999deg")
     if isinstance(kind, options._File):
@@ -79,4 +81,4 @@ def gives_an_example(said, kind):
 def test_every_option_has_a_type_that_refuses_something():
     """Free text is only what names a scene, a target, a method of grouping or a title."""
     free = {option.opts[-1] for _, option in COMMANDS_AND_OPTIONS if not senseless(option.type.types[0] if isinstance(option.type, click.Tuple) else option.type)}
-    assert free <= {"--patches", "--illuminant", "--scene", "--target", "--training", "--truth", "--title", "--spectral-step", "--reference", "--observer"}, free
+    assert free <= {"--scheduler", "--patches", "--illuminant", "--scene", "--target", "--training", "--truth", "--title", "--spectral-step", "--reference", "--observer"}, free

@@ -1,0 +1,96 @@
+"""`plenocli refocus`: captures of cameras out of focus, the letters of a real camera, wrong requests."""
+
+import numpy as np
+import pytest
+
+from plenocli.artefacts import read_artefact
+from plenocli.cli.main import run
+from plenocli.sensor import lightfield
+
+CAMERA = """
+[main_lens]
+focal_length = "50 mm"
+f_number = 8
+aperture_shape = "square"
+[object]
+distance = "{distance}"
+samples_per_lenslet = [6, 6]
+[lenslet_array]
+distance = "55 mm"
+superpixel_pitch = "44 um"
+focal_length = "352 um"
+count = [15, 15]
+[sensor]
+distance = "352 um"
+pixel_pitch = "4 um"
+pixels_per_lenslet = [11, 11]
+[light]
+wavelengths = ["550 nm"]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("refocus")
+
+
+@pytest.mark.parametrize("distance, reach", [("550 mm", 1), ("500 mm", 5), ("620 mm", 5)])
+def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distance, reach):
+    """capture-sim works with system matrices of waves and knows nothing of slopes."""
+    name = distance.split()[0]
+    camera, capture, out = folder / f"{name}.toml", folder / f"{name}.h5", folder / f"{name}-planes.h5"
+    camera.write_text(CAMERA.format(distance=distance))
+    grid = f"{reach}x{reach}" if reach == 1 else "3x3"
+    assert run(["capture-sim", str(camera), "--scene", "skimage:camera", "--model", "ray", "--superpixels", grid, "--coherent-ring", "0", "--noise", "none", "-o", str(capture)]) == 0
+    assert run(["refocus", str(capture), "--camera", str(camera), "-o", str(out)]) == 0
+    data = read_artefact(out, "lightfield").data
+    true = lightfield.slope_of(float(name) * 1e-3, 0.05, 0.055, 352e-6)
+    sure = data["depth/confidence"][3:-3, 3:-3] > 0.4
+    assert sure.sum() > 10
+    assert np.median(data["depth/slope"][3:-3, 3:-3][sure]) == pytest.approx(true, abs=0.25)
+    assert abs(data["refocus/slope"][np.argmax(data["refocus/sharpness"])] - true) <= 0.5
+
+
+def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
+    """The white sheet with the t at the left is farther away than the grey one with a and b, and each is sharpest at its own slope."""
+    real, cal, out = shared_data / "plenoptic" / "letters", folder / "letters-cal.h5", folder / "letters.h5"
+    assert run(["calibrate", "--white", str(real / "letters_ULF_M1_white.png"), "--dark", str(real / "letters_ULF_M1_dark.png"), "-o", str(cal)]) == 0
+    slopes = [w for s in np.linspace(-1.5, 2, 15) for w in ("--slope", f"{s:.3f}")]
+    assert run(["refocus", str(real / "letters_ULF_M1.png"), "--calibration", str(cal), *slopes, "-o", str(out)]) == 0
+    data = read_artefact(out, "lightfield").data
+    step = lightfield.STEP
+
+    def sharpest(columns):
+        part = data["refocus/value"][:, 2 * step:18 * step, columns[0] * step:columns[1] * step]
+        return data["refocus/slope"][np.argmax([lightfield.sharpness(p) for p in part])]
+
+    t, ab = sharpest((4, 7)), sharpest((9, 16))
+    assert t < ab - 0.2 and abs(t) < 0.6 and 0.2 < ab < 1.2
+    depth = data["depth/slope"]
+    assert np.median(depth[4:16, 4:7]) < 0.2 < np.median(depth[4:16, 9:16])
+
+
+@pytest.mark.parametrize("arguments, code, words", [
+    (["--distance", "500mm"], 2, "--camera"), (["--distance", "500mm", "--slope", "1", "--camera", "550.toml"], 2, "not both"), (["--slope", "nan"], 2, "0.5"),
+    (["--calibration", "550.h5"], 3, "capture"), (["--camera", "none.toml"], 3, "none.toml")])
+def test_wrong_requests_have_one_message(folder, capfd, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(folder)
+    assert run(["refocus", "550.h5", *arguments, "-o", "never.h5"]) == code
+    assert words in capfd.readouterr().err and not (folder / "never.h5").exists()
+
+
+def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
+    import OpenImageIO as oiio
+
+    path = folder / "photo.png"
+    out = oiio.ImageOutput.create(str(path))
+    out.open(str(path), oiio.ImageSpec(40, 40, 1, "uint8"))
+    out.write_image(np.random.default_rng(0).integers(0, 200, (40, 40, 1)).astype(np.uint8))
+    out.close()
+    assert run(["refocus", str(path), "-o", str(folder / "never.h5")]) == 3
+    assert "--calibration" in capfd.readouterr().err
+
+
+def test_show_draws_it(folder):
+    assert run(["show", str(folder / "550-planes.h5"), "-o", str(folder / "550.png")]) == 0
+    assert (folder / "550.png").stat().st_size > 20_000

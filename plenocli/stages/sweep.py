@@ -8,6 +8,7 @@ import shutil
 import tomllib
 from collections import deque
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,8 @@ def open_store(output, plot, overwrite, inputs):
     again = overwrite or folder.is_dir()  # what an unfinished run left is ours
     check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs)
     if plot is not None:
+        if find_spec("matplotlib") is None:
+            raise UsageError("pictures need matplotlib, which is not installed", "--plot", "pip install 'plenocli[plot]', or leave it out")
         check_output(plot, overwrite=again, inputs=inputs, suffixes=(".png",))
     store = Store(folder, output, plot, overwrite, again)
     try:
@@ -356,7 +359,9 @@ def finish(space, rows, objectives, store, computed, command):
     provenance = Provenance(command, describe_inputs(inputs), space.seed, _base_text(space))
     publish(store.output.with_suffix(".csv"), _csv(rows, keys, names, figures, ahead).encode(), overwrite=store.again)
     artefact = Artefact("sweep", data, {"sweep": attrs}, provenance)
-    if store.plot is not None:
+    if store.plot is not None and not ahead.any():
+        note("no point has all figures of the front: there is nothing to draw")
+    elif store.plot is not None:
         from plenocli.report.front import front_picture
 
         publish(store.plot, front_picture(artefact), overwrite=store.again)
@@ -368,7 +373,7 @@ def finish(space, rows, objectives, store, computed, command):
     best = sorted(np.flatnonzero(ahead), key=lambda i: tuple(-m[i] if way == "max" else m[i] for m, way in zip(merit, objectives.values())))
     shown = [{"point": rows[i].number, **{name: float(m[i]) for name, m in zip(objectives, merit) if name not in keys}, **rows[i].point} for i in best]
     return {"output": str(store.output), "points": len(rows), "computed": computed, "refused": len(reasons), "with_remarks": len(remarks), "first_reason": next(iter(reasons.values()), ""), "first_remark": next(iter(remarks.values()), [""])[0], "objectives": objectives,
-            "front": shown, "cpu_seconds": sum(row.result["seconds"] for row in rows)} | ({} if store.plot is None else {"plot": str(store.plot)})
+            "front": shown, "cpu_seconds": sum(row.result["seconds"] for row in rows)} | ({"plot": str(store.plot)} if store.plot is not None and ahead.any() else {})
 
 
 _CLASSES = {error.exit_code: error for error in (ConfigError, InputError, NumericsError)}

@@ -179,8 +179,9 @@ def test_cameras_that_are_refused_are_rows_with_the_reason(tmp_path):
 def test_a_matrix_that_is_refused_refuses_its_points(tmp_path):
     report_text = SMALL.replace("accuracy = 1e-2", "accuracy = 1e-12").replace("[6, 8]", "[6]")
     with pytest.raises(PlenoError, match="none of 4 points could be computed") as caught:
-        sweep(described(tmp_path, report_text), tmp_path / "out.h5")
+        sweep(described(tmp_path, report_text), tmp_path / "out.h5", plot=tmp_path / "front.png")
     assert caught.value.exit_code == 5
+    assert not (tmp_path / "front.png").exists()
     artefact = read_artefact(tmp_path / "out.h5", "sweep")
     assert artefact.data["sweep/status"].tolist() == [5] * 4 and "1e-12" in artefact.attrs["sweep"]["reasons"]["3"]
 
@@ -201,8 +202,12 @@ def test_mistakes_in_the_file_end_the_run_before_any_work(tmp_path, old, new, er
     assert said in str(caught.value) and not list(tmp_path.glob("out*"))
 
 
-def test_outputs_are_guarded(whole, tmp_path):
+def test_outputs_are_guarded(whole, tmp_path, monkeypatch):
     path, table, _ = whole
+    with monkeypatch.context() as without:
+        without.setattr("plenocli.stages.sweep.find_spec", lambda name: None)
+        with pytest.raises(UsageError, match="matplotlib"):
+            sweep(path, tmp_path / "out.h5", plot=tmp_path / "front.png")
     with pytest.raises(UsageError, match="exists already"):
         sweep(path, table)
     (tmp_path / "mine.csv").write_text("precious")

@@ -36,3 +36,16 @@ def test_files_named_in_the_readme_exist():
     targets = re.findall(r"^([a-z][a-z0-9-]*):", (ROOT / "Makefile").read_text(), re.M)
     for target in re.findall(r"`make (?:-j2 )?([a-z][\w-]*)`", text):
         assert target in targets, target
+
+
+def test_python_in_the_documentation_runs(tmp_path, monkeypatch):
+    from plenocli.cli.main import run
+
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scientist.md").read_text(), re.S)
+    monkeypatch.chdir(tmp_path)
+    assert run(["simulate-pif", str(ROOT / "sample_configs" / "tiny.toml"), "--model", "ray", "--superpixels", "3x3", "-o", "pif.h5"]) == 0
+    for block in blocks:
+        names = {}
+        exec(block, names)
+        assert names["psf"].shape == (13, 13) and names["own"].shape == (169, 64) and 0.1 < names["psf"].sum() <= 1.001
+    assert blocks

@@ -5,6 +5,8 @@ import errno
 import importlib
 import os
 import sys
+import time
+from functools import partial
 
 import click
 
@@ -57,12 +59,16 @@ class Pipeline(click.Group):
 
 @click.group(
     cls=Pipeline,
+    invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Exit codes: 0 done; 2 usage or configuration; 3 an input file is unreadable, damaged or of the wrong kind; "
     "4 the output could not be written; 5 numerically impossible or accuracy unreachable; 70 a bug of plenocli.",
 )
 @click.version_option(__version__, prog_name="plenocli")
-def cli():
+@click.option("-q", "--quiet", is_flag=True, help="No progress and no notes; errors and results only.")
+@click.option("-v", "--verbose", is_flag=True, help="Also say what a command cost: time and memory.")
+@click.pass_context
+def cli(ctx, quiet, verbose):
     """Model a plenoptic camera end to end: from its description and a scene to captures, spectra and images.
 
     \b
@@ -72,6 +78,23 @@ def cli():
 
     Every command has --help with examples. Lengths carry their unit: 550nm, "250 um", 50mm.
     """
+    from plenocli.stages import progress
+
+    progress.quiet = quiet
+    if verbose:
+        ctx.call_on_close(partial(_cost, time.monotonic()))
+    if ctx.invoked_subcommand is None:
+        from plenocli.stages.next_step import next_step
+
+        click.echo(f"{ctx.get_help()}\n\nNext: {next_step('.')}")
+
+
+def _cost(start):
+    import resource
+
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    seconds, peak = sum(u.ru_utime + u.ru_stime for u in used), max(u.ru_maxrss for u in used) / 2**20
+    click.echo(f"plenocli: {time.monotonic() - start:.2f} s, {seconds:.2f} s of processor time, at most {peak:.2f} GiB of memory", err=True)
 
 
 def main(argv=None):

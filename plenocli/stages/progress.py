@@ -4,6 +4,8 @@ import contextlib
 import contextvars
 import sys
 
+quiet = False
+"""Whether the person asked for silence: no bars, no notes."""
 _EAR = contextvars.ContextVar("ear", default=None)
 
 
@@ -11,7 +13,7 @@ def bar(iterable, total=None, label=""):
     """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, and while `heard` listens."""
     from tqdm import tqdm
 
-    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None if _EAR.get() is None else True, leave=False)
+    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=True if quiet or _EAR.get() is not None else None, leave=False)
 
 
 def note(text):
@@ -19,7 +21,7 @@ def note(text):
     ear = _EAR.get()
     if ear is not None:
         ear.append(text)
-    else:
+    elif not quiet:
         print(f"plenocli: {text}", file=sys.stderr)
 
 

@@ -1,0 +1,50 @@
+"""What to type next, by what lies in a folder."""
+
+from pathlib import Path
+
+MOST = 40
+"""Files looked at."""
+
+
+def next_step(folder):
+    """One sentence with a command, from the newest plenocli files in `folder`."""
+    found = _kinds(Path(folder))
+    cameras = sorted(p.name for p in Path(folder).glob("*.toml") if _is_camera(p))
+    first = {kind: names[0] for kind, names in found.items()}
+    if "image" in first and "capture" in first:
+        return f"plenocli score {' '.join(found['image'][:3])} --truth {first['capture']} -o score.json --report report.html"
+    if "spectra" in first:
+        return f"plenocli show {first['spectra']} -o spectra.png"
+    if "capture" in first and "pif" in first:
+        return f"plenocli reconstruct {first['capture']} --pif {first['pif']} -o image.h5"
+    if "capture" in first and "calibration" in first:
+        return f"plenocli demux {first['capture']} --calibration {first['calibration']} -o spectra.exr"
+    if "pif" in first and cameras:
+        return f"plenocli capture-sim {cameras[0]} --pif {first['pif']} --scene skimage:astronaut --snr 60dB -o capture.h5"
+    if "calibration" in first:
+        return f"plenocli demux YOUR.nef --calibration {first['calibration']} -o spectra.exr"
+    if cameras:
+        return f"plenocli simulate-pif {cameras[0]} -o pif.h5"
+    return "describe a camera (plenocli schema camera; examples are in sample_configs), then plenocli simulate-pif camera.toml -o pif.h5; or measure yours: plenocli calibrate --help"
+
+
+def _kinds(folder):
+    """Kind -> names of artefacts in the folder, newest first; what cannot be read is left out."""
+    import h5py
+
+    found = {}
+    for path in sorted(folder.glob("*.h5"), key=lambda p: (-p.stat().st_mtime, p.name))[:MOST]:
+        try:
+            with h5py.File(path, "r") as file:
+                kind = file.attrs["plenocli_kind"].decode()
+        except (OSError, KeyError, AttributeError, UnicodeDecodeError):
+            continue
+        found.setdefault("pif" if kind == "pif-index" else kind, []).append(path.name)
+    return found
+
+
+def _is_camera(path):
+    try:
+        return path.stat().st_size < 1 << 20 and "[lenslet_array]" in path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False

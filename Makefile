@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse tiny tradeoff bench-pif clean
+.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny tradeoff bench-pif docs clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -83,9 +83,15 @@ bench-sparse: $(READY) ## sparse coding beside SPAMS, scikit-learn, FISTA and an
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python pipelines/benchmarks/sparse.py --run $(RUNS)/bench-sparse
 
+bench-reconstruct: $(READY) ## every method of reconstruction at 60, 40, 30 and 20 dB, square and circular lenslets: quality and time of each
+	$(BIN)/python pipelines/benchmarks/reconstruct.py --run $(RUNS)/bench-reconstruct
+
 bench-pif: $(READY) ## the system matrix beside prysm, poppy, hcipy and LightPipes: time and error of each
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python pipelines/benchmarks/pif.py --run $(RUNS)/bench-pif
+
+docs: $(READY) ## the pages of docs/ that come from the program: commands, file format
+	$(BIN)/python pipelines/pages.py docs
 
 clean: ## remove results, keep the environment
 	rm -rf $(RUNS)

@@ -14,12 +14,12 @@ TRAINING ?=
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 # a result is called by its method; what a method needs beyond its name stands here
-METHODS := block-mean tikhonov tsvd nnls-300 nnls lmmse dictionary
+METHODS := block-mean tikhonov tsvd nnls-300 nnls lmmse dictionary tv pnp
 OPTIONS_nnls-300 := --method nnls --nnls-iterations 300
 OPTIONS_lmmse-3x3 := --method lmmse --overlap 3
 OPTIONS_dictionary := --method dictionary --dictionary $(RUN)/dictionary.h5
 OPTIONS_lmmse-no-neighbours := --method lmmse --pif $(RUN)/pif.h5
-OPTIONS = $(or $(OPTIONS_$*),--method $*) $(if $(findstring lmmse,$*),$(TRAINING:%=--training %))
+OPTIONS = $(or $(OPTIONS_$*),--method $*) $(if $(filter lmmse% tv pnp,$*),$(TRAINING:%=--training %))
 
 PAPER := $(patsubst %,$(RUN)/paper/%.h5,$(METHODS) lmmse-3x3)
 # converged nnls takes minutes a sweep and only shows again what it does on the paper's capture
@@ -43,7 +43,7 @@ $(RUN)/stray/capture.h5: $(CONFIG) | $(RUN)/stray/
 	$(P) capture-sim $< --model fresnel --accuracy 1e-3 --refine $(REFINE) --bandwidth 10nm --superpixels 3x3 --coherent-ring 1 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 2 -o $@ --overwrite
 
 $(RUN)/dictionary.h5: $(RUN)/pif.h5
-	$(P) learn-dict $(TRAINING) --pif $< $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 -o $@ --overwrite
+	$(P) learn-dict $(TRAINING) --pif $< $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 --synthesis -o $@ --overwrite
 
 $(RUN)/paper/dictionary.h5 $(RUN)/stray/dictionary.h5: $(RUN)/dictionary.h5
 

@@ -18,7 +18,7 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")
 @click.option("--noise-sigma", type=options.POSITIVE, help="Standard deviation of the noise, relative like A x; default what the capture says, else estimated.")
 @click.option("--alpha", type=options.NON_NEGATIVE, help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.")
-@click.option("--rank", type=click.IntRange(1), help="Directions kept by tsvd; default by the discrepancy principle.")
+@click.option("--rank", type=click.IntRange(1), help="Directions kept by tsvd; default by the least estimated error.")
 @click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 for dictionary; default as learnt.")
 @click.option("--nnls-iterations", type=click.IntRange(1), help="Stop nnls after so many gradient steps; default converged.")
 @click.option("--clip", is_flag=True, help="Set negative values to zero; their share is reported either way.")
@@ -34,14 +34,17 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler, overwrite, as_json, **settings):
     """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet, relative to white.
 
-    OUT is an image .h5 (with the predicted standard deviation for lmmse) or .exr; with several captures a folder with one
-    file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the others. With
+    pnp takes turns between the data of every lenslet and a denoiser that sees the whole picture; tv prefers flat areas.
+    auto captures pieces of training photographs with this matrix and this noise, and takes what does best on them.
+
+    OUT is an image .h5 (with the predicted standard deviation for lmmse, tv and pnp, and what of a lenslet's object the
+    sensor can see at all) or .exr; with several captures a folder with one file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the others. With
     --calibration and no --pif the picture has one value a lenslet.
 
     \b
     Examples:
       plenocli reconstruct capture.h5 --pif pif.h5 -o picture.h5
-      plenocli reconstruct capture.h5 --pif pif-3x3.h5 --method lmmse --overlap 3 -o picture.h5
+      plenocli reconstruct capture.h5 --pif pif-3x3.h5 --method lmmse -o picture.h5
       plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary d.h5 -o picture.exr
       plenocli reconstruct shots/*.h5 --pif pif.h5 --workers 2 -o pictures/
       plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
@@ -53,7 +56,7 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler,
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
         rule = f", {one['rule']}" if "rule" in one else ""
-        seen = f", {one['seen']['share']:.0%} of the object seen" if "seen" in one else ""
+        seen = f", {one['seen']['directions']} of {one['seen']['points']} directions of the object above the noise" if "seen" in one else ""
         line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
     else:
         line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"

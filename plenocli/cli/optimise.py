@@ -32,7 +32,7 @@ def command(ctx, description, output, as_json, **settings):
     """
     from plenocli.cli.sections import read_options
     from plenocli.stages.optimise import run_optimise
-    from plenocli.stages.sweep import lines
+    from plenocli.stages.sweep_table import lines
 
     report = run_optimise(description, output, read_options=read_options, command=options.command_line(ctx), **settings)
     options.summary(report, as_json, lines(report))

@@ -32,7 +32,8 @@ def command(ctx, description, output, as_json, **settings):
       plenocli sweep sweep.toml --scheduler tcp://10.0.0.1:8786 -o sweep.h5
     """
     from plenocli.cli.sections import read_options
-    from plenocli.stages.sweep import lines, run_sweep
+    from plenocli.stages.sweep import run_sweep
+    from plenocli.stages.sweep_table import lines
 
     report = run_sweep(description, output, read_options=read_options, command=options.command_line(ctx), **settings)
     options.summary(report, as_json, lines(report))

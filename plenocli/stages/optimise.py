@@ -8,8 +8,10 @@ repeated from its journal up to where it was.
 import numpy as np
 
 from plenocli.errors import ConfigError, UsageError
+from plenocli.stages.design_space import open_space
 from plenocli.stages.scheduler import open_pool
-from plenocli.stages.sweep import finish, objectives_of, open_space, open_store
+from plenocli.stages.sweep_store import open_store
+from plenocli.stages.sweep_table import finish, objectives_of
 
 
 def run_optimise(path, output, *, read_options, trials=100, batch=4, seed=0, workers=1, scheduler=None, mem_limit=None, plot=None, overwrite=False, command=""):

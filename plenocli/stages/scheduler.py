@@ -146,7 +146,11 @@ class _Executing:
     def submit(self, token, function, task):
         """Hand in a task."""
         call = (self._call, function, task) if self._call else (_remotely, __version__, function, task)
-        self._running[self._executor.submit(*call)] = (token, function, task)
+        try:
+            self._running[self._executor.submit(*call)] = (token, function, task)
+        except BrokenExecutor:  # a process died since we looked
+            self._suspects.append((token, function, task))
+            self._renew()
 
     def next(self):
         """(token, result or PlenoError) of a task that has ended."""
@@ -177,15 +181,20 @@ class _Executing:
     def _restart(self, job):
         """New workers in place of those that died; (token, Lost) where `job` was alone with them, and not for the first time."""
         alone = not self._running
-        broken = [future for future in self._running if not future.done() or future.exception() is not None]
-        self._suspects.extendleft(reversed([job, *(self._running.pop(future) for future in broken)]))
-        _stop(self._executor, True)
-        self._executor = self._start()
+        self._suspects.appendleft(job)
+        self._renew()
         self._deaths = self._deaths + 1 if alone else 0
         if self._deaths < ATTEMPTS:
             return None
         self._deaths = 0
         return self._suspects.popleft()[0], Lost(f"its process died {ATTEMPTS} times (was it killed, or out of memory?)", fix="take fewer --workers, or run again")
+
+    def _renew(self):
+        """New workers; what the old ones had not finished is under suspicion."""
+        broken = [future for future in self._running if not future.done() or future.exception() is not None]
+        self._suspects.extend(self._running.pop(future) for future in broken)
+        _stop(self._executor, True)
+        self._executor = self._start()
 
     def close(self):
         """Give up what is under way."""

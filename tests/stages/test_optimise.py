@@ -8,7 +8,7 @@ import pytest
 from plenocli.artefacts import read_artefact
 from plenocli.cli.main import run
 from plenocli.errors import ConfigError, UsageError
-from plenocli.stages import optimise, sweep
+from plenocli.stages import optimise, sweep_store
 
 pytest.importorskip("optuna")
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,7 +73,7 @@ def test_the_search_finds_what_chance_does_not(space, tmp_path, monkeypatch):
             row.result = {"status": 0, "reason": "", "notes": [], "seconds": 0.0, "metrics": {"psnr_db": -abs(f - 7) - (choice == "block-mean")}}
         return len(rows)
 
-    monkeypatch.setattr(sweep.Store, "evaluate", figures)
+    monkeypatch.setattr(sweep_store.Store, "evaluate", figures)
     assert run(["optimise", str(space), "--trials", "80", "-o", str(tmp_path / "best.h5")]) == 0
     values = table(tmp_path / "best.h5").data["sweep/parameter"]
     assert np.abs(values[-30:, 0] - 7).mean() < 0.6 * np.abs(values[:10, 0] - 7).mean()

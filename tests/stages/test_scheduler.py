@@ -103,6 +103,18 @@ def test_a_process_that_dies_takes_no_result_along(tasks, tmp_path):
     assert found == {n: n * n for n in range(8)} | {"x": "alive"}
 
 
+def test_tasks_may_be_handed_in_while_processes_die(tasks, tmp_path):
+    """The pool learns of the death between two tasks, not while it waits for one."""
+    with open_pool(2) as pool:
+        pool.submit("first", tasks.die_once, str(tmp_path / "x"))
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "x").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(1.0)
+        pool.submit("second", tasks.square, 3)
+        assert dict([pool.next(), pool.next()]) == {"first": "alive", "second": 9}
+
+
 def test_a_task_that_kills_every_process_is_lost_alone(tasks):
     with open_pool(2) as pool:
         found = dict(run_all(pool, [(name, tasks.die, name) for name in ("a", "b", "deadly", "c", "d")]))

@@ -17,7 +17,8 @@ from plenocli.cli.sections import read_options
 from plenocli.config.sweep import number
 from plenocli.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
 from plenocli.stages import chain
-from plenocli.stages.sweep import lines, run_sweep
+from plenocli.stages.sweep import run_sweep
+from plenocli.stages.sweep_table import lines
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -205,7 +206,7 @@ def test_mistakes_in_the_file_end_the_run_before_any_work(tmp_path, old, new, er
 def test_outputs_are_guarded(whole, tmp_path, monkeypatch):
     path, table, _ = whole
     with monkeypatch.context() as without:
-        without.setattr("plenocli.stages.sweep.find_spec", lambda name: None)
+        without.setattr("plenocli.stages.sweep_store.find_spec", lambda name: None)
         with pytest.raises(UsageError, match="matplotlib"):
             sweep(path, tmp_path / "out.h5", plot=tmp_path / "front.png")
     with pytest.raises(UsageError, match="exists already"):

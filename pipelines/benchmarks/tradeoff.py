@@ -35,7 +35,7 @@ ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
 NEAR = 3.0
 """A rung that was passed over is timed if its estimated error is at most so many times what was asked."""
-LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_products", "exact_band", "size_band"}
+LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_products", "expected_rank", "_own_terms", "exact_band", "size_band"}
 """Functions that plan and do not compute: what was measured outlives their changes."""
 
 
@@ -179,10 +179,12 @@ def expected(run, cases, budget):
     return matrices, sum(truths.values())
 
 
-def run_case(run, case, budget, race):
+def run_case(run, case, budget, race, kept_only=False):
     """Fill in what was measured of a case, of its chosen rung and of those it was chosen from."""
     chosen, others = case["_chosen"], case["_others"]
     truth = truth_of(run, case)
+    if kept_only and not (truth and record_path(run, case, chosen, truth).exists()):
+        return case | {"not_run": f"estimated {dial.seconds_here(chosen):.2g} s"}
     if truth is None:
         return case | {"not_run": "brute force cannot be afforded"}
     found = measured(run, case, chosen, truth)
@@ -193,7 +195,7 @@ def run_case(run, case, budget, race):
     for other in others if race else ():
         # what serves is timed unless it is hopeless; what is thought too coarse, only if it would have been faster
         limit = min(budget, 4 * max(chosen.seconds(), 0.01) if other.error <= case["accuracy"] else chosen.seconds())
-        if other.seconds() <= limit:
+        if other.seconds() <= limit and (not kept_only or record_path(run, case, other, truth).exists()):
             again = measured(run, case, other, truth)
             if "errors" in again:
                 case["others"].append({"rung": other.name, "estimated_error": other.error, "achieved": max(again["errors"]), "seconds": again["seconds"],
@@ -314,6 +316,7 @@ def main():
     parser.add_argument("--memory", type=float, default=4.0, help="nor those estimated to take more GiB than this")
     parser.add_argument("--no-race", action="store_true", help="do not time the other rungs that might serve")
     parser.add_argument("--plan", action="store_true", help="only say what would be run")
+    parser.add_argument("--table", action="store_true", help="only tabulate what is kept")
     options = parser.parse_args()
     run = ROOT / options.run
     run.mkdir(parents=True, exist_ok=True)
@@ -329,9 +332,9 @@ def main():
     if options.plan:
         return None
     for number, case in enumerate(todo):
-        case |= run_case(run, case, options.budget, not options.no_race)
+        case |= run_case(run, case, options.budget, not options.no_race, options.table)
         print(line(case), flush=True)
-        if number % 20 == 19:
+        if number % 20 == 19 and not options.table:
             write(run, cases)
     write(run, cases)
     print(markdown([c for c in cases]).split("\n\n")[-1] if cases else "")

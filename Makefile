@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny tradeoff bench-pif docs clean
+.PHONY: help env demo test extremes faults test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,6 +69,9 @@ colorchecker: $(READY) ## a real ColorChecker under narrow-band light against it
 
 raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. DARK=.. CAPTURES="a.nef b.nef"
 	$(PIPELINE) pipelines/raw.mk RUN=$(RUNS)/raw
+
+paper: spatial spectral ## the paper's figures made anew, each beside what the paper says: runs/paper.html
+	$(BIN)/python pipelines/paper.py $(RUNS)/spatial $(RUNS)/spectral/achromat $(RUNS)/paper.html
 
 tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (hours)
 	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff

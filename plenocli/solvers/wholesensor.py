@@ -13,7 +13,7 @@ from plenocli.operators import to_blocks, to_plane
 FROM, TO, ROUNDS = 6.0, 0.1, 10
 """Plug and play: first and last tau over the error that is expected at the start, and rounds in between; chosen on validation
 scenes (docs/model.md)."""
-TV_WEIGHT, TV_ROUNDS = 1.0, 20
+TV_WEIGHT, TV_ROUNDS = 0.2, 20
 """Total variation: its weight times the error expected at the start, and rounds of ADMM."""
 
 

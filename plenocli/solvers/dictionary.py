@@ -38,7 +38,7 @@ class Settings:
     """lam, delta: weights in the scaled problem (see `Learner`).  batch: patches an iteration (the paper: at least 4 per
     atom).  snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.  initial: patches, random or pca.
     gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form.
-    tol: duality gap of the coding; at 1e-4 what is left open moves the next objective by 3e-4, at 1e-6, which costs the same, by nothing."""
+    tol: relative duality gap of the coding."""
 
     atoms: int
     batch: int

@@ -167,7 +167,8 @@ def expected(run, cases, budget):
     matrices, truths = 0.0, {}
     for case in cases:
         camera, exact = camera_of(case["camera"]), case["model"] == "auto"
-        window = None if case["scope"] == "isolated" else 1 if exact else wide_window(camera)
+        near = 1 if case["accuracy"] > 2e-3 else 2 if case["accuracy"] > 2e-4 else 3
+        window = None if case["scope"] == "isolated" else near if exact else wide_window(camera)
         truth = Truth(camera, "exact" if exact else "fresnel", window, reach_of(case), run / "reference")
         if case["scope"] == "isolated" or not exact:
             todo = [c for c in (case["_chosen"], *case["_others"]) if not record_path(run, case, c, truth).exists()]
@@ -312,7 +313,7 @@ def main():
     parser.add_argument("--accuracy", action="append", type=float, help="only this accuracy (repeatable)")
     parser.add_argument("--model", action="append", choices=["fresnel", "auto"], help="fresnel: within that model; auto: against the exact one (default: both)")
     parser.add_argument("--scope", action="append", choices=["isolated", "neighbours"], help="one lenslet alone, or neighbours as the dial finds right (default: both)")
-    parser.add_argument("--budget", type=float, default=120.0, help="matrices estimated to take more seconds than this are not run")
+    parser.add_argument("--budget", type=float, default=30.0, help="matrices estimated to take more seconds than this are not run")
     parser.add_argument("--memory", type=float, default=4.0, help="nor those estimated to take more GiB than this")
     parser.add_argument("--no-race", action="store_true", help="do not time the other rungs that might serve")
     parser.add_argument("--plan", action="store_true", help="only say what would be run")

@@ -50,6 +50,15 @@ class Lmmse:
         determined = self.gain**2 @ (1 / (self.power + self.sigma**2))
         return np.clip(determined / np.maximum(self.variance, np.finfo(float).tiny), 0, 1)
 
+    def common_scale(self, y):
+        """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
+        return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)[1]).sum(axis=1))])
+
+    def _likelihood(self, w):
+        """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale, signal), but for a constant."""
+        expected = np.outer(SCALES, self.power) + self.sigma**2
+        return -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
+
     def _coordinates(self, y):
         """Brightness (signal,) and uncorrelated coordinates (k, signal) of y (pixel, signal)."""
         return self.uniform @ y / (self.uniform @ self.uniform), self.analysis @ y - self.offset[:, None]
@@ -60,8 +69,7 @@ class Lmmse:
         Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the mean and the deviation
         (at least 0.2) that make all signals together most likely; one signal alone says little where noise is strong.
         """
-        expected = np.outer(SCALES, self.power) + self.sigma**2
-        likelihood = -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
+        likelihood = self._likelihood(w)
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
         logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
         for _ in range(ROUNDS):

@@ -181,15 +181,27 @@ class Estimators:
         return by_lenslet(self._solver(method, y, sigma, truth, report), y), None
 
     def _jointly(self, data, report):
-        """(x, sigma) of LMMSE over 3x3 lenslets; once more with the noise that is left over, where that is MISFIT times larger."""
+        """(x, sigma) of LMMSE over 3x3 lenslets, the covariance scaled to this picture's contrast; once more with the noise that
+        is left over, where that is MISFIT times larger."""
         sigma = self._joint_noise(data, report)
-        x, spread = self._joint(sigma, data.scene).apply(data.y)
+        x, spread = self._scaled(data, sigma, report)
         left = self._left_over(data.y, x)
         if self.coupled and self.settings.noise_sigma is None and left > MISFIT * sigma:
             note(f"the capture holds {left / sigma:.3g} times more than its noise that the system matrix cannot produce: sigma = {left:.3g} is used")
             report |= {"noise_sigma": left, "noise_source": "what the estimate leaves over"}
-            x, spread = self._joint(left, data.scene).apply(data.y)
+            x, spread = self._scaled(data, left, report)
         return x, spread
+
+    def _scaled(self, data, sigma, report):
+        """(x, sigma) of the joint estimate with scale x covariance, one scale a picture; steps of sqrt(2), so that captures of
+        one kind share what is worked out."""
+        y = data.y - self._stray(data.y) if self.coupled else data.y
+        y = y[1:-1, 1:-1] if min(y.shape[:2]) > 2 else y
+        scale = self._lmmse(sigma, data.scene).common_scale(y.reshape(-1, y.shape[2]).T)
+        scale = 2.0 ** (round(2 * np.log2(scale)) / 2)
+        report["scale"] = scale
+        x, spread = self._joint(sigma / np.sqrt(scale), data.scene).apply(data.y)
+        return x, np.sqrt(scale) * spread
 
     def _left_over(self, y, x):
         """Root mean square of y - A x over the lenslets that have all their neighbours (all, where none has)."""

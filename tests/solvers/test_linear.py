@@ -91,6 +91,8 @@ def test_lmmse_finds_the_contrast_of_each_signal(system):
     assert np.sqrt(np.mean(np.log(scales / scale) ** 2)) < 0.45  # 20 coordinates know a variance to 0.32
     assert error(found) < 1.01 * error(estimator.apply(y, scale)) and error(found) < 0.98 * error(estimator.apply(y))
     assert np.sqrt(np.mean(sigma**2 / scale)) == pytest.approx(error(found), rel=0.08)
+    assert estimator.common_scale(a @ x[:, :1] + 0 * y) == pytest.approx(scale[0], rel=1.0)
+    assert estimator.common_scale(y / 3) == pytest.approx(estimator.common_scale(y) / 9, rel=0.3)
     dark = estimator.adaptive(np.zeros((60, 3)))[0]
     np.testing.assert_allclose(dark, 0, atol=1e-12)
 

@@ -11,9 +11,31 @@ _EAR = contextvars.ContextVar("ear", default=None)
 
 def bar(iterable, total=None, label=""):
     """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, and while `heard` listens."""
+    if quiet or _EAR.get() is not None:
+        return _Silent(iterable)
     from tqdm import tqdm
 
-    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=True if quiet or _EAR.get() is not None else None, leave=False)
+    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None, leave=False)
+
+
+class _Silent:
+    """A bar that nobody sees, without the lock between processes that tqdm makes and a worker that is ended would leave behind."""
+
+    def __init__(self, iterable):
+        self.n, self._iterable = 0, iterable
+
+    def __iter__(self):
+        return iter(self._iterable)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def update(self, count=1):
+        """Count on."""
+        self.n += count
 
 
 def note(text):

@@ -200,7 +200,8 @@ class _Executing:
         """Give up what is under way."""
         for future in self._running:
             future.cancel()
-        _stop(self._executor, bool(self._running))
+        executor, self._executor = self._executor, None
+        _stop(executor, bool(self._running))
 
 
 def _stop(executor, busy):

@@ -154,6 +154,17 @@ def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
     assert [p.name for p in (tmp_path / "whole.parts").iterdir()] == ["points.jsonl"]
 
 
+@pytest.mark.slow
+def test_an_interrupt_ends_everything_with_one_line(whole, tmp_path):
+    command = [sys.executable, "-m", "plenocli", "sweep", str(whole[0]), "-o", str(tmp_path / "out.h5"), "--workers", "2"]
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    kept, deadline = tmp_path / "out.parts" / "points.jsonl", time.monotonic() + 300
+    while child.poll() is None and time.monotonic() < deadline and (not kept.exists() or b'"status"' not in kept.read_bytes()):
+        time.sleep(0.02)
+    os.killpg(child.pid, signal.SIGINT)
+    assert child.communicate(timeout=60)[1].split() == ["plenocli:", "error:", "interrupted"] and child.returncode == 130
+
+
 def journal_lines(path):
     return [json.loads(line.split(" ", 1)[1]) for line in path.read_text().splitlines() if line.endswith("]")]
 

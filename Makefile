@@ -73,7 +73,7 @@ raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. 
 paper: spatial spectral ## the paper's figures made anew, each beside what the paper says: runs/paper.html
 	$(BIN)/python pipelines/paper.py $(RUNS)/spatial $(RUNS)/spectral/achromat $(RUNS)/paper.html
 
-tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (hours)
+tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (an hour; PLAN=1 says how long)
 	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff
 
 sweep: $(READY) ## a design space in one command: the examples of sample_configs/sweeps, tables and fronts in runs/sweep

@@ -55,7 +55,8 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler,
                              scheduler=scheduler, overwrite=overwrite, command=options.command_line(ctx))
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
-        rule = f", {one['rule']}" if "rule" in one else ""
+        rule = f" ({one['reason']})" if settings["method"] == "auto" else ""
+        rule += f", {one['rule']}" if "rule" in one else ""
         seen = f", {one['seen']['directions']} of {one['seen']['points']} directions of the object above the noise" if "seen" in one else ""
         line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
     else:

@@ -118,6 +118,7 @@ class Estimators:
         from dataclasses import replace
 
         from plenocli.solvers.natural import draw_patches
+        from plenocli.stages.superpixels import Superpixels
 
         shape = self.system.object_shape
         side = tuple(TRIAL_SIDE * n for n in shape)
@@ -132,7 +133,7 @@ class Estimators:
         y += sigma * rng.standard_normal(y.shape)
         alone = Estimators(replace(self.system, blocks=self.system.own[None], offsets=np.zeros((1, 2), int)), replace(self.settings, noise_sigma=sigma, overlap=1))
         alone.svd, alone._cache = self.svd, self._cache
-        data = type("Trial", (), dict(y=y, sigma=sigma, scene=scene))
+        data = Superpixels(y, sigma, scene)
         quality = {}
         for method in candidates:
             error = np.square(alone._run(method, data, None, {})[0] - truth).reshape(TRIAL_SIDE, TRIALS, -1).mean(axis=(0, 2))
@@ -153,7 +154,7 @@ class Estimators:
             inner = (slice(1, -1), slice(1, -1))
             edge[inner], held = False, (edge, known[0].copy())
         sigma = self._noise(data, y[inner], report)
-        x, spread = known or (np.empty((*y.shape[:2], self.svd.vt.shape[1])) for _ in "xs")
+        x, spread = known or np.empty((2, *y.shape[:2], self.svd.vt.shape[1]))
         x[inner], spread[inner] = self._adaptive(sigma, data.scene, y[inner])
         error = float(np.sqrt(np.mean(np.square(spread[inner]))))
         report["start"] = f"lmmse, which expects an error of {error:.3g}"

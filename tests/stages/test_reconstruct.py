@@ -133,12 +133,13 @@ def test_unknown_noise_is_estimated_and_said(tmp_path, capsys):
 def test_neighbours_light_is_noticed_and_taken_away(tmp_path, capsys):
     truth = make_files(tmp_path, coupled=True)
     quality = {}
-    for method in ("tikhonov", "lmmse", "tsvd"):
+    for method in ("tikhonov", "lmmse", "tsvd", "pnp"):
         alone = reconstruct(tmp_path, "--method", method, "--overlap", "1")
         assert "3x3" in capsys.readouterr().err
         joint = reconstruct(tmp_path, "--method", method)
         quality[method] = [psnr(i.data["image/value"], truth) for i in (alone, joint)]
         assert quality[method][1] > quality[method][0] + 1, quality
+    assert quality["pnp"][1] > quality["lmmse"][1] + 0.2, quality  # the border's lenslets are those of lmmse
 
 
 def test_dictionary_chain(single, capsys):

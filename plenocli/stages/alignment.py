@@ -22,7 +22,8 @@ def align(calibration, signal, noise, mode, path, levels=True):
     mode: auto corrects what is more than chance, on corrects whatever is found and fails where nothing can be, off looks at
     nothing. stray: plenocli.sensor.moved.even_light, patterns that deserve unknowns of their own where there is more of it than
     chance (None: there is not). record: what was found, for the file and the report (None: off).
-    levels: whether offset and stray light are corrected, which mean nothing where the motion cannot be followed.
+    levels: whether offset and stray light are corrected, which mean nothing where the motion cannot be followed. A predicted
+    response errs in shape by more than either, and would pass its errors off as both: there motion alone is corrected.
     """
     from plenocli.sensor.moved import even_light
     from plenocli.sensor.registration import REACH, motion_since
@@ -43,7 +44,7 @@ def align(calibration, signal, noise, mode, path, levels=True):
         raise NumericsError(f"cannot be registered: the best motion is {motion.reach:.3g} px, further than it can be followed", path, "calibrate again, or use --register off")
     if better and (mode == "on" or motion.moved):
         corrected.append("motion")
-    levels = levels and not lost
+    levels = levels and not lost and not c.predicted
     if levels and motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
         corrected.append("offset")
     if levels and motion.strayed:

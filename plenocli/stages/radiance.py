@@ -14,7 +14,8 @@ LIT = 1024  # lenslets whose white tells the light
 
 @dataclass(frozen=True)
 class Response:
-    """A calibration as demux uses it (arrays as in the calibration artefact). threads: for factoring it."""
+    """A calibration as demux uses it (arrays as in the calibration artefact). threads: for factoring it; predicted: from a
+    description, not from captures."""
 
     response: np.ndarray
     variance: np.ndarray | None
@@ -32,6 +33,7 @@ class Response:
     gain: float | None
     read_variance: float
     threads: int = 1
+    predicted: bool = False
 
     @property
     def shared(self):
@@ -145,11 +147,12 @@ def read_response(path):
     black = black.reshape(2, 2) if black.size == 4 else np.full((2, 2), float(black.ravel()[0]))
     dark_attrs = attrs.get("dark", {})
     dark = Dark(data["dark/mean"], black, dark_attrs.get("exposure"), dark_attrs.get("sigma"))
-    gain = response.get("gain_e_per_dn")
+    gain, notes = response.get("gain_e_per_dn"), response.get("notes")
+    predicted = isinstance(notes, dict) and notes.get("source") == "predicted"
     return Response(data["response/F"], data.get("response/covariance"), data["response/wavelength"], data["response/origin"],
                     tuple(int(n) for n in data["response/window"]), data["grid/centre"], data["grid/valid"].astype(bool), data["response/white"], dark, str(response.get("cfa", "mono")),
                     str(response.get("units", "DN")), float(levels.get("white", np.inf)), response.get("exposure_s"), None if gain is None else 1 / gain,
-                    float(response.get("read_noise", 0.0)) ** 2)
+                    float(response.get("read_noise", 0.0)) ** 2, predicted=predicted)
 
 
 def readout(exposure, c, path):

@@ -19,7 +19,7 @@ NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
 WHOLE = ("pnp", "tv")
 """Methods that reconstruct all lenslets together."""
 TRIALS, TRIAL_SIDE = 5, 3
-"""Held pieces of training pictures, of so many lenslets a side, on which `auto` tries its candidates."""
+"""Pieces of training pictures, of so many lenslets a side, on which `auto` tries its candidates."""
 MARGIN = 0.05
 """dB by which a method must be better in the trial to be taken instead of lmmse."""
 SLOW = 2000
@@ -92,17 +92,18 @@ class Estimators:
     def _choose(self, data):
         """{"method", "reason", "trial_db"} for this noise: the best of the candidates on pieces of photographs, seen by this camera.
 
-        What is compared is measured, not promised: TRIALS pieces of training pictures are captured by the own block with the
-        noise of this capture, relative to the signal, and reconstructed by each candidate. lmmse has seen these pictures in
+        What is compared is measured, not promised: TRIALS pieces of training pictures, of about the capture's contrast, are
+        captured by the own block with the noise of this capture, relative to the signal, and reconstructed by each candidate. lmmse has seen these pictures in
         its covariance, so that a method that wins wins in earnest.
         """
         candidates = ["lmmse", "pnp", *(["dictionary"] if self.settings.dictionary is not None else [])]
         sigma = self._joint_noise(data, {}) if self.coupled else self._noise(data, data.y, {})
         loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)  # an empty capture is all noise
         relative = float(f"{sigma / loudness:.1e}")
-        key = ("trial", relative, data.scene)
+        contrast = self._contrast(data, sigma)
+        key = ("trial", relative, contrast, data.scene)
         if key not in self._cache:
-            self._cache[key] = self._trial(candidates, relative, data.scene)
+            self._cache[key] = self._trial(candidates, relative, contrast, data.scene)
         quality = self._cache[key]
         if not quality:
             return {"method": "lmmse", "reason": "the training pictures are too small for a trial of others"}
@@ -113,8 +114,16 @@ class Estimators:
             note(f"{best} of {data.y.shape[0] * data.y.shape[1]} lenslets takes about {data.y.shape[0] * data.y.shape[1] * self.system.own.shape[1] * 1e-4 / 60:.0f} minutes of CPU; --method lmmse takes seconds")
         return {"method": best, "reason": f"best on pieces of training photographs at this noise ({told})", "trial_db": quality}
 
-    def _trial(self, candidates, relative, scene):
-        """Mean PSNR (dB) of each candidate over the pieces, {} where no picture is large enough."""
+    def _contrast(self, data, sigma):
+        """Variance within a lenslet over its squared brightness, as LMMSE sees this capture; in powers of two, that captures share trials."""
+        y = data.y - self._stray(data.y) if self.coupled else data.y
+        estimator = self._lmmse(sigma, data.scene)
+        bright = max(float(np.mean(y @ estimator.uniform)) / float(estimator.uniform @ estimator.uniform), 1e-6)
+        scale = estimator.common_scale(y.reshape(-1, y.shape[2]).T)
+        return 2.0 ** round(np.log2(scale * estimator.variance.mean() / bright**2))
+
+    def _trial(self, candidates, relative, contrast, scene):
+        """Mean PSNR (dB) of each candidate over pieces of about this contrast, {} where no picture is large enough."""
         from dataclasses import replace
 
         from plenocli.solvers.natural import draw_patches
@@ -126,8 +135,10 @@ class Estimators:
         if not large:
             return {}
         rng = stream(self.settings.seed, "trial")
-        pieces = draw_patches(large, side, TRIALS, rng).T.reshape(TRIALS, *side)
-        truth = to_blocks(np.concatenate(list(pieces), axis=1), shape)
+        pieces = draw_patches(large, side, 16 * TRIALS, rng).T.reshape(-1, *side)
+        within = [to_blocks(p, shape).var(axis=2).mean() / max(p.mean() ** 2, 1e-12) for p in pieces]
+        alike = np.argsort(np.abs(np.log(np.maximum(within, 1e-12) / contrast)), kind="stable")[:TRIALS]
+        truth = to_blocks(np.concatenate([pieces[k] for k in alike], axis=1), shape)
         y = truth @ self.system.own.T
         sigma = relative * float(np.sqrt(np.mean(y**2)))
         y += sigma * rng.standard_normal(y.shape)

@@ -109,6 +109,7 @@ def _steps():
         "learn-dict": (["learn-dict", "photo.png", "--pif", "pif.h5", "--atoms", "80", "--batch", "64", "--iterations", "2"], "dictionary.h5"),
         "reconstruct": (["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"], "image.h5"),
         "reconstruct exr": (["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"], "image.exr"),
+        "refocus": (["refocus", "capture.h5", "--planes", "3"], "planes.h5"),
         "score": (["score", "image.h5", "--truth", "capture.h5"], "score.json"),
         "show": (["show", "image.h5"], "image.png"),
     }

@@ -17,7 +17,7 @@ STORED = {"pif.h5": ["capture-sim", "camera.toml", "--scene", "photo.png", "--pi
           "shards.000.h5": ["reconstruct", "capture.h5", "--pif", "shards.h5", "-o", "out.h5"], "capture.h5": ["reconstruct", "X", "--pif", "pif.h5", "-o", "out.h5"],
           "calibration.h5": ["demux", "colorchecker.dng", "--calibration", "X", "-o", "out.exr"], "spectra.h5": ["score", "X", "--truth", "colorchecker", "-o", "out.json"],
           "dictionary.h5": ["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "dictionary", "--dictionary", "X", "-o", "out.h5"],
-          "image.h5": ["score", "X", "--truth", "capture.h5", "-o", "out.json"]}
+          "planes.h5": ["show", "X", "-o", "out.png"], "image.h5": ["score", "X", "--truth", "capture.h5", "-o", "out.json"]}
 SIGNED = {"capture.exr": ["reconstruct", "X", "--pif", "pif.h5", "-o", "out.h5"], "spectra.exr": ["score", "X", "--truth", "colorchecker", "-o", "out.json"],
           "white.dng": ["calibrate", "--white", "X", "-o", "out.h5"]}
 FOREIGN = {name: ["capture-sim", "camera.toml", "--scene", "X", "--pif", "pif.h5", "-o", "out.h5"] for name in ("photo.png", "photo.tif", "photo.jpg")}

@@ -12,7 +12,7 @@ import pytest
 
 from tests.faults.harness import is_clean_refusal, tree
 
-QUICK = ("simulate-pif 3x3", "capture-sim", "white", "reconstruct", "reconstruct exr", "score")
+QUICK = ("simulate-pif 3x3", "capture-sim", "white", "reconstruct", "reconstruct exr", "refocus", "score")
 LONG = ("simulate-pif", "capture-sim exr", "simulate-response", "calibrate", "demux", "demux exr", "learn-dict", "show")
 STAGES = (*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG))
 CALLS = ("write", "pwrite", "pread", "fsync", "ftruncate", "replace", "open")

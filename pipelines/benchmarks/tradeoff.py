@@ -266,7 +266,7 @@ def markdown(cases):
 
 def _cell(case):
     if "achieved" not in case:
-        return "refused" if "refused" in case else case["not_run"].replace("estimated ", "") if "not_run" in case else "FAILED"
+        return "refused" if "refused" in case else f"({case['not_run'].replace('estimated ', '')})" if "not_run" in case else "FAILED"
     letter = {"rays": "R", "fresnel, low rank": "F", "fresnel, triple product": "T"}.get(case["rung"], "E")
     mark = {"held": "", "open": " ?", "missed": " **missed**"}[verdict(case)]
     return f"{case['achieved']:.0e}{mark}, {case['seconds']:.2g} s {letter}"

@@ -118,7 +118,7 @@ def expected_products(view, band, parabolic, place=(0, 0)):
     if band.window is None:
         return own
     decades = max(0.0, math.log10(5e-3 / band.cut))
-    return own * (2.7 + 3 * decades**1.1) * (1 + 0.3 * min(1.0, decades) * sum(n != 0 for n in place))
+    return own * (3.2 + 3.5 * decades**1.1) * (1 + 0.3 * min(1.0, decades) * sum(n != 0 for n in place))
 
 
 def _own_terms(view, band):
@@ -148,7 +148,7 @@ def cost(camera, view, band, shape, double):
         sketch = 1.12 / FILL * rank + 8
         operations += both * (products * (16 * sketch + 4 * across) + 60 * sketch**2) + 600 * sketch**3
         operations += 0 if not band.sensor_count else 4 * both * lines * rank
-        seconds += 0.01 + (0 if lit == 1 else 0.01 * lit**2) + 4e-9 * both * products
+        seconds += 0.01 + (0 if lit == 1 else 0.01 * lit**2) + 6e-9 * both * products
         largest = max(largest, item * (both * (products + 3 * sketch)))
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
     size = shape[1] * shape[2] * shape[3]

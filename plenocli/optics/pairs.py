@@ -105,14 +105,14 @@ class Pair:
                             min(0.5, tolerance / (3 * self.weight)), self.symmetric)
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
-        kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 10) for axis in (0, 1)]
+        kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15) for axis in (0, 1)]
         (r, i), (s, j) = kept
         coupling = (residual.core[r[:, None], s] * field[i[:, None], j]).astype(self.row.dtype)
         x = self.row.sheet(self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0])
         y = x if self.symmetric else self.column.sheet(self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1])
         # now that it is seen what each term brings: residuals send light where the separable part does not
         brings = [np.linalg.norm(sheet, axis=0) ** 2 / len(end.way.points) for sheet, end in ((x, self.row), (y, self.column))]
-        (some,) = _strong((np.abs(coupling) ** 2 * np.outer(*brings)).sum(axis=1), tolerance / 2)
+        (some,) = _strong((np.abs(coupling) ** 2 * np.outer(*brings)).sum(axis=1), tolerance / 4)
         x, coupling = x[:, some], coupling[np.ix_(some, some)]
         return x, x if self.symmetric else y[:, some], coupling
 

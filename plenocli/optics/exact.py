@@ -113,12 +113,12 @@ def expected_rank(view, band, parabolic, place=(0, 0)):
 
 
 def expected_products(view, band, parabolic, place=(0, 0)):
-    """Pairs (r, i) of terms that the field on superpixel `place` is compressed from, all its lenslets together: within 0.6 to 1.6 alike."""
+    """Pairs (r, i) of terms that the field on superpixel `place` is compressed from, all its lenslets together: fitted alike."""
     own = 1.27 * (1 if parabolic else 1.36) * (1 + corner_phase(view)) ** 0.22 * expected_rank(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)
     if band.window is None:
         return own
     decades = max(0.0, math.log10(5e-3 / band.cut))
-    return own * (3.2 + 3.5 * decades**1.1) * (1 + 0.3 * min(1.0, decades) * sum(n != 0 for n in place))
+    return own * (3.2 + 3.5 * decades**1.3) * (1 + 0.3 * min(1.0, decades) * sum(n != 0 for n in place))
 
 
 def _own_terms(view, band):

@@ -153,17 +153,18 @@ def _guess(problem, threshold):
     """
     count, atoms = problem.b.shape
     c, rows = np.zeros((count, atoms)), problem.d.shape[0]
-    unit = np.max(np.abs(problem.d / threshold), initial=0)
-    if count * SMALL < rows**3 or not (unit > 0 and problem.y.any()):
+    unit, level = np.max(np.abs(problem.d / threshold), initial=0), np.max(np.abs(problem.y), initial=0)
+    # both in their own units below, so that squares stay within range
+    if count * SMALL < rows**3 or not (unit > 0 and level > np.finfo(float).tiny and 1e-30 < unit * level < 1e30):
         return c
     scaled = problem.d / threshold / unit
     energy, basis = np.linalg.eigh(scaled @ scaled.T)
-    inside = problem.y.T @ basis
+    inside = (problem.y / level).T @ basis
     energy, power, ridge = np.maximum(energy, 0), np.mean(inside**2, axis=0), energy[-1]
     for _ in range(6):
         determined = np.sum(energy / (energy + ridge))
-        ridge = 3 / unit / np.sqrt(np.sum(energy * power / (energy + ridge) ** 2) / determined)
-    keep = int(GUESSED * np.sum(energy / (energy + ridge)))
+        ridge = 3 / (unit * level) / np.sqrt(np.sum(energy * power / (energy + ridge) ** 2) / determined)
+    keep = min(int(GUESSED * np.sum(energy / (energy + ridge))), atoms)
     if not keep:
         return c
     turned = inside / (energy + ridge) @ basis.T
@@ -171,8 +172,8 @@ def _guess(problem, threshold):
     scaled, turned = scaled.astype(np.float32), (turned / size).astype(np.float32)  # a guess need not be exact
     for first in range(0, count, BLOCK):
         found = turned[first : first + BLOCK] @ scaled
-        largest = np.argpartition(-np.abs(found), keep, axis=1)[:, :keep]
-        c[first + np.arange(len(found))[:, None], largest] = size / unit * np.take_along_axis(found, largest, axis=1) / threshold[largest]
+        largest = np.argpartition(-np.abs(found), keep - 1, axis=1)[:, :keep]
+        c[first + np.arange(len(found))[:, None], largest] = level * size / unit * np.take_along_axis(found, largest, axis=1) / threshold[largest]
     return c
 
 

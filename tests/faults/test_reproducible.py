@@ -23,7 +23,7 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, name):
         folder = tmp_path / ("another folder " * (number + 1)).strip()
         folder.mkdir()
         for path in source.iterdir():
-            if path.name != result:
+            if path.is_file() and path.name != result:
                 shutil.copy(path, folder)
                 os.utime(folder / path.name, (1e9, 1e9 + number))
         environment = os.environ | STRANGE | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(77 + number)}
@@ -36,7 +36,7 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, name):
 def test_workers_change_nothing(runner, stages, tmp_path, name):
     source, steps = stages
     arguments, _ = steps[name]
-    for path in source.iterdir():
+    for path in filter(Path.is_file, source.iterdir()):
         shutil.copy(path, tmp_path)
     suffix = Path(arguments[1]).suffix
     for copy in ("a", "b", "c"):

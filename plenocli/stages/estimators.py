@@ -210,7 +210,8 @@ class Estimators:
         y = data.y - self._stray(data.y) if self.coupled else data.y
         y = y[1:-1, 1:-1] if min(y.shape[:2]) > 2 else y
         scale = self._lmmse(sigma, data.scene).common_scale(y.reshape(-1, y.shape[2]).T)
-        scale = 2.0 ** (round(2 * np.log2(scale)) / 2)
+        # never above 1: light that the matrix does not produce passes for contrast, and would be amplified
+        scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
         report["scale"] = scale
         x, spread = self._joint(sigma / np.sqrt(scale), data.scene).apply(data.y)
         return x, np.sqrt(scale) * spread

@@ -7,10 +7,10 @@ from plenocli.cli import options
 
 @click.command("optimise", short_help="Search a design space for the best cameras.")
 @options.input_path("description", metavar="SWEEP.toml")
-@click.option("-o", "--output", required=True, type=options.FILE, metavar="OUT", help="Table to write, .h5; the same goes beside it as .csv.")
+@options.table_output
 @click.option("--trials", type=click.IntRange(1, 100_000), default=100, show_default=True, help="Points to try in all, those of earlier runs included.")
 @click.option("--batch", type=click.IntRange(1, 1000), default=4, show_default=True, help="Points proposed at a time, and so the most that run side by side; another number is another search.")
-@click.option("--plot", type=options.FILE, help="Also draw the front, such as front.png; needs matplotlib.")
+@options.front_plot
 @options.seed
 @options.workers
 @options.scheduler

@@ -136,6 +136,8 @@ def input_path(name, **settings):
 
 
 output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="File to write; a folder when there are several inputs.")
+table_output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="Table to write, .h5; the same goes beside it as .csv.")
+front_plot = click.option("--plot", type=FILE, help="Also draw the front, such as front.png; needs matplotlib.")
 overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")

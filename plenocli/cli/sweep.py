@@ -7,8 +7,8 @@ from plenocli.cli import options
 
 @click.command("sweep", short_help="Carry a design space through the stages: a table, and the designs that no other beats.")
 @options.input_path("description", metavar="SWEEP.toml")
-@click.option("-o", "--output", required=True, type=options.FILE, metavar="OUT", help="Table to write, .h5; the same goes beside it as .csv.")
-@click.option("--plot", type=options.FILE, help="Also draw the front, such as front.png; needs matplotlib.")
+@options.table_output
+@options.front_plot
 @options.seed
 @options.workers
 @options.scheduler

@@ -102,7 +102,7 @@ def _place(samples, slope, step):
 
 
 def sharpness(picture):
-    """Mean square of the gradient over the variance's scale: of pictures of one scene, the largest is the sharpest. NaN is left out."""
+    """Mean square of the gradient: of pictures of one scene, the largest is the sharpest. NaN is left out."""
     down, right = np.gradient(picture)
     return float(np.nanmean(down**2 + right**2))
 

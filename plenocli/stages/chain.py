@@ -74,6 +74,7 @@ def matrix_key(task, camera, files):
 
 
 def _digest(value, files):
+    """SHA-256 of the version and of a JSON-able value, with paths of `files` (path -> digest) standing as what they hold."""
     from plenocli import __version__
 
     def content(part):

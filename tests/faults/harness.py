@@ -64,3 +64,27 @@ def is_clean_refusal(outcome, code, *words):
     """Whether a command ended with `code` (or one of several) and one message that names every word, without a traceback."""
     codes = code if isinstance(code, tuple) else (code,)
     return outcome.code in codes and "Traceback" not in outcome.text and "internal error" not in outcome.text and all(w in outcome.text for w in words)
+
+
+def mutants(good, count, rng):
+    """`count` damaged copies: cut, flipped bits, a zeroed block, a huge number, a piece put in twice, a stretch of noise."""
+    for number in range(count):
+        bad = bytearray(good)
+        at, length = int(rng.integers(len(good))), int(2 ** rng.uniform(0, 12))
+        match number % 6:
+            case 0:
+                del bad[at:]
+            case 1:
+                for spot in rng.integers(len(good), size=rng.integers(1, 9)):
+                    bad[spot] ^= 1 << int(rng.integers(8))
+            case 2:
+                bad[at:at + length] = bytes(len(bad[at:at + length]))
+            case 3:
+                huge = [b"\xff\xff\xff\x7f", b"\xff" * 8, b"\xff\xff\xff\xff\xff\xff\xff\x7f", b"\x7f\xff\xff\xff"][number // 6 % 4]
+                bad[at:at + len(huge)] = huge[:len(bad[at:at + len(huge)])]
+            case 4:
+                bad[at:at] = good[at // 2:at // 2 + length]
+            case 5:
+                bad[at:at + length] = rng.bytes(len(bad[at:at + length]))
+        if bytes(bad) != good:
+            yield bytes(bad)

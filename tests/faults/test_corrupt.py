@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.faults.harness import is_clean_refusal
+from tests.faults.harness import is_clean_refusal, mutants
 
 CONFIGS = {"camera.toml": ["simulate-pif", "X", "--explain"], "colour.toml": ["simulate-response", "X", "--model", "ray", "-o", "out.h5"],
            "scene.toml": ["simulate-pif", "camera.toml", "--explain", "--scene", "X"]}
@@ -21,32 +21,6 @@ STORED = {"pif.h5": ["capture-sim", "camera.toml", "--scene", "photo.png", "--pi
 SIGNED = {"capture.exr": ["reconstruct", "X", "--pif", "pif.h5", "-o", "out.h5"], "spectra.exr": ["score", "X", "--truth", "colorchecker", "-o", "out.json"],
           "white.dng": ["calibrate", "--white", "X", "-o", "out.h5"]}
 FOREIGN = {name: ["capture-sim", "camera.toml", "--scene", "X", "--pif", "pif.h5", "-o", "out.h5"] for name in ("photo.png", "photo.tif", "photo.jpg")}
-
-
-def mutants(good, count, rng):
-    """`count` damaged copies: cut, flipped bits, a zeroed block, a huge number, a piece put in twice, a stretch of noise."""
-    for number in range(count):
-        bad = bytearray(good)
-        at, length = int(rng.integers(len(good))), int(2 ** rng.uniform(0, 12))
-        match number % 6:
-            case 0:
-                del bad[at:]
-            case 1:
-                for spot in rng.integers(len(good), size=rng.integers(1, 9)):
-                    bad[spot] ^= 1 << int(rng.integers(8))
-            case 2:
-                bad[at:at + length] = bytes(len(bad[at:at + length]))
-            case 3:
-                huge = [b"\xff\xff\xff\x7f", b"\xff" * 8, b"\xff\xff\xff\xff\xff\xff\xff\x7f", b"\x7f\xff\xff\xff"][number // 6 % 4]
-                bad[at:at + len(huge)] = huge[:len(bad[at:at + len(huge)])]
-            case 4:
-                bad[at:at] = good[at // 2:at // 2 + length]
-            case 5:
-                bad[at:at + length] = rng.bytes(len(bad[at:at + length]))
-        if bytes(bad) != good:
-            yield bytes(bad)
-
-
 
 
 class Bench:

@@ -83,9 +83,11 @@ def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
     try:
         with h5py.File(_open_image(image), "r") as file:
             return _parse(path, file, kind, limit, skip)
-    except PlenoError:
+    except (PlenoError, MemoryError):
         raise
-    except Exception as error:  # h5py raises half a dozen types for a malformed file
+    except Exception as error:  # h5py raises half a dozen types for a malformed file, and these for lack of memory
+        if "memory allocation failed" in str(error):
+            raise MemoryError(str(error)) from error
         raise InputError(f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again") from error
 
 

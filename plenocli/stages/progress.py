@@ -15,6 +15,7 @@ def bar(iterable, total=None, label=""):
         return _Silent(iterable)
     from tqdm import tqdm
 
+    tqdm.monitor_interval = 0  # no thread that watches the bar
     return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None, leave=False)
 
 

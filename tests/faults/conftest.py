@@ -13,6 +13,16 @@ import pytest
 from tests.faults.harness import Runner
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_configs"
+SWEEP = """
+camera = "camera.toml"
+[vary]
+"main_lens.f_number" = [7, 8]
+[simulate-pif]
+superpixels = "1x1"
+coherent-ring = 0
+[reconstruct]
+method = "block-mean"
+"""
 
 
 @pytest.fixture(scope="session")
@@ -49,13 +59,12 @@ def _make_files(folder, steps, runner):
     (folder / "camera.toml").write_text((SAMPLES / "tiny.toml").read_text())
     (folder / "colour.toml").write_text(_spectral_camera())
     (folder / "scene.toml").write_text((SAMPLES / "scenes" / "shallow.toml").read_text())
+    (folder / "sweep.toml").write_text(SWEEP)
     _write_pictures(folder)
     for name, (arguments, result) in steps.items():
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
         assert outcome.code == 0, (name, outcome.text)
     _write_shards(folder)
-    (folder / "sweep.toml").write_text('camera = "camera.toml"\n[vary]\n"main_lens.f_number" = [7, 8]\n[simulate-pif]\nsuperpixels = "1x1"\ncoherent-ring = 0\n[reconstruct]\nmethod = "block-mean"\n')
-    assert runner.run(["sweep", "sweep.toml", "-o", "sweep.h5"], folder, limit=120).code == 0
     (folder / "done").touch()
 
 
@@ -112,4 +121,5 @@ def _steps():
         "refocus": (["refocus", "capture.h5", "--planes", "3"], "planes.h5"),
         "score": (["score", "image.h5", "--truth", "capture.h5"], "score.json"),
         "show": (["show", "image.h5"], "image.png"),
+        "sweep": (["sweep", "sweep.toml"], "sweep.h5"),
     }

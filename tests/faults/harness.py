@@ -56,8 +56,14 @@ class Runner:
 
 
 def tree(folder):
-    """Relative path -> bytes of every file below a folder."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+    """Relative path -> bytes of every file below a folder, but for the journal that a sweep keeps on purpose."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file() and p.name != "points.jsonl"}
+
+
+def results(path, name):
+    """The files that the command with the result `path` writes, as `tree` gives them where that result is called `name`: a sweep's table has a twin."""
+    twin = Path(path).with_suffix(".csv")
+    return {name: Path(path).read_bytes()} | ({str(Path(name).with_suffix(".csv")): twin.read_bytes()} if twin.exists() else {})
 
 
 def is_clean_refusal(outcome, code, *words):

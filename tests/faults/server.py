@@ -1,8 +1,8 @@
 """Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line. See harness.py.
 
 A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, "lasting": whether all later
-calls fail too}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "short"},
-writes that take only a part.
+calls fail too}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "memory", "nth":
+bytes of memory beyond what is in use}; {"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a part.
 """
 
 import errno
@@ -105,6 +105,13 @@ def _arm(fault, fired):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (fault["nth"], resource.RLIM_INFINITY))
         return _real_write(fired, b"x")
+    if fault["call"] == "memory":
+        with open("/proc/self/status") as table:
+            used = next(int(line.split()[1]) << 10 for line in table if line.startswith("VmData"))
+        # not of the address space: that would take the stack too, without which nothing can be told to anyone
+        return resource.setrlimit(resource.RLIMIT_DATA, (used + fault["nth"], resource.RLIM_INFINITY))
+    if fault["call"] == "array":
+        return _arm_arrays(fault["nth"], fault.get("lasting"), fired)
     if fault["call"] == "short":
         return _arm_short(fired)
     real, seen = getattr(os, fault["call"]), 0
@@ -147,6 +154,50 @@ def _arm_bytes(room, number, fired):
             return written
 
         setattr(os, name, full)
+
+
+def _arm_arrays(nth, lasting, fired):
+    """numpy's memory comes from functions of ours; the nth piece, and perhaps all that follow, is refused."""
+    import ctypes
+
+    import numpy
+
+    size, address = ctypes.c_size_t, ctypes.c_void_p
+    libc, seen = ctypes.CDLL(None), 0
+    for name in ("malloc", "calloc", "realloc"):
+        getattr(libc, name).restype = address
+
+    def granted():
+        nonlocal seen
+        seen += 1
+        refused = seen == nth or (lasting and seen > nth)
+        if seen == nth:
+            _real_write(fired, b"x")
+        return not refused
+
+    kinds = {"malloc": (address, size), "calloc": (address, size, size), "realloc": (address, address, size), "free": (address, address, size)}
+    calls = {"malloc": lambda _, count: libc.malloc(size(count)) if granted() else None, "calloc": lambda _, many, each: libc.calloc(size(many), size(each)) if granted() else None,
+             "realloc": lambda _, old, count: libc.realloc(address(old), size(count)) if granted() else None}
+
+    types = {name: ctypes.CFUNCTYPE(None if name == "free" else address, *arguments) for name, arguments in kinds.items()}
+
+    class Handler(ctypes.Structure):
+        _fields_ = [("name", ctypes.c_char * 127), ("version", ctypes.c_uint8), ("context", address), *types.items()]
+
+    made = {name: types[name](call) for name, call in calls.items()}
+    # nothing is given back: arrays are freed while numpy's exception stands, which a function in Python would lose
+    handler = Handler(b"faulty", 1, None, **made, free=ctypes.cast(libc.getpid, types["free"]))
+    python = ctypes.pythonapi
+    python.PyCapsule_New.restype, python.PyCapsule_New.argtypes = ctypes.py_object, [address, ctypes.c_char_p, address]
+    python.PyCapsule_GetPointer.restype, python.PyCapsule_GetPointer.argtypes = address, [ctypes.py_object, ctypes.c_char_p]
+    table = ctypes.cast(python.PyCapsule_GetPointer(numpy._core._multiarray_umath._ARRAY_API, None), ctypes.POINTER(address))
+    capsule = python.PyCapsule_New(ctypes.addressof(handler), b"mem_handler", None)
+    ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(table[304])(capsule)  # PyDataMem_SetHandler
+    _kept.append((handler, capsule))
+
+
+_kept = []
+"""What must live as long as the process."""
 
 
 def _arm_short(fired):

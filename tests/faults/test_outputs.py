@@ -10,12 +10,12 @@ import subprocess
 import numpy as np
 import pytest
 
-from tests.faults.harness import is_clean_refusal, tree
+from tests.faults.harness import is_clean_refusal, results, tree
 
-QUICK = ("simulate-pif 3x3", "capture-sim", "white", "reconstruct", "reconstruct exr", "refocus", "score")
+QUICK = ("simulate-pif 3x3", "capture-sim", "white", "reconstruct", "reconstruct exr", "refocus", "score", "sweep")
 LONG = ("simulate-pif", "capture-sim exr", "simulate-response", "calibrate", "demux", "demux exr", "learn-dict", "show")
 STAGES = (*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG))
-CALLS = ("write", "pwrite", "pread", "fsync", "ftruncate", "replace", "open")
+CALLS = ("write", "pwrite", "pread", "fsync", "ftruncate", "replace", "open", "mkdir")
 OLD = b"what was there before"
 
 
@@ -32,8 +32,10 @@ def workshop(stages, tmp_path):
         target = tmp_path / "out" / f"new{os.path.splitext(result)[1]}"
         shutil.rmtree(tmp_path / "out")
         (tmp_path / "out").mkdir()
-        target.write_bytes(OLD)
-        return [*arguments, "-o", target.relative_to(tmp_path), "--overwrite"], target, (source / result).read_bytes()
+        whole = results(source / result, target.name)
+        for file in whole:
+            (target.parent / file).write_bytes(OLD)
+        return [*arguments, "-o", target.relative_to(tmp_path), "--overwrite"], target, whole
 
     return tmp_path, ready
 
@@ -41,11 +43,17 @@ def workshop(stages, tmp_path):
 def check(outcome, target, whole):
     """What must hold after any fault: the old file or, where only the last step failed, the whole new one; nothing else."""
     assert is_clean_refusal(outcome, 4), outcome
-    assert tree(target.parent) in ({target.name: OLD}, {target.name: whole})
+    assert is_old_or_new(target, whole), sorted(tree(target.parent))
+
+
+def is_old_or_new(target, whole):
+    """Whether each file of a result is as it was or as it should become, with nothing beside."""
+    there = tree(target.parent)
+    return there.keys() == whole.keys() and all(content in (OLD, whole[file]) for file, content in there.items())
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_any_call_may_fail(runner, workshop, campaign, name):
+def test_any_call_may_fail(runner, workshop, campaign, count, name):
     folder, ready = workshop
     rng, points = np.random.default_rng(list(name.encode())), 0
     for call in CALLS:
@@ -54,33 +62,67 @@ def test_any_call_may_fail(runner, workshop, campaign, name):
             error = "ENOSPC" if call in ("write", "pwrite", "ftruncate") else "EIO"
             outcome = runner.run(command, folder, fault={"call": call, "nth": nth, "error": error, "lasting": bool(rng.integers(2))})
             if not outcome.fired:
-                assert outcome.code == 0 and tree(target.parent) == {target.name: whole}, outcome
+                assert outcome.code == 0 and tree(target.parent) == whole, outcome
                 break
             points += 1
             if outcome.code == 0:  # a courtesy may fail unseen, such as telling the disk of the new name
-                assert tree(target.parent) == {target.name: whole}
+                assert tree(target.parent) == whole
             elif call in ("pread", "open") and outcome.code == 3:
-                assert is_clean_refusal(outcome, 3) and tree(target.parent) == {target.name: OLD}, outcome
+                assert is_clean_refusal(outcome, 3) and set(tree(target.parent).values()) == {OLD}, outcome
             else:
                 check(outcome, target, whole)
     assert points >= 2
+    count("the n-th write, read, fsync, rename ... failing", points=points, signals=0, old_files_lost=0)
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_a_disk_may_be_full_at_any_byte(runner, workshop, campaign, name):
+def test_a_disk_may_be_full_at_any_byte(runner, workshop, campaign, count, name):
     folder, ready = workshop
-    size = len(ready(name)[2])
+    _, target, whole = ready(name)
+    size = len(whole[target.name])
     places = [0, 1, size - 1, *range(4096, size, 4096)]
-    most = campaign(2, 80)
+    most = campaign(2, 10_000)
     if len(places) > most:
         places = sorted({0, size - 1, *np.random.default_rng(5).choice(places, most, replace=False).tolist()})
     for room in places:
         command, target, whole = ready(name)
-        # OpenEXR writes by itself: there a limit of the file's size takes the place of the disk's
-        outcome = runner.run(command, folder, fault={"call": "filesize" if target.suffix == ".exr" else "bytes", "nth": room})
+        # OpenEXR and a sweep's journal write by themselves: there a limit of the file's size takes the place of the disk's
+        outcome = runner.run(command, folder, fault={"call": "filesize" if target.suffix == ".exr" or name == "sweep" else "bytes", "nth": room})
         assert outcome.fired
         check(outcome, target, whole)
         assert "space" in outcome.text
+    count("a disk full at byte 0, each 4 KiB and the last", points=len(places), signals=0, old_files_lost=0)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_any_array_may_find_no_memory(runner, workshop, campaign, count, name):
+    """The first 100 arrays one by one, then ever farther apart, until none is left: once or from there on."""
+    folder, ready = workshop
+    nth, points = 1, 0
+    while True:
+        command, target, whole = ready(name)
+        outcome = runner.run(command, folder, fault={"call": "array", "nth": nth, "lasting": points % 2})
+        if not outcome.fired:
+            assert outcome.code == 0 and tree(target.parent) == whole, outcome
+            break
+        points += 1
+        assert outcome.code == 0 and tree(target.parent) == whole or is_clean_refusal(outcome, (4, 5), "memory") and is_old_or_new(target, whole), (nth, outcome)
+        nth = max(nth + 1, int(nth * campaign(3, 1.04 if nth > 100 else 1)))
+    assert points >= 3
+    count("allocation failing, n-th array", points=points, signals=0, old_files_lost=0)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_any_limit_of_memory(runner, workshop, campaign, count, name):
+    """A shell's or a queue's limit, from nothing more than what is in use up to enough."""
+    folder, ready = workshop
+    limits = campaign((0, 10**6, 260 << 20), (0, *(int(3000 * 1.9**step) for step in range(18)), 257 << 20, 300 << 20, 400 << 20))
+    for room in limits:
+        command, target, whole = ready(name)
+        outcome = runner.run(command, folder, fault={"call": "memory", "nth": room})
+        assert outcome.code == 0 and tree(target.parent) == whole or is_clean_refusal(outcome, 5, "memory") and is_old_or_new(target, whole), (room, outcome)
+        assert outcome.code == 0 or room < 300 << 20
+    count("allocation failing, limits of memory", points=len(limits), signals=0, old_files_lost=0)
 
 
 @pytest.mark.parametrize("name", ["simulate-pif 3x3", "white", "reconstruct", "score"])
@@ -88,7 +130,7 @@ def test_short_writes_give_the_same_bytes(runner, workshop, name):
     folder, ready = workshop
     command, target, whole = ready(name)
     outcome = runner.run(command, folder, fault={"call": "short"})
-    assert outcome.code == 0 and outcome.fired and target.read_bytes() == whole
+    assert outcome.code == 0 and outcome.fired and tree(target.parent) == whole
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -121,7 +163,7 @@ def test_a_real_full_disk(runner, workshop, campaign):
     try:
         for name in campaign(QUICK[::2], (*QUICK, *LONG)):
             command, target, whole = ready(name)
-            if len(whole) < 70_000:
+            if len(whole[target.name]) < 70_000:
                 continue
             small = disk / target.name
             small.write_bytes(OLD)

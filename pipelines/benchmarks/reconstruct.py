@@ -94,7 +94,7 @@ def compare(args):
         first = Estimators(system, Settings())
         _ = first.svd
         for scene in args.scene:
-            pictures = first._training(scene)
+            pictures = first.prior.pictures(scene)
             for snr in args.snr:
                 for seed in range(args.seeds):
                     data, truth = capture(system, args.count or count, scene, snr, seed)
@@ -106,7 +106,7 @@ def compare(args):
                         if options["method"] == "dictionary":
                             settings["dictionary"] = Path(dictionaries[lenslets])
                         one = Estimators(replace(system), Settings(seed=seed, **settings))
-                        one.svd, one._cache = first.svd, {("pictures", scene): pictures}
+                        one.svd, one.prior.pictures_of[scene] = first.svd, pictures
                         found = measure(one, data, truth, options)
                         rows.append({"lenslets": lenslets, "scene": scene, "snr_db": snr, "seed": seed, "method": method} | found)
                         print(f"{lenslets} {scene} {snr:g} dB, {method}: {found['psnr_db']:.2f} dB, SSIM {found['ssim']:.3f}, {found['seconds']:.1f} s ({found['took']})", flush=True)

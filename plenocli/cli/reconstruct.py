@@ -37,6 +37,9 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler,
     pnp takes turns between the data of every lenslet and a denoiser that sees the whole picture; tv prefers flat areas.
     auto captures pieces of training photographs with this matrix and this noise, and takes what does best on them.
 
+    A pif of a camera with filters in its pupil gives a picture for each band, from one linear model of all bands: with
+    simulate-pif --spectral-step auto for the whole width of the filters, else one wavelength stands for each.
+
     OUT is an image .h5 (with the predicted standard deviation for lmmse, tv and pnp, and what of a lenslet's object the
     sensor can see at all) or .exr; with several captures a folder with one file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the others. With
     --calibration and no --pif the picture has one value a lenslet.
@@ -58,7 +61,8 @@ def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler,
         rule = f" ({one['reason']})" if settings["method"] == "auto" else ""
         rule += f", {one['rule']}" if "rule" in one else ""
         seen = f", {one['seen']['directions']} of {one['seen']['points']} directions of the object above the noise" if "seen" in one else ""
-        line = f"{one['output']}: {one['rows']} x {one['columns']} points, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
+        bands = " in bands of " + ", ".join(f"{b:.4g}" for b in one["bands_nm"]) + " nm" if len(one["bands_nm"]) > 1 else ""
+        line = f"{one['output']}: {one['rows']} x {one['columns']} points{bands}, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
     else:
         line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"
     options.summary(report, as_json, line)

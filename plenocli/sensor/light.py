@@ -60,6 +60,39 @@ def broadened(lines, fwhm):
     return _normalised(wavelengths, np.concatenate([b.photons for b in bands])[order])
 
 
+def band_weights(camera, wavelengths, power):
+    """What system matrices A_k at `wavelengths` (k,) m, ascending, make of a capture in white light of the spectral `power`.
+
+    Returns (bands (band,) m, weights (band, k)): the capture is y = sum_b (sum_k weights[b, k] A_k) x_b, in units where a mono
+    sensor's efficiency is 1. A camera without filters in its pupil has one band, its lines equally strong. Otherwise, where the
+    wavelengths are nodes of `broadband` no wider apart than a filter, bands are the [light] wavelengths, x is linear between
+    them and constant beyond; where they are not, each wavelength is a band and stands for all that its filter lets through.
+    """
+    from plenocli.optics.pupil import filter_transmittance
+
+    wavelengths = np.asarray(wavelengths, float)
+    if camera.filter_array is None:
+        return np.array([wavelengths.mean()]), np.full((1, len(wavelengths)), 1 / len(wavelengths))
+    filters = camera.filter_array.filters
+    step = np.diff(wavelengths).min() if len(wavelengths) > 1 else np.inf
+    if step <= min(f.fwhm for f in filters):
+        light = broadband(camera, power, step)
+        near = np.abs(light.wavelengths[None] - wavelengths[:, None]).argmin(axis=1)
+        if np.abs(light.wavelengths[near] - wavelengths).max() < 1e-12:
+            bands = np.array(sorted(camera.light.wavelengths))
+            hats = np.stack([np.interp(wavelengths, bands, one) for one in np.eye(len(bands))])
+            return bands, hats * light.photons[near]
+    light = broadband(camera, power)
+    passed = np.array([[filter_transmittance(f, w) for w in wavelengths] for f in filters])
+    behind = passed.argmax(axis=0)
+    blocked = [w for w, t, k in zip(wavelengths, passed.max(axis=0), behind) if t < filter_transmittance(filters[k], filters[k].center) / 10]
+    if blocked:
+        raise UsageError(f"no filter of the camera passes {blocked[0] * 1e9:.4g} nm, one of the wavelengths of its system matrix",
+                         fix="simulate-pif at the filters' wavelengths, or --spectral-step auto")
+    through = np.array([sum(n * filter_transmittance(f, w) for w, n in zip(light.wavelengths, light.photons)) for f in filters])
+    return wavelengths, np.diag(through[behind] / passed.max(axis=0) / np.bincount(behind)[behind])
+
+
 def has_colour(camera):
     """Whether the camera tells wavelengths apart: filters in the pupil, or a colour filter array on the sensor."""
     return camera.filter_array is not None or camera.sensor.cfa != "mono"

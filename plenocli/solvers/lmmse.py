@@ -17,13 +17,19 @@ ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
 
+LEVEL_SURE = 10
+"""A brightness about which nothing is assumed must stand so many times above the noise; else it belongs to the field."""
+
+
 @dataclass(frozen=True)
 class Lmmse:
-    """Everything that `prepare` works out once. uniform (pixel,): A times a field of ones; mean (point,), variance (point,): of
-    a field about its brightness; analysis (k, pixel), offset (k,): y to uncorrelated coordinates; power (k,): their variance
-    at scale 1; gain (point, k): back to the field; sigma: of a pixel."""
+    """Everything that `prepare` works out once. levels (level, pixel): y to brightnesses, one a band that can be told apart; even
+    (point, level): fields of brightness one; mean (point,), variance (point,): of a field about its brightness; analysis
+    (k, pixel), offset (k,): y to uncorrelated coordinates; power (k,): their variance at scale 1; gain (point, k): back to the
+    field; sigma: of a pixel. Points of several bands stand one band after the other."""
 
-    uniform: np.ndarray
+    levels: np.ndarray
+    even: np.ndarray
     mean: np.ndarray
     offset: np.ndarray
     analysis: np.ndarray
@@ -34,16 +40,22 @@ class Lmmse:
 
     def apply(self, y, scale=1.0):
         """(pixel, signal) -> (point, signal), with the covariance times `scale`, a number or one a signal."""
-        level, w = self._coordinates(y)
-        return level + self.mean[:, None] + self.gain @ (w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:])))
+        w = self._coordinates(y)
+        field = self.gain @ (w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:])))
+        return self.even @ (self.levels @ y) + self.mean[:, None] + field
 
     def adaptive(self, y):
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the estimates and their predicted
         standard deviations (point, signal), the scales (signal,)."""
-        scale = self.scales(self._coordinates(y)[1])
+        scale = self.scales(self._coordinates(y))
         left = self.gain**2 @ (1 / (self.power[:, None] + self.sigma**2 / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
-        return self.apply(y, scale), np.sqrt(left + self.sigma**2 / (self.uniform @ self.uniform)), scale
+        level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]  # the patterns are orthogonal
+        return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
+
+    def brightness(self, y):
+        """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
+        return self.even.mean(axis=0) @ (self.levels @ y)
 
     def seen(self):
         """Share of each point's variance about the brightness of its field that the superpixel determines at scale 1, (point,)."""
@@ -52,7 +64,7 @@ class Lmmse:
 
     def common_scale(self, y):
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
-        return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)[1]).sum(axis=1))])
+        return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])
 
     def _likelihood(self, w):
         """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale, signal), but for a constant."""
@@ -60,8 +72,8 @@ class Lmmse:
         return -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
 
     def _coordinates(self, y):
-        """Brightness (signal,) and uncorrelated coordinates (k, signal) of y (pixel, signal)."""
-        return self.uniform @ y / (self.uniform @ self.uniform), self.analysis @ y - self.offset[:, None]
+        """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
+        return self.analysis @ y - self.offset[:, None]
 
     def scales(self, w):
         """The scale of each signal from its coordinates w (k, signal): the posterior mean of its logarithm.
@@ -82,34 +94,60 @@ class Lmmse:
         return np.exp(logs @ posterior)
 
 
-def prepare(svd, mean, covariance, sigma):
+def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
     """The LMMSE estimator for y = A x + n, n white with standard deviation `sigma`, x = level + t with any level and t of
     the given statistics at an unknown scale.
 
-    svd: of A.  mean (point,), covariance (point, point): of fields of natural photographs; their brightness is taken out
-    here, as the superpixel measures it: level(x) = u^T A x / u^T u with u = A 1. What is left of y, (I - u u^T/u^T u) y,
-    depends on t alone, and  t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A m)  is worked out in the eigenvectors of
-    the signal's covariance: of directions of A whose signal is below 0.3 % of the noise, and of eigenvectors below 1 % of
-    it, nothing is kept.  sigma > 0.  Source: Kay, Estimation Theory, 1993, section 12.3, for one scale.
+    svd: of A, whose points are those of one band after the other.  mean (point,), covariance (point, point): of fields of
+    natural photographs; bands (band, band): covariance of the bands at a point, its diagonal about 1, so that fields have
+    kron(bands, covariance).  Their brightness, one a band, is taken out here, as the superpixel measures it: level(x) = F^+ A x,
+    F = A times fields of ones. What is left of y, (I - F F^+) y, depends on t alone, and
+    t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A m)  is worked out in the eigenvectors of the signal's covariance: of
+    directions of A whose signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept.  Bands that
+    the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their own: there it is part of t.  sigma > 0.
+    Source: Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md, "Spatial reconstruction".
     """
     from plenocli.errors import NumericsError
 
     if not sigma > 0:
         raise NumericsError(f"LMMSE needs a positive noise level, not {sigma}", fix="give --noise-sigma, or use --method tikhonov")
-    uniform = svd.u @ (svd.s * svd.vt.sum(axis=1))
-    weight = svd.vt.T @ (svd.s * (svd.u.T @ uniform)) / (uniform @ uniform)
-    mean = mean - weight @ mean
-    pulled = covariance @ weight
-    covariance = covariance - pulled - pulled[:, None] + weight @ pulled
-    strength = svd.s**2 * np.einsum("ij,ij->i", svd.vt @ covariance, svd.vt)
+    bands = np.asarray(bands, float)
+    levels, even = _levels(svd, bands, np.mean(np.diag(covariance)), sigma)
+    left, weight = levels / np.linalg.norm(levels, axis=1)[:, None], (levels @ svd.u * svd.s) @ svd.vt
+    mean = np.tile(mean, len(bands))
+    mean = mean - even @ (weight @ mean)
+    pulled = _times(bands, covariance, weight.T)
+
+    def spread(v):
+        """Covariance of t times v (point, n)."""
+        v = v - weight.T @ (even.T @ v)
+        return _times(bands, covariance, v) - even @ (pulled.T @ v)
+
+    strength = svd.s**2 * np.einsum("ij,ji->i", svd.vt, spread(svd.vt.T))
     used = np.flatnonzero(strength > 1e-5 * sigma**2)
     seen = svd.s[used, None] * svd.vt[used]
-    cross = covariance @ seen.T
+    cross = spread(seen.T)
     data = seen @ cross
     power, vectors = np.linalg.eigh((data + data.T) / 2)
     kept = power > 1e-4 * sigma**2
     power, vectors = power[kept], vectors[:, kept]
     analysis = vectors.T @ svd.u[:, used].T
-    along = analysis @ uniform / (uniform @ uniform)
-    return Lmmse(uniform, mean, vectors.T @ (seen @ mean), analysis - along[:, None] * uniform, power, cross @ vectors,
-                 np.diag(covariance).copy(), float(sigma))
+    analysis = analysis - (analysis @ left.T) @ left
+    variance = np.kron(np.diag(bands), np.diag(covariance)) - np.sum(even * (2 * pulled - even @ (weight @ pulled)), axis=1)
+    return Lmmse(levels, even, mean, vectors.T @ (seen @ mean), analysis, power, cross @ vectors, variance, float(sigma))
+
+
+def _levels(svd, bands, variance, sigma):
+    """(levels (level, pixel), even (point, level)) of Lmmse: orthogonal rows that measure brightnesses, and the fields they stand for."""
+    values, vectors = np.linalg.eigh(bands)
+    ones = np.kron(vectors * np.sqrt(np.maximum(values, 0)), np.ones((svd.vt.shape[1] // len(bands), 1)))
+    u, s, vt = np.linalg.svd(svd.s[:, None] * (svd.vt @ ones), full_matrices=False)
+    kept = s * np.sqrt(variance) > LEVEL_SURE * sigma
+    kept[0] = True
+    return (svd.u @ u[:, kept] / s[kept]).T, ones @ vt[kept].T
+
+
+def _times(bands, covariance, v):
+    """kron(bands, covariance) v, v (point, n), points of one band after the other."""
+    parts = v.reshape(len(bands), -1, v.shape[1])
+    return np.tensordot(bands, np.stack([covariance @ part for part in parts]), 1).reshape(v.shape)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 RING = 1
+MOST = 256
+"""Singular vectors through which a superpixel is seen at most."""
 
 
 def by_lenslet(solve, y):
@@ -25,25 +27,23 @@ class JointLmmse:
     """LMMSE of a block from the superpixels within one ring, see `prepare_joint`."""
 
     mean: float
-    shape: tuple
     analysis: np.ndarray
-    response: np.ndarray
-    offsets: np.ndarray
+    offset: np.ndarray
     cross: np.ndarray
     data: np.ndarray
-    variance: float
+    variance: np.ndarray
 
     def apply(self, y):
         """(lenslet_row, lenslet_column, pixel) -> (x, sigma), both (lenslet_row, lenslet_column, point).
 
         Beyond the array's border there is nothing to look at: blocks there use the superpixels that exist. Light from
-        outside the array is taken to have the scene's mean and covariance (none where `offsets` is only (0, 0)).
+        outside the array is taken to have the scene's mean and covariance.
         """
         from scipy.linalg import cholesky, solve_triangular
 
         rows, columns = y.shape[:2]
-        z = y @ self.analysis.T - self.mean * self.response.sum(axis=2).sum(axis=0)
-        x, sigma = np.empty((rows, columns, self.shape[0] * self.shape[1])), np.empty((rows, columns, self.shape[0] * self.shape[1]))
+        z = y @ self.analysis.T - self.offset
+        x, sigma = np.empty((2, rows, columns, len(self.variance)))
         ring = [(dr, dc) for dr in range(-RING, RING + 1) for dc in range(-RING, RING + 1)]
         windows = {}
         for r in range(rows):
@@ -65,12 +65,13 @@ class JointLmmse:
         return x, sigma
 
 
-def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigma, *, most=256):
+def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigma, bands=((1.0,),), *, most=MOST):
     """Set up LMMSE from 3x3 superpixels for a scene with the stationary `autocovariance` (lags up to `needed_reach`).
 
-    svd: of the own block A_0.  blocks (offset, pixel, point), offsets (offset, 2): as in BlockToeplitz.  object_shape: points
-    (rows, columns) of a block.  mean, autocovariance: of natural.autocovariance.  sigma > 0: noise of a pixel.
-    Superpixels are seen through at most `most` left singular vectors of A_0, those whose signal can exceed a hundredth of
+    svd: of the own block A_0.  blocks (offset, pixel, point), offsets (offset, 2): as in BlockToeplitz, points of several bands
+    one band after the other.  object_shape: points (rows, columns) of a block in one band.  mean, autocovariance: of
+    natural.autocovariance.  bands (band, band): covariance of the bands at a point, its diagonal about 1.  sigma > 0: noise of
+    a pixel.  Superpixels are seen through at most `most` left singular vectors of A_0, those whose signal can exceed a hundredth of
     the noise: a linear reduction of the data, for which the estimate is exact, neighbours' light included. Covariances are
     inner products of each vector's footprint on the object with the footprints filtered by the autocovariance (FFT).
     """
@@ -80,18 +81,22 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
         raise NumericsError(f"LMMSE needs a positive noise level, not {sigma}", fix="give --noise-sigma, or use --method tikhonov")
     blocks, offsets = np.asarray(blocks, float), np.asarray(offsets, int)
     rows, columns = object_shape
-    strength = svd.s**2 * np.abs(autocovariance).max() * rows * columns
+    bands = np.asarray(bands, float)
+    count = len(bands)
+    strength = svd.s**2 * np.abs(autocovariance).max() * np.linalg.eigvalsh(bands)[-1] * rows * columns
     used = max(1, min(int(np.count_nonzero(strength > 1e-4 * sigma**2)), most, svd.rank()))
     analysis = svd.u[:, :used].T
     response = np.stack([analysis @ block for block in blocks])
     reach = int(np.abs(offsets).max(initial=0))
     side = 2 * reach + 1
-    footprint = np.zeros((used, side * rows, side * columns))
+    footprint = np.zeros((used * count, side * rows, side * columns))
     for block, (dr, dc) in zip(response, offsets):
         r, c = (reach - dr) * rows, (reach - dc) * columns
-        footprint[:, r : r + rows, c : c + columns] += block.reshape(used, rows, columns)
+        footprint[:, r : r + rows, c : c + columns] += block.reshape(-1, rows, columns)
     margin = 2 * RING * np.array([rows, columns])
     filtered = _filter(footprint, autocovariance, margin)
+    if count > 1 or bands[0, 0] != 1:
+        filtered = np.einsum("ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])).reshape(filtered.shape)
 
     def shifted(dr, dc):
         """The filtered footprints as seen by a lenslet (dr, dc) from the one whose footprints they are."""
@@ -104,10 +109,10 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
     data = np.block([[pairs[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
     data = (data + data.T) / 2
     data[np.diag_indices(len(data))] += sigma**2
-    own = (slice(None), slice(reach * rows, (reach + 1) * rows), slice(reach * columns, (reach + 1) * columns))
+    own = np.s_[:, reach * rows : (reach + 1) * rows, reach * columns : (reach + 1) * columns]
     cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
     middle = autocovariance.shape[0] // 2
-    return JointLmmse(mean, tuple(object_shape), analysis, response, offsets, cross, data, float(autocovariance[middle, middle]))
+    return JointLmmse(mean, analysis, mean * response.sum(axis=(0, 2)), cross, data, np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns))
 
 
 def needed_reach(object_shape, offsets):

@@ -20,10 +20,10 @@ TV_WEIGHT, TV_ROUNDS = 0.2, 20
 class DataTerm:
     """|y - A x|^2/sigma^2 of a sensor, in the directions of the own block that can be seen.
 
-    svd: of the own block.  object_shape: points (rows, columns) of a block.  y (lenslet_row, lenslet_column, pixel): own light,
-    neighbours' taken away.  sigma > 0: noise of a pixel.  contrast: what a point may differ from what the prior expects;
-    singular vectors whose signal is then below 3 % of the noise are dropped.  held: (mask (lenslet_row, lenslet_column), x like
-    y's lenslets (.., point)) of lenslets whose light is not their own: their objects stay what they are.
+    svd: of the own block.  object_shape: points (rows, columns) of a block in one band.  y (lenslet_row, lenslet_column, pixel):
+    own light, neighbours' taken away.  sigma > 0: noise of a pixel.  contrast: what a point may differ from what the prior
+    expects; singular vectors whose signal is then below 3 % of the noise are dropped.  held: (mask (lenslet_row,
+    lenslet_column), x like y's lenslets (.., point)) of lenslets whose light is not their own: their objects stay what they are.
     """
 
     def __init__(self, svd, object_shape, y, sigma, contrast=0.1, held=None):
@@ -32,7 +32,7 @@ class DataTerm:
         self.s, self.vt, self.z = svd.s[:kept], svd.vt[:kept], y @ svd.u[:, :kept]
 
     def proximal(self, picture, tau):
-        """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column)."""
+        """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column) or (band, row, column)."""
         v = to_blocks(picture, self.shape)
         share = self.s / (self.s**2 + (self.sigma / tau) ** 2)
         x = v + ((self.z - (v @ self.vt.T) * self.s) * share) @ self.vt
@@ -45,6 +45,20 @@ class DataTerm:
 def schedule(error):
     """Falling tau for `plug_and_play` from a picture whose root mean square error is expected to be `error`."""
     return np.geomspace(FROM * error, TO * error, ROUNDS)
+
+
+def denoiser(bands):
+    """Block matching for pictures (row, column), or (band, row, column) whose bands have the covariance `bands` (band, band): these
+    are turned into uncorrelated ones, most of them nearly flat, which leaves white noise white."""
+    from plenocli.solvers.denoise import block_matching
+
+    def denoise(picture, tau):
+        if picture.ndim == 2:
+            return block_matching(picture, tau)
+        turn = np.linalg.eigh(bands)[1].T
+        return np.tensordot(turn.T, np.stack([block_matching(plane, tau) for plane in np.tensordot(turn, picture, 1)]), 1)
+
+    return denoise
 
 
 def plug_and_play(term, start, denoise, taus):
@@ -62,10 +76,13 @@ def total_variation(term, start, error, *, rounds=TV_ROUNDS):
     """
     from skimage.restoration import denoise_tv_chambolle
 
+    def flatter(picture):
+        return denoise_tv_chambolle(picture, weight=TV_WEIGHT * error, eps=1e-5, max_num_iter=60)
+
     x = start
     dual = np.zeros_like(x)
     for _ in range(rounds):
-        v = denoise_tv_chambolle(x + dual, weight=TV_WEIGHT * error, eps=1e-5, max_num_iter=60)
+        v = flatter(x + dual) if x.ndim == 2 else np.stack([flatter(plane) for plane in x + dual])
         dual = dual + x - v
         x = term.proximal(v - dual, error)
     return v

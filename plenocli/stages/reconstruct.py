@@ -50,8 +50,8 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Solved:
-    """A picture (row, column), its standard deviation and what is seen of a block, or None, the report, the share of it below zero,
-    points of a block or None."""
+    """A picture (row, column) or (band, row, column), its standard deviation and what is seen of a block, or None, the report, the
+    share of it below zero, points of a block or None, wavelengths of the bands or ()."""
 
     picture: np.ndarray
     sigma: np.ndarray | None
@@ -59,6 +59,7 @@ class Solved:
     report: dict
     negative: float
     block: tuple | None
+    bands: tuple
 
 
 def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, suffix=".h5", scheduler=None, overwrite=False, command=""):
@@ -88,7 +89,7 @@ def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, s
 
     try:
         if pif:  # a broken one ends the run here, before any capture
-            _estimators(recipe) if scheduler is None and (settings.workers == 1 or not several) else read_system(pif, settings.mem_limit)
+            _estimators(recipe) if scheduler is None and (settings.workers == 1 or not several) else read_system(pif, settings.mem_limit, by_band=True)
         # one capture alone may use all cores for its linear algebra
         with open_pool(min(settings.workers, len(batch.todo)), scheduler) if several else nullcontext(Here()) as pool:
             return summarise(batch, outcomes(batch, pool, partial(reconstruct_capture, recipe), write))
@@ -98,7 +99,7 @@ def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, s
 
 @lru_cache(maxsize=1)
 def _estimators(recipe):
-    return Estimators(read_system(recipe.pif, recipe.settings.mem_limit), recipe.settings)
+    return Estimators(read_system(recipe.pif, recipe.settings.mem_limit, by_band=True), recipe.settings)
 
 
 def _check_options(settings, pif, calibration):
@@ -118,20 +119,21 @@ def _check_options(settings, pif, calibration):
 
 def reconstruct_capture(recipe, capture):
     """The Solved of one capture; what many captures need is made once a process."""
-    settings, block, sigma, seen = recipe.settings, None, None, None
+    settings, block, sigma, seen, bands = recipe.settings, None, None, None, ()
     if recipe.pif is None:
         picture, report = _white_normalised(capture, recipe.calibration), {"method": "block-mean", "reason": "sum over the superpixel, over that of white"}
     else:
         estimators = _estimators(recipe)
         data, block = read_superpixels(capture, estimators.system, recipe.calibration, settings.mem_limit), estimators.system.object_shape
-        blocks, spread, report = estimators.solve(data, _truth(settings.truth, block, data.y.shape[:2]))
+        bands = estimators.system.bands
+        blocks, spread, report = estimators.solve(data, _truth(settings.truth, block, data.y.shape[:2], max(1, len(bands))))
         picture, sigma = to_plane(blocks, block), None if spread is None else to_plane(spread, block)
         report |= _limits(data, estimators.system, report)
         noise = report.get("noise_sigma") or data.sigma
         if noise:
             seen, report["seen"] = estimators.seen(noise)
     negative = float(np.mean(picture < 0))
-    return Solved(np.maximum(picture, 0) if settings.clip else picture, sigma, seen, report, negative, block)
+    return Solved(np.maximum(picture, 0) if settings.clip else picture, sigma, seen, report, negative, block, bands)
 
 
 def _limits(data, system, report):
@@ -146,7 +148,7 @@ def _limits(data, system, report):
     return {} if found is None else {"limits": found}
 
 
-def _truth(path, shape, count):
+def _truth(path, shape, count, bands):
     """The true blocks (lenslet_row, lenslet_column, point) from a capture that holds its scene, an image .h5 or an EXR; or None."""
     if path is None:
         return None
@@ -163,10 +165,11 @@ def _truth(path, shape, count):
     if picture is None:
         raise InputError("holds no scene", path, "give a simulated capture, or an image")
     picture = np.asarray(picture, float)
-    picture = picture.mean(axis=0) if picture.ndim == 3 else picture
-    expected = (count[0] * shape[0], count[1] * shape[1])
+    picture = picture.mean(axis=0, keepdims=True) if picture.ndim == 3 and bands == 1 else picture.reshape(-1, *picture.shape[-2:])
+    expected = (bands, count[0] * shape[0], count[1] * shape[1])
     if picture.shape != expected:
-        raise InputError(f"is {picture.shape[0]} x {picture.shape[1]} points, the picture {expected[0]} x {expected[1]}", path, "give the object as sampled (capture-sim --scene-out)")
+        raise InputError(f"has {' x '.join(map(str, picture.shape))} bands, rows and columns of points, the picture {' x '.join(map(str, expected))}", path,
+                         "give the object as sampled (capture-sim --scene-out)")
     return to_blocks(picture, shape)
 
 
@@ -189,19 +192,23 @@ def _white_normalised(capture, calibration):
 
 def _write(target, solved, settings, capture, origin, overwrite):
     """Write one picture; returns its report."""
-    from plenocli.artefacts import Artefact, Provenance, describe_inputs, provenance_texts, write_artefact, write_exr
+    from plenocli.artefacts import Artefact, Provenance, describe_inputs, provenance_texts, write_artefact, write_exr, write_spectral_exr
 
     picture, sigma, report = solved.picture, solved.sigma, solved.report
     inputs = describe_inputs({"capture": capture, "pif": origin["pif"], "calibration": origin["calibration"], "dictionary": settings.dictionary,
                               "truth": settings.truth, "training": files_of(settings.training)})
     provenance = Provenance(origin["command"], inputs, settings.seed)
-    if target.suffix == ".exr":
+    if target.suffix == ".exr" and picture.ndim == 3:
+        write_spectral_exr(target, solved.bands, picture, sigma=sigma, attrs={"method": report["method"]} | provenance_texts(provenance), overwrite=overwrite)
+    elif target.suffix == ".exr":
         channels = {"Y": picture.astype(np.float32)} | ({} if sigma is None else {"sigma": sigma.astype(np.float32)})
         write_exr(target, channels, {"method": report["method"]} | provenance_texts(provenance), overwrite=overwrite)
     else:
         data = {"image/value": picture} | {f"image/{name}": values for name, values in (("sigma", sigma), ("seen", solved.seen)) if values is not None}
+        data |= {"image/wavelength": np.array(solved.bands)} if picture.ndim == 3 else {}
         attrs = {"method": report["method"], "parameters": {k: v for k, v in report.items() if k != "method"}, "clipped": solved.negative if settings.clip else 0.0}
         if solved.block is not None:
             attrs["notes"] = {"block": list(solved.block)}
         write_artefact(target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite)
-    return report | {"output": str(target), "rows": picture.shape[0], "columns": picture.shape[1], "negative_share": solved.negative, "clipped": settings.clip}
+    return report | {"output": str(target), "rows": picture.shape[-2], "columns": picture.shape[-1], "bands_nm": [w * 1e9 for w in solved.bands],
+                     "negative_share": solved.negative, "clipped": settings.clip}

@@ -40,6 +40,9 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
         lit = np.all(np.isfinite(signal), axis=2)
         scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
         return Superpixels(np.where(lit[:, :, None], signal, 0) * scale[:, :, None], None, None)
+    light = mosaic.meta.get("illuminant")
+    if system.illuminant and light and light != system.illuminant:
+        note(f"{Path(path).name} was lit by {light}, the system matrix has its bands for {system.illuminant}: colours will be off")
     shape = tuple(int(n) for n in mosaic.meta.get("superpixel_shape", system.pixel_shape))
     if shape != system.pixel_shape:
         raise InputError(f"has superpixels of {shape[0]} x {shape[1]} pixels, the system matrix {system.pixel_shape[0]} x {system.pixel_shape[1]}", path, "use the pif of this camera")

@@ -79,6 +79,33 @@ def test_lmmse_is_the_textbook_formula(system, scale):
         np.testing.assert_allclose(found[:, k], mean + gain @ (y[:, k] - a @ mean), atol=5e-3)
 
 
+BANDS = np.array([[1.0, 0.5, 0.1], [0.5, 1.2, 0.3], [0.1, 0.3, 0.8]])
+
+
+@pytest.mark.parametrize("told_apart", [True, False])
+def test_lmmse_of_several_bands_is_one_linear_model(told_apart):
+    rng = np.random.default_rng(4)
+    a = rng.random((40, 3, 12)) * (1 + np.kron(np.eye(3), np.ones((14, 1)))[:40, :, None])
+    if not told_apart:
+        a[:, 2] = a[:, 1] * (1 + 1e-6 * rng.random((40, 12)))  # the last two bands make the same superpixel
+    a = a.reshape(40, 36)
+    root = rng.standard_normal((12, 12)) / 4
+    c, mean, sigma = root @ root.T, np.full(12, 0.4), 1e-3
+    estimator = lmmse.prepare(linear.decompose(a), mean, c, sigma, BANDS)
+    even = np.kron(np.eye(3), np.ones((12, 1)))
+    y = a @ (np.repeat(rng.random((3, 5)), 12, axis=0) + 0.3 * rng.standard_normal((36, 5))) + sigma * rng.standard_normal((40, 5))
+    found, spread, scale = estimator.adaptive(y)
+    if told_apart:
+        for k in range(5):
+            prior = scale[k] * np.kron(BANDS, c) + 1e3 * even @ even.T  # brightnesses about which nothing is known
+            gain = np.linalg.solve(a @ prior @ a.T + sigma**2 * np.eye(40), a @ prior).T
+            expected = np.tile(mean, 3) + gain @ (y[:, k] - a @ np.tile(mean, 3))
+            np.testing.assert_allclose(found[:, k], expected, atol=1e-6)
+            np.testing.assert_allclose(spread[:, k], np.sqrt(np.diag(prior - gain @ a @ prior)), rtol=1e-3)
+    assert estimator.levels.shape == (3 if told_apart else 2, 40) and np.abs(found).max() < 5 and np.isfinite(spread).all()
+    np.testing.assert_allclose(a @ found, y, atol=0.2)
+
+
 def test_lmmse_finds_the_contrast_of_each_signal(system):
     a, x, _ = system
     rng = np.random.default_rng(6)
@@ -119,27 +146,30 @@ def neighbours(coupled):
     return (blocks, RING) if coupled else (blocks[4:5], RING[4:5])
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_joint_lmmse_is_the_full_covariance(coupled):
+@pytest.mark.parametrize(("coupled", "bands"), [(False, np.eye(1)), (True, np.eye(1)), (True, BANDS[1:, 1:])])
+def test_joint_lmmse_is_the_full_covariance(coupled, bands):
     blocks, offsets = neighbours(coupled)
-    rng, count, sigma = np.random.default_rng(3), 3, 1e-2
+    rng, count, sigma, n = np.random.default_rng(3), 3, 1e-2, len(bands)
+    if n > 1:
+        blocks = np.concatenate([blocks, blocks[:, ::-1] * np.linspace(0.5, 1, 9)[:, None]], axis=2)
     reach = overlap.needed_reach((N, N), offsets)
     lag = np.arange(-reach, reach + 1)
     covariance_map = 0.05 * np.exp(-np.hypot(lag[:, None], lag[None, :]) / 6)
-    joint = overlap.prepare_joint(linear.decompose(blocks[len(blocks) // 2]), blocks, offsets, (N, N), 0.4, covariance_map, sigma, most=99)
+    joint = overlap.prepare_joint(linear.decompose(blocks[len(blocks) // 2]), blocks, offsets, (N, N), 0.4, covariance_map, sigma, bands, most=99)
     side = count + 2  # light from one lenslet outside counts, with the scene's statistics
     op = BlockToeplitz(blocks, offsets, (side, side))
     index = np.arange((side * N) ** 2).reshape(side, N, side, N).transpose(0, 2, 1, 3).ravel()
     r, c = np.divmod(index, side * N)
     full_map = 0.05 * np.exp(-np.hypot(*(np.arange(-side * N, side * N + 1)[s] for s in ((slice(None), None), (None, slice(None))))) / 6)
-    cover = full_map[r[:, None] - r[None, :] + side * N, c[:, None] - c[None, :] + side * N]
+    cover = full_map[r[:, None] - r[None, :] + side * N, c[:, None] - c[None, :] + side * N].reshape(side**2, N * N, side**2, N * N)
+    cover = np.einsum("ab,lpmq->lapmbq", bands, cover).reshape(op.domain.size, op.domain.size)  # points of one band after the other
     identity = np.eye(op.domain.size).reshape(-1, *op.domain.shape)
     matrix = np.stack([op.forward(e)[1:-1, 1:-1].ravel() for e in identity], axis=1)
     y = rng.random((count, count, 9)) + matrix.sum(axis=1).reshape(count, count, 9) * 0.4
     data = matrix @ cover @ matrix.T + sigma**2 * np.eye(len(matrix))
     cross = cover @ matrix.T
-    estimate = 0.4 + (cross @ np.linalg.solve(data, y.ravel() - 0.4 * matrix.sum(axis=1))).reshape(side, side, N * N)
-    error = np.sqrt(0.05 - np.einsum("ij,ji->i", cross, np.linalg.solve(data, cross.T))).reshape(side, side, N * N)
+    estimate = 0.4 + (cross @ np.linalg.solve(data, y.ravel() - 0.4 * matrix.sum(axis=1))).reshape(op.domain.shape)
+    error = np.sqrt(np.diag(cover) - np.einsum("ij,ji->i", cross, np.linalg.solve(data, cross.T))).reshape(op.domain.shape)
     x, spread = joint.apply(y)
     np.testing.assert_allclose(x[1, 1], estimate[2, 2], atol=1e-8)  # the middle lenslet of 3x3 sees everything there is
     np.testing.assert_allclose(spread[1, 1], error[2, 2], atol=1e-8)

@@ -26,14 +26,15 @@ def matrices(coupled):
     return np.stack([own if not o.any() else 0.02 / np.abs(o).sum() * np.roll(own, 2 * o[0] * PIXELS + 2 * o[1], axis=0)[:, ::-1] for o in ring]), ring
 
 
-def make_files(folder, coupled=False, noise=60.0, **attrs):
-    """pif.h5 and capture.h5 (of the astronaut) in `folder`; returns the true picture."""
+def make_files(folder, coupled=False, noise=60.0, stray=1.0, **attrs):
+    """pif.h5 and capture.h5 (of the astronaut) in `folder`; returns the true picture. stray: neighbours' light in the capture, over
+    that of the pif."""
     blocks, offsets = matrices(coupled)
     data = {"pif/A": blocks[None], "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": offsets, "pif/pixel_shape": np.array([PIXELS] * 2),
             "pif/object_shape": np.array([N] * 2), "pif/column_energy": blocks.sum(axis=(0, 1))[None]}
     write_artefact(folder / "pif.h5", Artefact("pif", data, {}, Provenance("test")), overwrite=True)
     picture = np.asarray(sample_picture(luminance(embedded_photograph("astronaut")), COUNT * N, COUNT * N), float)
-    y = BlockToeplitz(blocks, offsets, (COUNT, COUNT)).forward(to_blocks(picture, (N, N)))
+    y = BlockToeplitz(blocks * np.where(offsets.any(axis=1), stray, 1)[:, None, None], offsets, (COUNT, COUNT)).forward(to_blocks(picture, (N, N)))
     sigma = np.sqrt(np.mean(y**2) * 10 ** (-noise / 10))
     y = y + sigma * np.random.default_rng(0).standard_normal(y.shape)
     about = dict(units="relative", black=0.0, noise_sigma=float(sigma), superpixel_shape=[PIXELS] * 2, lenslet_count=[COUNT] * 2, target="skimage:astronaut") | attrs
@@ -140,6 +141,13 @@ def test_neighbours_light_is_noticed_and_taken_away(tmp_path, capsys):
         quality[method] = [psnr(i.data["image/value"], truth) for i in (alone, joint)]
         assert quality[method][1] > quality[method][0] + 1, quality
     assert quality["pnp"][1] > quality["lmmse"][1] + 0.2, quality  # the border's lenslets are those of lmmse
+
+
+def test_light_that_the_matrix_lacks_does_not_pass_for_contrast(tmp_path):
+    truth = make_files(tmp_path, coupled=True, stray=3.0)
+    image = reconstruct(tmp_path, "--method", "lmmse")
+    assert image.attrs["image"]["parameters"]["scale"] == 1  # the likeliest is 30, with which the picture has 12.6 dB
+    assert psnr(image.data["image/value"], truth) > 19
 
 
 def test_dictionary_chain(single, capsys):

@@ -3,8 +3,9 @@
 from plenocli.accuracy.dial import seconds_here
 
 
-def explain(plan):
-    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was left out, warnings."""
+def explain(plan, memory=None):
+    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was left out, warnings. memory: bytes that
+    the chosen one takes as it is written, where known."""
     rows, columns = plan.superpixels
     head = [
         f"asked: accuracy {plan.accuracy:.2g} ({plan.asked_by})",
@@ -13,6 +14,7 @@ def explain(plan):
         "",
         *_table(candidates(plan)),
         "",
+        *([] if memory is None else [f"memory: about {_size(memory)}" + (", written in pieces" if memory < plan.bytes else "")]),
         "error by source: " + ", ".join(f"{name} {value:.1g}" for name, value in plan.split.items()) + f"; together {plan.estimated:.1g}",
     ]
     nodes = [

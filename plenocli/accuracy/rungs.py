@@ -78,7 +78,7 @@ def _square_cost(camera, view, band, shape, double):
         terms *= 0.65
     return {"operations": 8.0 * 1.2 * fine * terms * pairs,
             "seconds": setup + pairs * (2.5e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9) + 0.005,
-            "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (1 << 25)}
+            "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (3 << 22)}
 
 
 RUNGS = (

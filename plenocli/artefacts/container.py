@@ -79,9 +79,8 @@ def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
     """
     path = Path(path)
     limit = default_mem_limit() if mem_limit is None else int(mem_limit)
-    image = _verified_bytes(path, limit)
     try:
-        with h5py.File(_open_image(image), "r") as file:
+        with h5py.File(_open_image(_verified_bytes(path, limit)), "r") as file:  # which keeps a copy: ours goes
             return _parse(path, file, kind, limit, skip)
     except (PlenoError, MemoryError):
         raise
@@ -268,13 +267,17 @@ def _storage(values):
     return {"chunks": tuple(chunks), "fletcher32": True, "track_times": False, "compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
+READING = 3
+"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies of them while it opens, then the values."""
+
+
 # --- reading -----------------------------------------------------------------------------------------------------------
 
 def _verified_bytes(path, limit):
     """The HDF5 part of the file at `path`, read once, its digest and length verified."""
     size = require_file(path)
-    if size > limit:
-        raise InputError(f"is {size / 1e9:.3g} GB, above the memory limit of {limit / 1e9:.3g} GB", path, "raise --mem-limit")
+    if READING * size > limit:
+        raise InputError(f"is {size / 1e9:.3g} GB, and reading takes {READING} times that, above the memory limit of {limit / 1e9:.3g} GB", path, f"raise --mem-limit to {READING * size / 2**20 + 1:.0f}MiB")
     try:
         content = path.read_bytes()
     except OSError as error:

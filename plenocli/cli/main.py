@@ -12,6 +12,7 @@ from functools import partial
 import click
 
 from plenocli import __version__
+from plenocli.artefacts.limits import limits_restored
 from plenocli.errors import PlenoError
 
 COMMANDS = (
@@ -109,8 +110,9 @@ def run(argv=None):
     """Run the command line with `argv` (default: the process's own) and return the exit code."""
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
     try:
-        _require_room()
-        code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
+        with limits_restored():
+            _require_room()
+            code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except click.exceptions.Abort:

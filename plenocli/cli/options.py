@@ -143,7 +143,17 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print the summar
 seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
 workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
 scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler instead, such as tcp://10.0.0.1:8786, or the file it wrote; the results are the same.")
-mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, help="Memory the stage may plan for, such as 4GiB; a plan that needs more is refused.")
+
+
+def _held(ctx, param, value):
+    from plenocli.artefacts.limits import hold
+
+    hold(value)
+    return value
+
+
+mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, callback=_held,
+                         help="Memory for data, such as 4GiB; a plan that needs more is refused, and nobody gets more. Interpreter and libraries come on top: 384 MiB, and 80 MiB a core.")
 
 
 coherent_ring = click.option("--coherent-ring", type=Ring(), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")

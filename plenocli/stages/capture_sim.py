@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.errors import ConfigError, InputError, NumericsError, UsageError
+from plenocli.errors import ConfigError, InputError, UsageError
 from plenocli.stages.progress import bar, note
 from plenocli.stages.scenes import Chart, Uniform, read_scene
 from plenocli.stages.seeds import stream
@@ -79,12 +79,12 @@ def _check_tiling(camera, where):
 
 def _check_memory(camera, settings, where):
     """Refuse, before any work, a sensor or an object larger than the memory granted: light, white and mosaic, float64, by colour."""
+    from plenocli.artefacts.limits import require_memory
+
     lenslets, pixels, points = (int(np.prod(n, dtype=object)) for n in (camera.lenslet_array.count, camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet))
     colours = 1 if camera.sensor.cfa == "mono" else 3
     needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * settings.refine**2)
-    if needed > settings.mem_limit:
-        raise NumericsError(f"the capture needs about {needed / 2**30:.2g} GiB, more than the limit of {settings.mem_limit / 2**30:.2g} GiB", where,
-                            "take fewer lenslets, pixels or points, a smaller --refine, or raise --mem-limit")
+    require_memory(needed, settings.mem_limit, "the capture", where, "take fewer lenslets, pixels or points, a smaller --refine")
 
 
 def _source(camera, settings, scene):

@@ -145,9 +145,13 @@ def _elsewhere(error, folder):
 
 @contextlib.contextmanager
 def _folder(task):
-    with tempfile.TemporaryDirectory(prefix="plenocli-", dir=task.get("scratch")) as name:
-        (Path(name) / "camera.toml").write_text(task["camera"], encoding="utf-8")
-        yield Path(name)
+    with contextlib.ExitStack() as stack:
+        try:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="plenocli-", dir=task.get("scratch"))))
+            (folder / "camera.toml").write_text(task["camera"], encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"cannot be written ({error.strerror})", task.get("scratch") or tempfile.gettempdir(), "free some space there, then run again: what is finished is kept") from None
+        yield folder
 
 
 def _without(folder, texts):

@@ -20,7 +20,7 @@ class Journal:
     def __init__(self, path):
         self.path, self.records = Path(path), {}
         try:
-            self._file = open(self.path, "a+b")
+            self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
             raise OutputError(f"cannot be written ({error.strerror})", path, "check the folder and its permissions") from None
         try:
@@ -45,8 +45,8 @@ class Journal:
 
     def _write(self, data):
         try:
-            self._file.write(data)
-            self._file.flush()
+            while data:
+                data = data[os.write(self._file.fileno(), data):]
             os.fsync(self._file.fileno())
         except OSError as error:
             raise OutputError(f"cannot be written ({error.strerror})", self.path, "free some space, then run again: what is finished is kept") from None

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.errors import NumericsError
+from plenocli.artefacts.container import READING
+from plenocli.artefacts.limits import require_memory
 
 WHOLE_BYTES = 1 << 27
 """A matrix up to this size is held in memory while it is computed; larger ones go to the disk in pieces."""
@@ -18,20 +19,25 @@ class Layout:
     groups: tuple | None = None
 
 
-def layout(plan, mem_limit, where):
-    """The Layout of a PifPlan's matrix under a memory limit (bytes). NumericsError where not even one superpixel's part fits.
-
-    Held whole up to WHOLE_BYTES and a quarter of the limit; one file up to half of the limit, which another stage can
-    read; else shards of an eighth of it.
-    """
+def cost(plan, mem_limit):
+    """(whether it is written in pieces, bytes of memory) of a PifPlan's matrix under a memory limit."""
     bands, superpixels = plan.shape[:2]
     slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
     streamed = plan.bytes > min(WHOLE_BYTES, mem_limit // 4)
-    needed = (3 * slab if streamed else plan.bytes) + work
-    if needed > mem_limit:
-        raise NumericsError(f"the matrix needs about {needed / 2**30:.2g} GiB at a time, more than the limit of {mem_limit / 2**30:.2g} GiB",
-                            where, "take fewer superpixels, points or wavelengths, or raise --mem-limit")
-    if plan.bytes <= mem_limit // 2 or superpixels == 1:
+    return streamed, (4 * slab if streamed else plan.bytes) + work
+
+
+def layout(plan, mem_limit, where):
+    """The Layout of a PifPlan's matrix under a memory limit (bytes). NumericsError where not even one superpixel's part fits.
+
+    Held whole up to WHOLE_BYTES and a quarter of the limit; one file where another stage can read it under
+    the same limit; else shards of an eighth of it.
+    """
+    bands, superpixels = plan.shape[:2]
+    slab = plan.bytes // (bands * superpixels)
+    streamed, needed = cost(plan, mem_limit)
+    require_memory(needed, mem_limit, "the matrix", where, "take fewer superpixels, points or wavelengths")
+    if READING * plan.bytes <= mem_limit or superpixels == 1:
         return Layout(streamed)
     size = max(1, mem_limit // 8 // (bands * slab))
     return Layout(True, tuple(tuple(range(start, min(start + size, superpixels))) for start in range(0, superpixels, size)))

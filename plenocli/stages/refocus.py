@@ -24,7 +24,7 @@ def run_refocus(capture, output, *, calibration=None, camera=None, distances=(),
     check_output(output, overwrite=overwrite, inputs=[capture, calibration, camera], suffixes=(".h5",))
     geometry = _geometry(camera) if camera is not None else None
     slopes = _slopes(slopes, distances, planes, geometry)
-    samples, shape = _samples(capture, calibration, mem_limit)
+    samples, shape = _samples(capture, calibration, mem_limit, len(slopes))
     pictures = np.stack([lightfield.refocus(samples, slope, shape)[0] for slope in slopes])
     sharp = [lightfield.sharpness(p) for p in pictures]
     data = {"refocus/value": pictures.astype(np.float32), "refocus/slope": slopes, "refocus/sharpness": np.array(sharp)}
@@ -75,13 +75,19 @@ def _slopes(slopes, distances, planes, geometry):
     return np.array(sorted(set(float(s) for s in slopes)))
 
 
-def _samples(capture, calibration, mem_limit):
+PIXEL_BYTES, PLANE_BYTES = 126, 1
+"""Memory for each pixel of the capture, and for each of its pixels and each plane (measured)."""
+
+
+def _samples(capture, calibration, mem_limit, planes=1):
     """(Samples, (rows, columns) of the picture in lenslet pitches) of a capture, along a calibration's grid or the tiles that its file names."""
     from plenocli.artefacts import read_artefact, read_mosaic
+    from plenocli.artefacts.limits import require_memory
     from plenocli.sensor.frames import tiled
     from plenocli.sensor.lightfield import collect
 
     mosaic = read_mosaic(capture, mem_limit=mem_limit)
+    require_memory(mosaic.values.size * (PIXEL_BYTES + PLANE_BYTES * planes), mem_limit, "refocusing", capture, "cut the capture")
     if mosaic.cfa != "mono":
         raise InputError(f"has the colour filter array {mosaic.cfa}; refocusing takes grey captures", capture, "demultiplex it first")
     if calibration is not None:
@@ -110,4 +116,4 @@ def _samples(capture, calibration, mem_limit):
     samples = collect(signal, white, centres, valid, pitch)
     if samples.value.size == 0:
         raise InputError("has no lit superpixel on the grid", capture, "check the white image and the calibration")
-    return samples, tuple(int(np.ceil(n / pitch)) for n in mosaic.values.shape)
+    return samples, tuple(max(1, int(np.ceil(n / pitch - 0.1))) for n in mosaic.values.shape)  # pitches are measured

@@ -48,7 +48,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     plan = plan_pif(camera, wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
                     accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs, lenslet=settings.lenslet)
     if explain:
-        return _explained(plan)
+        return _explained(plan, pif_pieces.cost(plan, settings.mem_limit)[1])
     chosen = pif_pieces.layout(plan, settings.mem_limit, camera_path)
     for warning in plan.warnings:
         note(warning)
@@ -82,11 +82,11 @@ def accuracy_record(plan):
             "reasons": [*plan.reasons, *plan.warnings], "left_out": list(plan.left_out)}
 
 
-def _explained(plan):
+def _explained(plan, memory):
     from plenocli.accuracy.explain import candidates, explain
 
     considered = candidates(plan)
-    return {"plan": explain(plan), "accuracy": accuracy_record(plan), "considered": considered,
+    return {"plan": explain(plan, memory), "memory": memory, "accuracy": accuracy_record(plan), "considered": considered,
             "seconds": next(c["seconds"] for c in considered if c["chosen"]), "bytes": plan.bytes, "superpixels": list(plan.superpixels),
             "coherent_ring": plan.coherent_ring, "estimated_accuracy": plan.estimated}
 

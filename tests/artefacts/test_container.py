@@ -281,7 +281,7 @@ def test_memory_limit_holds_for_the_file_and_for_what_it_declares(tmp_path):
     assert (tmp_path / "x.h5").stat().st_size < 50_000
     with pytest.raises(InputError, match="declares .* above the memory limit"):
         read_artefact(tmp_path / "x.h5", mem_limit=100_000)
-    with pytest.raises(InputError, match="GB, above the memory limit"):
+    with pytest.raises(InputError, match="times that, above the memory limit"):
         read_artefact(tmp_path / "x.h5", mem_limit=100)
 
 

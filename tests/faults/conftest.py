@@ -59,7 +59,7 @@ def _make_files(folder, steps, runner):
     (folder / "camera.toml").write_text((SAMPLES / "tiny.toml").read_text())
     (folder / "colour.toml").write_text(_spectral_camera())
     (folder / "scene.toml").write_text((SAMPLES / "scenes" / "shallow.toml").read_text())
-    (folder / "sweep.toml").write_text(SWEEP)
+    (folder / "designs.toml").write_text(SWEEP)
     _write_pictures(folder)
     for name, (arguments, result) in steps.items():
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
@@ -121,5 +121,5 @@ def _steps():
         "refocus": (["refocus", "capture.h5", "--planes", "3"], "planes.h5"),
         "score": (["score", "image.h5", "--truth", "capture.h5"], "score.json"),
         "show": (["show", "image.h5"], "image.png"),
-        "sweep": (["sweep", "sweep.toml"], "sweep.h5"),
+        "sweep": (["sweep", "designs.toml"], "sweep.h5"),
     }

@@ -33,7 +33,7 @@ def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campa
     assert tree(target.parent) == whole
     empty(target.parent)
     rng, killed, finished = np.random.default_rng(list(name.encode())), 0, 0
-    for _ in range(campaign(4, 200)):
+    while killed < campaign(4, 200):
         outcome = runner.run(command, tmp_path, kill_after=rng.uniform(0, usual))
         if outcome.code == 0:
             finished += 1
@@ -44,7 +44,7 @@ def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campa
         assert all(left.get(file, content) == content for file, content in whole.items())  # absent or whole
         if whole.keys() <= left.keys():
             empty(target.parent)
-    assert killed, (killed, finished)
+        assert finished < 1000
     assert runner.run(command, tmp_path).code == 0
     assert tree(target.parent) == whole
     count("kill -9 of a stage", killed=killed, finished_before=finished, partial_files=0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from plenocli.errors import NumericsError
 from plenocli.sensor.frames import photon_transfer
@@ -10,7 +11,7 @@ from plenocli.sensor.noise import SensorModel, add_white_noise
 MODEL = SensorModel(gain=0.25, read_noise=4.0, full_well=15000, bits=12, black_level=64)
 
 
-def test_photon_transfer_slope_is_the_gain():
+def test_photon_transfer_slope_is_the_gain(count):
     rng = np.random.default_rng(1)
     levels = np.linspace(0, 12000, 40)
     values = np.stack([MODEL.expose(np.full(40000, level), rng) for level in levels]).astype(float)
@@ -20,6 +21,34 @@ def test_photon_transfer_slope_is_the_gain():
     assert offset == pytest.approx(MODEL.gain**2 * MODEL.read_noise**2 + 1 / 12, rel=0.03)
     np.testing.assert_allclose(mean, 64 + 0.25 * levels, atol=0.5)
     np.testing.assert_allclose(variance, MODEL.variance(levels), rtol=0.04)
+    count("photon transfer, slope against gain", off_by_parts_per_10000=round(1e4 * abs(slope / MODEL.gain - 1)))
+
+
+CLASSES = {"dark": 0.0, "a few electrons": 3.0, "mid": 7500.0, "near full well": 14300.0}
+"""Mean electrons of a class of pixels: shot noise reaches neither the black level's zero nor the full well."""
+
+
+def z_scores(values, mean, variance, third):
+    """Distance of the sample's mean, variance and third central moment from what they should be, in standard errors."""
+    d = values - mean
+    moments = [d.mean(), (d**2).mean() - variance, (d**3).mean() - third]
+    return [m / ((d**k).std() / np.sqrt(d.size)) for k, m in zip((1, 2, 3), moments)]
+
+
+@pytest.mark.parametrize("model", [MODEL, pytest.param(SensorModel(gain=1.0, read_noise=2.2, full_well=15000, bits=14, black_level=256), marks=pytest.mark.slow)], ids=["0.25 DN an electron", "1 DN an electron"])
+def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of_the_model(count, model):
+    """Poisson electrons and Gaussian read noise, rounded: third central moment K^3 mu. Together a false alarm once in a hundred seeds."""
+    size, rng, worst = 2_000_000, np.random.default_rng(1288), 0.0
+    for mean in CLASSES.values():
+        values = model.expose(np.full(size, mean), rng).astype(float)
+        worst = max(worst, *np.abs(z_scores(values, model.black_level + model.gain * mean, model.variance(mean), model.gain**3 * mean)))
+    tests = 3 * len(CLASSES) * 2
+    assert worst < norm.isf((1 - 0.99 ** (1 / tests)) / 2)
+    # the same test sees a gain off by 0.1 %, read noise off by 1 %, and electrons that are not Poisson
+    assert abs(z_scores(model.expose(np.full(size, 7507.5), rng).astype(float), model.black_level + model.gain * 7500, model.variance(7500), 0)[0]) > 6
+    noisier = SensorModel(model.gain, 1.01 * model.read_noise, model.full_well, model.bits, model.black_level)
+    assert z_scores(noisier.expose(np.zeros(size), rng).astype(float), model.black_level, model.variance(0), 0)[1] > 4
+    count("noise, z-tests of mean, variance and skewness", pixel_classes=len(CLASSES), samples=size * len(CLASSES), beyond_chance=0)
 
 
 def test_photon_transfer_of_two_frames_finds_gain_and_read_noise():

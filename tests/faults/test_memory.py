@@ -1,0 +1,114 @@
+"""--mem-limit: a plan that needs more is refused with what would do, what it says it needs is what it takes, and nobody takes more.
+
+Memory is the most that a process of its own had resident, over what the same command takes on the smallest camera.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from plenocli.artefacts.limits import base_memory
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = (ROOT / "sample_configs" / "tiny.toml").read_text()
+WATCHED = ("import sys; from plenocli.cli.main import run; code = run(sys.argv[1:])\n"
+           "peak = next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
+           "print(f'\\nend {code} {peak << 10}')")
+SIZES = {"simulate-pif": (24, 28, 32), "capture-sim": (60, 90, 120), "refocus": (30, 45, 60), "score": (30, 45, 60)}
+CASES = [pytest.param(stage, size, marks=() if (stage, size) == ("capture-sim", 60) else pytest.mark.slow) for stage, sizes in SIZES.items() for size in sizes]
+
+
+def watched(folder, *arguments):
+    """(exit code, most bytes resident, stdout, stderr) of a command in a process of its own."""
+    done = subprocess.run([sys.executable, "-c", WATCHED, *map(str, arguments)], cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
+    said, _, end = done.stdout.rpartition("\nend ")
+    code, peak = end.split()
+    return int(code), int(peak), said, done.stderr
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("memory")
+
+
+def camera(folder, stage, size):
+    """Name of a camera whose size grows with `size`: of the matrix for simulate-pif, else of the array."""
+    pixels, count = (size, 9) if stage == "simulate-pif" else (16, size)
+    name = f"{stage}-{size}.toml"
+    (folder / name).write_text(TINY.replace("[8, 8]", f"[{pixels}, {pixels}]").replace("[13, 13]", f"[{pixels}, {pixels}]").replace("[5, 5]", f"[{count}, {count}]")
+                               .replace('pixel_pitch = "2 um"', f'pixel_pitch = "{26 / pixels} um"'))
+    return name
+
+
+def command(folder, stage, size):
+    """Arguments of a stage on the camera of a size, its inputs made."""
+    name = camera(folder, stage, size)
+    if stage == "simulate-pif":
+        return ["simulate-pif", name, "--superpixels", "5x5", "--coherent-ring", "0", "--model", "ray", "-o", "out.h5", "--overwrite"]
+    pif, capture, picture = (f"{stage}-{size}-{what}.h5" for what in ("pif", "capture", "image"))
+    take = ["capture-sim", name, "--pif", pif, "--scene", "skimage:astronaut", "--snr", "50dB", "--overwrite"]
+    steps = [["simulate-pif", name, "--superpixels", "1x1", "--coherent-ring", "0", "-o", pif], [*take, "-o", capture],
+             ["reconstruct", capture, "--pif", pif, "--method", "block-mean", "-o", picture]]
+    for step in steps[:{"capture-sim": 1, "refocus": 2, "score": 3}[stage]]:
+        if not (folder / step[-1]).exists():
+            assert watched(folder, *step)[0] == 0
+    return {"capture-sim": [*take, "-o", "out.h5"], "refocus": ["refocus", capture, "--planes", "3", "-o", "out.h5", "--overwrite"],
+            "score": ["score", picture, "--truth", capture, "-o", "out.json", "--overwrite"]}[stage]
+
+
+@cache
+def least(folder, stage):
+    """What the smallest problem takes, bytes resident."""
+    return watched(folder, *command(folder, stage, 5))[1]
+
+
+def in_bytes(text):
+    number, unit = re.fullmatch(r"([\d.]+)(MiB|GiB)", text).groups()
+    return float(number) * {"MiB": 2**20, "GiB": 2**30}[unit]
+
+
+@pytest.mark.parametrize("stage, size", CASES)
+def test_what_is_needed_is_what_is_said_and_less_is_refused(folder, count, stage, size):
+    arguments = command(folder, stage, size)
+    # the inputs must be readable for the plan to be made
+    code, peak, said, error = watched(folder, *arguments, "--mem-limit", "24MiB")
+    assert code == 5 and peak < least(folder, stage) + (100 << 20), error
+    if stage == "simulate-pif":  # in pieces it would take less
+        needed = json.loads(watched(folder, *arguments[:-3], "--explain", "--json")[2])["memory"]
+    else:
+        needed = in_bytes(re.search(r"needs about (\S+),", error)[1])
+        assert in_bytes(re.search(r"raise --mem-limit to (\S+)", error)[1]) == pytest.approx(1.05 * needed, rel=0.01)
+        assert watched(folder, *arguments, "--mem-limit", f"{int(0.9 * needed)}B")[0] == 5
+    limit = int(1.05 * needed)
+    code, peak, *_ = watched(folder, *arguments, *(["--mem-limit", f"{limit}B"] if stage != "simulate-pif" else []))
+    assert code == 0 and peak <= limit + base_memory()
+    taken = peak - least(folder, stage)
+    assert 0.8 * needed <= taken <= 1.2 * needed, (needed, taken)
+    count("--mem-limit, the estimate against what was taken", sizes=1, off_by_more_than_20_percent=0)
+
+
+def test_nobody_gets_more_than_the_limit_and_the_base():
+    code = ("import resource, numpy\nfrom plenocli.artefacts.limits import base_memory, hold, limits_restored\n"
+            "with limits_restored():\n"
+            "    hold(100 << 20)\n    few = numpy.ones(90 << 17)\n"
+            "    try:\n        numpy.ones((100 << 20) + base_memory() >> 3)\n        raise SystemExit('more than the limit')\n    except MemoryError: pass\n"
+            "numpy.ones((100 << 20) + base_memory() >> 3)\n")
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+
+@pytest.mark.parametrize("words", [["inspect", "image.h5"], ["show", "image.h5", "-o", "a.png"], ["score", "image.h5", "--truth", "capture.h5", "-o", "a.json"], ["refocus", "capture.h5", "-o", "a.h5"],
+                                   ["reconstruct", "capture.h5", "--pif", "pif.h5", "-o", "a.h5"], ["learn-dict", "photo.png", "--pif", "pif.h5", "-o", "a.h5"],
+                                   ["capture-sim", "camera.toml", "--scene", "photo.png", "-o", "a.h5"], ["simulate-pif", "camera.toml", "-o", "a.h5"]], ids=lambda w: w[0])
+def test_every_stage_with_the_option_refuses_what_cannot_fit(runner, stages, tmp_path, words):
+    source, _ = stages
+    for path in source.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    outcome = runner.run([*words, "--mem-limit", "1KiB"], tmp_path)
+    assert outcome.code in (3, 5) and "raise --mem-limit" in outcome.text and not (tmp_path / "a.h5").exists(), outcome
+    assert outcome.cpu < 2

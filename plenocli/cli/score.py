@@ -4,12 +4,12 @@ import click
 
 from plenocli.cli import options
 
-METRICS = ("psnr", "ssim", "block-mean", "rmse", "patches", "spectral-angle", "delta-e", "snr", "classification", "single-pixel", "coherence", "response")
+METRICS = ("psnr", "ssim", "block-mean", "rmse", "patches", "spectral-angle", "delta-e", "snr", "classification", "single-pixel", "coherence", "response", "depth")
 
 
 @click.command("score", short_help="Compare results with the truth: JSON, a table, a report.")
 @options.input_path("results", nargs=-1, required=True, metavar="RESULT...")
-@click.option("--truth", metavar="TRUTH", help="Capture that holds its scene, photograph, spectral EXR, image or spectra .h5, skimage:astronaut, or colorchecker.")
+@click.option("--truth", metavar="TRUTH", help="Capture that holds its scene, photograph, spectral EXR, image or spectra .h5, skimage:astronaut, colorchecker, or for refocused planes a distance such as 620mm.")
 @options.output
 @click.option("--report", type=options.FILE, help="Also write a page with pictures, such as report.html.")
 @click.option("--metric", "metrics", multiple=True, type=click.Choice(METRICS), help="Only these numbers. Repeatable; default all that apply.")
@@ -26,12 +26,12 @@ METRICS = ("psnr", "ssim", "block-mean", "rmse", "patches", "spectral-angle", "d
 @options.as_json
 @click.pass_context
 def command(ctx, results, output, as_json, **settings):
-    """Compare RESULTs (image, spectra, dictionary or calibration; .h5 or .exr) with the truth, side by side in one table.
+    """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr) with the truth, side by side in one table.
 
     Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline. Spectra: error per band and over the six patches of the
     paper, spectral angle, colour difference, SNR under three names, how often a lenslet tells its patch (with scikit-learn
     installed also by a trained classifier), and all against single pixel where one of the RESULTs is that. Dictionaries: coherence.
-    Calibrations: response against response. OUT is JSON with the definition of every number; null stands for "infinite" (no error
+    Calibrations: response against response. Refocused planes (made with --camera): depth over the geometric limit. OUT is JSON with the definition of every number; null stands for "infinite" (no error
     at all) or "does not apply".
 
     \b
@@ -40,6 +40,7 @@ def command(ctx, results, output, as_json, **settings):
       plenocli score chart.exr --truth colorchecker --white white1.h5 --white white2.h5 -o score.json
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
+      plenocli score planes.h5 --truth 620mm -o depth.json
     """
     from plenocli.stages.score import run_score, table
 

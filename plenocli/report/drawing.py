@@ -75,9 +75,9 @@ def show_map(axes, values, title="", bar="", **options):
     return image
 
 
-def colour_bar(axes, image, label, **options):
-    """A slim colour bar beside `axes`."""
-    made = axes.figure.colorbar(image, ax=axes, **({"fraction": 0.046, "pad": 0.02} | options))
+def colour_bar(axes, image, label):
+    """A slim colour bar beside `axes`, as high as what they show."""
+    made = axes.figure.colorbar(image, cax=axes.inset_axes((1.025, 0, 0.04, 1)))
     made.outline.set_linewidth(0.4)
     made.set_label(label)
     return made

@@ -34,7 +34,7 @@ def calibration_figures(artefact):
     data = artefact.data
     figures = []
     if "grid/centre" in data:
-        figures.append((calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual")), _grid_caption(artefact)))
+        figures.append((calibration_picture(data.get("white/flat"), data["grid/centre"], data["grid/valid"], data.get("grid/residual"), _predicted(artefact)), _grid_caption(artefact)))
     if "response/F" not in data:
         return figures
     values, window, wavelengths = data["response/F"], tuple(int(n) for n in data["response/window"]), data["response/wavelength"]
@@ -48,10 +48,13 @@ def calibration_figures(artefact):
     return [*figures, (response_picture(values, window, wavelengths), f"Response F of the lenslet in the middle [{units} for unit relative radiance]: pixels that answer to each band.")]
 
 
-def _grid_caption(artefact):
+def _predicted(artefact):
     model = artefact.attrs.get("grid", {}).get("model")
-    predicted = isinstance(model, dict) and model.get("kind") == "description"
-    return "The lenslet grid of the camera's description." if predicted else "The lenslet grid found on the white image."
+    return isinstance(model, dict) and model.get("kind") == "description"
+
+
+def _grid_caption(artefact):
+    return "The lenslet grid of the camera's description." if _predicted(artefact) else "The lenslet grid found on the white image."
 
 
 def dictionary_figures(result, name, history=None, system=None):

@@ -7,10 +7,10 @@ from plenocli.report.drawing import (
 )
 
 
-def calibration_picture(flat, centres, valid, residual=None):
+def calibration_picture(flat, centres, valid, residual=None, predicted=False):
     """The white image (row, column; peak 1 in each superpixel) with the lenslet centres found, and a close-up.
 
-    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None. flat None: the centres alone.
+    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None. flat None: the centres alone. predicted: nobody looked for them.
     """
     centres, valid = np.asarray(centres), np.asarray(valid, dtype=bool)
     found = centres[valid & np.isfinite(centres).all(axis=-1)]
@@ -24,12 +24,12 @@ def calibration_picture(flat, centres, valid, residual=None):
             limits = extent
         else:
             limits = (found[:, 1].min() - 5, found[:, 1].max() + 5, found[:, 0].max() + 5, found[:, 0].min() - 5)
-        colours = np.full(len(found), 0.0) if residual is None else np.asarray(residual)[valid & np.isfinite(centres).all(axis=-1)]
+        colours = np.full(len(found), 0.0) if residual is None or predicted else np.asarray(residual)[valid & np.isfinite(centres).all(axis=-1)]
         size = max(0.8, min(14.0, 5000 / max(len(found), 1)))
         dots = whole.scatter(found[:, 1], found[:, 0], c=np.nan_to_num(colours), s=size, cmap=LEVEL_MAP, linewidths=0)
         whole.set(xlim=limits[:2], ylim=limits[2:], aspect="equal", xlabel="column [px]", ylabel="row [px]",
-                  title=f"{len(found)} lenslets found" + (" on the white image" if flat is not None else ""))
-        if residual is not None:
+                  title=f"{len(found)} lenslets" + (" as described" if predicted else " found" + (" on the white image" if flat is not None else "")))
+        if residual is not None and not predicted:
             colour_bar(whole, dots, "distance from the lattice [px]")
         middle = found[np.argmin(((found - found.mean(axis=0)) ** 2).sum(axis=1))]
         nearest = np.sort(np.hypot(*(found - middle).T))
@@ -91,7 +91,7 @@ def filters_picture(camera):
         pupil.set(xlim=(-1.05 * half, 1.05 * half), ylim=(1.05 * half, -1.05 * half), aspect="equal", xlabel="pupil [mm]", title="filters [nm]")
         for letter, curve in zip(letters, curves, strict=True):
             through.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
-            top = np.argmax(curve) if np.ptp(curve) else len(curve) // 8
+            top = np.argmax(curve) if np.ptp(curve) else len(curve) * 14 // 15
             through.annotate("sensor" if len(letters) == 1 else letter, (wavelengths[top] * 1e9, curve[top]), ha="center", va="bottom", fontsize=7.5)
         through.set(xlim=(400, 700), ylim=(0, 1.05), xlabel="wavelength [nm]", title="transmittance, and quantum efficiency of the sensor")
         through.grid(True)

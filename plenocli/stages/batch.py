@@ -20,7 +20,8 @@ class Batch:
 
 
 def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
-    """Batch of `captures` (paths): one goes to the file `output`, several go to a folder, each to its own name with `suffix`.
+    """Batch of `captures` (paths): one goes to the file `output`, several, or one to a name without a suffix, to a folder, each to its
+    own name with `suffix`.
 
     The folder is made; in it finished results are skipped unless overwrite. what: the result in words, for messages, such
     as "spectra are". inputs: all files that are read, which no result may replace. Errors: UsageError, OutputError.
@@ -28,9 +29,9 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
     from plenocli.artefacts import check_output
 
     captures, output = [Path(c) for c in captures], Path(output)
-    if len(captures) == 1 and not os.path.isdir(output):  # Path.is_dir raises where a name is too long
+    if len(captures) == 1 and output.suffix and not os.path.isdir(output):  # Path.is_dir raises where a name is too long
         if output.suffix not in (".exr", ".h5"):
-            raise UsageError(f"{what} written as .exr or .h5, not {output.suffix or 'without a suffix'}", output, "change the suffix of OUT")
+            raise UsageError(f"{what} written as .exr or .h5, not {output.suffix}", output, "change the suffix of OUT")
         check_output(output, overwrite=overwrite, inputs=inputs)
         jobs = [(captures[0], output)]
         return Batch(output, False, jobs, jobs)

@@ -8,6 +8,7 @@ import numpy as np
 from plenocli.errors import InputError, PlenoError, UsageError
 from plenocli.plain import plain
 from plenocli.stages.progress import note
+from plenocli.stages.score_depth import score_lightfield
 from plenocli.stages.score_inputs import CHART, block_of, read_result, read_truth, read_whites
 from plenocli.stages.score_response import score_calibration
 from plenocli.stages.score_spectra import against_single_pixel, score_spectra
@@ -23,7 +24,8 @@ GROUPS = {
     "classification": ("classification_accuracy", "nearest_patch_accuracy"),
     "single-pixel": ("rmse_over_single_pixel", "six_patch_rmse_over_single_pixel", "delta_e_over_single_pixel", "snr_over_single_pixel_db"),
     "response": ("response_gain_per_band", "response_error_per_band", "response_error_lenslet_per_band", "response_pixel_per_band", "response_leak"),
-    "limits": ("noise_relative", "model_error_relative", "limited_by", "seen_share"),
+    "depth": ("depth_slope", "depth_slope_found", "depth_slope_error", "depth_slope_worst", "depth_sure_share", "sharpest_slope_error", "depth_distance_m", "depth_distance_error_m", "depth_limit_m"),
+    "limits": ("noise_relative", "model_error_relative", "limited_by", "expected_loss_db", "seen_share"),
     "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
     "coherence": (
         "coherence_raw", "coherence_candes_romberg", "coherence_effective", "coherence_effective_mean", "welch_bound",
@@ -121,7 +123,9 @@ class _Context:
 
 def _score_one(path, context):
     """(JSON-able entry, what the report draws) of one result."""
-    result = read_result(path, ("image", "spectra", "dictionary", "calibration"), context.mem_limit)
+    from plenocli.artefacts.limits import require_memory
+
+    result = read_result(path, ("image", "spectra", "dictionary", "calibration", "lightfield"), context.mem_limit)
     entry = {"name": Path(path).name, "kind": result.kind}
     if result.kind == "calibration":
         wavelengths, entry["metrics"] = score_calibration(path, context.truth, context.mem_limit)
@@ -130,6 +134,9 @@ def _score_one(path, context):
         entry["method"] = result.method
     if result.kind == "dictionary":
         entry["metrics"] = _score_dictionary(path, result, context.system)
+    if result.kind == "lightfield":
+        entry["metrics"] = score_lightfield(path, context.truth, context.mem_limit)
+        return entry, None
         return entry, {"result": result}
     if context.truth is None:
         raise UsageError("the truth is missing", path, "name it with --truth: a capture, photograph, spectral EXR, image, spectra or colorchecker")
@@ -224,6 +231,7 @@ _NEEDS = {
 
 def _name_apart(scored, paths):
     """Short labels for the table: file stems, with the folder's name where two stems are equal, else with a number."""
+    "depth": "give planes of refocus --camera",
     stems = [Path(path).stem for path in paths]
     labels = stems if len(set(stems)) == len(stems) else [f"{Path(p).parent.name}/{stem}" for p, stem in zip(paths, stems, strict=True)]
     for number, (entry, label) in enumerate(zip(scored, labels, strict=True), start=1):
@@ -231,11 +239,11 @@ def _name_apart(scored, paths):
 
 
 def _definitions(scored):
-    from plenocli.metrics import classify, coherence, quality, response, snr, spectral
+    from plenocli.metrics import classify, coherence, depth, quality, response, snr, spectral
 
     found = {}
     for entry in scored:
-        home = {"dictionary": [coherence], "image": [quality], "spectra": [spectral]}.get(entry.get("kind"), [])
+        home = {"dictionary": [coherence], "image": [quality], "spectra": [spectral], "lightfield": [depth]}.get(entry.get("kind"), [])
         if entry.get("kind") == "calibration":
             home = [response]
         elif "wavelengths_nm" in entry:

@@ -15,7 +15,7 @@ _CHART_OVERSAMPLING = 20  # chart samples per lenslet and side when the truth of
 class Result:
     """values: (row, column) or (band, row, column) float64; wavelengths (band,) m or None; quantity "" for pictures.
 
-    kind: "image", "spectra", "dictionary" (values are then the atoms) or "calibration" (values are then the response as stored).
+    kind: "image", "spectra", "dictionary" (values are then the atoms), "calibration" (the response as stored) or "lightfield" (planes).
     sigma: like values, or None.
     """
 
@@ -60,6 +60,8 @@ def _from_artefact(path, kinds, mem_limit):
         return Result(path.stem, "dictionary", artefact.data["dictionary/atoms"], attrs=attrs)
     if artefact.kind == "calibration":
         return Result(path.stem, "calibration", artefact.data.get("response/F"), attrs=attrs)
+    if artefact.kind == "lightfield":
+        return Result(path.stem, "lightfield", artefact.data["refocus/value"], attrs=attrs)
     kind = artefact.kind
     data = {part: artefact.data.get(f"{kind}/{part}") for part in ("value", "sigma", "wavelength")}
     values = np.asarray(data["value"], dtype=np.float64)

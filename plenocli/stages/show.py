@@ -9,6 +9,10 @@ import numpy as np
 from plenocli.errors import InputError, UsageError
 
 
+GAP = 30
+"""Pixels between the pictures of one file."""
+
+
 def run_show(files, output=None, *, truth=None, calibration=None, points=(), lenslets=(), overwrite=False, mem_limit=None):
     """Draw `files` into one PNG and return {"output", "files", "kinds", "captions"}.
 
@@ -160,11 +164,11 @@ def stacked(pngs):
     if len(pngs) == 1:
         return pngs[0]
     images = [Image.open(io.BytesIO(png)).convert("RGB") for png in pngs]
-    sheet = Image.new("RGB", (max(i.width for i in images), sum(i.height for i in images)), "white")
+    sheet = Image.new("RGB", (max(i.width for i in images), sum(i.height + GAP for i in images) - GAP), "white")
     top = 0
     for image in images:
         sheet.paste(image, ((sheet.width - image.width) // 2, top))
-        top += image.height
+        top += image.height + GAP
     buffer = io.BytesIO()
     sheet.save(buffer, "png")
     return buffer.getvalue()

@@ -1,5 +1,7 @@
 """`plenocli refocus`: captures of cameras out of focus, the letters of a real camera, wrong requests."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,13 @@ def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distanc
     assert sure.sum() > 10
     assert np.median(data["depth/slope"][3:-3, 3:-3][sure]) == pytest.approx(true, abs=0.25)
     assert abs(data["refocus/slope"][np.argmax(data["refocus/sharpness"])] - true) <= 0.5
+    for number, truth in enumerate((distance.replace(" ", ""), str(capture))):  # told, or what the capture says of its camera
+        assert run(["score", str(out), "--truth", truth, "-o", str(folder / f"{name}-{number}.json")]) == 0
+    told, known = (json.loads((folder / f"{name}-{number}.json").read_text())["metrics"] for number in (0, 1))
+    assert told == known
+    assert told["depth_slope"] == pytest.approx(true, abs=1e-6) and told["depth_slope_error"] < 0.25 and told["depth_sure_share"] > 0.05
+    near = lightfield.distance_of(true + np.array([-0.5, 0.5]), 0.05, 0.055, 352e-6)
+    assert told["depth_limit_m"] == pytest.approx(abs(near[1] - near[0]), rel=0.01) and told["depth_distance_error_m"] < 0.3 * told["depth_limit_m"]
 
 
 def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
@@ -94,3 +103,13 @@ def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
 def test_show_draws_it(folder):
     assert run(["show", str(folder / "550-planes.h5"), "-o", str(folder / "550.png")]) == 0
     assert (folder / "550.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("arguments, code, words", [
+    ([], 2, "--truth 620mm"), (["--truth", "far"], 2, "620mm"), (["--truth", "550mm"], 3, "--camera"), (["--truth", "550mm", "--metric", "psnr"], 3, "--camera")])
+def test_depth_is_not_scored_without_distances(folder, capfd, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(folder)
+    if not (folder / "plain.h5").exists():
+        assert run(["refocus", "550.h5", "-o", "plain.h5"]) == 0
+    assert run(["score", "plain.h5" if len(arguments) > 1 and "mm" in arguments[1] else "550-planes.h5", *arguments, "-o", "never.json"]) == code
+    assert words in capfd.readouterr().err and not (folder / "never.json").exists()

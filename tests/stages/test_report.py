@@ -12,6 +12,7 @@ from plenocli.scene.chart import chart_scene
 from plenocli.stages.report import run_report
 from plenocli.stages.run_folder import RunFolder
 from plenocli.stages.score import run_score
+from tests.reference import browser
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,6 +66,13 @@ def folder(tmp_path_factory):
     spatial(root / "spatial", rng)
     spectral(root / "spectral", rng)
     return root
+
+
+@pytest.fixture(scope="module")
+def page(folder, tmp_path_factory):
+    made = tmp_path_factory.mktemp("page") / "report.html"
+    run_report(folder, made)
+    return made
 
 
 def test_the_page_shows_both_chains(folder, tmp_path):
@@ -158,3 +166,24 @@ def test_responses_are_compared_and_the_filters_of_a_described_camera_drawn(tmp_
     assert "Responses compared" in page and "error of the response, 450 nm" in page and "predicted.h5 less measured.h5" in page
     assert page.count("<figure>") == 1 + 2 + 3  # difference; grid and response of either; filters of the one that is described
     assert page.count("Filters in the pupil of the main lens, seen") == 2  # caption and description of one picture
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium here to open the page in")
+@pytest.mark.parametrize("width, height", [(1280, 900), (390, 844)], ids=["desktop", "phone"])
+def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, height):
+    import io
+
+    from PIL import Image
+
+    pytest.importorskip("tornado")
+    (tmp_path / "profile").mkdir()
+    pictures = "Promise.all([...document.images].map(i => i.decode())).then(() => [...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width]))"
+    seen = browser.look_at(page, width, height, f"{pictures}.then(p => ({{pictures: p, needs: document.documentElement.scrollWidth, has: innerWidth}}))", tmp_path / "profile")
+    assert seen["messages"] == []
+    assert [address for address in seen["requests"] if not address.startswith("data:")] == [page.resolve().as_uri()]
+    assert len(seen["value"]["pictures"]) == 16 and all(natural > 300 and shown > 250 for natural, shown in seen["value"]["pictures"])
+    assert seen["value"]["needs"] <= seen["value"]["has"] == width, "the page scrolls sideways"
+    shot = np.asarray(Image.open(io.BytesIO(seen["png"])).convert("L"))
+    assert shot.shape[1] == width and shot.shape[0] > 4 * height
+    dark = (shot < 128).reshape(len(shot), -1).any(axis=1)
+    assert np.ptp(shot) > 200 and dark.mean() > 0.3 and np.flatnonzero(dark)[-1] > 0.9 * len(shot), "pictures and text from top to bottom"

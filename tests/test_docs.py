@@ -1,0 +1,160 @@
+"""Every command line of the README and of docs, run as it stands and in the order of its page, by bash in a folder of a new user.
+
+What is run: fenced blocks marked `sh`. The files that the pages name as the reader's own, and the cameras of sample_configs, are small ones here.
+"""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plenocli.cli.main import run
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+BLOCKS = {page: re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.S | re.M) for page in PAGES}
+NEEDS = {"lens import": "optiland", "dask ": "distributed", "optimise": "optuna"}
+"""Words of a block -> the module of an extra without which it cannot run."""
+SMALL = {"count = [20, 30]": "count = [12, 18]", "[20, 20]": "[12, 12]", '"80 um"': '"48 um"', '"640 um"': '"384 um"', "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]"}
+SWEEP = {"[5, 6, 8, 10]": "[6, 8]", "[[9, 9], [11, 11], [13, 13], [15, 15], [17, 17]]": "[[9, 9]]", "steps = 5": "steps = 2", '["40 dB", "60 dB"]': '["60 dB"]'}
+
+
+def rewritten(text, changes):
+    for old, new in changes.items():
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.fixture(scope="session")
+def kit(tmp_path_factory):
+    """A folder with what the pages suppose: descriptions, photographs, RAW files of a small camera with four filters, a run to report."""
+    from PIL import Image
+    from skimage import data
+
+    from plenocli.artefacts import read_mosaic
+    from tests.reference.chart import paint_folder
+
+    folder = tmp_path_factory.mktemp("kit")
+    shutil.copytree(ROOT / "sample_configs", folder / "sample_configs")
+    tiny, spectral = ((ROOT / "sample_configs" / f"{name}.toml").read_text() for name in ("tiny", "demo_spectral"))
+    spectral = rewritten(spectral, SMALL)
+    for name, text in {"seed_spatial": tiny, "seed_spatial_250um": tiny, "seed_spectral": spectral, "dslr": spectral.replace("bits = 12", 'bits = 12\ncfa = "RGGB"\ncamera = "Nikon 5100 (NPL)"').replace("quantum_efficiency = 0.55\n", "")}.items():
+        (folder / "sample_configs" / f"{name}.toml").write_text(text)
+    sweep = folder / "sample_configs" / "sweeps" / "lenslets.toml"
+    sweep.write_text(rewritten(sweep.read_text(), SWEEP))
+    (folder / "camera.toml").write_text(spectral)
+
+    (folder / "photos").mkdir()
+    Image.fromarray(data.astronaut()).save(folder / "photo.png")
+    for name in ("camera", "coffee", "chelsea", "coins"):
+        Image.fromarray(getattr(data, name)()).save(folder / "photos" / f"{name}.jpg", quality=95)
+
+    (folder / "captures").mkdir()
+    shots = {"white": ["--target", "white"], "dark": ["--target", "dark"], "captures/chart": ["--target", "colorchecker"], "captures/a": ["--scene", str(folder / "photo.png")],
+             **{f"b{nm}": ["--target", f"mono:{nm}nm"] for nm in (450, 540, 570, 650)}}
+    for seed, (name, what) in enumerate(shots.items()):
+        made = folder / f"{name}.dng"
+        assert run(["capture-sim", str(folder / "camera.toml"), *what, "--model", "fresnel", "--accuracy", "1e-2", "--superpixels", "1x1", "--seed", str(seed), "-o", str(made)]) == 0
+        made.rename(made.with_suffix(".nef"))
+    shutil.copy(folder / "captures" / "a.nef", folder / "capture.nef")
+    Image.fromarray(read_mosaic(folder / "capture.nef").values.astype(np.uint16)).save(folder / "lightfield.png")
+
+    chart = folder / "chart"
+    chart.mkdir()
+    paint_folder(chart)
+    (folder / "triplet.zmx").write_text(ZMX)
+    made = folder / "explore"  # what the other pages made, for the one that goes on from there
+    (made / "captures").mkdir(parents=True)
+    bands = [word for nm in (450, 540, 570, 650) for word in ("--band", f"{nm}nm={folder}/b{nm}.nef")]
+    assert run(["calibrate", "--white", str(folder / "white.nef"), "--dark", str(folder / "dark.nef"), *bands, "-o", str(made / "calibration.h5")]) == 0
+    pif, camera = str(made / "pif.h5"), str(folder / "sample_configs" / "tiny.toml")
+    assert run(["simulate-pif", camera, "--model", "ray", "--superpixels", "1x1", "-o", pif]) == 0
+    for seed, name in enumerate(("capture", "captures/one", "captures/two")):
+        assert run(["capture-sim", camera, "--pif", pif, "--scene", "skimage:coins", "--snr", "50dB", "--seed", str(seed), "-o", str(made / f"{name}.h5")]) == 0
+    (folder / "runs" / "spatial").mkdir(parents=True)
+    shutil.copy(pif, folder / "runs" / "spatial" / "pif.h5")
+    (folder / "Makefile").write_text(f"raw:\n\t$(MAKE) -f {ROOT}/pipelines/raw.mk RUN=runs/raw\n")
+    return folder
+
+
+ZMX = """VERS 140124 258 36214
+MODE SEQ
+UNIT MM X W X CM MR CPMM
+ENPD 10
+WAVM 1 0.55 1
+PWAV 1
+SURF 0
+  CURV 0.0 0 0 0 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  CURV 0.02 0 0 0 0
+  DISZ 4
+  GLAS N-BK7 0 0 1.5168 64.17 0 0 0 0 0 0
+  DIAM 8 1 0 0 1
+SURF 2
+  CURV -0.02 0 0 0 0
+  DISZ 47
+  DIAM 8 1 0 0 1
+SURF 3
+  CURV 0.0 0 0 0 0
+  DISZ 0
+"""
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return str(one.getsockname()[1])
+
+
+def bash(script, folder, timeout):
+    """(exit code, what was printed) of a script; what it left running in the background is ended."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")} | {"PATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    with open(folder / "log", "w+") as log:
+        child = subprocess.Popen(["bash", "-euo", "pipefail", "-x", "-c", script], cwd=folder, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True)
+        try:
+            child.wait(timeout=timeout)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+        log.seek(0)
+        return child.returncode, log.read()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if BLOCKS[page]])
+def test_the_page_runs_as_it_stands(kit, tmp_path, page):
+    folder = tmp_path / "user"
+    shutil.copytree(kit, folder, ignore=shutil.ignore_patterns("explore"))
+    if page == "docs/explore.md":
+        shutil.copytree(kit / "explore", folder, dirs_exist_ok=True)
+    blocks, left = [], []
+    for block in BLOCKS[page]:
+        missing = [module for words, module in NEEDS.items() if words in block and find_spec(module) is None]
+        (left if missing else blocks).append((block, missing))
+    script = "".join(block for block, _ in blocks).replace("8786", free_port())
+    code, log = bash(script, folder, 900)
+    assert code == 0, log[-3000:]
+    if left:
+        pytest.skip("without " + ", ".join(sorted({m for _, missing in left for m in missing})) + f" these were not run: {[block for block, _ in left]}")
+
+
+def test_every_command_line_stands_in_a_block_that_is_run():
+    """Except those that show what cannot be had here: they stand in blocks marked bash or text."""
+    for page in PAGES:
+        if page != "docs/files.md":
+            outside = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+            assert not re.findall(r"^ *(?:plenocli|make) [a-z].*", outside, re.M), page

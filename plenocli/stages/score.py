@@ -121,6 +121,10 @@ class _Context:
         self.sensor_snr = _sensor_snr(capture, mem_limit) if capture else None
 
 
+POINT_BYTES = 128
+"""Memory for each point of a picture that is compared (measured)."""
+
+
 def _score_one(path, context):
     """(JSON-able entry, what the report draws) of one result."""
     from plenocli.artefacts.limits import require_memory
@@ -130,13 +134,13 @@ def _score_one(path, context):
     if result.kind == "calibration":
         wavelengths, entry["metrics"] = score_calibration(path, context.truth, context.mem_limit)
         return entry | {"wavelengths_nm": [round(float(w) * 1e9, 6) for w in wavelengths]}, None
+    if result.kind == "lightfield":
+        entry["metrics"] = score_lightfield(path, context.truth, context.mem_limit)
+        return entry, None
     if result.method:
         entry["method"] = result.method
     if result.kind == "dictionary":
         entry["metrics"] = _score_dictionary(path, result, context.system)
-    if result.kind == "lightfield":
-        entry["metrics"] = score_lightfield(path, context.truth, context.mem_limit)
-        return entry, None
         return entry, {"result": result}
     if context.truth is None:
         raise UsageError("the truth is missing", path, "name it with --truth: a capture, photograph, spectral EXR, image, spectra or colorchecker")
@@ -145,6 +149,7 @@ def _score_one(path, context):
         raise InputError("holds no finite value", context.truth)
     picture = {"result": result, "truth": truth}
     if result.wavelengths is None:
+        require_memory(POINT_BYTES * truth.size, context.mem_limit, "the comparison", path, "score a part of it")
         block = context.block or block_of(result, context.truth, context.system)
         entry["metrics"] = _score_image(path, result, truth, block)
         picture["block"] = block
@@ -155,6 +160,8 @@ def _score_one(path, context):
     limits = result.attrs.get("parameters", {}).get("limits") if isinstance(result.attrs.get("parameters"), dict) else None
     if limits:
         entry["metrics"] |= {"noise_relative": limits["noise"], "model_error_relative": limits["model_error"], "limited_by": limits["limited_by"]}
+        if limits.get("expected_loss_db") is not None:
+            entry["metrics"]["expected_loss_db"] = limits["expected_loss_db"]
     seen = result.attrs.get("parameters", {}).get("seen") if isinstance(result.attrs.get("parameters"), dict) else None
     if seen:
         entry["metrics"]["seen_share"] = seen["share"]
@@ -224,6 +231,7 @@ _NEEDS = {
     "spectral-angle": "give a spectral result",
     "limits": "give a picture that reconstruct made with a --pif of known accuracy",
     "delta-e": "give a spectral result",
+    "depth": "give planes of refocus --camera",
     "classification": "give a spectral result and its --patches, two or more; one of the two numbers needs scikit-learn (plenocli[ml])",
     "single-pixel": "give spectra of demux --method single-pixel among the results",
 }
@@ -231,7 +239,6 @@ _NEEDS = {
 
 def _name_apart(scored, paths):
     """Short labels for the table: file stems, with the folder's name where two stems are equal, else with a number."""
-    "depth": "give planes of refocus --camera",
     stems = [Path(path).stem for path in paths]
     labels = stems if len(set(stems)) == len(stems) else [f"{Path(p).parent.name}/{stem}" for p, stem in zip(paths, stems, strict=True)]
     for number, (entry, label) in enumerate(zip(scored, labels, strict=True), start=1):

@@ -38,8 +38,8 @@ class Lambda(click.ParamType):
 def command(ctx, images, pif, output, resume, overwrite, as_json, **settings):
     """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship with scikit-image, without the astronaut).
 
-    Every fifth picture is held out; the result is compared there with LMMSE, a linear method that learns nothing but a
-    covariance, and says so if it does not win. The dictionary holds its history and what --resume needs.
+    Every fifth picture is held out; the result is compared there with the LMMSE that reconstruct takes of a lenslet by itself
+    (a covariance, and a contrast for every patch), and says so if it does not win. The dictionary holds its history and what --resume needs.
 
     \b
     Examples:

@@ -47,12 +47,6 @@ def lambda_path(dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, p
         yield lam, code
 
 
-def largest_lambda(dictionary, signals, *, weights=None, free=()):
-    """The smallest lambda per signal for which c = 0 (outside `free`): 2 max_j |D_j^T y| / w_j."""
-    problem = prepare(dictionary, signals, 1.0, weights, free)
-    return np.max(np.abs(problem.b) / problem.threshold, axis=1)
-
-
 def noise_lambda(dictionary, sigma, *, weights=None):
     """2 sigma sqrt(2 ln L) max_j |D_j| / w_j: white noise of that standard deviation alone would, for most signals, be coded as zero.
 
@@ -137,19 +131,34 @@ def _active_set(problem, gram, threshold, tol, passes, start, workers):
     return SparseCode(problem.restore(c), objective, gap, done, len(missed))
 
 
-GUESSED = 0.7
-"""Atoms to begin with, as a share of those that the ridge regression determines (its degrees of freedom)."""
+ROUNDS = 14
+"""Of alternating directions in the guess."""
+
+RELAXATION = 1.8
+"""Their over-relaxation."""
+
+CONVERTED = 1.3
+"""Their penalty times a typical |c|, where the threshold is 1: of 0.8 to 5 the one that finds most of the support in few rounds."""
+
+FAINT = 0.1
+"""Directions of D of less power than this times the penalty do not count in the guess."""
+
+GUESSED = 1.2
+"""Atoms to begin with, at most, as a share of those that a ridge regression determines (its degrees of freedom)."""
+
+TOGETHER = 256
+"""Signals guessed together: what belongs to them stays in a core's cache."""
 
 SMALL = 1_000_000
-"""Signals times this must exceed the cube of the rows, or the regression's eigendecomposition costs more than the guess saves."""
+"""Signals times this must exceed the cube of the rows, or the guess's eigendecomposition costs more than it saves."""
 
 
 def _guess(problem, threshold):
-    """Coefficients (signal, atom) to begin with: the largest of a ridge regression, half of which stay, with their sign.
+    """Coefficients (signal, atom) to begin with: a few rounds of alternating directions for all signals at once.
 
-    With c' = threshold c the penalty is 2 |c'|, which has the curvature of a ridge c'^2 / |c'|; three times that of a typical |c'|
-    serves best (measured on photographs through a plenoptic matrix; a third or three times as much costs little). Zero where there
-    are too few signals to pay for it.
+    ADMM converges too slowly on a plenoptic matrix to solve anything, but some rounds, in single precision, find nine tenths of the
+    atoms in use with their sign, for the price of a few products. Zero where there are too few signals to pay for it.
+    Source: Boyd, Parikh, Chu, Peleato & Eckstein, Found. Trends Mach. Learn. 3 (2011) 1, sections 3.4.3 and 6.4.
     """
     count, atoms = problem.b.shape
     c, rows = np.zeros((count, atoms)), problem.d.shape[0]
@@ -157,24 +166,62 @@ def _guess(problem, threshold):
     # both in their own units below, so that squares stay within range
     if count * SMALL < rows**3 or not (unit > 0 and level > np.finfo(float).tiny and 1e-30 < unit * level < 1e30):
         return c
-    scaled = problem.d / threshold / unit
+    scaled, signals = problem.d / threshold / unit, problem.y / level
     energy, basis = np.linalg.eigh(scaled @ scaled.T)
-    inside = (problem.y / level).T @ basis
-    energy, power, ridge = np.maximum(energy, 0), np.mean(inside**2, axis=0), energy[-1]
-    for _ in range(6):
-        determined = np.sum(energy / (energy + ridge))
-        ridge = 3 / (unit * level) / np.sqrt(np.sum(energy * power / (energy + ridge) ** 2) / determined)
-    keep = min(int(GUESSED * np.sum(energy / (energy + ridge))), atoms)
+    energy = np.maximum(energy, 0)
+    penalty, determined = _typical(energy, np.mean((basis.T @ signals) ** 2, axis=1), unit * level)
+    keep = min(int(GUESSED * determined), atoms)
     if not keep:
         return c
-    turned = inside / (energy + ridge) @ basis.T
-    size = np.abs(turned).max()
-    scaled, turned = scaled.astype(np.float32), (turned / size).astype(np.float32)  # a guess need not be exact
-    for first in range(0, count, BLOCK):
-        found = turned[first : first + BLOCK] @ scaled
-        largest = np.argpartition(-np.abs(found), keep - 1, axis=1)[:, :keep]
-        c[first + np.arange(len(found))[:, None], largest] = level * size / unit * np.take_along_axis(found, largest, axis=1) / threshold[largest]
+    used = energy > FAINT * penalty
+    half = np.ascontiguousarray((basis[:, used] / np.sqrt(energy[used] + penalty)).T @ scaled, np.float32)
+    scaled, signals = scaled.astype(np.float32), (unit * level * signals.T).astype(np.float32)
+    for first in range(0, count, TOGETHER):
+        part = slice(first, first + TOGETHER)
+        found = _alternate(signals[part] @ scaled, half)
+        if keep < atoms:
+            size = np.abs(found)
+            found[size < np.partition(size, atoms - keep, axis=1)[:, atoms - keep, None]] = 0
+        np.divide(found, penalty * unit**2 * threshold, out=c[part])
     return c
+
+
+def _typical(energy, power, level):
+    """(penalty, atoms that the data determine), where thresholds are 1 / level: CONVERTED over the coefficients' size.
+
+    energy, power (row,): of the dictionary and of the signals in its singular directions. The size is that of a ridge regression
+    whose ridge has, at three times that size, the slope of the l1 penalty; ridge and size settle each other in a few rounds.
+    """
+    ridge = energy[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for _ in range(6):
+            determined = np.sum(energy / (energy + ridge))
+            ridge = 3 / level / np.sqrt(np.sum(energy * power / (energy + ridge) ** 2) / determined)
+        determined = np.sum(energy / (energy + ridge))
+    return CONVERTED / 3 * ridge, determined if np.isfinite(ridge) else 0
+
+
+def _alternate(right, half):
+    """ROUNDS of ADMM for  min c^T G c / 2 - right c + |c|_1, G + penalty inverted as (I - half^T half) / penalty; penalty times its sparse iterate.
+
+    right: (signal, atom) float32.  half: (row, atom) float32. Everything times the penalty: `total` is the sum of sparse iterate and
+    scaled dual variable, `dual` the part of it within +-1.
+    """
+    total, dual, sparse, ahead, seen = (np.zeros_like(right) for _ in range(5))
+    inner = np.empty((len(right), len(half)), np.float32)
+    for k in range(ROUNDS):
+        np.subtract(sparse, dual, out=ahead)
+        ahead += right
+        np.matmul(ahead, half.T, out=inner)
+        ahead -= np.matmul(inner, half, out=seen)
+        if k:
+            ahead -= sparse
+            ahead *= np.float32(RELAXATION)
+            ahead += total
+        total, ahead = ahead, total
+        np.clip(total, -1, 1, out=dual)
+        np.subtract(total, dual, out=sparse)
+    return sparse
 
 
 def _compiled(solve_signals, gram, problem, threshold, tol, passes, c, done, workers):

@@ -7,7 +7,7 @@ import numpy as np
 
 from plenocli.errors import NumericsError
 from plenocli.solvers import linear, lmmse, nnls, spectral
-from plenocli.solvers.l1 import largest_lambda, sparse_code
+from plenocli.solvers.l1 import sparse_code
 
 EPS = np.finfo(float).eps
 SIZES = ((1, 1), (2, 1), (3, 2), (5, 3), (4, 4), (11, 10), (50, 50), (60, 17))
@@ -80,7 +80,7 @@ def coded(a, y, relative, tol=1e-6):
     Excess: by how much the objective is above the better of no code and least squares, over it: no minimum is. Below 1e-8 of the
     largest lambda the slopes that certify a gap drown in rounding, and the gap, which comes with every code, says so.
     """
-    most = largest_lambda(a, y).max()
+    most = 2 * np.abs(a.T @ y).max()
     lam = relative * (most if most > 0 else 1.0)
     code = sparse_code(a, y, lam, tol=tol, workers=1)
     assert np.isfinite(code.c).all()

@@ -72,6 +72,18 @@ def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
     assert learn(pif, "--iterations", 3, "--seed", 5, "--resume", tmp_path / "a.h5", "-o", tmp_path / "a.h5", "--overwrite") == 0
 
 
+def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(pif, tmp_path):
+    from plenocli.artefacts import read_artefact
+
+    whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
+    assert learn(pif, "--iterations", 20, "--synthesis", "-o", whole) == 0
+    assert learn(pif, "--iterations", 1, "-o", part) == 0
+    for done in range(2, 21):  # each goes on from what the one before left in the file
+        assert learn(pif, "--iterations", done, *(["--synthesis"] if done == 20 else []), "--resume", part, "-o", part, "--overwrite") == 0
+    whole, part = (read_artefact(path, "dictionary").data for path in (whole, part))
+    assert set(whole) == set(part) and all(whole[key].tobytes() == part[key].tobytes() for key in whole)
+
+
 @pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
 def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
     from plenocli.artefacts import write_exr

@@ -1,13 +1,16 @@
-"""One and two workers of a Dask cluster on this machine: captures a second that reconstruct gets through, and the bytes.
+"""One and two workers of a Dask cluster on this machine: what reconstruct gets through, and whether the bytes are those of one process.
 
-python pipelines/benchmarks/cluster.py --run runs/bench-cluster [--config sample_configs/seed_spatial.toml] [--captures 4] [--rounds 2]
+python pipelines/benchmarks/cluster.py --run runs/bench-cluster [--config sample_configs/seed_spatial.toml] [--captures 4] [--rounds 2] [--workers 1 2]
 
-Two clusters, one with a single worker, take turns after a round that warms them (each worker factors the matrix once). CPU time is
-that of the workers: where other programs want the cores too, it says more than the clock.
+Several captures are tasks each; of one capture (--captures 1) batches of its lenslets are. The method is converged non-negative
+least squares, or what stands in METHOD for several captures. Clusters take turns after a round that warms them (each worker factors
+the matrix once); with --rounds 1 there is none. CPU time is that of the workers: where other programs want the cores too, it says
+more than the clock. What was measured is kept in RUN/cluster.json, so that --workers 1 and --workers 2 may run apart.
 """
 
 import argparse
 import hashlib
+import json
 import os
 import signal
 import statistics
@@ -16,7 +19,8 @@ import sys
 import time
 from pathlib import Path
 
-METHOD = ["--method", "nnls", "--nnls-iterations", "300"]
+METHOD = {False: ["--method", "nnls", "--nnls-iterations", "300"], True: ["--method", "nnls"]}
+"""By whether there is one capture alone."""
 
 
 def plenocli(*arguments):
@@ -60,6 +64,7 @@ def main():
     parser.add_argument("--config", default="sample_configs/seed_spatial.toml")
     parser.add_argument("--captures", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     options = parser.parse_args()
     run = options.run.resolve()
     run.mkdir(parents=True, exist_ok=True)
@@ -70,23 +75,28 @@ def main():
         if not capture.exists():
             plenocli("capture-sim", options.config, "--pif", pif, "--scene", "skimage:astronaut", "--snr", "60dB", "--seed", seed, "-o", capture)
 
-    clusters, wall, cpu, bytes_of = {n: Cluster(run, n) for n in (1, 2)}, {1: [], 2: []}, {1: [], 2: []}, set()
+    kept = run / f"cluster-{options.captures}.json"
+    known = json.loads(kept.read_text()) if kept.exists() else {"wall": {}, "cpu": {}, "bytes": []}
+    clusters = {n: Cluster(run, n) for n in options.workers}
     try:
-        for round_ in range(options.rounds + 1):
-            for n in (1, 2) if round_ % 2 else (2, 1):
-                start, spent, out = time.monotonic(), clusters[n].cpu(), run / f"pictures-{n}"
-                plenocli("reconstruct", *captures, "--pif", pif, *METHOD, "--scheduler", clusters[n].known, "--overwrite", "-o", out)
-                bytes_of.add(hashlib.sha256(b"".join(p.read_bytes() for p in sorted(out.iterdir()))).hexdigest())
-                if round_:
-                    wall[n].append(time.monotonic() - start)
-                    cpu[n].append(clusters[n].cpu() - spent)
-                    print(f"{n} worker(s): {wall[n][-1]:.1f} s, CPU {cpu[n][-1]:.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+        for round_ in range(options.rounds + (options.rounds > 1)):
+            for n in options.workers if round_ % 2 else options.workers[::-1]:
+                start, spent, out = time.monotonic(), clusters[n].cpu(), run / (f"pictures-{n}" if len(captures) > 1 else f"picture-{n}.h5")
+                plenocli("reconstruct", *captures, "--pif", pif, *METHOD[len(captures) == 1], "--scheduler", clusters[n].known, "--overwrite", "-o", out)
+                files = sorted(out.iterdir()) if len(captures) > 1 else [out]
+                known["bytes"] = sorted({*known["bytes"], hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()})
+                if round_ or options.rounds == 1:
+                    known["wall"].setdefault(str(n), []).append(time.monotonic() - start)
+                    known["cpu"].setdefault(str(n), []).append(clusters[n].cpu() - spent)
+                    print(f"{n} worker(s): {known['wall'][str(n)][-1]:.1f} s, CPU {known['cpu'][str(n)][-1]:.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
     finally:
         for cluster in clusters.values():
             cluster.close()
-    medians = {n: statistics.median(wall[n]) for n in wall}
-    print(f"{options.captures} captures: {medians[1]:.1f} s with one worker, {medians[2]:.1f} s with two: {medians[1] / medians[2]:.2f} times the throughput; "
-          f"CPU of two over one {statistics.median(cpu[2]) / statistics.median(cpu[1]):.2f}; bytes {'the same' if len(bytes_of) == 1 else 'DIFFER'}")
+    kept.write_text(json.dumps(known, indent=1))
+    wall, cpu = ({n: statistics.median(values) for n, values in known[what].items()} for what in ("wall", "cpu"))
+    if len(wall) > 1:
+        print(f"{options.captures} captures: {wall['1']:.1f} s with one worker, {wall['2']:.1f} s with two: {wall['1'] / wall['2']:.2f} times the throughput; "
+              f"CPU of two over one {cpu['2'] / cpu['1']:.2f}; bytes {'the same' if len(known['bytes']) == 1 else 'DIFFER'}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 from plenocli.operators import BlockToeplitz, to_blocks, to_plane
 from plenocli.solvers.overlap import by_lenslet
 from plenocli.stages import noise_level, per_lenslet, trial
-from plenocli.stages.progress import note
+from plenocli.stages.progress import bar, note
 from plenocli.stages.scene_prior import ScenePrior
 
 NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
@@ -20,10 +20,15 @@ INNER = (slice(1, -1), slice(1, -1))
 
 
 class Estimators:
-    """Solvers for one system matrix (stages.systems.System) under the options of the command (stages.reconstruct.Settings)."""
+    """Solvers for one system matrix (stages.systems.System) under the options of the command (stages.reconstruct.Settings).
 
-    def __init__(self, system, settings):
-        self.system, self.settings, self._trials = system, settings, {}
+    threads: of compiled code, None for all cores. elsewhere: set to send batches of lenslets to other processes, see `in_batches`.
+    """
+
+    elsewhere = None
+
+    def __init__(self, system, settings, threads=None):
+        self.system, self.settings, self.threads, self._trials = system, settings, threads, {}
         self.coupled = len(system.offsets) > 1
         self.overlap = settings.overlap or (3 if self.coupled else 1)
 
@@ -70,7 +75,7 @@ class Estimators:
 
     def alone(self, sigma):
         """Estimators for the own superpixel without neighbours, at the given noise."""
-        one = Estimators(replace(self.system, blocks=self.system.own[None], offsets=np.zeros((1, 2), int)), replace(self.settings, noise_sigma=sigma, overlap=1))
+        one = Estimators(replace(self.system, blocks=self.system.own[None], offsets=np.zeros((1, 2), int)), replace(self.settings, noise_sigma=sigma, overlap=1), self.threads)
         one.svd, one.prior = self.svd, self.prior
         if self.settings.dictionary is not None:
             one.learnt = self.learnt
@@ -95,6 +100,14 @@ class Estimators:
             return x, spread
         x[INNER], _ = self._by_lenslet(method, data, y[INNER], None if truth is None else truth[INNER], report)
         return x, None
+
+    def in_batches(self, solve, z, size, *options):
+        """What solve(camera, batch, *options), a function of stages.per_lenslet, gives for z (row, signal), `size` signals at a time, in
+        their order. Several batches go to elsewhere(solve, batches, options), where it is set."""
+        batches = [z[:, start : start + size] for start in range(0, z.shape[1], size)]
+        if self.elsewhere is not None and len(batches) > 1:
+            return self.elsewhere(solve, batches, options)
+        return [solve(self, batch, *options) for batch in bar(batches, len(batches), "batches of lenslets")]
 
     def noise(self, data, report):
         """Standard deviation of what the estimate of all of the capture takes for noise; the report says which one it is."""
@@ -198,6 +211,6 @@ class Estimators:
             report["rule"] = "isotropic total variation, weight by the error that lmmse expects"
         else:
             taus = wholesensor.schedule(error)
-            picture = wholesensor.plug_and_play(term, to_plane(x, shape), wholesensor.denoiser(self.prior.bands()), taus)
+            picture = wholesensor.plug_and_play(term, to_plane(x, shape), wholesensor.denoiser(self.prior.bands()), bar(taus, len(taus), "rounds"))
             report["rule"] = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
         return to_blocks(picture, shape), spread

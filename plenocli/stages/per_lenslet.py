@@ -1,11 +1,19 @@
 """Methods of reconstruct that look at one lenslet at a time. Each takes (camera, y (pixel, signal), sigma, truth or None, report) and
-returns x (point, signal); camera is the Estimators that asks. The report learns the method's parameters."""
+returns x (point, signal); camera is the Estimators that asks. The report learns the method's parameters.
+
+Where a lenslet takes long, what is the same for all is worked out first, and the lenslets are solved in batches, by a function of
+(camera, batch, ...) that other processes can run.
+"""
 
 import numpy as np
 
 from plenocli.errors import InputError
 from plenocli.stages.progress import note
 
+SPLIT = ("nnls", "dictionary")
+"""Methods whose lenslets are solved in batches."""
+BATCH = {"nnls": 128, "nnls converged": 4, "dictionary": 128}
+"""Lenslets of a batch: some seconds of work. The same however many work, as the last digits depend on it."""
 HINDSIGHT = "oracle: least error against the truth, which no camera has"
 
 
@@ -42,35 +50,51 @@ def tsvd(camera, y, sigma, truth, report):
 
 def nnls(camera, y, sigma, truth, report):
     """Converged, or stopped after settings.nnls_iterations."""
+    svd, steps = camera.svd, camera.settings.nnls_iterations
+    lenslets, points = y.shape[1], svd.vt.shape[1]
+    if not steps and lenslets * points > 50_000:
+        note(f"converged non-negative least squares of {lenslets} lenslets takes about {2 * lenslets * (points / 1600) ** 2.5 / 60:.0f} minutes of CPU; "
+             "--nnls-iterations 300 stops early")
+    found = camera.in_batches(nnls_batch, svd.compress(y), BATCH["nnls" if steps else "nnls converged"])
+    report |= {"kkt_violation": max(kkt for _, kkt in found),
+               "rule": f"stopped after {steps} steps of accelerated projected gradient from 0" if steps else "converged, optimality conditions checked"}
+    return np.concatenate([x for x, _ in found], axis=1)
+
+
+def nnls_batch(camera, z):
+    """(x (point, signal), worst violation of the optimality conditions) of compressed signals z."""
     from plenocli.solvers import nnls
 
-    svd, steps = camera.svd, camera.settings.nnls_iterations
-    matrix, z = svd.s[:, None] * svd.vt, svd.compress(y)
-    if not steps and z.shape[1] * matrix.shape[1] > 50_000:
-        note(f"converged non-negative least squares of {z.shape[1]} lenslets takes about {2 * z.shape[1] * (matrix.shape[1] / 1600) ** 2.5 / 60:.0f} minutes of CPU; "
-             "--nnls-iterations 300 stops early")
-    found = nnls.projected_gradient(matrix, z, steps) if steps else nnls.converged(matrix, z, workers=camera.settings.workers)
-    report |= {"kkt_violation": float(found.kkt.max()),
-               "rule": f"stopped after {steps} steps of accelerated projected gradient from 0" if steps else "converged, optimality conditions checked"}
-    return found.x
+    matrix, steps = camera.svd.s[:, None] * camera.svd.vt, camera.settings.nnls_iterations
+    found = nnls.projected_gradient(matrix, z, steps) if steps else nnls.converged(matrix, z)
+    return found.x, float(found.kkt.max())
 
 
 def dictionary(camera, y, sigma, truth, report):
     """The mean over the mirror images of a learnt dictionary."""
-    from plenocli.solvers.dictionary import averaged
-
-    atoms, paint, attrs = camera.learnt
+    _, _, attrs = camera.learnt
     svd, asked = camera.svd, camera.settings.lam
     scale = float(svd.s[0])
     learnt = float(attrs["parameters"]["sigma"])
     louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
     lam = asked if asked is not None else float(attrs["lambda"]) * louder
     kept = min(svd.rank(), attrs["parameters"].get("directions", len(svd.s)))
-    seen = (svd.s[:kept, None] / scale) * svd.vt[:kept]
-    x, gap, nonzeros = averaged(seen, atoms, svd.compress(y)[:kept] / scale, lam, camera.system.object_shape, synthesis=paint)
+    z = svd.compress(y)[:kept] / scale
+    found = camera.in_batches(dictionary_batch, z, BATCH["dictionary"], lam)
+    nonzeros = sum(n * part.shape[1] for part, _, n in found) / z.shape[1]
     rule = "given" if asked is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder:.3g} for more noise"
-    report |= {"lambda": lam, "rule": rule, "average": "over the mirror images of the dictionary", "worst_gap": gap, "nonzeros": nonzeros}
-    return x
+    report |= {"lambda": lam, "rule": rule, "average": "over the mirror images of the dictionary", "worst_gap": max(gap for _, gap, _ in found), "nonzeros": nonzeros}
+    return np.concatenate([x for x, _, _ in found], axis=1)
+
+
+def dictionary_batch(camera, z, lam):
+    """(x (point, signal), worst gap, mean non-zeros) of compressed signals z (direction, signal), relative to the largest singular value."""
+    from plenocli.solvers.dictionary import averaged
+
+    atoms, paint, _ = camera.learnt
+    svd, kept = camera.svd, len(z)
+    seen = (svd.s[:kept, None] / float(svd.s[0])) * svd.vt[:kept]
+    return averaged(seen, atoms, z, lam, camera.system.object_shape, synthesis=paint, workers=camera.threads)
 
 
 def read_dictionary(path, system, mem_limit=None):

@@ -10,8 +10,9 @@ _EAR = contextvars.ContextVar("ear", default=None)
 
 
 def bar(iterable, total=None, label=""):
-    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, and while `heard` listens."""
-    if quiet or _EAR.get() is not None:
+    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, for a single step, and while
+    `heard` listens."""
+    if quiet or total == 1 or _EAR.get() is not None:
         return _Silent(iterable)
     from tqdm import tqdm
 

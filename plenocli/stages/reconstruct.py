@@ -1,18 +1,18 @@
 """reconstruct: the picture in front of the camera from a capture, per lenslet or with the neighbours."""
 
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
-from plenocli.errors import InputError, UsageError
+from plenocli.errors import InputError, PlenoError, UsageError
 from plenocli.operators import to_blocks, to_plane
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.estimators import Estimators
-from plenocli.stages.progress import note
-from plenocli.stages.scheduler import Here, absolute, open_pool
+from plenocli.stages.per_lenslet import SPLIT
+from plenocli.stages.progress import bar, heard, note
+from plenocli.stages.scheduler import Here, absolute, open_pool, run_all
 from plenocli.stages.superpixels import calibrated, read_superpixels
 from plenocli.stages.systems import read_system
 from plenocli.stages.training import files_of
@@ -40,12 +40,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that the picture of a capture depends on beside it; digests tell files from others of the same name."""
+    """All that the picture of a capture depends on beside it; digests tell files from others of the same name. threads: as in Estimators."""
 
     settings: Settings
     pif: Path | None
     calibration: Path | None
     digests: tuple
+    threads: int | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Solved:
 
 def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, suffix=".h5", scheduler=None, overwrite=False, command=""):
     """Reconstruct every capture; returns a summary dict. Several go to settings.workers processes, or to the Dask cluster of
-    `scheduler` (stages.scheduler).
+    `scheduler` (stages.scheduler); so do batches of the lenslets of a single one, by methods that take long over each.
 
     One capture gives the file `output` (.h5 or .exr), several a folder with one file each; finished ones are skipped unless
     overwrite. One that fails does not stop the others; an error with the worst exit code follows at the end.
@@ -76,12 +77,13 @@ def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, s
     batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
     if not batch.todo:
         return summarise(batch, ())
-    several = batch.several or scheduler is not None
+    split = not batch.several and settings.method in SPLIT
+    workers = settings.workers if split else min(settings.workers, len(batch.todo))
+    pooled = scheduler is not None or workers > 1
     files = describe_inputs({"pif": pif, "calibration": calibration, "dictionary": settings.dictionary})
-    recipe = Recipe(replace(settings, workers=1) if several else settings, pif, calibration, tuple(f["sha256"] for f in files.values()))
-
+    recipe = Recipe(settings, pif, calibration, tuple(f["sha256"] for f in files.values()), 1 if pooled else None)
     if scheduler is not None:
-        named = replace(recipe.settings, dictionary=absolute(settings.dictionary), truth=absolute(settings.truth), training=tuple(map(absolute, settings.training)))
+        named = replace(settings, dictionary=absolute(settings.dictionary), truth=absolute(settings.truth), training=tuple(map(absolute, settings.training)))
         recipe = replace(recipe, settings=named, pif=absolute(pif), calibration=absolute(calibration))
 
     def write(solved, capture, target):
@@ -89,17 +91,36 @@ def run_reconstruct(captures, output, settings, *, pif=None, calibration=None, s
 
     try:
         if pif:  # a broken one ends the run here, before any capture
-            _estimators(recipe) if scheduler is None and (settings.workers == 1 or not several) else read_system(pif, settings.mem_limit, by_band=True)
-        # one capture alone may use all cores for its linear algebra
-        with open_pool(min(settings.workers, len(batch.todo)), scheduler) if several else nullcontext(Here()) as pool:
-            return summarise(batch, outcomes(batch, pool, partial(reconstruct_capture, recipe), write))
+            _estimators(recipe) if split or not pooled else read_system(pif, settings.mem_limit, by_band=True)
+        with open_pool(workers, scheduler) as pool:
+            if split and pooled:
+                _estimators(recipe).elsewhere = partial(_spread, recipe, pool)
+            return summarise(batch, outcomes(batch, Here() if split else pool, partial(reconstruct_capture, recipe), write))
     finally:
         _estimators.cache_clear()
 
 
 @lru_cache(maxsize=1)
 def _estimators(recipe):
-    return Estimators(read_system(recipe.pif, recipe.settings.mem_limit, by_band=True), recipe.settings)
+    return Estimators(read_system(recipe.pif, recipe.settings.mem_limit, by_band=True), recipe.settings, recipe.threads)
+
+
+def _spread(recipe, pool, solve, batches, options):
+    """What `solve` (see Estimators.in_batches) gives for the batches, through the pool, in their order; the first PlenoError is raised."""
+    found = {}
+    with bar(None, len(batches), "batches of lenslets") as progress:
+        for number, result in run_all(pool, ((k, partial(_solve_batch, recipe, solve, options), batch) for k, batch in enumerate(batches))):
+            if isinstance(result, PlenoError):
+                raise result
+            found[number] = result
+            progress.update()
+    return [found[number] for number in range(len(batches))]
+
+
+def _solve_batch(recipe, solve, options, batch):
+    """The task of a batch, in any process; what they share is made once a process. What there is to say, the one that sent it has said."""
+    with heard():
+        return solve(_estimators(recipe), batch, *options)
 
 
 def _check_options(settings, pif, calibration):
@@ -128,7 +149,7 @@ def reconstruct_capture(recipe, capture):
         bands = estimators.system.bands
         blocks, spread, report = estimators.solve(data, _truth(settings.truth, block, data.y.shape[:2], max(1, len(bands))))
         picture, sigma = to_plane(blocks, block), None if spread is None else to_plane(spread, block)
-        report |= _limits(data, estimators.system, report)
+        report |= _limits(data, estimators, report)
         noise = report.get("noise_sigma") or data.sigma
         if noise:
             seen, report["seen"] = estimators.seen(noise)
@@ -136,8 +157,9 @@ def reconstruct_capture(recipe, capture):
     return Solved(np.maximum(picture, 0) if settings.clip else picture, sigma, seen, report, negative, block, bands)
 
 
-def _limits(data, system, report):
-    """{"limits": ...} of a picture: whether the capture's noise or the error of the matrix decides; {} where that is not known."""
+def _limits(data, estimators, report):
+    """{"limits": ...} of a picture: whether the capture's noise or the error of the matrix decides, and what the latter is expected
+    to cost; {} where that is not known."""
     from plenocli.accuracy.limits import what_limits
     from plenocli.artefacts.provenance import file_digest
 

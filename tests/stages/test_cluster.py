@@ -117,6 +117,53 @@ def test_captures_go_to_the_cluster_and_come_back_the_same(cluster, tmp_path, mo
             assert len(found) == 4 and all(p.read_bytes() == (Path(f"{kind}-here") / p.name).read_bytes() for p in found)
 
 
+@pytest.mark.parametrize("method", [["nnls"], ["nnls", "--nnls-iterations", "30"], ["dictionary", "--dictionary", "dictionary.h5"]], ids=["converged", "stopped", "dictionary"])
+def test_batches_of_the_lenslets_of_one_capture_give_the_bytes_of_one_process(cluster, tmp_path, monkeypatch, method):
+    from plenocli.stages import per_lenslet, reconstruct
+
+    known, workers = cluster
+    workers(2)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(per_lenslet, "BATCH", dict.fromkeys(per_lenslet.BATCH, 2))  # nine lenslets: five batches
+    described(tmp_path)
+    assert run(["simulate-pif", "camera.toml", "--model", "fresnel", "--superpixels", "1x1", "-o", "pif.h5"]) == 0
+    assert run(["capture-sim", "camera.toml", "--pif", "pif.h5", "--scene", "skimage:coins", "--snr", "50dB", "-o", "view.h5"]) == 0
+    if method[0] == "dictionary":
+        assert run(["learn-dict", "skimage:camera", "skimage:brick", "--pif", "pif.h5", "--iterations", "1", "--atoms", "20", "--batch", "60", "-o", "dictionary.h5"]) == 0
+    spread, send = [], reconstruct._spread
+    monkeypatch.setattr(reconstruct, "_spread", lambda recipe, pool, solve, batches, options: spread.append(batches) or send(recipe, pool, solve, batches, options))
+    for name, options in {"here": [], "there": ["--scheduler", str(known)], "beside": ["--workers", "2"]}.items():
+        assert run(["reconstruct", "view.h5", "--pif", "pif.h5", "--method", *method, *options, "-o", f"{name}.h5"]) == 0
+    assert [len(batches) for batches in spread] == [5, 5], "only the two with workers send batches out"
+    assert len({Path(f"{name}.h5").read_bytes() for name in ("here", "there", "beside")}) == 1
+
+
+def test_a_worker_killed_over_a_batch_of_lenslets_loses_nothing(cluster, tmp_path):
+    from distributed import Client
+
+    known, workers = cluster
+    alive = {p.pid: p for p in workers(2)}
+    text = (ROOT / "sample_configs" / "tiny.toml").read_text()
+    (tmp_path / "camera.toml").write_text(text.replace("[8, 8]", "[14, 14]").replace("[5, 5]", "[8, 8]"))
+    pif, view = str(tmp_path / "pif.h5"), str(tmp_path / "view.h5")
+    assert run(["simulate-pif", str(tmp_path / "camera.toml"), "--model", "fresnel", "--superpixels", "1x1", "-o", pif]) == 0
+    assert run(["capture-sim", str(tmp_path / "camera.toml"), "--pif", pif, "--scene", "skimage:coins", "--snr", "50dB", "-o", view]) == 0
+    command = ["reconstruct", view, "--pif", pif, "--method", "nnls"]
+    assert run([*command, "-o", str(tmp_path / "here.h5")]) == 0
+    with open(tmp_path / "log", "w") as log, Client(scheduler_file=str(known), set_as_default=False) as client:
+        child = subprocess.Popen([sys.executable, "-m", "plenocli", *command, "--scheduler", str(known), "-o", str(tmp_path / "there.h5")], stderr=log, stdout=log,
+                                 env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])})
+        busy, deadline = [], time.monotonic() + 120
+        while not busy and child.poll() is None and time.monotonic() < deadline:
+            pids = client.run(os.getpid)
+            busy = [pids[address] for address, tasks in client.processing().items() if tasks and address in pids]
+        assert busy, "the batches were over before anyone could be killed"
+        os.killpg(busy[0], signal.SIGKILL)
+        alive[busy[0]].wait()
+        assert child.wait(timeout=300) == 0, (tmp_path / "log").read_text()
+    assert (tmp_path / "there.h5").read_bytes() == (tmp_path / "here.h5").read_bytes()
+
+
 def test_one_capture_and_a_bad_one_on_the_cluster(cluster, tmp_path, capsys):
     known, workers = cluster
     workers(1)

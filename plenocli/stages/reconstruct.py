@@ -165,8 +165,8 @@ def _limits(data, estimators, report):
 
     sigma = report.get("noise_sigma") or data.sigma
     signal = float(np.sqrt(np.mean(np.square(data.y))))
-    same = data.matrix is not None and data.matrix == file_digest(system.path)
-    found = what_limits(sigma / signal if sigma and signal else None, system.accuracy, data.accuracy, same)
+    same = data.matrix is not None and data.matrix == file_digest(estimators.system.path)
+    found = what_limits(sigma / signal if sigma and signal else None, estimators.system.accuracy, data.accuracy, same)
     return {} if found is None else {"limits": found}
 
 

@@ -1,6 +1,6 @@
 # Algorithm 1 of the paper at its full size: 40x40 points, 1600 atoms, 6400 patches an iteration.
 #   make -f pipelines/dictionary.mk RUN=runs/mine ITERATIONS=100 TRAINING=photographs/
-# Every iteration prints a line; report.html draws the history. `ablation` learns once more without the incoherence term.
+# Every iteration prints a line; stopped anywhere, the next make goes on after the last one. report.html draws the history. `ablation` learns once more without the incoherence term.
 CONFIG ?= sample_configs/seed_spatial.toml
 ITERATIONS ?= 20
 SNR ?= 60dB
@@ -11,7 +11,7 @@ SEED ?= 3
 
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
-COMMON = $(TRAINING) --pif $(RUN)/pif.h5 $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed $(SEED) --synthesis $(LEARN)
+COMMON = $(TRAINING) --pif $(RUN)/pif.h5 $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed $(SEED) --synthesis --checkpoint $(@D)/unfinished.h5 $(LEARN)
 
 all: $(RUN)/report.html
 ablation: $(RUN)/without-delta/report.html

@@ -29,13 +29,14 @@ class Lambda(click.ParamType):
 @click.option("--gradient-steps", type=click.IntRange(0), default=0, show_default=True, help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.")
 @click.option("--synthesis", is_flag=True, help="Also regress atoms that paint what the learnt ones code; reconstruct uses them.")
 @click.option("--resume", type=options.FILE, help="Go on from this dictionary; the result equals that of one long run.")
+@click.option("--checkpoint", type=options.FILE, help="Keep the state here after every iteration, and go on from it if there is one: the same command, given again after an interruption, loses no more than an iteration. Removed at the end.")
 @options.seed
 @click.option("--workers", type=click.IntRange(1, 1024), default=None, help="Threads of the compiled solver; default all cores. The result does not depend on it.")
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, images, pif, output, resume, overwrite, as_json, **settings):
+def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **settings):
     """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship with scikit-image, without the astronaut).
 
     Every fifth picture is held out; the result is compared there with the LMMSE that reconstruct takes of a lenslet by itself
@@ -49,7 +50,7 @@ def command(ctx, images, pif, output, resume, overwrite, as_json, **settings):
     """
     from plenocli.stages.learn_dict import Settings, run_learn_dict
 
-    report = run_learn_dict(images, output, Settings(**settings), pif=pif, resume=resume, overwrite=overwrite, command=options.command_line(ctx))
+    report = run_learn_dict(images, output, Settings(**settings), pif=pif, resume=resume, checkpoint=checkpoint, overwrite=overwrite, command=options.command_line(ctx))
     verdict = "above" if report["beats_lmmse"] else "NOT above"
     line = (f"{output}: {report['atoms']} atoms, {report['iterations']} iterations, lambda {report['lambda']:.2e}, held out {report['validation_psnr_db']:.2f} dB, "
             f"averaged over mirror images {report['averaged_psnr_db']:.2f} dB, {verdict} LMMSE {report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest {report['coherence']['coherence_effective']:.3f}, "

@@ -38,11 +38,12 @@ class Settings:
     mem_limit: int | None = None
 
 
-def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=False, command=""):
+def run_learn_dict(images, output, settings, *, pif, resume=None, checkpoint=None, overwrite=False, command=""):
     """Learn, or go on learning from `resume`, and write a dictionary artefact; returns a summary dict.
 
     `settings.iterations` counts all iterations, those of `resume` included, so that an interrupted run and its
-    continuation end with the same atoms as one that was left alone.
+    continuation end with the same atoms as one that was left alone. checkpoint: a file that keeps the state after every
+    iteration, from which the run goes on where there is one; removed at the end.
     """
     from plenocli.artefacts import check_output
     from plenocli.solvers.dictionary import Learner
@@ -50,11 +51,15 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
 
     files = files_of(images)
     check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])], suffixes=(".h5",))
+    kept = checkpoint is not None and Path(checkpoint).exists()
+    if checkpoint is not None:
+        check_output(checkpoint, overwrite=True, inputs=[pif, output, *(files or ()), *([resume] if resume else [])], suffixes=(".h5",))
+        resume = checkpoint if kept else resume
     system = read_system(pif, settings.mem_limit)
     pictures = read_training(images, system.object_shape)
     training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))
     earlier = _read_resume(resume, system) if resume else None
-    chosen = _resolve(settings, system, earlier)
+    chosen = _resolve(settings, system, earlier, same=kept)
     names = sorted({Path(n).name for n, _ in training})
     if earlier and names != earlier[2]:
         raise UsageError(f"the resumed dictionary was trained on {', '.join(earlier[2])}", "--resume", "give the same pictures")
@@ -69,30 +74,36 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, overwrite=Fals
     state = earlier[0] if earlier else machine.start()
     if state.iteration > settings.iterations:
         raise UsageError(f"{Path(resume).name} has done {state.iteration} iterations, more than {settings.iterations}", "--iterations", "ask for more")
+    origin = dict(command=command, pif=pif, files=files, seed=chosen.seed, names=[n for n, _ in training], held=[n for n, _ in held])
     for _ in bar(range(settings.iterations - state.iteration), settings.iterations - state.iteration, "iterations"):
         state = machine.step(state)
         _tell(state)
+        if checkpoint is not None:
+            _write(checkpoint, state, None, machine, chosen, system, {}, origin, True)
     synthesis = machine.synthesis(state) if settings.synthesis else None
     summary = _judge(machine, state, synthesis, svd, training, chosen)
-    _write(output, state, synthesis, machine, chosen, system, summary, dict(
-        command=command, pif=pif, files=files, resume=None, seed=chosen.seed, names=[n for n, _ in training], held=[n for n, _ in held]), overwrite)
+    _write(output, state, synthesis, machine, chosen, system, summary, origin, overwrite)
+    if checkpoint is not None:
+        Path(checkpoint).unlink(missing_ok=True)
+    if not summary["beats_lmmse"]:
+        note(f"the dictionary does NOT beat LMMSE with a contrast for every patch on held-out pictures ({summary['averaged_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} dB): "
+             "reconstruct --method lmmse is the better choice")
     return summary | {"output": str(output)}
 
 
-def _resolve(settings, system, earlier):
-    """solvers.dictionary.Settings from the command line and, for a resumed run, from the file."""
+def _resolve(settings, system, earlier, same=False):
+    """solvers.dictionary.Settings from the command line and, for a resumed run, from the file. same: defaults may not differ either."""
     from plenocli.solvers import dictionary
 
     points = int(np.prod(system.object_shape))
     if earlier:
         stored = dictionary.Settings(**earlier[1])
-        wanted = {"atoms": settings.atoms, "batch": settings.batch, "lam": settings.lam}
+        wanted = {name: getattr(settings, name) for name in ("atoms", "batch", "lam") if getattr(settings, name) not in (None, "noise")}
+        wanted |= {name: getattr(settings, name) for name in ("delta", "snr_db", "seed", "initial", "gradient_steps") if same or getattr(settings, name) != getattr(Settings, name)}
         for name, value in wanted.items():
-            if value is not None and value != "noise" and value != getattr(stored, name):
-                raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
-        for name, value in (("delta", settings.delta), ("snr_db", settings.snr_db), ("seed", settings.seed), ("initial", settings.initial), ("gradient_steps", settings.gradient_steps)):
-            if value != getattr(stored, name) and value != getattr(Settings, name):
-                raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", "--resume", "leave the option out")
+            if value != getattr(stored, name):
+                raise UsageError(f"the resumed dictionary was learnt with {name} = {getattr(stored, name)}, not {value}", *(
+                    ("--checkpoint", "give the same options, or remove the file") if same else ("--resume", "leave the option out")))
         return stored
     atoms = settings.atoms or points
     return dictionary.Settings(atoms, settings.batch or 4 * atoms, settings.lam, settings.delta, settings.snr_db, settings.seed, settings.initial, gradient_steps=settings.gradient_steps)
@@ -161,22 +172,21 @@ def _judge(machine, state, synthesis, svd, training, chosen):
 
 
 def _write(output, state, synthesis, machine, chosen, system, summary, origin, overwrite):
+    """The artefact of a state; summary: of `_judge`, {} where the run goes on."""
     from dataclasses import asdict
 
     from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact
 
-    measures = summary["coherence"]
     data = {"dictionary/atoms": state.atoms} | ({} if synthesis is None else {"dictionary/synthesis": synthesis})
     data |= {f"dictionary/history/{name}": np.array(values) for name, values in state.history.items()}
     data |= {f"dictionary/state/{name}": value for name, value in state.save().items()}
     attrs = {"delta": chosen.delta, "lambda": chosen.lam, "object_shape": list(system.object_shape), "iterations": state.iteration, "scale": machine.scale,
-             "coherence_effective": measures["coherence_effective"], "coherence_average": measures["coherence_effective_mean"],
-             "coherence_raw": measures["coherence_raw"], "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
-             "coherence_welch": measures["welch_bound"], "coherence": measures,
              "parameters": {"settings": asdict(chosen), "sigma": machine.sigma, "directions": len(machine.seen), "training": sorted({Path(n).name for n in origin["names"]}), "validation": sorted({Path(n).name for n in origin["held"]})},
              "notes": {k: summary[k] for k in ("validation_psnr_db", "averaged_psnr_db", "lmmse_psnr_db", "beats_lmmse", "worst_gap") if k in summary}}
+    if summary:
+        measures = summary["coherence"]
+        attrs |= {"coherence_effective": measures["coherence_effective"], "coherence_average": measures["coherence_effective_mean"], "coherence_raw": measures["coherence_raw"],
+                  "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]), "coherence_welch": measures["welch_bound"], "coherence": measures}
     attrs = {k: v for k, v in attrs.items() if v is not None}
     provenance = Provenance(origin["command"], describe_inputs({"pif": origin["pif"], "image": origin["files"]}), origin["seed"])
     write_artefact(output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite)
-    if not summary["beats_lmmse"]:
-        note(f"the dictionary does NOT beat LMMSE with a contrast for every patch on held-out pictures ({summary['averaged_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} dB): reconstruct --method lmmse is the better choice")

@@ -84,6 +84,50 @@ def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(
     assert set(whole) == set(part) and all(whole[key].tobytes() == part[key].tobytes() for key in whole)
 
 
+def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkeypatch, capsys):
+    from plenocli.solvers.dictionary import Learner
+
+    whole, rest, kept = tmp_path / "whole.h5", tmp_path / "rest" / "whole.h5", tmp_path / "kept.h5"
+    rest.parent.mkdir()
+    step, taken = Learner.step, []
+
+    def breaking(self, state):
+        taken.append(state.iteration)
+        if len(taken) == 4:
+            raise KeyboardInterrupt
+        return step(self, state)
+
+    assert learn(pif, "--iterations", 6, "-o", whole) == 0
+    monkeypatch.setattr(Learner, "step", breaking)
+    assert learn(pif, "--iterations", 6, "--checkpoint", kept, "-o", rest) != 0
+    assert not rest.exists() and kept.exists()
+    assert learn(pif, "--iterations", 6, "--checkpoint", kept, "--delta", 0, "-o", rest) == 2
+    assert learn(pif, "--iterations", 6, "--checkpoint", kept, "--seed", 1, "-o", rest) == 2
+    capsys.readouterr()
+    assert learn(pif, "--iterations", 6, "--checkpoint", kept, "-o", rest) == 0
+    assert taken == [0, 1, 2, 3, 3, 4, 5] and not kept.exists()
+    from plenocli.artefacts import read_artefact
+
+    one, other = (read_artefact(path, "dictionary") for path in (whole, rest))
+    assert set(one.data) == set(other.data) and all(one.data[key].tobytes() == other.data[key].tobytes() for key in one.data)
+    for name in ("parameters", "notes", "coherence"):
+        assert one.attrs["dictionary"][name] == other.attrs["dictionary"][name]
+
+
+def test_a_checkpoint_with_other_defaults_is_not_taken(pif, tmp_path, monkeypatch):
+    from plenocli.solvers.dictionary import Learner
+
+    kept = tmp_path / "kept.h5"
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "synthesis", lambda *_: 1 / 0)
+        assert learn(pif, "--iterations", 1, "--delta", 0, "--synthesis", "--checkpoint", kept, "-o", tmp_path / "d.h5") != 0
+    assert kept.exists()
+    assert learn(pif, "--iterations", 1, "--checkpoint", kept, "-o", tmp_path / "d.h5") == 2  # the default delta is another
+    assert learn(pif, "--iterations", 1, "--checkpoint", kept, "-o", kept) == 2
+    assert learn(pif, "--iterations", 1, "--checkpoint", pif, "-o", tmp_path / "d.h5") == 4
+    assert learn(pif, "--iterations", 1, "--delta", 0, "--checkpoint", kept, "-o", tmp_path / "d.h5") == 0
+
+
 @pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
 def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
     from plenocli.artefacts import write_exr

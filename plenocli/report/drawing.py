@@ -24,7 +24,7 @@ _STYLE = {
     "xtick.labelcolor": "#444444", "ytick.labelcolor": "#444444", "xtick.major.width": 0.6, "ytick.major.width": 0.6,
     "xtick.major.size": 3, "ytick.major.size": 3, "axes.grid": False, "grid.color": "#e3e3e3", "grid.linewidth": 0.6,
     "lines.linewidth": 1.4, "axes.axisbelow": True, "figure.facecolor": "white", "savefig.facecolor": "white",
-    "image.cmap": LEVEL_MAP, "mathtext.default": "regular",
+    "figure.constrained_layout.w_pad": 0.07, "figure.constrained_layout.wspace": 0.03, "image.cmap": LEVEL_MAP, "mathtext.default": "regular",
 }
 
 

@@ -95,9 +95,9 @@ def spectra_figures(result, name, lenslets=None):
 
 def image_figures(result, name, seen=None):
     """One picture without truth, and where it is known what of each lenslet's object the sensor sees, (object_row, object_column)."""
-    from plenocli.report.pictures import picture
+    from plenocli.report.pictures import picture, seen_map
 
     figures = [(picture(result.values, name), f"{name}{': ' + result.method if result.method else ''}; no truth to compare with.")]
     if seen is not None:
-        figures.append((picture(seen, "seen"), f"What the sensor tells apart of the object under a lenslet: {seen.mean():.0%} of its directions; black lies in the null space."))
+        figures.append((seen_map(seen), f"What the sensor tells apart of the object under a lenslet: {seen.mean():.0%} of its directions; 0 lies in the null space."))
     return figures

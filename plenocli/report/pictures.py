@@ -232,6 +232,14 @@ def picture(values, title=""):
     return made.png
 
 
+
+def seen_map(share):
+    """What of a lenslet's object the sensor tells apart, 0 to 1, by object point (row, column)."""
+    with drawing(4.6, 3.8) as made:
+        axes = made.figure.subplots()
+        show_map(axes, share, "seen of the object under a lenslet", "share that is told apart, by object point", cmap=LEVEL_MAP, vmin=0, vmax=1)
+    return made.png
+
 def method_bars(documents):
     """PSNR of every method, one colour an experiment: documents is a sequence of (name, entries of a score document)."""
     methods = list(dict.fromkeys(entry["label"] for _, entries in documents for entry in entries))

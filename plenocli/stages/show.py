@@ -1,6 +1,7 @@
 """show: one picture of a file, or of several: artefacts, EXR, RAW and photographs."""
 
 import io
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import numpy as np
 from plenocli.errors import InputError, UsageError
 
 
-GAP = 30
-"""Pixels between the pictures of one file."""
+CAPTION, LINE = 16, 24
+"""Height of a letter and of a line of a caption, pixels."""
 
 
 def run_show(files, output=None, *, truth=None, calibration=None, points=(), lenslets=(), overwrite=False, mem_limit=None):
@@ -36,7 +37,7 @@ def run_show(files, output=None, *, truth=None, calibration=None, points=(), len
         figures = [figure for file, (kind, artefact) in zip(files, found) for figure in _FIGURES[kind](Path(file), artefact, choice)]
     if not figures:
         raise InputError("holds nothing that can be drawn", files[0], "inspect shows what it holds")
-    publish(output, stacked([png for png, _ in figures]), overwrite=overwrite)
+    publish(output, stacked(figures), overwrite=overwrite)
     return {"output": str(output), "files": [str(f) for f in files], "kinds": kinds, "captions": [caption for _, caption in figures]}
 
 
@@ -157,18 +158,23 @@ def _compared(files, truth, mem_limit):
     return figures
 
 
-def stacked(pngs):
-    """One PNG of several, below each other on white."""
-    from PIL import Image
+def stacked(figures):
+    """One PNG of several (PNG, caption), below each other on white, each under its caption."""
+    from matplotlib.font_manager import findfont
+    from PIL import Image, ImageDraw, ImageFont
 
-    if len(pngs) == 1:
-        return pngs[0]
-    images = [Image.open(io.BytesIO(png)).convert("RGB") for png in pngs]
-    sheet = Image.new("RGB", (max(i.width for i in images), sum(i.height + GAP for i in images) - GAP), "white")
-    top = 0
-    for image in images:
-        sheet.paste(image, ((sheet.width - image.width) // 2, top))
-        top += image.height + GAP
+    font = ImageFont.truetype(findfont("DejaVu Sans"), CAPTION)
+    images = [Image.open(io.BytesIO(png)).convert("RGB") for png, _ in figures]
+    width = max(image.width for image in images)
+    captions = [textwrap.wrap(caption, max(20, int(width / (0.56 * CAPTION)))) for _, caption in figures]
+    heights = [len(lines) * LINE + LINE // 2 for lines in captions]
+    sheet = Image.new("RGB", (width, sum(i.height for i in images) + sum(heights) + LINE * (len(images) - 1)), "white")
+    pen, top = ImageDraw.Draw(sheet), 0
+    for image, lines, height in zip(images, captions, heights):
+        for number, line in enumerate(lines):
+            pen.text((10, top + 6 + number * LINE), line, fill="#5b6670", font=font)
+        sheet.paste(image, ((width - image.width) // 2, top + height))
+        top += height + image.height + LINE
     buffer = io.BytesIO()
     sheet.save(buffer, "png")
     return buffer.getvalue()

@@ -75,8 +75,11 @@ def test_stacking_keeps_every_picture():
         Image.new("RGB", (width, height), (value,) * 3).save(buffer, "png")
         return buffer.getvalue()
 
-    sheet = np.asarray(Image.open(io.BytesIO(stacked([png(10, 4, 3), png(90, 6, 2)]))))[..., 0]
-    assert sheet.shape == (5, 6) and (sheet[:3, 1:5] == 10).all() and (sheet[3:] == 90).all() and (sheet[:3, [0, 5]] == 255).all()
+    sheet = np.asarray(Image.open(io.BytesIO(stacked([(png(10, 200, 30), "the first"), (png(90, 300, 20), "")]))))[..., 0]
+    (top, left), (bottom, right) = np.argwhere(sheet == 10).min(axis=0), np.argwhere(sheet == 10).max(axis=0)
+    assert (bottom - top + 1, right - left + 1) == (30, 200) and left == 50 and (sheet[top : bottom + 1, left : right + 1] == 10).all()
+    assert sheet.shape[1] == 300 and (sheet[-20:] == 90).all() and (sheet[bottom + 1 : -20] == 255).all()
+    assert 0 < (sheet[:top] < 200).mean() < 0.2, "the caption, above its picture"
 
 
 @pytest.mark.parametrize("arguments, code, message", [

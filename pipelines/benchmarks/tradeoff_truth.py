@@ -1,8 +1,8 @@
 """The cameras of the measured trade of accuracy against time, and three of their columns by brute force, kept as files.
 
 The columns are those of the points at the corner, at the middle of an edge and at the centre of a lenslet. Paraxial sums take
-every pixel of up to sixteen superpixels. Exact ones, in which every node of the lenslets sends its wave to every node of the sensor,
-take as many pixels of the own superpixel, spread over it, as they can afford. Nothing here shares code with plenocli.optics.
+every pixel of up to sixteen superpixels. Exact ones, in which every node of the lenslets sends its wave to every node of the sensor
+(summed as matrix products, rayleigh.rayleigh_products), take as many pixels of the own superpixel, spread over it, as they can afford. Nothing here shares code with plenocli.optics.
 """
 
 import hashlib
@@ -21,10 +21,11 @@ from tests.reference import rayleigh  # noqa: E402
 from tests.reference.fresnel import sensor_nodes  # noqa: E402
 from tests.reference.window import _disc, _Rule, energies  # noqa: E402
 
-WAVES, FLOPS = 5e7, 2e10
-"""Values of the exact kernel, and operations in products, a second of one core: to say beforehand how long the sums take."""
-AFFORDED = 5e9, 1e9
-"""Values of the exact kernel that a camera's columns may take: with up to nine lenslets, and with more."""
+WAVES, FLOPS = 1e9, 2e10
+"""Values of the exact kernel (as summed by rayleigh.rayleigh_products), and operations in products, a second of one core: to say
+beforehand how long the sums take."""
+AFFORDED = 5e9, 4e10
+"""Values of the exact kernel that a camera's columns may take: of isolated lenslets, and with neighbours."""
 FEW = 12
 """Pixels that an exact column is compared on at the least."""
 SMALL = {"object.samples_per_lenslet": (16, 16)}
@@ -159,13 +160,15 @@ class Truth:
 
     def _pixel_nodes(self):
         """Nodes per pixel for fringes from opposite ends of the coherent window (or of one lenslet), to 1e-10; where lenslets hold
-        many diffraction cells, of lenslets up to five apart: those further apart make too little of them (1e-7 of a column)."""
+        many diffraction cells, of lenslets up to five apart: those further apart make too little of them (1e-7 of a column; from three
+        apart less than 1e-5, which does for the few accuracies that exact sums of many cells are affordable at)."""
         camera, sensor = self.camera, self.camera.sensor
         cell = camera.lenslet_array.pitch * sensor.pixel_pitch / (camera.light.wavelengths[0] * sensor.distance)
         if self.window is None:
             return math.ceil(1.7 * cell + 9)
         across = 2 * self.window + 1
-        return math.ceil(1.7 * cell * (across if cells(camera) < 15 else min(across, 5)) + 5)
+        most = across if cells(camera) < 15 else 3 if self.model == "exact" and cells(camera) > 50 else 5
+        return math.ceil(1.7 * cell * min(across, most) + 5)
 
     def _image_points(self):
         rows, columns = self.camera.object.samples_per_lenslet
@@ -187,7 +190,7 @@ class Truth:
         rows = sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
         if self.model != "exact":
             return rows, None
-        most = int(AFFORDED[(self.window or 0) > 1] / self._values_per_pixel() / len(rows))
+        most = int(AFFORDED[self.window is not None] / self._values_per_pixel() / len(rows))
         return (rows, None) if most >= across else (rows, sorted({int(across * (i + 0.5) / most) for i in range(most)}))
 
     def _values_per_pixel(self):
@@ -222,7 +225,9 @@ class Truth:
                 lens = rayleigh.lens_phase(array.profile, array.focal_length, y, x, k) * wy[:, None] * wx
                 y, x = y + row * array.pitch, x + column * array.pitch
                 fields = np.array([wave(point, y, x) for point in self._image_points()])
-                total = total + rayleigh.rayleigh_sum(fields * lens, y, x, v, u, sensor.distance, k)
+                # rows of pixels by themselves: the shorter the intervals, the fewer products
+                sums = [rayleigh.rayleigh_products(fields * lens, y, x, line, u, sensor.distance, k) for line in np.split(v, len(self.rows))]
+                total = total + np.concatenate(sums, axis=1)
         energy = np.abs(total) ** 2 * wv[:, None] * wu
         return energy.reshape(3, len(self.rows), nodes, len(across), nodes).sum(axis=(2, 4))
 

@@ -24,6 +24,8 @@ ROUNDING = {False: 3e-7, True: 3e-10}
 """Error of a column from rounding in single and double precision (measured)."""
 BAND_SHARE = 0.5
 """Share of the accuracy that the wavelengths of a band may use up."""
+STEPS = 6
+"""Halvings, on a logarithmic scale, of the range in which the finest accuracy that can be reached is sought."""
 SHARE = 0.2
 """Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
 
@@ -163,6 +165,8 @@ def _consider(request, rung):
         tried.append(_sized(request, rung, ring, split, nodes))
         if tried[-1].why is None:
             return tried[-1]
+        if not math.isfinite(tried[-1].error):  # nor with more rings
+            break
     # none serves: the fewest rings that come as near as any
     least = min(c.error for c in tried)
     return next(c for c in tried if c.error <= 1.1 * least)
@@ -195,7 +199,7 @@ def _sized(request, rung, ring, split, nodes):
     try:
         bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in _finest(request, nodes))
     except NumericsError as error:
-        return Candidate(rung.name, rung.model, str(error))
+        return Candidate(rung.name, rung.model, error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
     if nodes:
@@ -220,25 +224,56 @@ def _cheapest(found):
 
 def _fall_back(request, found):
     """Where nothing serves: the best there is for a default accuracy, exit 5 for one that was asked for."""
-    possible = [c for c in found if math.isfinite(c.error)]
-    if not possible:
+    asked, possible = request.accuracy, [c for c in found if math.isfinite(c.error)]
+    least = min((math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible), default=math.inf)
+    reached, again, best = _finest_served(request, found, max(asked, min(1.3 * least + 1.1 * BEST_ACCURACY, 0.99)))
+    if best is None:
         reasons = "; ".join(f"{c.name}: {c.why}" for c in found)
         raise NumericsError(f"no model serves this camera ({reasons})", "model", "change the camera, or leave --model at auto")
-    best = min(possible, key=lambda c: c.error)
-    reachable = 1.3 * math.hypot(*(v for k, v in best.split.items() if k != "sampling")) + 1.1 * BEST_ACCURACY
+    why = next(c.why for c in found if c.name == best.name)
     if request.explicit:
-        advice = f"ask for {reachable:.1g} or coarser"
+        advice = f"ask for {reached:.2g} or coarser"
         if request.model == "auto" and best.split["model"] > 0.5 * best.error:
             advice += f", or name a model (--model {best.model}) to ask for accuracy within that model only"
-        raise NumericsError(f"accuracy {request.accuracy:g} cannot be reached: the best is about {reachable:.1g} ({best.name}: {best.why})", "accuracy", advice)
-    request.warnings.append(f"the {request.asked_by} calls for accuracy {request.accuracy:.1g}; the best there is for this camera is "
-                            f"about {reachable:.1g} ({best.name}: {best.why})")
-    request.accuracy = min(reachable, 0.99)
-    again = [_consider(request, rung) for rung in RUNGS if request.model in ("auto", rung.model)]
-    best = _cheapest(again)
-    if best is None:
-        raise NumericsError("no model serves this camera at any accuracy", "accuracy", "name a model with --model")
+        raise NumericsError(f"accuracy {asked:g} cannot be reached: the best is about {reached:.2g} ({best.name}: {why})", "accuracy", advice)
+    request.warnings.append(f"the {request.asked_by} calls for accuracy {asked:.1g}; the best there is for this camera is "
+                            f"about {reached:.1g} ({best.name}: {why})")
+    request.accuracy = reached
     return request, again, best
+
+
+def _finest_served(request, found, limit):
+    """(accuracy, candidates, the chosen one) of about the finest accuracy that something serves between the request's, which nothing
+    does, and `limit`; the chosen one is None where nothing serves any."""
+    asked, low, served = request.accuracy, request.accuracy, (limit, found, None)
+    # what limits a rung that could be sized is known; others may serve what is coarser
+    trials = [limit] if any(math.isfinite(c.error) for c in found) else []
+    high = limit
+    for accuracy in [*trials, 0.99]:
+        served = _served(request, accuracy)
+        high = accuracy
+        if served[2] is not None:
+            break
+    for _ in range(STEPS if served[2] is not None else 0):
+        middle = _rounded_up(math.sqrt(low * high))
+        if not low < middle < high:
+            break
+        trial = _served(request, middle)
+        low, high, served = (low, middle, trial) if trial[2] is not None else (middle, high, served)
+    request.accuracy = asked
+    return served
+
+
+def _served(request, accuracy):
+    request.accuracy = accuracy
+    found = [_consider(request, rung) for rung in RUNGS if request.model in ("auto", rung.model)]
+    return accuracy, found, _cheapest(found)
+
+
+def _rounded_up(value):
+    """To two digits, so that what is said can be asked for."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit
 
 
 def _plan(request, found, best):

@@ -258,7 +258,7 @@ class ExactSquareLenslets:
             pair, first = pairs[m, n], len(left)
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
             x, y, coupling = pair.factors(max(self._extent), tolerance)
-            if len(coupling) > 2 * guess and (m, n) != kept[-1]:  # its own rank is far lower
+            if coupling.shape[0] > 2 * guess and (m, n) != kept[-1]:  # its own rank is far lower
                 x, y = Product([x], [y], {(0, 0): coupling}, False).factors(tolerance / 2 * math.sqrt(count), guess // 3)
                 coupling = np.eye(x.shape[1], dtype=self.dtype)
             if symmetric and not pair.symmetric:  # the lenslet mirrored by the diagonal brings the transpose
@@ -271,7 +271,7 @@ class ExactSquareLenslets:
         right = left if symmetric else right
         product = Product(left, right, couplings, symmetric)
         high, wide = product.factors(cut * math.sqrt(count), guess)
-        products = max(len(c) for c in couplings.values())
+        products = max(c.shape[0] for c in couplings.values())
         return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes), products
 
     def _expected_rank(self, sy, sx):

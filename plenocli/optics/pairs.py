@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from plenocli.optics.product import thin
 from plenocli.optics.psf import legendre
 from plenocli.optics.quadrature import gauss, nodes_for
 from plenocli.optics.residual import Residual, path, split
@@ -106,14 +107,13 @@ class Pair:
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
         kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15) for axis in (0, 1)]
-        (r, i), (s, j) = kept
-        coupling = (residual.core[r[:, None], s] * field[i[:, None], j]).astype(self.row.dtype)
+        coupling = _coupled(thin(residual.core), thin(field), kept).astype(self.row.dtype)
         x = self.row.sheet(self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0])
         y = x if self.symmetric else self.column.sheet(self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1])
         # now that it is seen what each term brings: residuals send light where the separable part does not
         brings = [np.linalg.norm(sheet, axis=0) ** 2 / len(end.way.points) for sheet, end in ((x, self.row), (y, self.column))]
-        (some,) = _strong((np.abs(coupling) ** 2 * np.outer(*brings)).sum(axis=1), tolerance / 4)
-        x, coupling = x[:, some], coupling[np.ix_(some, some)]
+        (some,) = _strong(brings[0] * (abs(coupling) ** 2 @ brings[1]), tolerance / 4)
+        x, coupling = x[:, some], coupling[some][:, some]
         return x, x if self.symmetric else y[:, some], coupling
 
     def _terms(self, tolerance):
@@ -125,6 +125,18 @@ class Pair:
         s = np.diag(s)
         # S through the directions that reach it on either side: exact on these
         return self._field @ columns.T @ v.conj() / s, np.diag(s), (u.conj().T @ rows @ self._field).T / s
+
+
+def _coupled(core, field, kept):
+    """core[r, s] field[i, j] for the pairs kept = ((r, i), (s, j)): an array, or sparse where both are."""
+    from scipy import sparse
+
+    (r, i), (s, j) = kept
+    if sparse.issparse(core) and sparse.issparse(field):
+        whole = sparse.kron(core, field, format="csr")
+        return sparse.csr_array(whole)[r * field.shape[0] + i][:, s * field.shape[1] + j]
+    core, field = (a.toarray() if sparse.issparse(a) else a for a in (core, field))
+    return core[r[:, None], s] * field[i[:, None], j]
 
 
 def _norms(interval, mixing):

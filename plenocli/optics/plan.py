@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -179,6 +180,7 @@ def distinct(camera, view, shape):
     return part(0, 0), sum(part(y, x) for y, x in firsts)
 
 
+@lru_cache(maxsize=1024)
 def pixel_nodes(accuracy, own, joint, cells, blur):
     """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy` (half, for rules that err all over their
     band), and the step of quadrature.band_rule.

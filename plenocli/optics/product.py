@@ -10,6 +10,8 @@ from plenocli.errors import NumericsError
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
+THIN = 1e-13
+"""Entries of a coupling below this share of its largest are rounding of double precision."""
 MAX_SKETCH = 2500
 """Columns of the largest sketch: beyond it the set-up takes minutes and the model is refused."""
 
@@ -20,7 +22,7 @@ class Product:
 
     def __init__(self, left, right, couplings, symmetric):
         self.left, self.right = left, right
-        self.couplings, self.symmetric = couplings, symmetric
+        self.couplings, self.symmetric = {key: thin(k) for key, k in couplings.items()}, symmetric
         self.rng = np.random.default_rng(20130701)
 
     def _through(self, side, blocks):
@@ -89,6 +91,17 @@ class Product:
         exact = sum(x[rows] @ c for x, c in zip(self.left, self._through(0, [x[columns].T for x in self.right])))
         difference = exact - high[rows] @ wide[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
+
+
+def thin(matrix):
+    """The matrix with its entries below rounding left out, sparse where few are left: couplings of singular vectors are all but diagonal."""
+    from scipy import sparse
+
+    if sparse.issparse(matrix):
+        return matrix
+    size = np.abs(matrix)
+    keep = size > THIN * size.max()
+    return sparse.csr_array(np.where(keep, matrix, 0)) if np.count_nonzero(keep) < matrix.size / 16 else matrix
 
 
 def orthonormal(columns):

@@ -282,6 +282,28 @@ def valid_for(camera, view):
     return None
 
 
+def _chord_counts(shape, width, slope, error):
+    """What `chords` will make: (axis, lines, nodes across the lines, nodes along all their pieces), without making them."""
+    half = width / 2
+
+    def pieces(ends):
+        total = 2 * ((nodes_for(slope * ends[0]) + 1) // 2)
+        for part in np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1)) if len(ends) > 1 else ():
+            total += 2 * len(part) * smooth_nodes(slope * float(np.max(ends[part] - ends[part - 1])) / 2, error)
+        return total
+
+    if shape == "square":
+        count = 2 * ((nodes_for(slope * half) + 1) // 2)
+        return 0, 1, count, pieces(np.array([half]))
+    if shape == "circle":
+        count = int(np.ceil(slope * half / 4 + 1.5 * np.cbrt(slope * half) + 3))
+        return 0, count, 2 * count, pieces(half * np.cos((np.arange(count) + 0.5) * np.pi / (2 * count) - np.pi / 2))
+    count = nodes_for(slope * 2 / math.sqrt(3) * half / 2)
+    # Gauss-Legendre nodes to a part in a million
+    t = -np.cos(np.pi * (np.arange(count) + 0.75) / (count + 0.5))
+    return 1, count, 2 * count, pieces((2 * half - half / 2 * (1 - t)) / math.sqrt(3))
+
+
 def cost(camera, view, band, shape, double):
     """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
     seconds (what does not scale with them, one core) and bytes (beyond the result).
@@ -290,25 +312,25 @@ def cost(camera, view, band, shape, double):
     (docs/model.md, "The dial").
     """
     grid = grid_of(shape[1])
-    cut = chords(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), band.sampling / 60 or 1e-7)
+    axis, count, on_scan, on_chords = _chord_counts(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), band.sampling / 60 or 1e-7)
     products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
     nodes, rough = [n * band.pixel_nodes for n in view.pixel_shape], 2 if double else 1
-    points, across, along = distinct(camera, view, shape)[0], nodes[1 - cut.axis], nodes[cut.axis]
+    points, across, along = distinct(camera, view, shape)[0], nodes[1 - axis], nodes[axis]
     # columns come in about eight blocks, at whose borders a line of points is begun anew
-    lanes = min(points, 8 + (view.object_shape[1 - cut.axis] if points == shape[3] else (view.object_shape[1 - cut.axis] + 1) // 2))
-    scan = sum(cut.at.size * len(p[cut.axis]) for p in products)
-    chord = sum(sum(x.size for x, _ in cut.pieces) * len(p[1 - cut.axis]) for p in products)
-    count, terms = len(cut.at) * len(products), band.terms
-    places = len({place[1 - cut.axis] for place in view.places(grid)}) if band.window is not None else shape[1]
+    lanes = min(points, 8 + (view.object_shape[1 - axis] if points == shape[3] else (view.object_shape[1 - axis] + 1) // 2))
+    scan = sum(on_scan * len(p[axis]) for p in products)
+    chord = sum(on_chords * len(p[1 - axis]) for p in products)
+    count, terms = count * len(products), band.terms
+    places = len({place[1 - axis] for place in view.places(grid)}) if band.window is not None else shape[1]
     operations = 8.0 * (1.4 * lanes * places * chord * terms * across + points * places * scan * terms * across
                         + 0.8 * points * scan * across * along * shape[1] + 0.3 * points * scan * terms**2)
     passes = rough * (6.7e-9 * places * across * (lanes * count * terms + points * scan) + 2.6e-9 * points * shape[1] * across * along
                       + 1.1e-8 * lanes * count * terms**2) + lanes * (2e-4 * places + 1.5e-4 * shape[1] + 4e-4)
-    tables = (lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms) + view.object_shape[cut.axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
+    tables = (lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms) + view.object_shape[axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
               + 9e-8 * places * (chord * across + scan * along))
     written = math.prod(shape[1:]) * 3e-8
     size_ = 16 if double else 8
-    heights = size_ * view.object_shape[cut.axis] * scan * terms * (1 if band.window is not None else shape[1])
+    heights = size_ * view.object_shape[axis] * scan * terms * (1 if band.window is not None else shape[1])
     spread = size_ * count * terms * across
     return {"operations": operations, "seconds": passes + tables + written + field_seconds(camera, view, band) + 0.015,
             "bytes": int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25)}

@@ -8,6 +8,7 @@ from plenocli.optics.geometry import geometry
 from plenocli.optics.pif import PifBuilder
 from plenocli.optics.plan import distinct, expected_terms
 from plenocli.optics.psf import separable_field
+from plenocli.optics.shaped import _chord_counts, chords
 from tests.optics.cameras import small_camera
 
 CHANGES = {
@@ -51,6 +52,13 @@ def test_expected_terms_are_those_found(half_pitches, tolerance):
     half = half_pitches * view.D2 / 2
     found = separable_field(camera, view, half, tolerance).terms
     assert abs(expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance) - found) <= 2 + 0.1 * found
+
+
+@pytest.mark.parametrize("shape", ["square", "circle", "hexagon"])
+@pytest.mark.parametrize("slope, error", [(1e4, 1e-10), (3e5, 1e-6), (2e6, 1e-4)])
+def test_chords_are_counted_as_they_are_made(shape, slope, error):
+    cut = chords(shape, 200e-6, slope, error)
+    assert _chord_counts(shape, 200e-6, slope, error) == (cut.axis, len(cut.at), cut.at.size, sum(x.size for x, _ in cut.pieces))
 
 
 @pytest.mark.parametrize("shape, lattice", [("circle", "square"), ("hexagon", "hexagonal")])

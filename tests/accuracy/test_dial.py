@@ -84,6 +84,24 @@ def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
         plan_pif(small_camera(), accuracy=1e-3)
 
 
+def test_what_too_many_terms_refuse_may_be_had_coarser(monkeypatch):
+    """The message and the default name what the fine rung can do, not the coarse rung's error."""
+    def size(view, grid, ring, accuracy, tolerance):
+        if accuracy < 0.0123:
+            raise NumericsError("a million terms", "model", "ask for less")
+        return size_band(view, grid, ring, accuracy, tolerance)
+
+    coarse, fine = rung("coarse", "ray", 0.7, 60e9), replace(rung("fine", "exact", 0.0, 6000e9), size=size)
+    monkeypatch.setattr(dial, "RUNGS", (coarse, fine))
+    with pytest.raises(NumericsError, match="fine: a million terms") as caught:
+        plan_pif(small_camera(), accuracy=1e-4)
+    best = float(str(caught.value).split("best is about ")[1].split()[0])
+    assert 0.0123 <= best < 0.016 and "name a model" not in str(caught.value)
+    assert plan_pif(small_camera(), accuracy=best).rung == "fine"
+    plan = plan_pif(small_camera())
+    assert plan.rung == "fine" and 0.0123 <= plan.accuracy < 0.016
+
+
 def test_a_scene_narrows_the_model(ladder):
     camera = small_camera(light__wavelengths=(450e-9, 550e-9, 650e-9))
     plan = plan_pif(camera, accuracy=1e-2, needs=Needs(spectrum=(500e-9, 700e-9), lenslets=(1, 2)))

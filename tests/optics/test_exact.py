@@ -13,7 +13,7 @@ from plenocli.optics.geometry import geometry
 from plenocli.optics.pif import PifBuilder
 from plenocli.optics.residual import Residual, ell, kappa, path, split
 from tests.optics.cameras import WAVELENGTH, small_camera
-from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, pupil_directions
+from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, pupil_directions, rayleigh_products, rayleigh_sum
 
 ISOLATED = [(0, 0)]
 NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
@@ -58,6 +58,18 @@ def test_the_reference_has_converged():
     camera, point = fast_camera(), image_points(fast_camera(), [0])
     coarse, fine = (column_energies(camera, WAVELENGTH, point, ISOLATED, (0, 0), pixel_nodes=n, density=d, rows=[2, 7]) for n, d in ((11, 1.0), (13, 1.3)))
     assert errors(coarse, fine).max() < 2e-10
+
+
+@pytest.mark.parametrize("place", [(0, 0), (0, 1), (-2, 1)], ids=str)
+def test_the_reference_as_products_is_the_sum_itself(place):
+    k, z, half, rng = 2 * np.pi / WAVELENGTH, 0.3e-3, 40e-6, np.random.default_rng(11)
+    y, x = rng.uniform(-half, half, (2, 40))
+    v, u = (rng.uniform(-half, half, 14) + 2 * half * n for n in place)
+    fields = rng.normal(size=(2, 40, 40)) + 1j * rng.normal(size=(2, 40, 40))
+    true = rayleigh_sum(fields, y, x, v, u, z, k)
+    fields = fields[:, np.argsort(y)][:, :, np.argsort(x)]
+    found = rayleigh_products(fields, np.sort(y), np.sort(x), np.sort(v), np.sort(u), z, k)
+    assert np.linalg.norm(found - true[:, np.argsort(v)][:, :, np.argsort(u)]) < 1e-10 * np.linalg.norm(true)
 
 
 @pytest.mark.parametrize("change", [

@@ -18,6 +18,8 @@ except ImportError:
 
 BLOCK = 16
 """Sensor nodes whose waves are in memory together."""
+MOST = 64
+"""Points along either axis that an interval may take to resolve the kernel, before it is halved."""
 
 
 def nodes(low, high, slope):
@@ -151,6 +153,102 @@ def rayleigh_sum(fields, y, x, v, u, z, k):
     return total * k / (2j * np.pi)
 
 
+def rayleigh_products(fields, y, x, v, u, z, k, tolerance=1e-12):
+    """The sum of rayleigh_sum as matrix products: between short intervals the kernel K(d, e) is, to `tolerance` of its largest value,
+    K(d, e_J) K(d_I, e_J)^-1 K(d_I, e) with a few displacements d_I, e_J, so that it is still summed as it stands.
+
+    Intervals too wide for that are halved. ValueError where random displacements find the kernel missed.
+    """
+    waves = _fast_wave if njit else _wave
+    low, high = ([f(a) - g(b) for a, b in ((v, y), (u, x))] for f, g in ((np.min, np.max), (np.max, np.min)))
+    counts = _fineness(low, high, z, k)
+    if max(counts) > MOST:
+        which = int(np.argmax([np.ptp(a) for a in (y, x, v, u)]))
+        parts = [[y, x, v, u], [y, x, v, u]]
+        middle = len(parts[0][which]) // 2
+        parts[0][which], parts[1][which] = parts[0][which][:middle], parts[1][which][middle:]
+        split = np.split(fields, [middle], which + 1) if which < 2 else (fields, fields)
+        found = [rayleigh_products(f, *part, z, k, tolerance) for f, part in zip(split, parts)]
+        return found[0] + found[1] if which < 2 else np.concatenate(found, axis=which - 1)
+
+    def kernel(d, e):
+        return waves(np.add(d * d, e * e), z, k)
+
+    grids = [(a + b) / 2 + (b - a) / 2 * np.cos(np.pi * (np.arange(n) + 0.5) / n) for a, b, n in zip(low, high, counts)]
+    rest, rows, columns = kernel(grids[0][:, None], grids[1]), [], []
+    largest = np.abs(rest).max()
+    while True:
+        i, j = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
+        if np.abs(rest[i, j]) < tolerance * largest or len(rows) == min(rest.shape):
+            break
+        rows.append(grids[0][i])
+        columns.append(grids[1][j])
+        rest = rest - np.outer(rest[:, j], rest[i]) / rest[i, j]
+    rows, columns = np.array(rows), np.array(columns)
+    matrix = kernel(rows[:, None], columns).T
+    rng = np.random.default_rng(1)
+    d, e = (rng.uniform(a, b, 300) for a, b in zip(low, high))
+    found = (np.linalg.solve(matrix, kernel(d, columns[:, None])) * kernel(rows[:, None], e)).sum(axis=0)
+    missed = np.abs(found - kernel(d, e)).max() / largest
+    if missed > 1e3 * tolerance:
+        raise ValueError(f"{len(rows)} displacements miss the kernel by {missed:.1e}")
+    one, other = kernel(v[:, None] - y, columns[:, None, None]), kernel(rows[:, None, None], u[:, None] - x)
+    sent = (one.reshape(-1, len(y)) @ fields.transpose(1, 0, 2).reshape(len(y), -1)).reshape(len(rows), -1)
+    sent = np.linalg.solve(matrix, sent).reshape(len(rows), -1, len(x))
+    total = sum(a @ b.T for a, b in zip(sent, other))
+    return total.reshape(len(v), len(fields), len(u)).transpose(1, 0, 2) * (k / (2j * np.pi))
+
+
+def _sine_cosine(turns):
+    """Of 2 pi turns, from the Taylor series of a quarter of the angle: compilers make vectors of it."""
+    t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
+    t2 = t * t
+    s = t * (1 - t2 * (1 / 6) * (1 - t2 * (1 / 20) * (1 - t2 * (1 / 42) * (1 - t2 * (1 / 72) * (1 - t2 * (1 / 110) * (1 - t2 * (1 / 156)))))))
+    c = 1 - t2 * (1 / 2) * (1 - t2 * (1 / 12) * (1 - t2 * (1 / 30) * (1 - t2 * (1 / 56) * (1 - t2 * (1 / 90) * (1 - t2 * (1 / 132) * (1 - t2 * (1 / 182)))))))
+    s, c = 2 * s * c, 1 - 2 * s * s
+    return 2 * s * c, 1 - 2 * s * s
+
+
+if njit:
+    _sine_cosine = njit(fastmath=True, error_model="numpy", cache=True)(_sine_cosine)
+
+
+def _wave(q, z, k):
+    """z/R^2 (1 + j/(k R)) exp(j k (R - z)), R^2 = z^2 + q: of the shape of q."""
+    side = np.sqrt(z * z + q)
+    return z / side**2 * (1 + 1j / (k * side)) * np.exp(1j * k * q / (side + z))
+
+
+def _fast_q(q, z, k):
+    """The same in compiled code."""
+    real, imag, flat = np.empty(q.size), np.empty(q.size), q.ravel()
+    for i in range(q.size):
+        side = np.sqrt(z * z + flat[i])
+        turns = k / (2 * np.pi) * flat[i] / (side + z)
+        s, c = _sine_cosine(turns)
+        size = z / (side * side)
+        tilt = size / (k * side)
+        real[i], imag[i] = size * c - tilt * s, size * s + tilt * c
+    out = np.empty(q.shape, np.complex128)
+    out.real[:], out.imag[:] = real.reshape(q.shape), imag.reshape(q.shape)
+    return out
+
+
+_fast_wave = njit(fastmath=True, error_model="numpy", cache=True)(_fast_q) if njit else None
+
+
+def _fineness(low, high, z, k):
+    """Points along either axis that resolve what of the kernel does not separate."""
+    counts = []
+    for axis in (0, 1):
+        d = np.linspace(low[axis], high[axis], 65)[:, None]
+        e = np.array([low[1 - axis], high[1 - axis], 0.0 if low[1 - axis] < 0 < high[1 - axis] else low[1 - axis]])
+        slopes = d / np.sqrt(z * z + d * d + e * e)
+        phase = k * (high[axis] - low[axis]) / 2 * np.ptp(slopes, axis=1).max()
+        counts.append(int(phase + 8 * np.cbrt(phase) + 24))
+    return counts
+
+
 def _waves(dy2, u, x, z, k):
     """Real and imaginary part of z/R^2 (1 + j/(k R)) exp(j k (R - z)), R^2 = z^2 + dy2 + (u - x)^2: (len(u), len(dy2), len(x)) each."""
     q = dy2[:, None] + (u[:, None, None] - x) ** 2
@@ -160,7 +258,7 @@ def _waves(dy2, u, x, z, k):
 
 
 def _fast(dy2, u, x, z, k):
-    """The same in compiled code; sine and cosine from the Taylor series of a quarter of the angle."""
+    """The same in compiled code."""
     real, imag = np.empty((len(u), len(dy2), len(x))), np.empty((len(u), len(dy2), len(x)))
     for i in range(len(u)):
         for a in range(len(dy2)):
@@ -168,12 +266,7 @@ def _fast(dy2, u, x, z, k):
                 q = dy2[a] + (u[i] - x[b]) ** 2
                 side = np.sqrt(z * z + q)
                 turns = k / (2 * np.pi) * q / (side + z)
-                t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
-                t2 = t * t
-                s = t * (1 - t2 * (1 / 6) * (1 - t2 * (1 / 20) * (1 - t2 * (1 / 42) * (1 - t2 * (1 / 72) * (1 - t2 * (1 / 110) * (1 - t2 * (1 / 156)))))))
-                c = 1 - t2 * (1 / 2) * (1 - t2 * (1 / 12) * (1 - t2 * (1 / 30) * (1 - t2 * (1 / 56) * (1 - t2 * (1 / 90) * (1 - t2 * (1 / 132) * (1 - t2 * (1 / 182)))))))
-                s, c = 2 * s * c, 1 - 2 * s * s
-                s, c = 2 * s * c, 1 - 2 * s * s
+                s, c = _sine_cosine(turns)
                 size = z / (side * side)
                 tilt = size / (k * side)
                 real[i, a, b] = size * c - tilt * s

@@ -4,9 +4,30 @@ from pathlib import Path
 
 import pytest
 
+from tests.messages import all_places, listen, shown_places
+
 
 def pytest_addoption(parser):
     parser.addoption("--campaign", action="store_true", help="run the fault campaigns in full (make faults), not a seeded share of them")
+    parser.addoption("--new-transcript", action="store_true", help="write the transcript of refusals anew (tests/faults/transcript.txt)")
+
+
+def pytest_configure(config):
+    """Note from the start where messages for users are made, so that the end of a run can say how many of them tests have seen."""
+    listen(_reached.add)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """What a test made plenocli say goes into its report."""
+    _reached.clear()
+    try:
+        return (yield)
+    finally:
+        item.user_properties.append(("places", " ".join(_reached)))
+
+
+_reached = set()
 
 
 @pytest.fixture
@@ -17,12 +38,18 @@ def count(record_property):
 
 def pytest_terminal_summary(terminalreporter):
     """What the tests counted."""
-    totals = {}
+    totals, reached = {}, set()
     for report in (r for found in terminalreporter.stats.values() for r in found if getattr(r, "when", None) == "call"):
+        reached.update(word for name, value in report.user_properties if name == "places" for word in value.split())
         for what, numbers in (value for name, value in report.user_properties if name == "count"):
             kept = totals.setdefault(what, {"tests": 0})
             for name, number in {"tests": 1, **numbers}.items():
                 kept[name] = kept.get(name, 0) + number
+    if reached:
+        shown = shown_places(reached)
+        totals["messages for users that tests saw made"] = {"places": len(shown), "in the code": len(all_places())}
+        if terminalreporter.verbosity > 0:
+            terminalreporter.line("never made: " + " ".join(sorted(set(all_places()) - shown)))
     if totals:
         terminalreporter.section("counts")
     for what, numbers in sorted(totals.items()):

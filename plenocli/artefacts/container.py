@@ -27,6 +27,7 @@ from plenocli.artefacts.atomic import replacement, reserve, write_at
 from plenocli.artefacts.sparse import SparseFile
 from plenocli.artefacts.structure import attribute_names, read_attribute, survey
 from plenocli.errors import InputError, PlenoError
+from plenocli.memory import size_text
 
 MAGIC = b"plenocli artefact 1\n"
 HEADER_BYTES = 512
@@ -277,7 +278,7 @@ def _verified_bytes(path, limit):
     """The HDF5 part of the file at `path`, read once, its digest and length verified."""
     size = require_file(path)
     if READING * size > limit:
-        raise InputError(f"is {size / 1e9:.3g} GB, and reading takes {READING} times that, above the memory limit of {limit / 1e9:.3g} GB", path, f"raise --mem-limit to {READING * size / 2**20 + 1:.0f}MiB")
+        raise InputError(f"is {size_text(size)}, and reading takes {READING} times that, above the memory limit of {size_text(limit)}", path, f"raise --mem-limit to {size_text(READING * size)}")
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -16,6 +16,7 @@ from plenocli.artefacts.dng import read_notes
 from plenocli.artefacts.limits import default_mem_limit
 from plenocli.artefacts.provenance import require_file
 from plenocli.errors import InputError
+from plenocli.memory import size_text
 
 CHILD = Path(__file__).with_name("raw_child.py")
 TIMEOUT_S = 120
@@ -41,7 +42,7 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
     size = require_file(path)
     limit = default_mem_limit() if mem_limit is None else int(mem_limit)
     if size > limit:
-        raise InputError(f"is {size / 1e9:.3g} GB, above the memory limit of {limit / 1e9:.3g} GB", path, "raise the memory limit")
+        raise InputError(f"is {size_text(size)}, above the memory limit of {size_text(limit)}", path, "raise --mem-limit")
     found, pixels = _from_child(path, limit, timeout_s)
     if "refused" in found:
         raise InputError(_reason(found, size), path, _FIX)

@@ -12,6 +12,7 @@ from plenocli.artefacts.limits import default_mem_limit
 from plenocli.artefacts.provenance import file_digest
 from plenocli.artefacts.stream import streamed_artefact
 from plenocli.errors import InputError
+from plenocli.memory import size_text
 
 
 def shard_path(index, number):
@@ -103,7 +104,7 @@ def read_pif(path, mem_limit=None):
             shape = (part.shape[0], len(artefact.data["pif/lenslet_offset"]), *part.shape[2:])
             size = int(np.prod(shape)) * part.itemsize
             if size > limit:
-                raise InputError(f"holds {size / 1e9:.3g} GB in all, above the memory limit of {limit / 1e9:.3g} GB", path, "raise --mem-limit")
+                raise InputError(f"holds {size_text(size)} in all, above the memory limit of {size_text(limit)}", path, f"raise --mem-limit to {size_text(1.4 * size)}")
             A = np.empty(shape, part.dtype)
         A[:, lenslets] = part
     attrs = {name: value for name, value in artefact.attrs["pif"].items() if name != "shards"}

@@ -5,6 +5,7 @@ import numpy as np
 from h5py import h5d, h5l, h5t, h5z
 
 from plenocli.errors import InputError
+from plenocli.memory import size_text
 
 _FIX = "make it with plenocli; files from elsewhere may hold only plain numeric datasets"
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
@@ -46,8 +47,7 @@ def survey(path, file, limit):
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
             if total > limit:
-                raise InputError(f"declares {total / 1e9:.3g} GB of data up to '/{child}', above the memory limit of "
-                                 f"{limit / 1e9:.3g} GB", path, "raise --mem-limit if the file is yours")
+                raise InputError(f"declares {size_text(total)} of data up to '/{child}', above the memory limit of {size_text(limit)}", path, "raise --mem-limit if the file is yours")
     return dict(sorted(declared.items()))
 
 

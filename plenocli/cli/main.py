@@ -3,7 +3,6 @@
 import difflib
 import errno
 import importlib
-import mmap
 import os
 import sys
 import time
@@ -12,8 +11,8 @@ from functools import partial
 import click
 
 from plenocli import __version__
-from plenocli.artefacts.limits import limits_restored
 from plenocli.errors import PlenoError
+from plenocli.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
 
 COMMANDS = (
     "simulate-pif",
@@ -38,8 +37,6 @@ COMMANDS = (
 
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-ROOM = 256 << 20
-"""Bytes of memory without which no command starts: HDF5, OpenBLAS and LLVM end the process where they get none."""
 
 
 class Pipeline(click.Group):
@@ -111,7 +108,7 @@ def run(argv=None):
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
     try:
         with limits_restored():
-            _require_room()
+            require_start()
             code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
@@ -132,12 +129,12 @@ def run(argv=None):
     except MemoryError as error:
         if debug:
             raise
-        return _fail(_no_memory(error), 5)
+        return _fail(lack_of_memory(error), 5)
     except Exception as error:  # the last line of defence: a bug must not look like a usage error
         if debug:
             raise
-        if _is_lack_of_memory(error):
-            return _fail(_no_memory(error), 5)
+        if is_lack_of_memory(error):
+            return _fail(lack_of_memory(error), 5)
         if isinstance(error, OSError) and (error.filename or error.errno in _NO_SPACE):
             where = error.filename or "standard output"
             return _fail(f"{where}: {error.strerror}; check the name, the permissions and the space on the disk", 4 if error.errno in _NO_SPACE else 3)
@@ -146,25 +143,6 @@ def run(argv=None):
             "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",
             70,
         )
-
-
-def _require_room():
-    """MemoryError where the limits of the shell or of a queue leave less than ROOM; no page of it is touched."""
-    try:
-        mmap.mmap(-1, ROOM, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
-    except OSError:
-        raise MemoryError(f"less than {ROOM >> 20} MiB can be had") from None
-
-
-def _is_lack_of_memory(error):
-    """Whether an error that is no MemoryError means the same: of a library, of a thread or process that cannot start."""
-    text = str(error).lower()
-    return getattr(error, "errno", None) in (errno.ENOMEM, errno.EAGAIN) or any(sign in text for sign in ("memory allocation failed", "start new thread", "failed to map segment", "bad_alloc"))
-
-
-def _no_memory(error):
-    said = f" ({error})" if str(error) else ""
-    return f"not enough memory{said}; use fewer points, lenslets or wavelengths, a lower --mem-limit, or raise the limit that the shell or the queue sets (ulimit -v)"
 
 
 def _fail(message, code):

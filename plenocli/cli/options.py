@@ -146,7 +146,7 @@ scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers
 
 
 def _held(ctx, param, value):
-    from plenocli.artefacts.limits import hold
+    from plenocli.memory import hold
 
     hold(value)
     return value

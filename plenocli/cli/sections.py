@@ -41,5 +41,5 @@ def _converted(option, value, where):
     try:
         made = [option.type.convert(str(v), option, None) for v in (value if option.multiple else [value])]
     except click.UsageError as error:
-        raise UsageError(error.message, where, option.help) from None
+        raise UsageError(error.message.rstrip("."), where, option.help) from None
     return tuple(made) if option.multiple else made[0]

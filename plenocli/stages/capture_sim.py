@@ -79,7 +79,7 @@ def _check_tiling(camera, where):
 
 def _check_memory(camera, settings, where):
     """Refuse, before any work, a sensor or an object larger than the memory granted: light, white and mosaic, float64, by colour."""
-    from plenocli.artefacts.limits import require_memory
+    from plenocli.memory import require_memory
 
     lenslets, pixels, points = (int(np.prod(n, dtype=object)) for n in (camera.lenslet_array.count, camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet))
     colours = 1 if camera.sensor.cfa == "mono" else 3

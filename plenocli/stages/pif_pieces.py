@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.artefacts.container import READING
-from plenocli.artefacts.limits import require_memory
+from plenocli.memory import require_memory
 
 WHOLE_BYTES = 1 << 27
 """A matrix up to this size is held in memory while it is computed; larger ones go to the disk in pieces."""

@@ -82,7 +82,7 @@ PIXEL_BYTES, PLANE_BYTES = 126, 1
 def _samples(capture, calibration, mem_limit, planes=1):
     """(Samples, (rows, columns) of the picture in lenslet pitches) of a capture, along a calibration's grid or the tiles that its file names."""
     from plenocli.artefacts import read_artefact, read_mosaic
-    from plenocli.artefacts.limits import require_memory
+    from plenocli.memory import require_memory
     from plenocli.sensor.frames import tiled
     from plenocli.sensor.lightfield import collect
 

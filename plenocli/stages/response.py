@@ -51,7 +51,7 @@ class Gathered:
             known += good.sum(axis=0)
             sums += (np.clip(cells, 0, None) / times).sum(axis=0, dtype=float), (good / times).sum(axis=0, dtype=float)
         middle = light[0] / max(number, 1)
-        if not number or middle < 6 * np.sqrt(max(light[1] / number - middle**2, 0) / number):
+        if not number or middle <= 6 * np.sqrt(max(light[1] / number - middle**2, 0) / number):
             raise NumericsError(f"the captures at {wavelength * 1e9:g} nm hold no light above the dark level", fix="check that dark and band files are not swapped")
         with np.errstate(invalid="ignore"):
             self.light[:, k], self.times[:, k] = sums / known

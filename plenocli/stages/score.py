@@ -25,7 +25,7 @@ GROUPS = {
     "single-pixel": ("rmse_over_single_pixel", "six_patch_rmse_over_single_pixel", "delta_e_over_single_pixel", "snr_over_single_pixel_db"),
     "response": ("response_gain_per_band", "response_error_per_band", "response_error_lenslet_per_band", "response_pixel_per_band", "response_leak"),
     "depth": ("depth_slope", "depth_slope_found", "depth_slope_error", "depth_slope_worst", "depth_sure_share", "sharpest_slope_error", "depth_distance_m", "depth_distance_error_m", "depth_limit_m"),
-    "limits": ("noise_relative", "model_error_relative", "limited_by", "expected_loss_db", "seen_share"),
+    "limits": ("noise_relative", "model_error_relative", "limited_by", "loss_at_most_db", "seen_share"),
     "snr": ("snr_capture_db", "snr_capture_mean_db", "snr_predicted_db", "snr_predicted_mean_db", "snr_sensor_db"),
     "coherence": (
         "coherence_raw", "coherence_candes_romberg", "coherence_effective", "coherence_effective_mean", "welch_bound",
@@ -63,6 +63,8 @@ def run_score(
         try:
             entry, picture = _score_one(path, context)
         except PlenoError as error:
+            if len(results) == 1:
+                raise
             entry, picture = _failed(path, error, errors), None
         scored.append(entry)
         pictures.append(picture)
@@ -72,6 +74,8 @@ def run_score(
             if "error" not in scored[i]:
                 _keep(scored[i]["metrics"], metrics)
         except PlenoError as error:
+            if len(results) == 1:
+                raise
             scored[i], pictures[i] = _failed(path, error, errors), None
     if len(errors) == len(results):
         raise errors[0]
@@ -127,7 +131,7 @@ POINT_BYTES = 128
 
 def _score_one(path, context):
     """(JSON-able entry, what the report draws) of one result."""
-    from plenocli.artefacts.limits import require_memory
+    from plenocli.memory import require_memory
 
     result = read_result(path, ("image", "spectra", "dictionary", "calibration", "lightfield"), context.mem_limit)
     entry = {"name": Path(path).name, "kind": result.kind}
@@ -160,8 +164,8 @@ def _score_one(path, context):
     limits = result.attrs.get("parameters", {}).get("limits") if isinstance(result.attrs.get("parameters"), dict) else None
     if limits:
         entry["metrics"] |= {"noise_relative": limits["noise"], "model_error_relative": limits["model_error"], "limited_by": limits["limited_by"]}
-        if limits.get("expected_loss_db") is not None:
-            entry["metrics"]["expected_loss_db"] = limits["expected_loss_db"]
+        if limits.get("loss_at_most_db") is not None:
+            entry["metrics"]["loss_at_most_db"] = limits["loss_at_most_db"]
     seen = result.attrs.get("parameters", {}).get("seen") if isinstance(result.attrs.get("parameters"), dict) else None
     if seen:
         entry["metrics"]["seen_share"] = seen["share"]

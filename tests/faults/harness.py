@@ -15,15 +15,17 @@ SERVER = Path(__file__).with_name("server.py")
 
 @dataclass(frozen=True)
 class Outcome:
-    """code: exit status, or minus the signal; text: stdout and stderr; seconds of wall time; cpu: of processor time; grown: bytes of peak memory above the server's."""
+    """code: exit status, or minus the signal; text: stdout and stderr; seconds of wall time; cpu: of processor time; grown: bytes of peak memory above the server's;
+    fired: whether the fault came to pass, notes: what it wrote down."""
 
     code: int
     text: str
     seconds: float
     cpu: float
     grown: int
-    fired: bool
     hung: bool
+    fired: bool
+    notes: str
 
 
 class Runner:

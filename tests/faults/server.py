@@ -2,7 +2,8 @@
 
 A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, "lasting": whether all later
 calls fail too}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "memory", "nth":
-bytes of memory beyond what is in use}; {"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a part.
+bytes of memory beyond what is in use}; {"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a part;
+{"call": "places"}, no fault: where messages are made, as file:line words.
 """
 
 import errno
@@ -56,9 +57,10 @@ def _serve(request):
         os.killpg(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
     answer = {"code": os.waitstatus_to_exitcode(status), "text": _drain(heard, said).decode("utf-8", "replace"), "seconds": time.perf_counter() - start, "cpu": usage.ru_utime + usage.ru_stime,
-              "grown": max(0, usage.ru_maxrss - before) * 1024, "fired": bool(_drain(noticed, fired)), "hung": not ended and request["kill_after"] is None}
+              "grown": max(0, usage.ru_maxrss - before) * 1024, "hung": not ended and request["kill_after"] is None}
     os.close(handle)
-    return answer
+    notes = _drain(noticed, fired).decode()
+    return answer | {"fired": bool(notes), "notes": notes}
 
 
 def _drain(reader, writer):
@@ -114,6 +116,10 @@ def _arm(fault, fired):
         return _arm_arrays(fault["nth"], fault.get("lasting"), fired)
     if fault["call"] == "short":
         return _arm_short(fired)
+    if fault["call"] == "places":
+        from tests.messages import listen
+
+        return listen(lambda place: _real_write(fired, f"{place} ".encode()))
     real, seen = getattr(os, fault["call"]), 0
 
     def failing(*arguments, **named):

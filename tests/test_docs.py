@@ -152,9 +152,24 @@ def test_the_page_runs_as_it_stands(kit, tmp_path, page):
         pytest.skip("without " + ", ".join(sorted({m for _, missing in left for m in missing})) + f" these were not run: {[block for block, _ in left]}")
 
 
-def test_every_command_line_stands_in_a_block_that_is_run():
-    """Except those that show what cannot be had here: they stand in blocks marked bash or text."""
+def test_command_lines_stand_in_blocks_that_are_run():
+    """All but the two that make the environment itself (README) and the script for a SLURM cluster."""
     for page in PAGES:
-        if page != "docs/files.md":
-            outside = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
-            assert not re.findall(r"^ *(?:plenocli|make) [a-z].*", outside, re.M), page
+        text = (ROOT / page).read_text(encoding="utf-8")
+        other = [block for mark, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M) if mark != "sh"]
+        assert not re.findall(r"^    (?:plenocli|make) [a-z].*", text, re.M), page
+        assert {line.split("#")[0].strip() for block in other for line in re.findall(r"^(?:plenocli|make) .*", block, re.M)} <= {"make demo", "make test"}, page
+
+
+def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
+    from plenocli.cli.sections import read_options
+    from plenocli.config.sweep import points
+    from plenocli.stages.design_space import open_space
+
+    (tmp_path / "sweeps").mkdir()
+    shutil.copy(ROOT / "sample_configs" / "tiny.toml", tmp_path)
+    example, = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / "explore.md").read_text(encoding="utf-8"), re.S | re.M)
+    (tmp_path / "sweeps" / "mine.toml").write_text(example)
+    space = open_space(tmp_path / "sweeps" / "mine.toml", read_options, 0)
+    rows = [space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, 0))]
+    assert len(rows) == 4 * 5 * 3 * 2 and all(row.task is not None and row.result is None for row in rows)

@@ -7,6 +7,9 @@ from plenocli.report.drawing import (
 )
 
 ZOOMED = 3  # superpixels per side in the close-up
+HISTORY = {"validation_psnr": "PSNR on held-out patches [dB]", "change": "change of the atoms (norm)", "coherence_max": "coherence of A phi, largest", "coherence_mean": "coherence of A phi, mean",
+           "dead_share": "share of atoms replaced", "nonzeros": "coefficients of a patch", "step_residual": "residual of the step (relative)", "worst_gap": "duality gap, worst (relative)"}
+"""What learning records, in words."""
 
 
 def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
@@ -314,7 +317,7 @@ def learning_history(history):
         for axes, (name, values) in zip(panels.flat, named.items(), strict=False):
             axes.set_axis_on()
             axes.plot(np.arange(1, len(values) + 1), values, color=COLOURS[0], marker="." if len(values) < 40 else "")
-            axes.set(title=name.replace("_", " "), xlabel="iteration")
+            axes.set(title=HISTORY.get(name, name.replace("_", " ")), xlabel="iteration")
             axes.xaxis.get_major_locator().set_params(integer=True)
             axes.grid(True)
     return made.png

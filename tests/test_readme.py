@@ -1,4 +1,4 @@
-"""Every plenocli command line in the README and in docs is one that the program understands (test_docs runs them)."""
+"""Every plenocli command line in the README, in docs (test_docs runs them) and in the help is one that the program understands."""
 
 import re
 import shlex
@@ -11,6 +11,7 @@ from plenocli.cli.main import COMMANDS, cli
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = [block for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")] for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.S | re.M)]
 LINES = sorted({line for block in BLOCKS for line in block.splitlines() if line.startswith("plenocli ")})
+EXAMPLES = sorted({line for page in (ROOT / "docs" / "commands").glob("*.md") for line in re.findall(r"^ +(plenocli [a-z].*)", page.read_text(), re.M)})
 
 
 def test_the_readme_shows_every_command():
@@ -18,9 +19,9 @@ def test_the_readme_shows_every_command():
     assert set(COMMANDS) - shown <= {"schema"}
 
 
-@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("line", sorted({*LINES, *EXAMPLES}))
 def test_command_lines_parse(line):
-    _, name, *arguments = shlex.split(line)
+    _, name, *arguments = shlex.split(line.partition(" > ")[0])
     command = cli.get_command(None, name)
     if hasattr(command, "commands"):  # a group: its subcommand is what parses
         name, *arguments = arguments

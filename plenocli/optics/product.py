@@ -43,7 +43,10 @@ class Product:
                 some = slice(start, start + count)
                 total[:len(order[some])] += x[order[some]] * signs[some, None]
             mixed.append(total.T)
-        return sum(x @ y for x, y in zip(mine, self._through(side, mixed)))
+        out = np.zeros((len(mine[0]), count), mine[0].dtype)
+        for x, y in zip(mine, self._through(side, mixed)):
+            _add_product(out, x, y)
+        return out
 
     def _extend(self, side, count, basis, inner):
         """A basis of the range of M (side 0) or M^T (1) with `count` more columns, and X^T times it for each factor of that side."""
@@ -55,7 +58,8 @@ class Product:
         if basis is not None:
             # what was numerically nothing is no direction of its own
             new = orthonormal(new - basis @ (basis.conj().T @ new))
-        seen = [x.T @ new.conj() for x in (self.right if side else self.left)]
+        turned = new.conj()
+        seen = [x.T @ turned for x in (self.right if side else self.left)]
         if basis is None:
             return new, seen
         return np.hstack([basis, new]), [np.hstack(pair) for pair in zip(inner, seen)]
@@ -91,6 +95,17 @@ class Product:
         exact = sum(x[rows] @ c for x, c in zip(self.left, self._through(0, [x[columns].T for x in self.right])))
         difference = exact - high[rows] @ wide[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
+
+
+def _add_product(out, x, y):
+    """out += x @ y, all row by row in memory, without an array between."""
+    from scipy.linalg.blas import get_blas_funcs
+
+    multiply = get_blas_funcs("gemm", (out,))
+    # columns of the transposed arrays lie together, as BLAS has them
+    done = multiply(1, np.ascontiguousarray(y, out.dtype).T, x.T, beta=1, c=out.T, overwrite_c=True)
+    if not np.shares_memory(done, out):
+        out[:] = done.T
 
 
 def thin(matrix):

@@ -1,12 +1,14 @@
 # Spatial reconstruction, section 3-2 of the paper. make -f pipelines/spatial.mk RUN=runs/mine CONFIG=camera.toml SCENE=photo.png
 #   paper/  captured and inverted with the same matrix of isolated lenslets, as the paper does
-#   stray/  captured with three times finer points, a 10 nm band and the neighbours' light; inverted with the coarse matrix,
-#           the neighbours' light taken away (and once without, to show what that costs)
+#   stray/  captured with three times finer points, a 10 nm band (five wavelengths), the neighbours' light and lenslets PITCH times
+#           as large, pixels too; inverted with the coarse matrix of the camera as described, the neighbours' light taken away (and
+#           once without, to show what that costs). The score has beside each method what this is expected to cost
 CONFIG ?= sample_configs/seed_spatial.toml
 SCENE ?= skimage:astronaut
 SAMPLING ?= fit
 SNR ?= 60dB
 REFINE ?= 3
+PITCH ?= 1.001
 ITERATIONS ?= 10
 BATCH ?=
 TRAINING ?=
@@ -39,7 +41,11 @@ $(RUN)/pif-3x3.h5: $(CONFIG) | $(RUN)
 $(RUN)/paper/capture.h5: $(CONFIG) $(RUN)/pif.h5 | $(RUN)/paper/
 	$(P) capture-sim $< --pif $(RUN)/pif.h5 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 1 -o $@ --overwrite
 
-$(RUN)/stray/capture.h5: $(CONFIG) | $(RUN)/stray/
+# superpixels must stay whole numbers of pixels: the pixels grow with the lenslets
+$(RUN)/stray/camera.toml: $(CONFIG) | $(RUN)/stray/
+	awk -v k=$(PITCH) '/^(superpixel_pitch|pixel_pitch|pitch) *=/ { match($$0, /[0-9.]+/); printf "%s%.9g%s\n", substr($$0, 1, RSTART - 1), substr($$0, RSTART, RLENGTH) * k, substr($$0, RSTART + RLENGTH); next } { print }' $< > $@
+
+$(RUN)/stray/capture.h5: $(RUN)/stray/camera.toml
 	$(P) capture-sim $< --model fresnel --accuracy 1e-3 --refine $(REFINE) --bandwidth 10nm --superpixels 3x3 --coherent-ring 1 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 2 -o $@ --overwrite
 
 $(RUN)/dictionary.h5: $(RUN)/pif.h5

@@ -47,11 +47,16 @@ class Lmmse:
     def adaptive(self, y):
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the estimates and their predicted
         standard deviations (point, signal), the scales (signal,)."""
-        scale = self.scales(self._coordinates(y))
+        scale = self.scales(y)
         left = self.gain**2 @ (1 / (self.power[:, None] + self.sigma**2 / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
         level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]  # the patterns are orthogonal
         return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
+
+    def expected(self, scale=1.0):
+        """Root mean square error that it expects of fields whose covariance is `scale` times the given one."""
+        left = scale * np.maximum(self.variance - self.gain**2 @ (1 / (self.power + self.sigma**2 / scale)), 0)
+        return float(np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1)))))
 
     def brightness(self, y):
         """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
@@ -75,13 +80,13 @@ class Lmmse:
         """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
         return self.analysis @ y - self.offset[:, None]
 
-    def scales(self, w):
-        """The scale of each signal from its coordinates w (k, signal): the posterior mean of its logarithm.
+    def scales(self, y):
+        """The scale of each signal of y (pixel, signal): the posterior mean of its logarithm.
 
         Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the mean and the deviation
         (at least 0.2) that make all signals together most likely; one signal alone says little where noise is strong.
         """
-        likelihood = self._likelihood(w)
+        likelihood = self._likelihood(self._coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
         logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
         for _ in range(ROUNDS):

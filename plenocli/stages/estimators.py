@@ -115,6 +115,19 @@ class Estimators:
             return noise_level.told_noise(data.y, data.sigma, report)
         return self._noise(data, self.without_stray(data.y), report)
 
+    def loss_db(self, data, report, error):
+        """What it costs at most that the capture is not A x and noise alone, dB, as LMMSE expects; None where that is not known.
+
+        error: of the matrix, root mean square of a pixel. It and what the capture holds beyond noise (report["excess"]) may all
+        fall upon the few directions that are seen, where noise has only their share of the pixels.
+        """
+        if "excess" not in report:
+            return None
+        share = max(1, np.count_nonzero(self.svd.s * CONTRAST > data.sigma)) / len(self.svd.u)
+        wrong = np.hypot(report["excess"], error) / np.sqrt(share)
+        now, known = (self.prior.lmmse(float(sigma), data.scene).expected(report.get("scale", 1.0)) for sigma in (np.hypot(data.sigma, wrong), data.sigma))
+        return 20 * float(np.log10(now / known))
+
     def without_stray(self, y):
         """y without the neighbours' light, as block means tell it: enough to estimate noise and contrast."""
         if not self.coupled:
@@ -161,6 +174,8 @@ class Estimators:
         sigma = self.noise(data, report)
         x, spread = self._scaled(data, sigma, report)
         left = self._left_over(data.y, x)
+        if self.settings.noise_sigma is None:
+            noise_level.excess(report, left, data.sigma)
         if self.coupled and self.settings.noise_sigma is None and left > noise_level.MISFIT * sigma:
             note(f"the capture holds {left / sigma:.3g} times more than its noise that the system matrix cannot produce: sigma = {left:.3g} is used")
             report |= {"noise_sigma": left, "noise_source": "what the estimate leaves over"}
@@ -169,15 +184,17 @@ class Estimators:
 
     def _scaled(self, data, sigma, report):
         """(x, sigma) of the joint estimate with scale x covariance, one scale a picture; steps of sqrt(2), so that captures of
-        one kind share what is worked out."""
+        one kind share what is worked out. sigma follows the contrast of each lenslet's own light."""
+        own = self.prior.lmmse(sigma, data.scene)
         y = self.without_stray(data.y)
         y = y[INNER] if min(y.shape[:2]) > 2 else y
-        scale = self.prior.lmmse(sigma, data.scene).common_scale(y.reshape(-1, y.shape[2]).T)
+        scale = own.common_scale(y.reshape(-1, y.shape[2]).T)
         # never above 1: light that the matrix does not produce passes for contrast, and would be amplified
         scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
         report["scale"] = scale
         x, spread = self.prior.joint(sigma / np.sqrt(scale), data.scene).apply(data.y)
-        return x, np.sqrt(scale) * spread
+        y = self._own_light(data.y, x) if self.coupled else data.y
+        return x, spread * np.sqrt(own.scales(y.reshape(-1, y.shape[2]).T)).reshape(*y.shape[:2], 1)
 
     def _left_over(self, y, x):
         """Root mean square of y - A x over the lenslets that have all their neighbours (all, where none has)."""
@@ -201,7 +218,7 @@ class Estimators:
         report["start"] = f"lmmse, which expects an error of {error:.3g}"
         held = None
         if known is not None:
-            held = noise_level.of_each(self.svd, y) > noise_level.MISFIT * sigma
+            held = noise_level.of_each(self.svd, y) > noise_level.BORDER * sigma
             held[INNER] = False
             held = held, x.copy()
             report["border"] = f"{int(held[0].sum())} lenslets stay those of LMMSE over 3x3 lenslets: they hold light from beyond the array"

@@ -7,6 +7,8 @@ from plenocli.stages.progress import note
 
 MISFIT = 1.5
 """Estimated noise over the capture's own from which on the estimate is believed."""
+BORDER = 1.3
+"""The same for a lenslet of the border to have light from beyond the array that could not be told."""
 ESTIMATED = "estimated from what the system matrix cannot produce"
 
 
@@ -17,9 +19,19 @@ def own_noise(svd, y, known, given, report, hint=""):
     MISFIT times larger: then y holds more than A x and the sensor's noise (neighbours' light, another matrix), which would be
     amplified if it were trusted as signal.
     """
-    sigma, source = (given, "given") if given is not None else _estimated(svd, y.reshape(-1, y.shape[-1]).T, known, hint)
+    if given is not None:
+        sigma, source = given, "given"
+    else:
+        sigma, source, found = _estimated(svd, y.reshape(-1, y.shape[-1]).T, known, hint)
+        excess(report, found, known)
     report |= {"noise_sigma": float(sigma), "noise_source": source}
     return float(sigma)
+
+
+def excess(report, found, known):
+    """Keeps in the report what is found beyond the known noise, root mean square, where both are known."""
+    if found is not None and known:
+        report["excess"] = float(np.sqrt(max(found**2 - known**2, 0.0)))
 
 
 def told_noise(y, known, report):
@@ -44,14 +56,14 @@ def _estimated(svd, stacked, known, hint):
     except NumericsError:
         if not known:
             raise
-        return known, "from the capture"
+        return known, "from the capture", None
     if known is None:
         note(f"the capture does not say its noise: sigma = {sigma:.3g}, {ESTIMATED}")
     elif sigma <= MISFIT * max(known, floor):
-        return max(known, floor), "from the capture"
+        return max(known, floor), "from the capture", sigma
     else:
         note(f"the capture holds {sigma / max(known, floor):.3g} times more than its noise that the system matrix cannot produce: sigma = {sigma:.3g} is used{hint}")
-    return sigma, ESTIMATED
+    return sigma, ESTIMATED, sigma
 
 
 def _floor(y):

@@ -167,7 +167,7 @@ def _limits(data, estimators, report):
     signal = float(np.sqrt(np.mean(np.square(data.y))))
     same = data.matrix is not None and data.matrix == file_digest(estimators.system.path)
     found = what_limits(sigma / signal if sigma and signal else None, estimators.system.accuracy, data.accuracy, same)
-    return {} if found is None else {"limits": found}
+    return {} if found is None else {"limits": found | {"loss_at_most_db": estimators.loss_db(data, report, found["model_error"] * signal)}}
 
 
 def _truth(path, shape, count, bands):

@@ -26,15 +26,17 @@ def matrices(coupled):
     return np.stack([own if not o.any() else 0.02 / np.abs(o).sum() * np.roll(own, 2 * o[0] * PIXELS + 2 * o[1], axis=0)[:, ::-1] for o in ring]), ring
 
 
-def make_files(folder, coupled=False, noise=60.0, stray=1.0, **attrs):
+def make_files(folder, coupled=False, noise=60.0, stray=1.0, beyond=0, **attrs):
     """pif.h5 and capture.h5 (of the astronaut) in `folder`; returns the true picture. stray: neighbours' light in the capture, over
-    that of the pif."""
+    that of the pif; beyond: lenslets by which the scene goes on outside the array."""
     blocks, offsets = matrices(coupled)
     data = {"pif/A": blocks[None], "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": offsets, "pif/pixel_shape": np.array([PIXELS] * 2),
             "pif/object_shape": np.array([N] * 2), "pif/column_energy": blocks.sum(axis=(0, 1))[None]}
     write_artefact(folder / "pif.h5", Artefact("pif", data, {}, Provenance("test")), overwrite=True)
-    picture = np.asarray(sample_picture(luminance(embedded_photograph("astronaut")), COUNT * N, COUNT * N), float)
-    y = BlockToeplitz(blocks * np.where(offsets.any(axis=1), stray, 1)[:, None, None], offsets, (COUNT, COUNT)).forward(to_blocks(picture, (N, N)))
+    side, inside = COUNT + 2 * beyond, slice(beyond, beyond + COUNT)
+    picture = np.asarray(sample_picture(luminance(embedded_photograph("astronaut")), side * N, side * N), float)
+    y = BlockToeplitz(blocks * np.where(offsets.any(axis=1), stray, 1)[:, None, None], offsets, (side, side)).forward(to_blocks(picture, (N, N)))[inside, inside]
+    picture = picture[beyond * N : (beyond + COUNT) * N, beyond * N : (beyond + COUNT) * N]
     sigma = np.sqrt(np.mean(y**2) * 10 ** (-noise / 10))
     y = y + sigma * np.random.default_rng(0).standard_normal(y.shape)
     about = dict(units="relative", black=0.0, noise_sigma=float(sigma), superpixel_shape=[PIXELS] * 2, lenslet_count=[COUNT] * 2, target="skimage:astronaut") | attrs
@@ -141,6 +143,22 @@ def test_neighbours_light_is_noticed_and_taken_away(tmp_path, capsys):
         quality[method] = [psnr(i.data["image/value"], truth) for i in (alone, joint)]
         assert quality[method][1] > quality[method][0] + 1, quality
     assert quality["pnp"][1] > quality["lmmse"][1] + 0.2, quality  # the border's lenslets are those of lmmse
+
+
+def border(picture):
+    return np.concatenate([picture[:N].ravel(), picture[-N:].ravel(), picture[N:-N, :N].ravel(), picture[N:-N, -N:].ravel()])
+
+
+@pytest.mark.parametrize(("beyond", "noise"), [(0, 60.0), (1, 35.0)])
+def test_border_lenslets_take_part_where_what_lies_beyond_can_be_told(tmp_path, beyond, noise):
+    truth = make_files(tmp_path, coupled=True, beyond=beyond, noise=noise)
+    joint, whole = (reconstruct(tmp_path, "--method", m) for m in ("lmmse", "pnp"))
+    error = [np.sqrt(np.mean((border(i.data["image/value"]) - border(truth)) ** 2)) for i in (joint, whole)]
+    held = int(whole.attrs["image"]["parameters"]["border"].split()[0])
+    if beyond:  # the scene goes on, nearly as it would mirrored
+        assert error[1] < 0.98 * error[0] and held == 0, (error, held)
+    else:  # nothing is there, and the light that is missing looks like no object's (dark lenslets do not mind)
+        assert error[1] < 1.1 * error[0] and held > 3 * COUNT, (error, held)
 
 
 def test_light_that_the_matrix_lacks_does_not_pass_for_contrast(tmp_path):

@@ -44,12 +44,19 @@ def limits_restored():
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def require_start():
-    """MemoryError where the limits of the shell or of a queue leave less than ROOM; no page of it is touched."""
+def can_have(count):
+    """Whether the system would give so many bytes; no page of them is touched."""
     try:
-        mmap.mmap(-1, ROOM, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+        mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
     except OSError:
-        raise MemoryError(f"less than {size_text(ROOM)} can be had") from None
+        return False
+    return True
+
+
+def require_start():
+    """MemoryError where the limits of the shell or of a queue leave less than ROOM."""
+    if not can_have(ROOM):
+        raise MemoryError(f"less than {size_text(ROOM)} can be had")
 
 
 def require_memory(needed, mem_limit, what, where=None, fewer="take less of it"):

@@ -27,7 +27,7 @@ from plenocli.artefacts.atomic import replacement, reserve, write_at
 from plenocli.artefacts.sparse import SparseFile
 from plenocli.artefacts.structure import attribute_names, read_attribute, survey
 from plenocli.errors import InputError, PlenoError
-from plenocli.memory import size_text
+from plenocli.memory import can_have, is_lack_of_memory, size_text
 
 MAGIC = b"plenocli artefact 1\n"
 HEADER_BYTES = 512
@@ -85,8 +85,8 @@ def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
             return _parse(path, file, kind, limit, skip)
     except (PlenoError, MemoryError):
         raise
-    except Exception as error:  # h5py raises half a dozen types for a malformed file, and these for lack of memory
-        if "memory allocation failed" in str(error):
+    except Exception as error:  # h5py raises half a dozen types for a malformed file
+        if is_lack_of_memory(error) and not can_have(READING * path.stat().st_size + (1 << 20)):
             raise MemoryError(str(error)) from error
         raise InputError(f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again") from error
 

@@ -46,22 +46,23 @@ def stages(tmp_path_factory, runner):
     """
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder, steps = base / "faults", _steps()
+    folder = base / "faults"
     with open(base / "faults.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "done").exists():
-            _make_files(folder, steps, runner)
-    return folder, steps
+            make_all(folder, runner)
+    return folder, _steps()
 
 
-def _make_files(folder, steps, runner):
+def make_all(folder, runner):
+    """Make the files of all stages in a new folder."""
     folder.mkdir()
     (folder / "camera.toml").write_text((SAMPLES / "tiny.toml").read_text())
     (folder / "colour.toml").write_text(_spectral_camera())
     (folder / "scene.toml").write_text((SAMPLES / "scenes" / "shallow.toml").read_text())
     (folder / "designs.toml").write_text(SWEEP)
     _write_pictures(folder)
-    for name, (arguments, result) in steps.items():
+    for name, (arguments, result) in _steps().items():
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
         assert outcome.code == 0, (name, outcome.text)
     _write_shards(folder)

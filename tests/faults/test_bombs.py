@@ -1,5 +1,6 @@
 """Small files that declare or hide something huge, or point elsewhere: refused within a second of processor time and 200 MB, with their name."""
 
+import hashlib
 import struct
 import zlib
 
@@ -41,6 +42,18 @@ def test_hdf5_with_a_valid_digest(runner, tmp_path, make):
     hdf5.hostile(tmp_path / "bomb.h5", make)
     outcome = runner.run(["inspect", "bomb.h5"], tmp_path, limit=10)
     assert is_cheap_refusal(outcome), outcome
+
+
+def test_superblocks_that_declare_a_huge_file(runner, stages, tmp_path):
+    """Sizes and addresses that HDF5 believes before anybody can look at an object; found by the fuzzer."""
+    whole = (stages[0] / "image.h5").read_bytes()
+    for place in range(8, 48, 4):
+        image = bytearray(whole[512:])
+        image[place:place + 8] = (2**60 + 2**33).to_bytes(8, "little")
+        head = f"plenocli artefact 1\nsha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode().ljust(512, b"\0")
+        (tmp_path / "bomb.h5").write_bytes(head + image)
+        outcome = runner.run(["inspect", "bomb.h5"], tmp_path, limit=10)
+        assert outcome.code == 0 or is_cheap_refusal(outcome), (place, outcome)
 
 
 def test_a_plain_hdf5_bomb_is_not_opened_at_all(runner, tmp_path):

@@ -1,6 +1,5 @@
 """A result appears whole or not at all, whatever fails while it is written."""
 
-import errno
 import os
 import signal
 import subprocess
@@ -44,35 +43,12 @@ def test_a_link_planted_at_the_temporary_name_is_not_followed(tmp_path):
 
 
 @pytest.mark.parametrize("call", ["write", "fsync", "replace", "ftruncate", "open"])
-def test_failing_the_nth_call_leaves_the_old_file_and_no_leftovers(tmp_path, monkeypatch, call):
+def test_failing_the_nth_call_leaves_the_old_file_and_no_leftovers(tmp_path, each_failure, call):
     publish(tmp_path / "a", b"old")
-    real, outcomes = getattr(os, call), []
-    for nth in range(1, 12):
-        count = 0
-
-        def failing(*args, **kwargs):
-            nonlocal count
-            count += 1
-            if count == nth:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return real(*args, **kwargs)
-
-        monkeypatch.setattr(atomic.os, call, failing)
-        try:
-            publish(tmp_path / "a", [b"new"] * 3, overwrite=True)
-            outcomes.append(True)
-        except OutputError as error:
-            outcomes.append(False)
-            assert "No space left" in str(error)
-        finally:
-            monkeypatch.undo()
-        assert (tmp_path / "a").read_bytes() in (b"old", b"newnewnew")
-        assert os.listdir(tmp_path) == ["a"]
-        if count < nth:
-            break
-        if call in ("write", "replace", "ftruncate"):
+    for done in each_failure(call, lambda: publish(tmp_path / "a", [b"new"] * 3, overwrite=True)):
+        assert (tmp_path / "a").read_bytes() in (b"old", b"newnewnew") and os.listdir(tmp_path) == ["a"]
+        if not done and call in ("write", "replace", "ftruncate"):
             assert (tmp_path / "a").read_bytes() == b"old"
-    assert outcomes[-1] and not outcomes[0]
 
 
 def test_short_writes_are_continued(tmp_path, monkeypatch):

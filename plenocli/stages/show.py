@@ -119,10 +119,13 @@ def _spectra(path, artefact, choice):
 
 
 def _image(path, artefact, choice):
-    from plenocli.report.figures import image_figures
+    from plenocli.report.figures import image_figures, spectra_figures
     from plenocli.stages.score_inputs import read_result
 
-    return image_figures(read_result(path, mem_limit=choice.mem_limit), path.name, None if artefact is None else artefact.data.get("image/seen"))
+    result = read_result(path, mem_limit=choice.mem_limit)
+    if result.wavelengths is not None:
+        return spectra_figures(result, path.name)[:1]
+    return image_figures(result, path.name, None if artefact is None else artefact.data.get("image/seen"))
 
 
 def _sweep(path, artefact, choice):
@@ -146,6 +149,9 @@ def _compared(files, truth, mem_limit):
     from plenocli.stages.score_inputs import block_of, read_result, read_truth
 
     results = [read_result(file, ("image",), mem_limit) for file in files]
+    several = [file for file, result in zip(files, results) if result.wavelengths is not None]
+    if several:
+        raise UsageError("has several bands, and pictures of one are compared", several[0], "score --report draws bands beside their truth")
     true = read_truth(truth, results[0])
     for file, result in zip(files, results):
         if result.values.shape != true.shape:

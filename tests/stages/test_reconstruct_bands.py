@@ -81,6 +81,14 @@ def test_bands_go_to_a_spectral_exr_and_to_score(folder, capsys):
     assert entries[0]["metrics"]["psnr_db"] == pytest.approx(expected, abs=1e-3) and len(entries) == 2
 
 
+def test_bands_are_drawn_and_not_compared_as_one_picture(folder, tmp_path, capsys):
+    reconstruct(folder, "--method", "block-mean", output="even.h5")
+    assert run(["show", str(folder / "even.h5"), "-o", str(tmp_path / "bands.png")]) == 0 and (tmp_path / "bands.png").stat().st_size > 5000
+    capsys.readouterr()
+    assert run(["show", str(folder / "even.h5"), "--truth", str(folder / "capture.h5"), "-o", str(tmp_path / "never.png")]) == 2
+    assert "score --report" in capsys.readouterr().err
+
+
 def test_the_truth_in_hindsight_has_bands_too(folder):
     truth = read_artefact(folder / "capture.h5", "capture").data["capture/scene"]
     error = {hint: rms(reconstruct(folder, "--method", "tikhonov", *options).data["image/value"] - truth) for hint, options in

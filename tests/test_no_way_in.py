@@ -35,10 +35,11 @@ def test_the_check_finds_what_it_looks_for(text, count):
     assert len(offences(text)) == count
 
 
-def test_no_module_runs_what_a_file_says():
+def test_no_module_runs_what_a_file_says(count):
     files = sorted(PACKAGE.rglob("*.py"))
     assert len(files) > 100
     assert {str(f.relative_to(PACKAGE)): offences(f.read_text()) for f in files if offences(f.read_text())} == {}
+    count("modules that run, unpickle or evaluate what a file says", modules=len(files), found=0)
 
 
 @pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "a/b.h5", "", "x\0.h5", 3])

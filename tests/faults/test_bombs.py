@@ -38,10 +38,11 @@ HDF5 = [hdf5._external_link, hdf5._soft_link, hdf5._loop, hdf5._external_storage
 
 
 @pytest.mark.parametrize("make", HDF5, ids=lambda make: make.__name__.strip("_"))
-def test_hdf5_with_a_valid_digest(runner, tmp_path, make):
+def test_hdf5_with_a_valid_digest(runner, tmp_path, count, make):
     hdf5.hostile(tmp_path / "bomb.h5", make)
     outcome = runner.run(["inspect", "bomb.h5"], tmp_path, limit=10)
     assert is_cheap_refusal(outcome), outcome
+    count("bombs", refused=1)
 
 
 def test_superblocks_that_declare_a_huge_file(runner, stages, tmp_path):
@@ -100,10 +101,11 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_pictures_and_raw_files(runner, tmp_path, name):
+def test_pictures_and_raw_files(runner, tmp_path, count, name):
     (tmp_path / f"bomb-{name}").write_bytes(FILES[name])
     outcome = runner.run(["inspect", f"bomb-{name}"], tmp_path, limit=10)
     assert is_cheap_refusal(outcome), outcome
+    count("bombs", refused=1)
 
 
 CONFIGS = {"deep": "a = " + "[" * 100_000, "deep tables": "[" + ".".join("a" * 50_000) + "]", "long": "x = 1\n" * 2_000_000, "number": "[sensor]\nbits = " + "9" * 100_000,
@@ -111,7 +113,8 @@ CONFIGS = {"deep": "a = " + "[" * 100_000, "deep tables": "[" + ".".join("a" * 5
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_descriptions(runner, tmp_path, name):
+def test_descriptions(runner, tmp_path, count, name):
     (tmp_path / "bomb.toml").write_text(CONFIGS[name])
     outcome = runner.run(["simulate-pif", "bomb.toml", "--explain"], tmp_path, limit=10)
     assert is_clean_refusal(outcome, (2, 3), "bomb.toml") and outcome.cpu < 2 and outcome.grown < 200e6 and len(outcome.text) < 5000, (outcome.code, outcome.text[:2000], outcome.grown)
+    count("bombs", refused=1)

@@ -64,16 +64,17 @@ def check(runner, folder, name, text):
 
 
 @pytest.mark.parametrize("places", ["apertures", "distances"])
-def test_energy_is_sound_or_the_camera_is_refused(runner, tmp_path, campaign, places):
+def test_energy_is_sound_or_the_camera_is_refused(runner, tmp_path, campaign, count, places):
     cases = EDGES if places == "apertures" else FAR
     if places == "apertures":
         cases = [cases[i] for i in np.random.default_rng(2).permutation(len(cases))[:campaign(12, len(cases))]]
     made = [check(runner, tmp_path, f"{places}{number}", camera(**case)) for number, case in enumerate(cases)]
     assert sum(made) >= len(made) // 4, f"{sum(made)} of {len(made)}"
+    count("cameras at the edges", computed_with_sound_energy=sum(made), refused_with_a_number=len(made) - sum(made))
 
 
 @pytest.mark.parametrize("method", ["block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "auto"])
-def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(runner, stages, tmp_path, method):
+def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(runner, stages, tmp_path, count, method):
     """All-zero, constant, and clipped captures: a picture without NaN, or a refusal."""
     from plenocli.artefacts import write_artefact
 
@@ -89,3 +90,4 @@ def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(runner,
             assert np.isfinite(read_artefact(tmp_path / f"{name}-out.h5", "image").data["image/value"]).all()
         else:
             assert is_clean_refusal(outcome, (3, 5), name) or is_clean_refusal(outcome, 5), (name, outcome)
+        count("captures at the edges, methods of reconstruct", pictures_without_nan=int(outcome.code == 0), refused=int(outcome.code != 0))

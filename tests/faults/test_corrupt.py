@@ -45,20 +45,26 @@ class Bench:
         return outcome
 
 
+def tell(count, tried, refused):
+    count("damaged files", files=tried, refused=refused, crashes=0, hangs=0, results_left=0, silent_wrong_reads_of_artefacts=0)
+
+
 def seed_of(name):
     return np.random.default_rng(list(name.encode()))
 
 
 @pytest.mark.parametrize("name", STORED)
-def test_no_damaged_artefact_is_read(runner, stages, tmp_path, campaign, name):
-    bench, count = Bench(runner, stages, tmp_path, name), campaign(8, 900)
-    for number, bad in enumerate(mutants(bench.good, count, seed_of(name))):
+def test_no_damaged_artefact_is_read(runner, stages, tmp_path, campaign, count, name):
+    bench, tried = Bench(runner, stages, tmp_path, name), 0
+    for number, bad in enumerate(mutants(bench.good, campaign(8, 900), seed_of(name))):
         command = STORED[name] if number % 4 == 0 else ["inspect", "X"]
         assert is_clean_refusal(bench.run(bad, command), 3, name), number
+        tried += 1
+    tell(count, tried, tried)
 
 
 @pytest.mark.parametrize("name", SIGNED)
-def test_a_digest_in_the_file_finds_every_change_of_values(runner, stages, tmp_path, campaign, name):
+def test_a_digest_in_the_file_finds_every_change_of_values(runner, stages, tmp_path, campaign, count, name):
     bench, refused = Bench(runner, stages, tmp_path, name), 0
     intact = json.loads(bench.run(bench.good, ["inspect", "X", "--json"]).text)
     assert intact["verified"]
@@ -73,32 +79,36 @@ def test_a_digest_in_the_file_finds_every_change_of_values(runner, stages, tmp_p
             refused += 1
             bench.run(bad, SIGNED[name])
     assert refused > 0
+    tell(count, number + 1, refused)
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_damaged_photographs_are_refused_or_read(runner, stages, tmp_path, campaign, name):
+def test_damaged_photographs_are_refused_or_read(runner, stages, tmp_path, campaign, count, name):
     bench, refused = Bench(runner, stages, tmp_path, name), 0
     for number, bad in enumerate(mutants(bench.good, campaign(12, 500), seed_of(name))):
         outcome = bench.run(bad, FOREIGN[name] if number % 4 == 0 else ["inspect", "X"])
         assert outcome.code == 0 or is_clean_refusal(outcome, 3, name), (number, outcome)
         refused += outcome.code == 3
     assert refused > 0
+    tell(count, number + 1, refused)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_damaged_descriptions_are_refused_with_their_name_or_are_other_cameras(runner, stages, tmp_path, campaign, name):
+def test_damaged_descriptions_are_refused_with_their_name_or_are_other_cameras(runner, stages, tmp_path, campaign, count, name):
     bench, refused = Bench(runner, stages, tmp_path, name), 0
     for number, bad in enumerate(mutants(bench.good, campaign(18, 600), seed_of(name))):
         outcome = bench.run(bad, CONFIGS[name])
         assert outcome.code in (0, 5) or is_clean_refusal(outcome, (2, 3), name), (number, outcome)
         refused += outcome.code in (2, 3)
     assert refused > 0
+    tell(count, number + 1, refused)
 
 
-def test_damaged_files_of_real_cameras_are_refused_or_read(runner, stages, tmp_path, campaign, shared_data):
+def test_damaged_files_of_real_cameras_are_refused_or_read(runner, stages, tmp_path, campaign, count, shared_data):
     real = [p for p in (shared_data / "raw").rglob("*") if p.suffix.lower() == ".nef" and runner.run(["inspect", p], tmp_path).code == 0]
     if not real:
         pytest.skip("no NEF among the real data")
+    refused = 0
     good, rng = min(real, key=lambda p: p.stat().st_size).read_bytes(), seed_of("NEF")
     for number, bad in enumerate(mutants(good, campaign(4, 400), rng)):
         # most of a RAW file is pixels: half of the mutants are hit in its tags
@@ -107,3 +117,5 @@ def test_damaged_files_of_real_cameras_are_refused_or_read(runner, stages, tmp_p
         (tmp_path / "real.NEF").write_bytes(bad)
         outcome = runner.run(["inspect", "real.NEF"], tmp_path, limit=20)
         assert not outcome.hung and (outcome.code == 0 or is_clean_refusal(outcome, 3, "real.NEF")), (number, outcome)
+        refused += outcome.code == 3
+    tell(count, number + 1, refused)

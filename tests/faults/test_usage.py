@@ -58,7 +58,7 @@ def senseless(kind):
 
 
 @pytest.mark.parametrize("words, option", COMMANDS_AND_OPTIONS, ids=lambda v: " ".join(v) if isinstance(v, tuple) else v.opts[-1])
-def test_senseless_values_are_refused_by_name_with_an_example(capfd, tmp_path, monkeypatch, words, option):
+def test_senseless_values_are_refused_by_name_with_an_example(capfd, tmp_path, monkeypatch, count, words, option):
     monkeypatch.chdir(tmp_path)
     flag, several = option.opts[-1], option.nargs
     assert run([*words, flag]) == 2 and flag in capfd.readouterr().err
@@ -69,6 +69,7 @@ def test_senseless_values_are_refused_by_name_with_an_example(capfd, tmp_path, m
         assert flag in said and "Traceback" not in said, (value, said)
         assert gives_an_example(said, kind), (value, said)
     assert not list(tmp_path.iterdir())
+    count("options with senseless values", options=1, values=1 + len(senseless(kind)), refused=1 + len(senseless(kind)))
 
 
 def gives_an_example(said, kind):

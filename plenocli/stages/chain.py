@@ -147,7 +147,7 @@ def _elsewhere(error, folder):
 def _folder(task):
     with contextlib.ExitStack() as stack:
         try:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="plenocli-", dir=task.get("scratch"))))
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="plenocli-", dir=task.get("scratch"), ignore_cleanup_errors=True)))
             (folder / "camera.toml").write_text(task["camera"], encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot be written ({error.strerror})", task.get("scratch") or tempfile.gettempdir(), "free some space there, then run again: what is finished is kept") from None

@@ -17,6 +17,8 @@ ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
 
+TOGETHER = 200
+"""Directions of A that are looked at together; after so many that hold no signal there is none."""
 LEVEL_SURE = 10
 """A brightness about which nothing is assumed must stand so many times above the noise; else it belongs to the field."""
 
@@ -128,10 +130,17 @@ def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
         v = v - weight.T @ (even.T @ v)
         return _times(bands, covariance, v) - even @ (pulled.T @ v)
 
-    strength = svd.s**2 * np.einsum("ij,ji->i", svd.vt, spread(svd.vt.T))
-    used = np.flatnonzero(strength > 1e-5 * sigma**2)
-    seen = svd.s[used, None] * svd.vt[used]
-    cross = spread(seen.T)
+    used, cross = [], []
+    for first in range(0, len(svd.s), TOGETHER):
+        rows = svd.s[first : first + TOGETHER, None] * svd.vt[first : first + TOGETHER]
+        along = spread(rows.T)
+        loud = np.flatnonzero(np.einsum("ij,ji->i", rows, along) > 1e-5 * sigma**2)
+        if not len(loud):
+            break  # what follows is weaker still
+        used.append(first + loud)
+        cross.append(along[:, loud])
+    used = np.concatenate([*used, np.zeros(0, int)])
+    seen, cross = svd.s[used, None] * svd.vt[used], np.concatenate([*cross, np.zeros((svd.vt.shape[1], 0))], axis=1)
     data = seen @ cross
     power, vectors = np.linalg.eigh((data + data.T) / 2)
     kept = power > 1e-4 * sigma**2

@@ -18,6 +18,9 @@ from plenocli.optics.psf import legendre
 from plenocli.optics.quadrature import gauss, nodes_for
 from plenocli.optics.residual import Residual, path, split
 
+SLAB = 256
+"""Rows whose squares are added up together, so that sums in single precision stay short."""
+
 
 class Way:
     """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m, from its centre) and the roots of
@@ -111,7 +114,8 @@ class Pair:
         x = self.row.sheet(self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0])
         y = x if self.symmetric else self.column.sheet(self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1])
         # now that it is seen what each term brings: residuals send light where the separable part does not
-        brings = [np.linalg.norm(sheet, axis=0) ** 2 / len(end.way.points) for sheet, end in ((x, self.row), (y, self.column))]
+        brings = [_energy(x) / len(self.row.way.points)]
+        brings += brings if self.symmetric else [_energy(y) / len(self.column.way.points)]
         (some,) = _strong(brings[0] * (abs(coupling) ** 2 @ brings[1]), tolerance / 4)
         x, coupling = x[:, some], coupling[some][:, some]
         return x, x if self.symmetric else y[:, some], coupling
@@ -142,6 +146,15 @@ def _coupled(core, field, kept):
 def _norms(interval, mixing):
     """Energy, for a mean point, that each column of `mixing` brings to the superpixel."""
     return (np.abs(interval.weigh @ mixing) ** 2).sum(axis=0)
+
+
+def _energy(columns):
+    """Sum of squares of each column of a complex matrix: (columns,)."""
+    total = np.zeros(2 * columns.shape[1])
+    for start in range(0, len(columns), SLAB):
+        parts = columns[start:start + SLAB].view(columns.real.dtype)
+        total += np.einsum("ij,ij->j", parts, parts)
+    return total.reshape(-1, 2).sum(axis=1)
 
 
 def _strong(power, tolerance):

@@ -184,7 +184,8 @@ class Estimators:
 
     def _scaled(self, data, sigma, report):
         """(x, sigma) of the joint estimate with scale x covariance, one scale a picture; steps of sqrt(2), so that captures of
-        one kind share what is worked out. sigma follows the contrast of each lenslet's own light."""
+        one kind share what is worked out. sigma goes by the geometric mean of that scale and the one of each lenslet's own light
+        (docs/model.md, "Spatial reconstruction")."""
         own = self.prior.lmmse(sigma, data.scene)
         y = self.without_stray(data.y)
         y = y[INNER] if min(y.shape[:2]) > 2 else y
@@ -194,7 +195,7 @@ class Estimators:
         report["scale"] = scale
         x, spread = self.prior.joint(sigma / np.sqrt(scale), data.scene).apply(data.y)
         y = self._own_light(data.y, x) if self.coupled else data.y
-        return x, spread * np.sqrt(own.scales(y.reshape(-1, y.shape[2]).T)).reshape(*y.shape[:2], 1)
+        return x, spread * (scale * own.scales(y.reshape(-1, y.shape[2]).T)).reshape(*y.shape[:2], 1) ** 0.25
 
     def _left_over(self, y, x):
         """Root mean square of y - A x over the lenslets that have all their neighbours (all, where none has)."""

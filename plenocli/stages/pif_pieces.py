@@ -24,7 +24,7 @@ def cost(plan, mem_limit):
     bands, superpixels = plan.shape[:2]
     slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
     streamed = plan.bytes > min(WHOLE_BYTES, mem_limit // 4)
-    return streamed, (4 * slab if streamed else plan.bytes) + work
+    return streamed, (5 * slab if streamed else plan.bytes) + work
 
 
 def layout(plan, mem_limit, where):

@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.artefacts import publish, read_artefact, read_mosaic, read_pif
 from plenocli.config import parse_camera
 from plenocli.report import figures, pictures, spectral_pictures
+from plenocli.report.drawing import drawing, show_picture
 from plenocli.report.page import Page
 from plenocli.stages.score_inputs import block_of, read_result, read_truth
 
@@ -42,7 +43,7 @@ def main(spatial, spectral, output):
 def _columns(run):
     artefact = read_pif(run / "pif.h5")
     rows, columns = (int(n) for n in artefact.data["pif/object_shape"])
-    points = [(rows // 2, columns // 2), (rows // 2, columns * 3 // 4), (rows // 4, columns * 3 // 4)]
+    points = [(rows // 2, columns // 2), (rows // 2, columns - 2), (1, columns - 2)]
     return figures.matrix_figures(artefact, points)[:1]
 
 
@@ -71,13 +72,12 @@ def _errors(run):
 
 
 def _photograph(run):
-    made = []
-    for method in ("single-pixel", "pinv"):
-        result = read_result(run / "spectra" / "measured" / f"photo-{method}.h5")
-        band = int(np.argmin(np.abs(result.wavelengths - 650e-9)))
-        plane = result.values[band]
-        made.append((pictures.picture(plane / np.nanpercentile(plane, 99.5), f"{method}, {result.wavelengths[band] * 1e9:.0f} nm"), f"One value a lenslet, {method}."))
-    return made
+    with drawing(9.6, 3.6) as made:
+        for axes, (method, name) in zip(made.figure.subplots(1, 2), (("single-pixel", "single pixel"), ("pinv", "demultiplexed")), strict=True):
+            result = read_result(run / "spectra" / "measured" / f"photo-{method}.h5")
+            band = int(np.argmin(np.abs(result.wavelengths - 650e-9)))
+            show_picture(axes, result.values[band] / np.nanpercentile(result.values[band], 99.5), f"{name}, {result.wavelengths[band] * 1e9:.0f} nm")
+    return [(made.png, "A photograph at the short exposure, one value a lenslet.")]
 
 
 def _learnt(run):

@@ -16,14 +16,15 @@ def capture_figures(mosaic, name, centres=None):
 
 
 def matrix_figures(artefact, points=None):
-    """Columns of A on the superpixels (of `points`, (row, column) each; else of an even choice), singular values and energy."""
-    from plenocli.report.pictures import matrix_summary, pif_columns
+    """Columns of A on the superpixels (of `points`, (row, column) each; else of an even choice), A itself, singular values and energy."""
+    from plenocli.report.pictures import matrix_picture, matrix_summary, pif_columns
 
     data = artefact.data
     pixels, objects = (tuple(int(n) for n in data[f"pif/{name}_shape"]) for name in ("pixel", "object"))
     columns = pif_columns(data["pif/A"][0], pixels, objects, data["pif/lenslet_offset"], points=points)
     summary = matrix_summary(data.get("pif/singular_values"), data["pif/column_energy"], data["pif/wavelength"], objects, artefact.attrs.get("pif", {}).get("rank"))
     return [(columns, "What the sensor sees of single object points, one panel a point, square-root scale. Panels stand as the points' images do on the lenslet."),
+            (matrix_picture(own_matrix(artefact)[0]), "The system matrix of the object's own superpixel, square-root scale: a column is what the sensor sees of one object point."),
             (summary, "Left: how many object patterns the sensor tells apart, and how well. Right: light that stays on the superpixels kept.")]
 
 

@@ -140,6 +140,18 @@ def _on_superpixels(column, pixel_shape, offsets):
     return picture
 
 
+def matrix_picture(matrix):
+    """A of one superpixel, (pixel, point): what each pixel has of each object point, square-root scale."""
+    shown, step = thumbnail(np.asarray(matrix, dtype=np.float64), 700)
+    with drawing(7.2, 4.6) as made:
+        axes = made.figure.subplots()
+        image = axes.imshow(shown, cmap=LIGHT_MAP, norm=_root_norm(float(shown.max()) or 1.0), interpolation="nearest", aspect="auto",
+                            extent=(-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5))
+        axes.set(xlabel="object point, row by row", ylabel="pixel of the superpixel, row by row", title=f"A, {matrix.shape[0]} x {matrix.shape[1]}")
+        colour_bar(axes, image, "share of a point's light in a pixel")
+    return made.png
+
+
 def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ranks=None):
     """Singular values of A relative to the largest, one line a band, and the share of light kept by object point.
 
@@ -195,7 +207,7 @@ def reconstructions(entries, truth, columns=4):
             image = below.imshow(error, cmap=SIGN_MAP, vmin=-top, vmax=top)
             bare(below)
         if image is not None:
-            bar = made.figure.colorbar(image, cax=panels[1, 0].inset_axes([0.04, 0.8, 0.92, 0.05]), orientation="horizontal")
+            bar = made.figure.colorbar(image, cax=panels[1, 0].inset_axes([0.04, 0.8, 0.92, 0.05]), orientation="horizontal", ticks=[-top, 0, top], format="%.2g")
             bar.set_label("error: result - truth\n(white = 1)")
             bar.outline.set_linewidth(0.4)
     return made.png

@@ -28,7 +28,7 @@ def run_report(folder, output, *, title=None, overwrite=False):
     page.cards(_headlines(spatial, spectral))
     for name, problem in run.unreadable:
         page.warning(f"{name} could not be read: it {problem}.")
-    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral), _designs(page, run)]
+    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral), _refocused(page, run, scores), _designs(page, run)]
     _files(page, run)
     publish(output, page.render().encode(), overwrite=overwrite)
     return {"output": str(output), "files": len(run.files), "unreadable": [name for name, _ in run.unreadable], "scores": len(scores),
@@ -153,6 +153,25 @@ def _capture(page, run, file):
     _add(page, capture_figures(mosaic, file.name, centres))
 
 
+def _refocused(page, run, scores):
+    """The section about refocused captures; returns its name, or None where there are none."""
+    from plenocli.report.planes import lightfield_figures
+
+    found = run.of_kind("lightfield")
+    if not found:
+        return None
+    page.section("Depth", "One capture focused on other planes. A slope is what a plane's picture moves for each pixel of view: 0 is focused on the lenslets, "
+                          "and one of parallax across the pupil is what geometry can tell.")
+    for file in scores:
+        if any(entry.get("kind") == "lightfield" for entry in file.content["results"]):
+            page.heading(file.name.removesuffix(".json"), file.command)
+            add_table(page, file.content)
+    for file in found:
+        page.heading(file.name.removesuffix(".h5"), file.command)
+        _add(page, lightfield_figures(file.artefact()))
+    return "Depth"
+
+
 def _designs(page, run):
     """The section about sweeps; returns its name, or None where there are none."""
     from plenocli.report.front import front_figures, front_rows
@@ -188,8 +207,21 @@ def _matrix(page, file):
     facts += [(label, _text(attrs[name])) for name, label in (
         ("rank", "numerical rank"), ("condition", "condition number"), ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
         ("coherent_ring", "rings of neighbours added coherently"), ("kappa", "kappa [1/m]"), ("model", "propagation")) if name in attrs]
-    page.table(["", ""], [list(fact) for fact in facts], text=True)
+    page.table(["", ""], [list(fact) for fact in [*facts, *_plan(artefact.provenance.accuracy)]], text=True)
+    why = [*artefact.provenance.accuracy.get("reasons", ()), *(f"left out: {text}" for text in artefact.provenance.accuracy.get("left_out", ()))]
+    if why:
+        page.code("\n".join(map(str, why)), "Why: the accuracy plan")
     _add(page, matrix_figures(artefact))
+
+
+def _plan(record):
+    """(label, text) of what simulate-pif planned: the accuracy asked for, what it expects, and where that comes from."""
+    parts = ", ".join(f"{name} {_text(error)}" for name, error in sorted(record.get("by_source", {}).items(), key=lambda item: -item[1]) if error)
+    texts = {"accuracy asked for": f"{_text(record['asked'])} ({record.get('asked_by', 'request')})" if "asked" in record else None,
+             "error expected": f"{_text(record['estimated'])}" + (f": {parts}" if parts else "") if "estimated" in record else None,
+             "computed by": record.get("rung"),
+             "error of that model itself": _text(record["model_error"]) if record.get("model_error") is not None else None}
+    return [(label, text) for label, text in texts.items() if text is not None]
 
 
 def _text(value):

@@ -1,6 +1,7 @@
 """`plenocli refocus`: captures of cameras out of focus, the letters of a real camera, wrong requests."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -98,6 +99,15 @@ def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
     out.close()
     assert run(["refocus", str(path), "-o", str(folder / "never.h5")]) == 3
     assert "--calibration" in capfd.readouterr().err
+
+
+def test_a_report_shows_planes_and_how_good_they_are(folder):
+    (folder / "run").mkdir()
+    shutil.copy(folder / "550-planes.h5", folder / "run")
+    assert run(["score", str(folder / "run" / "550-planes.h5"), "--truth", "550mm", "-o", str(folder / "run" / "depth.json")]) == 0
+    assert run(["report", str(folder / "run"), "-o", str(folder / "run.html")]) == 0
+    page = (folder / "run.html").read_text()
+    assert page.count("<figure>") == 4 and ">Depth</h2>" in page and "error of the slope over the geometric limit, median" in page
 
 
 def test_show_draws_it(folder):

@@ -18,9 +18,14 @@ BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 ROOT = Path(__file__).resolve().parents[2]
 
 
+PLAN = {"asked": 1e-3, "asked_by": "request", "by_source": {"model": 0.0, "sampling": 3e-4, "neighbourhood": 6e-4}, "estimated": 6.7e-4, "left_out": ["lenslets beyond 1 ring(s)"],
+        "model": "fresnel", "model_error": 0.0277, "reasons": ["superpixels 3x3 as asked"], "rung": "fresnel, low rank"}
+
+
 def put(path, kind, data, attrs=None, inputs=None):
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_artefact(path, Artefact(kind, data, attrs or {}, Provenance(f"plenocli made {path.name}", describe_inputs(inputs or {}), 1, "# camera\n")), overwrite=True)
+    provenance = Provenance(f"plenocli made {path.name}", describe_inputs(inputs or {}), 1, "# camera\n", PLAN if kind == "pif" else {})
+    write_artefact(path, Artefact(kind, data, attrs or {}, provenance), overwrite=True)
     return path
 
 
@@ -79,9 +84,10 @@ def test_the_page_shows_both_chains(folder, tmp_path):
     summary = run_report(folder, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert summary["sections"] == ["Spatial", "Spectral"] and summary["unreadable"] == [] and summary["scores"] == 3
-    # bars, results, close-up, capture, PIF, matrix, atoms, history; bars, errors, patches, 2 x bands, grid, response, capture
-    assert page.count("<figure>") == 16
-    for word in ("score-same", "lmmse", "PSNR [dB]", "RMSE over the six patches, 450 nm", "symmetry defect", "chart-single-pixel", "plenocli made pif.h5", "# camera"):
+    # bars, results, close-up, capture, PIF, A, matrix, atoms, history; bars, errors, patches, 2 x bands, grid, response, capture
+    assert page.count("<figure>") == 17
+    for word in ("score-same", "lmmse", "PSNR [dB]", "RMSE over the six patches, 450 nm", "symmetry defect", "chart-single-pixel", "plenocli made pif.h5", "# camera",
+                 "0.001 (request)", "0.00067: neighbourhood 0.0006, sampling 0.0003", "fresnel, low rank", "0.0277", "superpixels 3x3 as asked", "left out: lenslets beyond 1 ring(s)"):
         assert word in page
     assert str(folder) not in page
 
@@ -181,7 +187,7 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
     seen = browser.look_at(page, width, height, f"{pictures}.then(p => ({{pictures: p, needs: document.documentElement.scrollWidth, has: innerWidth}}))", tmp_path / "profile")
     assert seen["messages"] == []
     assert [address for address in seen["requests"] if not address.startswith("data:")] == [page.resolve().as_uri()]
-    assert len(seen["value"]["pictures"]) == 16 and all(natural > 300 and shown > 250 for natural, shown in seen["value"]["pictures"])
+    assert len(seen["value"]["pictures"]) == 17 and all(natural > 300 and shown > 250 for natural, shown in seen["value"]["pictures"])
     assert seen["value"]["needs"] <= seen["value"]["has"] == width, "the page scrolls sideways"
     shot = np.asarray(Image.open(io.BytesIO(seen["png"])).convert("L"))
     assert shot.shape[1] == width and shot.shape[0] > 4 * height

@@ -42,6 +42,14 @@ def test_no_module_runs_what_a_file_says(count):
     count("modules that run, unpickle or evaluate what a file says", modules=len(files), found=0)
 
 
+def test_libraw_runs_in_the_limited_child_only():
+    importing = {path.name: {a.name.split(".")[0] for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import) for a in node.names} for path in PACKAGE.rglob("*.py")}
+    assert [name for name, modules in importing.items() if "rawpy" in modules] == ["raw_child.py"]
+    child = (PACKAGE / "artefacts" / "raw_child.py").read_text()
+    assert all(limit in child for limit in ("RLIMIT_AS", "RLIMIT_CPU", "RLIMIT_FSIZE")) and child.index("setrlimit") < child.index("rawpy.imread")
+    assert not [path.name for path in PACKAGE.rglob("*.py") if "import raw_child" in path.read_text() or "raw_child import" in path.read_text()]
+
+
 @pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "a/b.h5", "", "x\0.h5", 3])
 def test_names_inside_a_file_never_become_paths(tmp_path, name):
     (tmp_path / "secret.h5").write_bytes(b"x")

@@ -49,14 +49,14 @@ def converged(matrix, z, *, tol=1e-10):
     return NonNegative(x, kkt, 0)
 
 
-def projected_gradient(matrix, z, iterations):
+def projected_gradient(matrix, z, iterations, norm=None):
     """The iterate after `iterations` steps from x = 0 of the accelerated projected gradient method (FISTA with x >= 0).
 
-    matrix (row, point), z (row, signal); step 1/|A|_2^2, momentum restarted per signal where it points uphill.
+    matrix (row, point), z (row, signal); step 1/|A|_2^2, momentum restarted per signal where it points uphill. norm: |A|_2, if known.
     """
     matrix, z = np.asarray(matrix, float), np.asarray(z, float)
     gram, target = matrix.T @ matrix, matrix.T @ z
-    step = 1 / np.linalg.norm(matrix, 2) ** 2
+    step = 1 / (np.linalg.norm(matrix, 2) if norm is None else norm) ** 2
     x = np.zeros_like(target)
     ahead, momentum = x, np.ones(z.shape[1])
     for _ in range(iterations):

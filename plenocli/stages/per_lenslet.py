@@ -66,7 +66,7 @@ def nnls_batch(camera, z):
     from plenocli.solvers import nnls
 
     matrix, steps = camera.svd.s[:, None] * camera.svd.vt, camera.settings.nnls_iterations
-    found = nnls.projected_gradient(matrix, z, steps) if steps else nnls.converged(matrix, z)
+    found = nnls.projected_gradient(matrix, z, steps, norm=camera.svd.s[0]) if steps else nnls.converged(matrix, z)
     return found.x, float(found.kkt.max())
 
 

@@ -104,3 +104,18 @@ def test_another_light_is_told(folder, tmp_path, capsys):
     write_artefact(tmp_path / "lamp.h5", capture)
     assert run(["reconstruct", str(tmp_path / "lamp.h5"), "--pif", str(folder / "pif.h5"), "--method", "block-mean", "-o", str(tmp_path / "out.h5")]) == 0
     assert "was lit by A" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_bands_with_the_neighbours_light(folder, tmp_path):
+    camera, joined = str(folder / "camera.toml"), ["--model", "fresnel", "--accuracy", "1e-2", "--superpixels", "3x3", "--coherent-ring", "1"]
+    assert run(["simulate-pif", camera, *joined, "-o", str(tmp_path / "pif.h5")]) == 0
+    assert run(["capture-sim", camera, *joined, *STEP, "--scene", "skimage:astronaut", "--snr", "50dB", "--seed", "1", "-o", str(tmp_path / "capture.h5")]) == 0
+    truth = read_artefact(tmp_path / "capture.h5", "capture").data["capture/scene"]
+    error = {}
+    for name, options in (("joint", ["lmmse"]), ("alone", ["lmmse", "--overlap", "1"]), ("tikhonov", ["tikhonov"]), ("pnp", ["pnp"])):
+        image = reconstruct(tmp_path, "--method", *options)
+        error[name] = np.sqrt(np.mean(rms(image.data["image/value"] - truth) ** 2))
+        if name == "joint":
+            assert 0.6 < np.sqrt(np.mean(image.data["image/sigma"] ** 2)) / error[name] < 1.6
+    assert error["joint"] < 0.5 * error["alone"] and error["tikhonov"] < 1.15 * error["joint"] and error["pnp"] < error["joint"], error

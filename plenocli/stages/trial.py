@@ -23,8 +23,6 @@ def choose(camera, data, kept):
     candidate. lmmse has seen these pictures in its covariance, so that a method that wins wins in earnest. kept: a dict, where
     trials are kept for captures to come.
     """
-    if len(camera.system.bands) > 1:
-        return {"method": "lmmse", "reason": "it alone knows how bands go together"}
     candidates = ["lmmse", "pnp", *(["dictionary"] if camera.settings.dictionary is not None else [])]
     sigma = camera.noise(data, {})
     loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)  # an empty capture is all noise
@@ -52,6 +50,18 @@ def _contrast(camera, data, sigma):
     return 2.0 ** round(np.log2(estimator.common_scale(y) * estimator.variance.mean() / bright**2))
 
 
+def _coloured(truth, bands, rng):
+    """Grey blocks (lenslet_row, lenslet_column, point) with points in several bands, each piece in the colour of some surface."""
+    from plenocli.scene.tables import surfaces
+
+    if len(bands) < 2:
+        return truth
+    colours = surfaces(np.array(bands))
+    colours = colours[rng.choice(len(colours), TRIALS, replace=False)]
+    colours = np.repeat(colours / colours.mean(axis=1, keepdims=True), SIDE, axis=0)
+    return (truth[:, :, None, :] * colours[:, :, None]).reshape(*truth.shape[:2], -1)
+
+
 def _trial(camera, candidates, relative, contrast, scene):
     """Mean PSNR (dB) of each candidate over pieces of about this contrast, {} where no picture is large enough."""
     from plenocli.solvers.natural import draw_patches
@@ -65,7 +75,7 @@ def _trial(camera, candidates, relative, contrast, scene):
     pieces = draw_patches(large, side, 16 * TRIALS, rng).T.reshape(-1, *side)
     within = [to_blocks(p, shape).var(axis=2).mean() / max(p.mean() ** 2, 1e-12) for p in pieces]
     alike = np.argsort(np.abs(np.log(np.maximum(within, 1e-12) / contrast)), kind="stable")[:TRIALS]
-    truth = to_blocks(np.concatenate([pieces[k] for k in alike], axis=1), shape)
+    truth = _coloured(to_blocks(np.concatenate([pieces[k] for k in alike], axis=1), shape), camera.system.bands, rng)
     y = truth @ camera.system.own.T
     sigma = relative * float(np.sqrt(np.mean(y**2)))
     y += sigma * rng.standard_normal(y.shape)

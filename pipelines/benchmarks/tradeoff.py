@@ -25,6 +25,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import numpy as np  # noqa: E402
+import scipy.sparse  # noqa: E402, F401  as all else that is imported, it is there before time is taken
 from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for, wide_window  # noqa: E402
 
 from plenocli.accuracy import dial, plan_pif  # noqa: E402

@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 from plenocli.config import load_camera  # noqa: E402
 from tests.reference import rayleigh  # noqa: E402
 from tests.reference.fresnel import sensor_nodes  # noqa: E402
-from tests.reference.window import _disc, _Rule, energies  # noqa: E402
+from tests.reference.window import _Rule, energies  # noqa: E402
 
 WAVES, FLOPS = 1e9, 2e10
 """Values of the exact kernel (as summed by rayleigh.rayleigh_products), and operations in products, a second of one core: to say
@@ -218,7 +218,7 @@ class Truth:
         (v, wv), (u, wu) = ([a[(np.asarray(chosen)[:, None] * nodes + np.arange(nodes)).ravel()] for a in pair]
                             for pair, chosen in (((v, wv), self.rows), ((u, wu), across)))
         far, total = self.window or 0, 0
-        wave = self._main_lens((far + 1.5) * array.pitch)
+        wave = rayleigh.main_lens_field(camera, (far + 1.5) * array.pitch)
         for row in range(-far, far + 1):
             for column in range(-far, far + 1):
                 (y, wy), (x, wx) = self._lenslet_nodes(row), self._lenslet_nodes(column)
@@ -230,31 +230,6 @@ class Truth:
                 total = total + np.concatenate(sums, axis=1)
         energy = np.abs(total) ** 2 * wv[:, None] * wu
         return energy.reshape(3, len(self.rows), nodes, len(across), nodes).sum(axis=(2, 4))
-
-    def _main_lens(self, reach):
-        """Field on the array, function of (image point, y, x), up to `reach` (m) from the image point: the same sum over direction
-        cosines as rayleigh.field_on_array, with weights that part the axes of the round pupil."""
-        lens, z = self.camera.main_lens, self.camera.lenslet_array.distance
-        k, radius = 2 * np.pi / self.camera.light.wavelengths[0], lens.aperture_diameter / 2
-        rim = radius / math.hypot(z, radius)
-        defocus = blur(self.camera) * self.camera.lenslet_array.pitch / z
-        count = int(1.1 * k * rim * (reach + defocus * z) + 60)
-        t, w = np.polynomial.legendre.leggauss(count)
-        weight = rim**2 * (_disc(count, 1.0, t, w) if lens.aperture_shape == "circle" else np.outer(w, w))
-        s2 = rim**2 * (t[:, None] ** 2 + t**2)
-        weight, shape = weight.astype(complex), rayleigh.amplitude(lens.apodisation, s2)
-        norm = math.sqrt(float((weight.real * shape**2).sum()))
-        if defocus:
-            eps = 1 / self.camera.object.distance + 1 / z - 1 / lens.focal_length
-            image, r2 = 1 / (1 / z - eps), z * z * s2 / (1 - s2)
-            weight = weight * np.exp(1j * k * ((np.sqrt(z * z + r2) - z) - np.sign(image) * (np.sqrt(image**2 + r2) - abs(image))))
-        weight = weight * shape / norm
-
-        def field(point, y, x):
-            down, right = np.exp(-1j * k * rim * np.outer(y - point[0], t)), np.exp(-1j * k * rim * np.outer(t, x - point[1]))
-            return down @ weight @ right * k / (2 * np.pi) * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
-
-        return field
 
 
 def _some(superpixels, count):

@@ -13,7 +13,9 @@ from plenocli.optics.geometry import geometry
 from plenocli.optics.pif import PifBuilder
 from plenocli.optics.residual import Residual, ell, kappa, path, split
 from tests.optics.cameras import WAVELENGTH, small_camera
-from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, pupil_directions, rayleigh_products, rayleigh_sum
+from tests.reference.fresnel import sensor_nodes
+from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, lens_phase, main_lens_field, pupil_directions, rayleigh_products, rayleigh_sum
+from tests.reference.rayleigh import nodes as rayleigh_nodes
 
 ISOLATED = [(0, 0)]
 NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
@@ -70,6 +72,13 @@ def test_the_reference_as_products_is_the_sum_itself(place):
     fields = fields[:, np.argsort(y)][:, :, np.argsort(x)]
     found = rayleigh_products(fields, np.sort(y), np.sort(x), np.sort(v), np.sort(u), z, k)
     assert np.linalg.norm(found - true[:, np.argsort(v)][:, :, np.argsort(u)]) < 1e-10 * np.linalg.norm(true)
+
+
+def test_the_reference_of_the_main_lens_by_axes_is_that_by_directions():
+    camera = fast_camera(4.0, object__distance=0.54)
+    y, point = np.linspace(-3e-5, 3e-5, 9), (3e-6, -4e-6)
+    whole = field_on_array(camera, WAVELENGTH, point, y, y, pupil_directions(camera))
+    assert np.linalg.norm(main_lens_field(camera, 4e-5)(point, y, y) - whole) < 1e-8 * np.linalg.norm(whole)
 
 
 @pytest.mark.parametrize("change", [
@@ -258,6 +267,41 @@ def test_full_size(name, profile):
     truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=nodes, rows=rows)
     for asked in (1e-2, 1e-4, 1e-6):
         assert errors(columns(camera, points, asked=asked)[:, rows], truth).max() <= asked
+
+
+@pytest.mark.slow
+def test_full_size_with_neighbours():
+    """3x3 superpixels at f/4.4 and 1e-3, as the dial has it: the corner's column and one inside, the light of 25 lenslets on lines of
+    pixels of the three kinds of superpixels. Each kind's error is scaled to all of its pixels; those left out mirror them."""
+    camera, points, lines = full_camera("f/4.4", "hyperbolic"), [0, 410], [3, 16, 29, 42]
+    plan = accuracy.plan_pif(camera, accuracy=1e-3, superpixels=(3, 3))
+    assert plan.model == "exact" and plan.bands[0].window == 2
+    builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+    found, pitch = builder.columns(points).transpose(2, 0, 1).reshape(2, 9, 52, 52), geometry(camera, WAVELENGTH).superpixel_pitch
+    missed = np.zeros(2)
+    for place, times in (((0, 0), 1), ((-1, 0), 2), ((-1, -1), 1)):
+        own = found[:, 3 * (place[0] + 1) + place[1] + 1]
+        truth = neighbour_energies(camera, image_points(camera, points), 2, tuple(pitch * n for n in place), lines)
+        missed += times * (errors(own[:, lines], truth) * np.linalg.norm(own, axis=(1, 2))) ** 2
+    assert (np.sqrt(missed) <= 1e-3 * np.linalg.norm(found, axis=(1, 2, 3))).all()
+
+
+def neighbour_energies(camera, image_points, window, centre, lines, nodes=10):
+    """column_energies of all lenslets up to `window` beside the own one on `lines` of pixels, by the sum as products."""
+    k, array, sensor = 2 * np.pi / WAVELENGTH, camera.lenslet_array, camera.sensor
+    (v, wv), (u, wu) = sensor_nodes(centre, sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch, nodes)
+    some = (np.array(lines)[:, None] * nodes + np.arange(nodes)).ravel()
+    half, reach, total = array.pitch / 2, np.abs(centre).max() + (window + 1) * array.pitch, 0
+    slope = reach / np.hypot(reach, sensor.distance) + array.pitch / (2 * array.focal_length) + camera.main_lens.aperture_diameter / (2 * array.distance)
+    (y, w), wave = rayleigh_nodes(-half, half, k * slope), main_lens_field(camera, (window + 1.5) * array.pitch)
+    lens = lens_phase(array.profile, array.focal_length, y, y, k) * np.outer(w, w)
+    for row in range(-window, window + 1):
+        for column in range(-window, window + 1):
+            down, right = y + row * array.pitch, y + column * array.pitch
+            fields = np.array([wave(point, down, right) for point in image_points])
+            total = total + rayleigh_products(fields * lens, down, right, v[some], u, sensor.distance, k)
+    energy = np.abs(total) ** 2 * wv[some, None] * wu
+    return energy.reshape(len(image_points), len(lines), nodes, -1, nodes).sum(axis=(2, 4))
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import roots_legendre
 
 from tests.reference.fresnel import sensor_nodes
+from tests.reference.window import _disc
 
 try:
     from numba import njit
@@ -72,6 +73,31 @@ def field_on_array(camera, wavelength, image_point, y, x, directions):
         some = slice(start, start + 20000)
         total += (np.exp(-1j * k * np.outer(y - image_point[0], sy[some])) * weight[some]) @ np.exp(-1j * k * np.outer(sx[some], x - image_point[1]))
     return total / wavelength * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
+
+
+def main_lens_field(camera, reach):
+    """The field on the array of a round or square pupil as a function of (image point, y, x), up to `reach` (m) from the image point:
+    the sum over direction cosines of field_on_array with weights that part the axes, for many nodes."""
+    lens, z = camera.main_lens, camera.lenslet_array.distance
+    k, radius = 2 * np.pi / camera.light.wavelengths[0], lens.aperture_diameter / 2
+    rim = radius / np.hypot(z, radius)
+    eps = 1 / camera.object.distance + 1 / z - 1 / lens.focal_length
+    count = int(1.1 * k * rim * (reach + abs(eps) * lens.aperture_diameter * z) + 60)
+    t, w = roots_legendre(count)
+    weight = rim**2 * (_disc(count, 1.0, t, w) if lens.aperture_shape == "circle" else np.outer(w, w))
+    s2 = rim**2 * (t[:, None] ** 2 + t**2)
+    weight, shape = weight.astype(complex), amplitude(lens.apodisation, s2)
+    norm = np.sqrt((weight.real * shape**2).sum())
+    if abs(eps) * lens.aperture_diameter * z > 1e-9 * camera.lenslet_array.pitch:
+        image, r2 = 1 / (1 / z - eps), z * z * s2 / (1 - s2)
+        weight = weight * np.exp(1j * k * ((np.sqrt(z * z + r2) - z) - np.sign(image) * (np.sqrt(image**2 + r2) - abs(image))))
+    weight = weight * shape / norm
+
+    def field(point, y, x):
+        down, right = np.exp(-1j * k * rim * np.outer(y - point[0], t)), np.exp(-1j * k * rim * np.outer(t, x - point[1]))
+        return down @ weight @ right * k / (2 * np.pi) * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
+
+    return field
 
 
 def field_of_spheres(camera, wavelength, image_point, y, x, radial=60, turns=240):

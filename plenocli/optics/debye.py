@@ -125,9 +125,11 @@ def _aperture_norm(lens, geometry):
     t, w = gauss(64)
     if lens.aperture_shape == "image":
         image = lens.samples("aperture_image")
-        centres = ((np.arange(len(image)) + 0.5) / len(image) - 0.5) * 2 * radius
-        cos2 = geometry.z2**2 / (geometry.z2**2 + centres[:, None] ** 2 + centres**2)
-        return (image * (shade(cos2) * cos2) ** 2).mean() * (2 * radius / geometry.z2) ** 2
+        t, w = gauss(3)
+        places = ((np.arange(len(image))[:, None] + 0.5 + t / 2) / len(image) - 0.5) * 2 * radius
+        cos2 = geometry.z2**2 / (geometry.z2**2 + places[:, :, None, None] ** 2 + places**2)
+        within = np.einsum("iajb,a,b->ij", (shade(cos2) * cos2) ** 2, w / 2, w / 2)
+        return (image * within).mean() * (2 * radius / geometry.z2) ** 2
     if lens.aperture_shape == "square":
         cos2 = geometry.z2**2 / (geometry.z2**2 + radius**2 * (t[:, None] ** 2 + t**2))
         return ((shade(cos2) * cos2) ** 2 * w * w[:, None]).sum() * (radius / geometry.z2) ** 2

@@ -8,6 +8,7 @@ import pytest
 from plenocli import accuracy
 from plenocli.errors import NumericsError
 from plenocli.optics import exact, product
+from plenocli.optics.bands import spectral_nodes
 from plenocli.optics.exact import fresnel_model_error
 from plenocli.optics.geometry import geometry
 from plenocli.optics.pif import PifBuilder
@@ -95,6 +96,23 @@ def test_every_kind_of_camera(change):
     camera, points = fast_camera(**change), [0, 12, 19]
     truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
     assert errors(columns(camera, points, asked=1e-5), truth).max() <= 1e-5
+
+
+def test_a_pupil_given_as_a_picture():
+    picture = np.random.default_rng(2).uniform(0.1, 1, (3, 3))
+    camera, points = fast_camera(main_lens__aperture_shape="image", main_lens__aperture_image="p.png").attach(aperture_image=picture), [0, 12, 19]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    assert errors(columns(camera, points, asked=1e-5), truth).max() <= 1e-5
+
+
+def test_a_band_of_light_is_the_sum_of_its_wavelengths():
+    camera, points = fast_camera(light__wavelengths=(WAVELENGTH,), light__band={"center": WAVELENGTH, "fwhm": 15e-9, "shape": "gaussian"}), [0, 12, 19]
+    truth = sum(share * column_energies(camera, w, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+                for w, share in zip(*spectral_nodes(camera.light.band, 12)))
+    for asked in (1e-2, 1e-4):
+        plan = accuracy.plan_pif(camera, accuracy=asked, superpixels=(1, 1), coherent_ring=0)
+        assert plan.model == "exact" and plan.band_nodes > 1
+        assert errors(columns(camera, points, asked=asked), truth).max() <= asked
 
 
 def test_a_window_of_pixels_off_the_superpixel_s_centre():

@@ -36,14 +36,21 @@ def amplitude(name, s2):
 
 
 def pupil_directions(camera, density=1.0, wavelength=None, reach=3.0):
-    """Direction cosines and weights d^2 s a(s)/N of a round or square pupil: (sy, sx, complex weight), N so that the light is 1.
+    """Direction cosines and weights d^2 s a(s)/N of a round or square pupil or one given as a picture: (sy, sx, complex weight), N so that the light is 1.
 
     reach: lenslet pitches between an image point and the places where its field is wanted.
     """
     lens, z = camera.main_lens, camera.lenslet_array.distance
     k, radius, pitch = 2 * np.pi / (wavelength or camera.light.wavelengths[0]), lens.aperture_diameter / 2, camera.lenslet_array.pitch
     rate = density * k / z * reach * pitch
-    if lens.aperture_shape == "square":
+    if lens.aperture_shape == "image":
+        picture = lens.samples("aperture_image")
+        edges = (2 * np.arange(len(picture) + 1) / len(picture) - 1) * radius
+        p, w = (np.array(a) for a in zip(*(nodes(a, b, rate) for a, b in zip(edges, edges[1:]))))
+        root = np.repeat(np.repeat(np.sqrt(picture), p.shape[1], 0), p.shape[1], 1)
+        p, w = p.ravel(), w.ravel()
+        y, x, weight = np.repeat(p, len(p)), np.tile(p, len(p)), (np.outer(w, w) * root).ravel()
+    elif lens.aperture_shape == "square":
         p, w = nodes(-radius, radius, rate)
         y, x, weight = np.repeat(p, len(p)), np.tile(p, len(p)), np.outer(w, w).ravel()
     else:
@@ -55,7 +62,8 @@ def pupil_directions(camera, density=1.0, wavelength=None, reach=3.0):
     r2 = y * y + x * x
     s2 = r2 / (z * z + r2)
     weight = weight * (1 - s2) ** 2 / z**2 * amplitude(lens.apodisation, s2)
-    norm = np.sqrt((weight * amplitude(lens.apodisation, s2)).sum())
+    through = root.ravel() if lens.aperture_shape == "image" else 1.0
+    norm = np.sqrt((weight * amplitude(lens.apodisation, s2) * through).sum())
     eps = 1 / camera.object.distance + 1 / z - 1 / camera.main_lens.focal_length
     if eps:
         image = 1 / (1 / z - eps)

@@ -6,7 +6,7 @@ singular vectors, which changes nothing but a constant, and the constant atom, w
 solver gets the same D and Y and starts from them, so Gram matrices count. All run in one process on one thread, in turns; a time is
 the median over the turns of the process time. Slow solvers get the first few signals only. The gap comes from the residual in
 double precision: (P - dual) / P with the scaled residual as the dual point. Solvers that are not installed are left out:
-`pip install -e '.[bench]'`.
+`pip install -e '.[bench]'`. A second table has the gaps that ours and the quickest of the others reach where it is hard.
 
 Writes RUN/sparse.json and RUN/sparse.md. Run from the project's root: python pipelines/benchmarks/sparse.py --help.
 """
@@ -29,6 +29,7 @@ import numpy as np  # noqa: E402
 
 SNR_DB = 60.0
 LAMBDAS = np.logspace(-7, -4.5, 11)
+HARD_SIGNALS = 16
 PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior point": "clarabel"}
 
 
@@ -36,7 +37,7 @@ PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior poin
 
 
 def problem(config, iterations, count, seed):
-    """dict: D (row, atom), Y (row, signal), lambda, and the validation table that chose it."""
+    """dict: D (row, atom), Y (row, signal) and the same without noise, lambda, and the validation table that chose it."""
     from plenocli.accuracy import plan_pif
     from plenocli.config import load_camera
     from plenocli.optics.pif import build_pif
@@ -59,11 +60,12 @@ def problem(config, iterations, count, seed):
     table = learner.validate_path(state.atoms, LAMBDAS)
     lam = max(table, key=lambda row: row[1])[0]
     rng = np.random.default_rng([seed, 99])
-    signals, _ = learner.measure(draw_patches(held, shape, count, rng), rng)
+    patches = draw_patches(held, shape, count, rng)
+    signals, _ = learner.measure(patches, rng)
     effective = learner.seen @ state.atoms
     constant = effective[:, :1] / np.linalg.norm(effective[:, 0])
-    effective, signals = (x - constant @ (constant.T @ x) for x in (effective[:, 1:], signals))
-    return {"D": effective, "Y": signals, "lambda": lam, "validation": [(float(a), float(b), float(c)) for a, b, c in table]}
+    effective, signals, clean = (x - constant @ (constant.T @ x) for x in (effective[:, 1:], signals, learner.seen @ patches))
+    return {"D": effective, "Y": signals, "clean": clean, "lambda": lam, "validation": [(float(a), float(b), float(c)) for a, b, c in table]}
 
 
 # the solvers: (D, Y, lambda) -> coefficients (atom, signal); libraries get the problem divided by lambda, since some of their
@@ -152,6 +154,50 @@ def measure(task, rounds, chosen):
     return rows, missing
 
 
+def hard_cases(task):
+    """Yields (name, D, Y, lambda) of what solvers stumble over."""
+    d, y, clean, lam = task["D"], task["Y"][:, :HARD_SIGNALS], task["clean"][:, :HARD_SIGNALS], task["lambda"]
+    most = 2 * np.abs(d.T @ y).max()
+    for name, value in (("lambda", lam), ("lambda / 100", lam / 100), ("lambda / 10,000", lam / 1e4), ("0.99 of the largest lambda", 0.99 * most), ("10 times the largest", 10 * most)):
+        yield name, d, y, value
+    yield "without noise", d, clean, lam
+    loud = clean + 1000 * (y - clean)
+    yield "0 dB, lambda x 1,000,000", d, loud, 1e6 * lam
+    yield "0 dB, same lambda", d, loud, lam
+    yield "100 atoms twice", np.concatenate([d, d[:, :100]], axis=1), y, lam
+    empty_d, empty_y = d.copy(), y.copy()
+    empty_d[:, ::50], empty_y[:, ::5] = 0, 0
+    yield "empty atoms and signals", empty_d, empty_y, lam
+    yield "rank 1", np.outer(d[:, 0], np.linspace(0.5, 1, d.shape[1])), y, lam
+
+
+def measure_hard(task, chosen):
+    """[(name, {solver: (median, largest gap) or None where it failed})] of `hard_cases`; a gap that is no number counts as 1."""
+    from plenocli.solvers.l1 import duality_gap
+
+    out = []
+    for name, d, y, lam in hard_cases(task):
+        gaps = {}
+        for solver in chosen:
+            try:
+                c = np.ascontiguousarray(np.nan_to_num(SOLVERS[solver][0](d, y, lam), nan=np.inf).T)
+                with np.errstate(all="ignore"):
+                    gap = np.nan_to_num(duality_gap(d, y, c, np.full(d.shape[1], lam / 2))[1], nan=1.0)
+                gaps[solver] = float(np.median(gap)), float(gap.max())
+            except Exception:
+                gaps[solver] = None
+        out.append((name, gaps))
+    return out
+
+
+def markdown_hard(hard, chosen):
+    """The table of `measure_hard`."""
+    lines = [f"{HARD_SIGNALS} signals, gap median / max", "", "| case | " + " | ".join(chosen) + " |", "|---" * (len(chosen) + 1) + "|"]
+    for name, gaps in hard:
+        lines.append(f"| {name} | " + " | ".join("failed" if gaps[solver] is None else "{:.0e} / {:.0e}".format(*gaps[solver]) for solver in chosen) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def markdown(task, rows, missing):
     """The table, with times relative to the first row."""
     lines = [f"D {task['D'].shape[0]} x {task['D'].shape[1]}, {task['Y'].shape[1]} signals, {SNR_DB:g} dB, lambda {task['lambda']:.2e}; versions: {', '.join(versions())}", "",
@@ -187,17 +233,21 @@ def main():
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     options.run.mkdir(parents=True, exist_ok=True)
-    kept = options.run / f"problem-{options.config.stem}-{options.iterations}-{options.signals}-{options.seed}.npz"
+    kept = options.run / f"problem2-{options.config.stem}-{options.iterations}-{options.signals}-{options.seed}.npz"
     if not kept.exists():
         np.savez(kept, **problem(options.config, options.iterations, options.signals, options.seed))
     with np.load(kept) as stored:
         task = {name: stored[name] for name in stored.files}
     task["lambda"] = float(task["lambda"]) * options.lambda_factor
     rows, missing = measure(task, options.rounds, ["ours", *(options.solver or list(SOLVERS)[1:])])
-    (options.run / "sparse.json").write_text(json.dumps({"lambda": task["lambda"], "validation": task["validation"].tolist(), "rows": rows, "missing": missing, "versions": versions()}, indent=1) + "\n")
     text = markdown(task, rows, missing)
+    print(text, flush=True)
+    quick = [name for name in ("ours", "SPAMS lasso, Cholesky") if name in {row["solver"] for row in rows}]
+    hard = measure_hard(task, quick) if options.lambda_factor == 1 else []
+    (options.run / "sparse.json").write_text(json.dumps({"lambda": task["lambda"], "validation": task["validation"].tolist(), "rows": rows, "hard": hard, "missing": missing, "versions": versions()}, indent=1) + "\n")
+    text += "\n" + markdown_hard(hard, quick) if hard else ""
     (options.run / "sparse.md").write_text(text)
-    print(text)
+    print(markdown_hard(hard, quick) if hard else "")
 
 
 if __name__ == "__main__":

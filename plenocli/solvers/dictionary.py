@@ -21,6 +21,7 @@ import numpy as np
 from plenocli.metrics.coherence import column_coherence
 from plenocli.solvers.l1 import lambda_path, sparse_code
 from plenocli.solvers.natural import draw_patches
+from plenocli.solvers.refit import dictionary_step, gradient_step, moments, ridge_of
 
 HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "coherence_mean", "coherence_max", "worst_gap", "step_residual")
 """After each iteration: validation objective (mean over patches), validation PSNR (dB, peak 1), share of atoms replaced, mean
@@ -186,10 +187,10 @@ class Learner:
         gram, right = 0.0, 0.0
         for _ in range(batches):
             patches = draw_patches(self.training, self.object_shape, self.settings.batch, rng)
-            part = _moments(patches, self.code(state.atoms, self.measure(patches, rng)[0]).c)
+            part = moments(patches, self.code(state.atoms, self.measure(patches, rng)[0]).c)
             gram, right = gram + part[0] / batches, right + part[1] / batches
         weight = SYNTHESIS_WEIGHT * self.settings.atoms / (batches * self.settings.batch)
-        ridge = max(weight * np.median(np.diag(gram)[1:]), _ridge(gram))
+        ridge = max(weight * np.median(np.diag(gram)[1:]), ridge_of(gram))
         return state.atoms + np.linalg.solve(gram + ridge * np.eye(len(gram)), (right - state.atoms @ gram).T).T
 
     def _refit(self, patches, c, atoms):
@@ -198,7 +199,7 @@ class Learner:
             centred = self.seen - self.seen.mean(axis=1, keepdims=True)
             strength, basis = np.linalg.svd(centred, full_matrices=False)[1:]
             self._step_basis = strength**2, basis.T
-        gram, right = _moments(patches - patches.mean(axis=0), c)
+        gram, right = moments(patches - patches.mean(axis=0), c)
         if self.settings.gradient_steps:
             return gradient_step(*self._step_basis, gram, right, self.settings.delta, atoms, self.settings.gradient_steps)
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
@@ -227,66 +228,9 @@ def averaged(seen, atoms, measured, lam, shape, *, synthesis=None, tol=1e-6, wor
     return total / len(images), worst, nonzeros
 
 
-def _moments(patches, c):
-    """(C C^T / B, X C^T / B)."""
-    return c @ c.T / patches.shape[1], patches @ c.T / patches.shape[1]
-
-
 def psnr(estimate, truth):
     """Peak signal-to-noise ratio in dB of patches in [0, 1], nothing clipped."""
     return float(-10 * np.log10(max(np.mean((estimate - truth) ** 2), np.finfo(float).tiny)))
-
-
-def dictionary_step(energy, basis, gram, right, delta):
-    """(Phi, residual): the minimum of (1/B)|X - Phi C|^2 + delta |A Phi|^2, in closed form.
-
-    Its normal equations are the Sylvester equation delta Q Phi + Phi (G + e I) = R with Q = A^T A = basis diag(energy) basis^T
-    (energy (k,), basis (point, k): directions of no energy may be left out), G = C C^T / B `gram`, R = X C^T / B `right`, and a ridge e = 1e-6 tr(G) / atoms that keeps it solvable where atoms are not
-    used. residual: |left - right|_F / |R|_F; above 1e-8 is NumericsError.
-    """
-    from scipy.linalg import eigh  # five times faster at 1600 atoms than numpy's
-
-    from plenocli.errors import NumericsError
-
-    ridge = _ridge(gram)
-    use, directions = eigh(gram, driver="evd")
-    use = np.maximum(use, 0) + ridge
-    turned = right @ directions
-    inside = basis.T @ turned
-    atoms = (turned / use + basis @ (inside / (delta * energy[:, None] + use) - inside / use)) @ directions.T
-    residual = _normal_residual(energy, basis, gram, right, delta, atoms)
-    if not residual <= 1e-8:
-        raise NumericsError(f"the dictionary step solves its equations only to {residual:.1e}", fix="use a larger --batch or another --delta")
-    return atoms, residual
-
-
-def gradient_step(energy, basis, gram, right, delta, atoms, steps):
-    """(Phi, residual): `steps` steps down the gradient 2 (Phi (G + e I) - R + delta Q Phi) from `atoms`, as published.
-
-    Arguments as in `dictionary_step`. Step length 1 / (2 (largest eigenvalue of G + e + delta times that of Q)), the largest that
-    is safe; Nesterov's momentum. The residual says how far from the minimum they end.
-    """
-    ridge = _ridge(gram)
-    length = 1 / (np.linalg.norm(gram, 2) + ridge + delta * energy.max())
-    ahead, momentum = atoms, 1.0
-    for _ in range(steps):
-        pull = delta * (basis @ (energy[:, None] * (basis.T @ ahead))) if delta else 0.0
-        moved = ahead - length * (ahead @ gram + ridge * ahead - right + pull)
-        after = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
-        ahead, atoms, momentum = moved + (momentum - 1) / after * (moved - atoms), moved, after
-    return atoms, _normal_residual(energy, basis, gram, right, delta, atoms)
-
-
-def _ridge(gram):
-    return max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
-
-
-def _normal_residual(energy, basis, gram, right, delta, atoms):
-    """|delta Q Phi + Phi (G + e I) - R|_F / |R|_F."""
-    left = atoms @ gram + _ridge(gram) * atoms
-    if delta:
-        left += delta * (basis @ (energy[:, None] * (basis.T @ atoms)))
-    return float(np.linalg.norm(left - right) / max(np.linalg.norm(right), np.finfo(float).tiny))
 
 
 def _unit(atoms, rng):

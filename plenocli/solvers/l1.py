@@ -108,9 +108,10 @@ BLOCK = 1024
 def _active_set(problem, gram, threshold, tol, passes, start, workers):
     """SparseCode of a prepared problem: Gram form for all signals, then the factored form for those it could not certify."""
     from plenocli.solvers import l1_plain
+    from plenocli.solvers.l1_guess import guess
 
     count = len(problem.b)
-    c = _guess(problem, threshold) if start is None else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T)
+    c = guess(problem, threshold) if start is None else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T)
     done = np.zeros(count, np.int64)
     try:
         from plenocli.solvers import l1_kernel
@@ -125,103 +126,12 @@ def _active_set(problem, gram, threshold, tol, passes, start, workers):
         objective[part], gap[part], _ = duality_gap(problem.d, problem.y[:, part], c[part], threshold)
     missed = np.flatnonzero(~(gap <= tol)) if passes > 0 else []
     for i in missed:
+        if objective[i] > problem.y[:, i] @ problem.y[:, i]:
+            c[i] = 0
         done[i] += l1_plain.solve_signal(problem.d, problem.y[:, i], None, threshold, tol, passes, c[i])
         one = slice(i, i + 1)
         objective[one], gap[one], _ = duality_gap(problem.d, problem.y[:, one], c[one], threshold)
     return SparseCode(problem.restore(c), objective, gap, done, len(missed))
-
-
-ROUNDS = 14
-"""Of alternating directions in the guess."""
-
-RELAXATION = 1.8
-"""Their over-relaxation."""
-
-CONVERTED = 1.3
-"""Their penalty times a typical |c|, where the threshold is 1: of 0.8 to 5 the one that finds most of the support in few rounds."""
-
-FAINT = 0.1
-"""Directions of D of less power than this times the penalty do not count in the guess."""
-
-GUESSED = 1.2
-"""Atoms to begin with, at most, as a share of those that a ridge regression determines (its degrees of freedom)."""
-
-TOGETHER = 256
-"""Signals guessed together: what belongs to them stays in a core's cache."""
-
-SMALL = 1_000_000
-"""Signals times this must exceed the cube of the rows, or the guess's eigendecomposition costs more than it saves."""
-
-
-def _guess(problem, threshold):
-    """Coefficients (signal, atom) to begin with: a few rounds of alternating directions for all signals at once.
-
-    ADMM converges too slowly on a plenoptic matrix to solve anything, but some rounds, in single precision, find nine tenths of the
-    atoms in use with their sign, for the price of a few products. Zero where there are too few signals to pay for it.
-    Source: Boyd, Parikh, Chu, Peleato & Eckstein, Found. Trends Mach. Learn. 3 (2011) 1, sections 3.4.3 and 6.4.
-    """
-    count, atoms = problem.b.shape
-    c, rows = np.zeros((count, atoms)), problem.d.shape[0]
-    unit, level = np.max(np.abs(problem.d / threshold), initial=0), np.max(np.abs(problem.y), initial=0)
-    # both in their own units below, so that squares stay within range
-    if count * SMALL < rows**3 or not (unit > 0 and level > np.finfo(float).tiny and 1e-30 < unit * level < 1e30):
-        return c
-    scaled, signals = problem.d / threshold / unit, problem.y / level
-    energy, basis = np.linalg.eigh(scaled @ scaled.T)
-    energy = np.maximum(energy, 0)
-    penalty, determined = _typical(energy, np.mean((basis.T @ signals) ** 2, axis=1), unit * level)
-    keep = min(int(GUESSED * determined), atoms)
-    if not keep:
-        return c
-    used = energy > FAINT * penalty
-    half = np.ascontiguousarray((basis[:, used] / np.sqrt(energy[used] + penalty)).T @ scaled, np.float32)
-    scaled, signals = scaled.astype(np.float32), (unit * level * signals.T).astype(np.float32)
-    for first in range(0, count, TOGETHER):
-        part = slice(first, first + TOGETHER)
-        found = _alternate(signals[part] @ scaled, half)
-        if keep < atoms:
-            size = np.abs(found)
-            found[size < np.partition(size, atoms - keep, axis=1)[:, atoms - keep, None]] = 0
-        np.divide(found, penalty * unit**2 * threshold, out=c[part])
-    return c
-
-
-def _typical(energy, power, level):
-    """(penalty, atoms that the data determine), where thresholds are 1 / level: CONVERTED over the coefficients' size.
-
-    energy, power (row,): of the dictionary and of the signals in its singular directions. The size is that of a ridge regression
-    whose ridge has, at three times that size, the slope of the l1 penalty; ridge and size settle each other in a few rounds.
-    """
-    ridge = energy[-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for _ in range(6):
-            determined = np.sum(energy / (energy + ridge))
-            ridge = 3 / level / np.sqrt(np.sum(energy * power / (energy + ridge) ** 2) / determined)
-        determined = np.sum(energy / (energy + ridge))
-    return CONVERTED / 3 * ridge, determined if np.isfinite(ridge) else 0
-
-
-def _alternate(right, half):
-    """ROUNDS of ADMM for  min c^T G c / 2 - right c + |c|_1, G + penalty inverted as (I - half^T half) / penalty; penalty times its sparse iterate.
-
-    right: (signal, atom) float32.  half: (row, atom) float32. Everything times the penalty: `total` is the sum of sparse iterate and
-    scaled dual variable, `dual` the part of it within +-1.
-    """
-    total, dual, sparse, ahead, seen = (np.zeros_like(right) for _ in range(5))
-    inner = np.empty((len(right), len(half)), np.float32)
-    for k in range(ROUNDS):
-        np.subtract(sparse, dual, out=ahead)
-        ahead += right
-        np.matmul(ahead, half.T, out=inner)
-        ahead -= np.matmul(inner, half, out=seen)
-        if k:
-            ahead -= sparse
-            ahead *= np.float32(RELAXATION)
-            ahead += total
-        total, ahead = ahead, total
-        np.clip(total, -1, 1, out=dual)
-        np.subtract(total, dual, out=sparse)
-    return sparse
 
 
 def _compiled(solve_signals, gram, problem, threshold, tol, passes, c, done, workers):

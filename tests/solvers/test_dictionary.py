@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_sylvester
 
-from plenocli.solvers import dictionary, linear
+from plenocli.solvers import dictionary, linear, refit
 from plenocli.solvers.natural import draw_patches
 
 SHAPE = (5, 6)
@@ -39,7 +39,7 @@ def test_step_solves_the_sylvester_equation(delta):
     a, c, x = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
     energy, basis = np.linalg.eigh(a.T @ a)
     gram, right = c @ c.T / 50, x @ c.T / 50
-    atoms, residual = dictionary.dictionary_step(energy, basis, gram, right, delta)
+    atoms, residual = refit.dictionary_step(energy, basis, gram, right, delta)
     ridge = 1e-6 * np.trace(gram) / 8
     np.testing.assert_allclose(atoms, solve_sylvester(delta * a.T @ a, gram + ridge * np.eye(8), right), rtol=1e-7, atol=1e-10)
     assert residual < 1e-10
@@ -50,7 +50,7 @@ def test_directions_without_energy_may_be_left_out():
     a, c, x = rng.random((5, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
     gram, right = c @ c.T / 50, x @ c.T / 50
     strength, basis = np.linalg.svd(a, full_matrices=False)[1:]
-    atoms, residual = dictionary.dictionary_step(strength**2, basis.T, gram, right, 0.1)
+    atoms, residual = refit.dictionary_step(strength**2, basis.T, gram, right, 0.1)
     np.testing.assert_allclose(atoms, solve_sylvester(0.1 * a.T @ a, gram + 1e-6 * np.trace(gram) / 8 * np.eye(8), right), rtol=1e-7, atol=1e-10)
     assert residual < 1e-10
 
@@ -61,8 +61,8 @@ def test_gradient_steps_approach_the_closed_form(delta):
     a, c, x = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50))
     energy, basis = np.linalg.eigh(a.T @ a)
     system = energy, basis, c @ c.T / 50, x @ c.T / 50, delta
-    exact, start = dictionary.dictionary_step(*system)[0], rng.standard_normal((12, 8))
-    found = [dictionary.gradient_step(*system, start, steps) for steps in (10, 100, 1000)]
+    exact, start = refit.dictionary_step(*system)[0], rng.standard_normal((12, 8))
+    found = [refit.gradient_step(*system, start, steps) for steps in (10, 100, 1000)]
     away = [np.linalg.norm(atoms - exact) for atoms, _ in found]
     assert away[0] > away[1] > away[2] and away[2] < 1e-6 * np.linalg.norm(exact)
     assert found[0][1] > found[1][1] > found[2][1]
@@ -80,7 +80,7 @@ def test_one_gradient_step_goes_down_the_slope():
         nudge = np.zeros_like(phi)
         nudge[place] = 1e-4
         slope[place] = (objective(phi + nudge) - objective(phi - nudge)) / 2e-4
-    moved = dictionary.gradient_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1, phi, 1)[0] - phi
+    moved = refit.gradient_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1, phi, 1)[0] - phi
     length = -np.sum(moved * slope) / np.sum(slope**2)
     np.testing.assert_allclose(moved, -length * slope, atol=1e-6 * np.abs(moved).max())
     assert objective(phi + moved) < objective(phi)
@@ -93,7 +93,7 @@ def test_step_lowers_its_objective():
     def objective(phi):
         return np.sum((x - phi @ c) ** 2) / 50 + 0.1 * np.sum((a @ phi) ** 2)
 
-    atoms, _ = dictionary.dictionary_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1)
+    atoms, _ = refit.dictionary_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1)
     for _ in range(20):
         assert objective(atoms + 1e-2 * rng.standard_normal(atoms.shape)) > objective(atoms)
 
@@ -101,7 +101,7 @@ def test_step_lowers_its_objective():
 def test_unused_atoms_do_not_break_the_step():
     c = np.zeros((8, 50))
     c[:3] = np.random.default_rng(0).standard_normal((3, 50))
-    atoms, _ = dictionary.dictionary_step(np.zeros(12), np.eye(12), c @ c.T / 50, np.ones((12, 50)) @ c.T / 50, 0.0)
+    atoms, _ = refit.dictionary_step(np.zeros(12), np.eye(12), c @ c.T / 50, np.ones((12, 50)) @ c.T / 50, 0.0)
     assert np.all(np.isfinite(atoms)) and not np.any(np.abs(atoms[:, 3:]) > 1e-9)
 
 

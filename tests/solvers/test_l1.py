@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from plenocli.solvers import l1
+from plenocli.solvers.l1_guess import guess
 
 
 def plenoptic_like(rows=30, atoms=40, signals=12, seed=0):
@@ -270,16 +271,16 @@ def test_guess_is_mostly_right_and_changes_nothing_but_the_work(weights):
     assert max(code.gap.max(), cold.gap.max()) <= 1e-8
     np.testing.assert_allclose(code.objective, cold.objective, rtol=1e-7)
     problem = l1.prepare(d, y, 1e-4, weights, ())
-    guess = l1._guess(problem, problem.threshold)
-    assert 3 < np.count_nonzero(guess) / 200 < 30
+    begin = guess(problem, problem.threshold)
+    assert 3 < np.count_nonzero(begin) / 200 < 30
     chance = np.count_nonzero(cold.c) / cold.c.size / 2
-    assert np.mean(np.sign(guess[guess != 0]) == np.sign(cold.c.T[guess != 0])) > 2 * chance
+    assert np.mean(np.sign(begin[begin != 0]) == np.sign(cold.c.T[begin != 0])) > 2 * chance
 
 
 def test_guess_scales_with_the_problem():
     d, y = plenoptic_like(signals=60)
     problem, far = l1.prepare(d, y, 1e-4, None, ()), l1.prepare(1e90 * d, 1e60 * y, 1e146, None, ())
-    guess, scaled = l1._guess(problem, problem.threshold), l1._guess(far, far.threshold)
-    np.testing.assert_allclose(1e30 * scaled, guess, rtol=1e-3, atol=1e-3 * np.abs(guess).max())
-    assert not l1._guess(l1.prepare(d, 0 * y, 1e-4, None, ()), problem.threshold).any()
-    assert not l1._guess(l1.prepare(0 * d, y, 1e-4, None, ()), problem.threshold).any()
+    begin, scaled = guess(problem, problem.threshold), guess(far, far.threshold)
+    np.testing.assert_allclose(1e30 * scaled, begin, rtol=1e-3, atol=1e-3 * np.abs(begin).max())
+    assert not guess(l1.prepare(d, 0 * y, 1e-4, None, ()), problem.threshold).any()
+    assert not guess(l1.prepare(0 * d, y, 1e-4, None, ()), problem.threshold).any()

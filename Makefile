@@ -43,7 +43,7 @@ extremes: $(READY) ## errors of the solvers against the condition of the matrix;
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/solvers/test_extremes.py tests/faults/test_cameras.py
 
-faults: $(READY) ## the fault campaigns in full: 12,000 damaged files, kills, full disks, bombs (hours)
+faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults
 
 fuzz: $(READY) ## ten minutes of coverage-guided fuzzing of every reader; what breaks one stays in runs/fuzz

@@ -18,12 +18,11 @@ def draw_patches(images, shape, count, rng, *, flips=True):
     which = rng.choice(len(images), size=count, p=share / share.sum())
     place = rng.random((count, 2))
     mirror = rng.integers(0, 2, (count, 2)) if flips else np.zeros((count, 2), int)
-    patches = np.empty((rows * columns, count))
-    for k, (image, (u, v), (down, right)) in enumerate(zip(which, place, mirror)):
-        r, c = int(u * room[image][0]), int(v * room[image][1])
-        patch = images[image][r : r + rows, c : c + columns]
-        patches[:, k] = patch[:: -1 if down else 1, :: -1 if right else 1].ravel()
-    return patches
+    corner = (place * np.array(room)[which]).astype(int)
+    patches = np.empty((count, rows, columns))  # written one by one, which columns of a matrix would make slow
+    for patch, image, (r, c), (down, right) in zip(patches, which.tolist(), corner.tolist(), mirror.tolist()):
+        patch[:] = images[image][r : r + rows, c : c + columns][:: -1 if down else 1, :: -1 if right else 1]
+    return patches.reshape(count, -1).T
 
 
 def mean_covariance(patches):

@@ -116,12 +116,13 @@ class Estimators:
         return self._noise(data, self.without_stray(data.y), report)
 
     def loss_db(self, data, report, error):
-        """What it costs at most that the capture is not A x and noise alone, dB, as LMMSE expects; None where that is not known.
+        """What it costs at most that the capture is not A x and noise alone, dB, as LMMSE expects; None where that is not known, or
+        where the method has no use for the statistics of photographs.
 
         error: of the matrix, root mean square of a pixel. It and what the capture holds beyond noise (report["excess"]) may all
         fall upon the few directions that are seen, where noise has only their share of the pixels.
         """
-        if "excess" not in report:
+        if "excess" not in report or "prior" not in vars(self):
             return None
         share = max(1, np.count_nonzero(self.svd.s * CONTRAST > data.sigma)) / len(self.svd.u)
         wrong = np.hypot(report["excess"], error) / np.sqrt(share)

@@ -93,11 +93,11 @@ class Estimators:
         x, spread = self._jointly(data, {})
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         y = self._own_light(data.y, x)
-        if method in WHOLE:
-            return self._whole(method, replace(data, y=y), report, (x, spread))
         report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
         if min(y.shape[:2]) <= 2:
             return x, spread
+        if method in WHOLE:
+            return self._whole(method, replace(data, y=y), report, (x, spread))
         x[INNER], _ = self._by_lenslet(method, data, y[INNER], None if truth is None else truth[INNER], report)
         return x, None
 
@@ -206,13 +206,13 @@ class Estimators:
     def _whole(self, method, data, report, known=None):
         """(x, sigma) of a method that sees the whole picture; sigma is that of LMMSE, from which it starts: an upper estimate.
 
-        data.y: own light.  known: (x, sigma) of the estimate that took the neighbours' light away: lenslets of the border start
-        there, and stay there where light from beyond the array is left in their superpixels.
+        data.y: own light.  known: (x, sigma) of the estimate that took the neighbours' light away: lenslets of the border stay what
+        they are there.
         """
         from plenocli.solvers import wholesensor
 
         shape, y = self.system.object_shape, data.y
-        inner = INNER if known is not None and min(y.shape[:2]) > 2 else np.s_[:, :]
+        inner = np.s_[:, :] if known is None else INNER
         sigma = self._noise(data, y[inner], report)
         x, spread = known or np.empty((2, *y.shape[:2], self.svd.vt.shape[1]))
         x[inner], spread[inner] = self._adaptive(sigma, data.scene, y[inner])
@@ -220,10 +220,9 @@ class Estimators:
         report["start"] = f"lmmse, which expects an error of {error:.3g}"
         held = None
         if known is not None:
-            held = noise_level.of_each(self.svd, y) > noise_level.BORDER * sigma
-            held[INNER] = False
-            held = held, x.copy()
-            report["border"] = f"{int(held[0].sum())} lenslets stay those of LMMSE over 3x3 lenslets: they hold light from beyond the array"
+            edge = np.ones(y.shape[:2], bool)
+            edge[inner] = False
+            held = edge, x.copy()
         term = wholesensor.DataTerm(self.svd, shape, y, sigma, 2 * error, held)
         if method == "tv":
             picture = wholesensor.total_variation(term, to_plane(x, shape), error)

@@ -7,8 +7,6 @@ from plenocli.stages.progress import note
 
 MISFIT = 1.5
 """Estimated noise over the capture's own from which on the estimate is believed."""
-BORDER = 1.3
-"""The same for a lenslet of the border to have light from beyond the array that could not be told."""
 ESTIMATED = "estimated from what the system matrix cannot produce"
 
 
@@ -38,13 +36,6 @@ def told_noise(y, known, report):
     """The capture's own noise `known`, but not less than rounding, where a matrix models all of the light."""
     report |= {"noise_sigma": max(known, _floor(y)), "noise_source": "from the capture"}
     return report["noise_sigma"]
-
-
-def of_each(svd, y):
-    """The same of each superpixel of y (lenslet_row, lenslet_column, pixel) by itself; 0 where the matrix produces everything."""
-    reached = svd.rank(1e-6)
-    rest = np.sum(np.square(y), axis=2) - np.sum(np.square(y @ svd.u[:, :reached]), axis=2)
-    return np.sqrt(np.maximum(rest, 0) / max(1, y.shape[2] - reached))
 
 
 def _estimated(svd, stacked, known, hint):

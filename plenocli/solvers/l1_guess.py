@@ -16,14 +16,14 @@ RELAXATION = 1.8
 CONVERTED = 1.3
 """Their penalty times a typical |c|, where the threshold is 1: of 0.6 to 2.1 the one that finds most of the support in few rounds."""
 
-FAINT = 0.1
+FAINT = 0.3
 """Directions of D of less power than this times the penalty do not count in the guess."""
 
 GUESSED = 1.2
 """Atoms to begin with, at most, as a share of those that a ridge regression determines (its degrees of freedom)."""
 
-TOGETHER = 256
-"""Signals guessed together: what belongs to them stays in a core's cache."""
+TOGETHER = 512
+"""Signals guessed together: many enough for quick products, few enough for the cache."""
 
 SINGLE = 1e6
 """Largest |D^T y| over the threshold that leaves single precision something to say."""
@@ -46,19 +46,19 @@ def guess(problem, threshold):
     # unit and level in their own units below, so that squares stay within range
     if count * SMALL < rows**3 or not (unit > 0 and level > np.finfo(float).tiny and unit * level < 1e30 and 1 < largest < SINGLE):
         return c
-    scaled, signals = problem.d / threshold / unit, problem.y / level
+    scaled = problem.d / threshold / unit
     energy, basis = np.linalg.eigh(scaled @ scaled.T)
     energy = np.maximum(energy, 0)
-    penalty, determined = _typical(energy, np.mean((basis.T @ signals) ** 2, axis=1), unit * level)
+    penalty, determined = _typical(energy, np.mean((basis.T @ (problem.y / level)) ** 2, axis=1), unit * level)
     keep = min(int(GUESSED * determined), atoms)
     if not keep:
         return c
     used = energy > FAINT * penalty
     half = np.ascontiguousarray((basis[:, used] / np.sqrt(energy[used] + penalty)).T @ scaled, np.float32)
-    scaled, signals = scaled.astype(np.float32), (unit * level * signals.T).astype(np.float32)
+    share = (energy[used] / (energy[used] + penalty)).astype(np.float32)
     for first in range(0, count, TOGETHER):
         part = slice(first, first + TOGETHER)
-        found = _alternate(signals[part] @ scaled, half)
+        found = _alternate((problem.b[part] / threshold).astype(np.float32), half, share)
         if keep < atoms:
             size = np.abs(found)
             found[size < np.partition(size, atoms - keep, axis=1)[:, atoms - keep, None]] = 0
@@ -81,24 +81,26 @@ def _typical(energy, power, level):
     return CONVERTED / 3 * ridge, determined if np.isfinite(ridge) else 0
 
 
-def _alternate(right, half):
-    """ROUNDS of ADMM for  min c^T G c / 2 - right c + |c|_1, G + penalty inverted as (I - half^T half) / penalty; penalty times its sparse iterate.
+def _alternate(right, half, share):
+    """Penalty times the sparse iterate after ROUNDS of ADMM for  min c^T G c / 2 - right c + |c|_1.
 
-    right: (signal, atom) float32.  half: (row, atom) float32. Everything times the penalty: `total` is the sum of sparse iterate and
-    scaled dual variable, `dual` the part of it within +-1.
+    right: (signal, atom) float32.  half: (row, atom) float32, with (G + penalty)^-1 = (I - half^T half) / penalty and half half^T =
+    diag(share). Everything times the penalty: `total` is the sum of sparse iterate and scaled dual variable, `dual` the part of it
+    within +-1; a round takes total to total + RELAXATION (right - dual - half^T half (right + total - 2 dual)), and half times
+    each of these is carried along, since it is short.
     """
-    total, dual, sparse, ahead, seen = (np.zeros_like(right) for _ in range(5))
-    inner = np.empty((len(right), len(half)), np.float32)
-    for k in range(ROUNDS):
-        np.subtract(sparse, dual, out=ahead)
-        ahead += right
-        np.matmul(ahead, half.T, out=inner)
-        ahead -= np.matmul(inner, half, out=seen)
-        if k:
-            ahead -= sparse
-            ahead *= np.float32(RELAXATION)
-            ahead += total
-        total, ahead = ahead, total
+    seen_right = right @ half.T
+    dual, step = np.empty_like(right), seen_right @ half
+    total, seen_total = right - step, seen_right * (1 - share)
+    for _ in range(ROUNDS - 1):
         np.clip(total, -1, 1, out=dual)
-        np.subtract(total, dual, out=sparse)
-    return sparse
+        seen_dual = dual @ half.T
+        seen = seen_right + seen_total - 2 * seen_dual
+        np.matmul(seen, half, out=step)
+        step += dual
+        np.subtract(right, step, out=step)
+        step *= np.float32(RELAXATION)
+        total += step
+        seen_total += np.float32(RELAXATION) * (seen_right - seen_dual - share * seen)
+    np.clip(total, -1, 1, out=dual)
+    return np.subtract(total, dual, out=total)

@@ -161,7 +161,7 @@ def cost(camera, view, band, shape, double):
         operations += 0 if not band.sensor_count else 4 * both * lines * rank
         sheets = lit**2 * (1 if even and a == b else 2)
         seconds += 0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products
-        seconds += 0.006 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across)
+        seconds += 0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across)
         largest = max(largest, item * (both * (products + 3 * sketch)))
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
     size = shape[1] * shape[2] * shape[3]

@@ -47,8 +47,9 @@ def check(outcome, target, whole):
 
 
 def is_old_or_new(target, whole):
-    """Whether each file of a result is as it was or as it should become, with nothing beside."""
-    there = tree(target.parent)
+    """Whether each file of a result is as it was or as it should become, with nothing beside but what a sweep could not clean in the
+    folder that is its own, where every call fails from some time on; the next run does."""
+    there = {name: content for name, content in tree(target.parent).items() if ".parts/scratch/" not in name}
     return there.keys() == whole.keys() and all(content in (OLD, whole[file]) for file, content in there.items())
 
 

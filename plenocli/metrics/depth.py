@@ -30,7 +30,7 @@ def score_depth(slope, confidence, true_slope, planes, sharpness):
     found = np.asarray(slope)[counted(slope, confidence)]
     error = np.abs(found - true_slope)
     middle, far = np.percentile(error, [50, 95]) if found.size else (np.nan, np.nan)
-    return {"depth_slope": float(true_slope), "depth_slope_found": float(np.median(found)) if found.size else np.nan, "depth_slope_error": float(middle), "depth_slope_worst": float(far),
+    return {"depth_slope": round(float(true_slope), 9) + 0.0, "depth_slope_found": float(np.median(found)) if found.size else np.nan, "depth_slope_error": float(middle), "depth_slope_worst": float(far),
             "depth_sure_share": found.size / np.size(slope), "sharpest_slope_error": float(sharpest(planes, sharpness) - true_slope)}
 
 

@@ -1,6 +1,6 @@
 """The dictionary step of Algorithm 1 (Berkner et al. 2013, Fig. 4): atoms that give clean patches back from their codes.
 
-min (1/B)|X - Phi C|^2 + delta |A Phi|^2 in closed form, and the published gradient steps beside it; docs/model.md, "Learning".
+min (1/B)|X - Phi C|^2 + delta |A Phi|^2 in closed form, and the published gradient steps beside it; docs/model.md, "Spatial reconstruction".
 """
 
 import numpy as np

@@ -156,11 +156,11 @@ def reach_of(case):
 # the sweep
 
 
-def truth_of(run, case):
-    """The Truth of a case; asking for it may take a paraxial sum."""
+def truth_of(run, case, kept_only=False):
+    """The Truth of a case; asking for it may take a paraxial sum, unless it is to be of what is kept only: then it may be None."""
     camera = camera_of(case["camera"])
     window = None if case["scope"] == "isolated" else wide_window(camera)
-    return truth_for(camera, "fresnel" if case["model"] == "fresnel" else "exact", window, reach_of(case), case["accuracy"], run / "reference")
+    return truth_for(camera, "fresnel" if case["model"] == "fresnel" else "exact", window, reach_of(case), case["accuracy"], run / "reference", kept_only)
 
 
 def expected(run, cases, budget):
@@ -184,7 +184,7 @@ def expected(run, cases, budget):
 def run_case(run, case, budget, race, kept_only=False):
     """Fill in what was measured of a case, of its chosen rung and of those it was chosen from."""
     chosen, others = case["_chosen"], case["_others"]
-    truth = truth_of(run, case)
+    truth = truth_of(run, case, kept_only)
     if kept_only and not (truth and record_path(run, case, chosen, truth).exists()):
         return case | {"not_run": f"estimated {dial.seconds_here(chosen):.2g} s"}
     if truth is None:

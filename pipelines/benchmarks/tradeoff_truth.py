@@ -251,11 +251,12 @@ class Plain(Truth):
         return 0.0
 
 
-def truth_for(camera, model, window, superpixels, accuracy, folder):
+def truth_for(camera, model, window, superpixels, accuracy, folder, kept_only=False):
     """The Truth against which a matrix of `accuracy` with a coherent `window` (None: isolated) is held.
 
     Paraxial: every lenslet there is. Exact: the fewest lenslets that leave out a tenth of the accuracy (as the paraxial model
-    has it), or as many as can be afforded; None where not even the nearest can.
+    has it), or as many as can be afforded; None where not even the nearest can. kept_only: compute nothing, and None where something is
+    not at hand.
     """
     if window is None or model == "fresnel":
         return Truth(camera, model, None if window is None else wide_window(camera), superpixels, folder)
@@ -263,8 +264,12 @@ def truth_for(camera, model, window, superpixels, accuracy, folder):
     if not affordable:
         return None
     wide = Plain(camera, "fresnel", wide_window(camera), [(0, 0)], folder)
+    if kept_only and not wide.path.exists():
+        return None
     for truth in affordable:
         near = Plain(camera, "fresnel", truth.window, [(0, 0)], folder)
+        if kept_only and not near.path.exists():
+            return None
         change = max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(wide.columns(), near.columns()))
         if change < 0.1 * accuracy:
             return truth

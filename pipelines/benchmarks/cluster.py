@@ -83,7 +83,7 @@ def main():
             for n in options.workers if round_ % 2 else options.workers[::-1]:
                 start, spent, out = time.monotonic(), clusters[n].cpu(), run / (f"pictures-{n}" if len(captures) > 1 else f"picture-{n}.h5")
                 plenocli("reconstruct", *captures, "--pif", pif, *METHOD[len(captures) == 1], "--scheduler", clusters[n].known, "--overwrite", "-o", out)
-                files = sorted(out.iterdir()) if len(captures) > 1 else [out]
+                files = [out / c.name for c in captures] if len(captures) > 1 else [out]
                 known["bytes"] = sorted({*known["bytes"], hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()})
                 if round_ or options.rounds == 1:
                     known["wall"].setdefault(str(n), []).append(time.monotonic() - start)

@@ -13,6 +13,9 @@ import numpy as np
 SCALES = np.geomspace(1e-3, 30, 60)
 """Scales of the covariance that are tried."""
 
+IMPLAUSIBLE = 8
+"""Scale that a whole picture does not have: 2.8 times the contrast of the average photograph in every lenslet."""
+
 ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
@@ -72,6 +75,10 @@ class Lmmse:
     def common_scale(self, y):
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
         return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])
+
+    def implausible(self, y):
+        """Whether the signals y (pixel, signal) together would need more contrast than a photograph has: a scale of IMPLAUSIBLE or more."""
+        return len(self.power) > 0 and self.common_scale(y) >= IMPLAUSIBLE
 
     def _likelihood(self, w):
         """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale, signal), but for a constant."""

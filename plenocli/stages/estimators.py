@@ -138,7 +138,23 @@ class Estimators:
 
     def _noise(self, data, y, report):
         hint = "" if self.coupled and self.overlap == 3 else ". If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3"
-        return noise_level.own_noise(self.svd, y, data.sigma, self.settings.noise_sigma, report, hint)
+        sigma = noise_level.own_noise(self.svd, y, data.sigma, self.settings.noise_sigma, report, hint)
+        misfit = data.sigma is not None and report["noise_source"] == noise_level.ESTIMATED
+        return self._explaining(sigma, data.scene, y, report) if misfit else sigma
+
+    def _explaining(self, sigma, scene, y, report):
+        """The noise with which photographs explain superpixels y: `sigma`, doubled as long as they would need more contrast than they have.
+
+        What the matrix cannot produce tells of light that it does not know; what it can produce by chance of such light looks like an
+        enormous contrast, in which every method would drown.
+        """
+        stacked, most = y.reshape(-1, y.shape[-1]).T, sigma
+        while self.prior.lmmse(most, scene).implausible(stacked):
+            most *= 2
+        if most > sigma:
+            note(f"photographs explain this capture only if sigma = {most:.3g}: most of the picture's detail is lost to light that the system matrix does not know")
+            report |= {"noise_sigma": most, "noise_source": "what photographs do not explain"}
+        return most
 
     def _sensor(self, count):
         return BlockToeplitz(self.system.blocks, self.system.offsets, count)

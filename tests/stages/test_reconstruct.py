@@ -164,6 +164,19 @@ def test_light_that_the_matrix_lacks_does_not_pass_for_contrast(tmp_path):
     assert psnr(image.data["image/value"], truth) > 19
 
 
+@pytest.mark.parametrize("stray, gain", [(1.0, 3), (3.0, 1), (10.0, -0.5)])
+def test_light_that_no_photograph_explains_is_not_amplified(tmp_path, stray, gain, capsys):
+    """A matrix without neighbours takes their light for contrast; plug and play had 6 dB less than the mean of each block."""
+    truth = make_files(tmp_path, coupled=True, stray=stray)
+    floor = psnr(reconstruct(tmp_path, "--method", "block-mean").data["image/value"], truth)
+    capsys.readouterr()
+    for method in ("lmmse", "pnp"):
+        image = reconstruct(tmp_path, "--method", method, "--overlap", "1")
+        assert psnr(image.data["image/value"], truth) > floor + gain, method
+        assert image.attrs["image"]["parameters"]["noise_source"] == "what photographs do not explain"
+        assert "only if sigma =" in capsys.readouterr().err
+
+
 def test_dictionary_chain(single, capsys):
     folder, truth = single
     learn = ["learn-dict", "skimage:camera", "skimage:coffee", "skimage:coins", "--pif", str(folder / "pif.h5"), "--batch", "150", "--lambda", "1e-5"]

@@ -269,7 +269,7 @@ def test_refusals():
 
 def full_camera(name, profile):
     """52x52 pixels and 40x40 points: f/4.4 and f/8 with 250 um lenslets, f/8 with 104 um ones."""
-    f_number, pitch, pixel = {"f/4.4": (4.4, 250e-6, 4.808e-6), "f/8": (8, 250e-6, 4.808e-6), "f/8, 104 um": (8, 104e-6, 2e-6), "f/2.2": (2.2, 250e-6, 4.808e-6)}[name]
+    f_number, pitch, pixel = {"f/4.4": (4.4, 250e-6, 4.808e-6), "f/8": (8, 250e-6, 4.808e-6), "f/8, 104 um": (8, 104e-6, 2e-6), "f/2.2": (2.2, 250e-6, 4.808e-6), "f/1.5": (1.5, 250e-6, 4.808e-6)}[name]
     return fast_camera(main_lens__focal_length=0.1, main_lens__aperture_diameter=0.11 / f_number, object__distance=1.1, lenslet_array__distance=0.11,
                        lenslet_array__pitch=pitch, lenslet_array__focal_length=pitch * f_number, lenslet_array__profile=profile,
                        sensor__distance=pitch * f_number, sensor__pixel_pitch=pixel, sensor__pixels_per_lenslet=(52, 52), object__samples_per_lenslet=(40, 40))
@@ -327,3 +327,15 @@ def test_full_size_at_f_2_2():
     camera, points, rows = full_camera("f/2.2", "parabolic"), [0, 137, 820], [3, 26]
     truth = energies_by_products(camera, image_points(camera, points), 0, (0, 0), rows, 12)
     assert errors(columns(camera, points, asked=2e-4)[:, rows], truth).max() <= 2e-4
+
+
+@pytest.mark.slow
+def test_pixels_that_hold_eight_fringes_of_a_lenslet_of_412_cells():
+    """f/1.5 at 400 nm, beyond what the rule of the pixels' nodes was fitted to."""
+    camera, wavelength, points = full_camera("f/1.5", "hyperbolic").replace(**{"light.wavelengths": (400e-9,)}), 400e-9, [0, 820, 137, 20]
+    found = []
+    for asked in (1e-5, 1e-2, 1e-3):
+        plan = accuracy.plan_pif(camera, model="fresnel", accuracy=asked, superpixels=(1, 1), coherent_ring=0)
+        found.append(PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(points)[0])
+    for asked, other in zip((1e-2, 1e-3), found[1:]):
+        assert (np.linalg.norm(other - found[0], axis=0) <= asked * np.linalg.norm(found[0], axis=0)).all()

@@ -159,7 +159,8 @@ def cost(camera, view, band, shape, double):
         # of many lenslets each brings few terms, so that products are narrow and wait for memory
         operations += both * (products * ((16 if lit == 1 else 26) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3
         operations += 0 if not band.sensor_count else 4 * both * lines * rank
-        sheets = lit**2 * (1 if even and a == b else 2)
+        # coarse cuts drop most lenslets
+        sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * max(0.0, math.log10(COARSE / band.cut)))
         seconds += 0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products
         seconds += 0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across)
         largest = max(largest, item * (both * (products + 3 * sketch)))

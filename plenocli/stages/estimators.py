@@ -104,7 +104,7 @@ class Estimators:
     def in_batches(self, solve, z, size, *options):
         """What solve(camera, batch, *options), a function of stages.per_lenslet, gives for z (row, signal), `size` signals at a time, in
         their order. Several batches go to elsewhere(solve, batches, options), where it is set."""
-        batches = [z[:, start : start + size] for start in range(0, z.shape[1], size)]
+        batches = [np.ascontiguousarray(z[:, start : start + size]) for start in range(0, z.shape[1], size)]  # as they arrive elsewhere: last digits depend on the layout
         if self.elsewhere is not None and len(batches) > 1:
             return self.elsewhere(solve, batches, options)
         return [solve(self, batch, *options) for batch in bar(batches, len(batches), "batches of lenslets")]

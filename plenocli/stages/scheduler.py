@@ -35,7 +35,7 @@ def open_pool(workers=1, scheduler=None, *, threads=False):
     scheduler, or the file that it wrote; then its workers serve, however many they are. UsageError where there is none.
     """
     if scheduler is not None:
-        with _cluster(scheduler) as client, contextlib.closing(_on_cluster(client)) as pool:
+        with _one_thread(), _cluster(scheduler) as client, contextlib.closing(_on_cluster(client)) as pool:
             yield pool
     elif workers == 1:
         with _one_thread():
@@ -44,7 +44,7 @@ def open_pool(workers=1, scheduler=None, *, threads=False):
         with _one_thread(), contextlib.closing(_Executing(lambda: ThreadPoolExecutor(workers), lambda: workers + 1, attempt)) as pool:
             yield pool
     else:
-        with _environment(), contextlib.closing(_Executing(lambda: _processes(workers), lambda: 2 * workers)) as pool:
+        with _one_thread(), _environment(), contextlib.closing(_Executing(lambda: _processes(workers), lambda: 2 * workers)) as pool:
             yield pool
 
 

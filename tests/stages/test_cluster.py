@@ -63,6 +63,21 @@ def described(folder):
     return folder / "sweep.toml"
 
 
+TWO_A_BATCH = """
+import sys
+from plenocli.cli.main import run
+from plenocli.stages import per_lenslet, reconstruct
+
+if __name__ == "__main__":
+    per_lenslet.BATCH = dict.fromkeys(per_lenslet.BATCH, 2)  # nine lenslets: five batches
+    sent, send = [], reconstruct._spread
+    reconstruct._spread = lambda recipe, pool, solve, batches, options: sent.extend(batches) or send(recipe, pool, solve, batches, options)
+    code = run(sys.argv[1:])
+    print(len(sent))
+    sys.exit(code)
+"""
+
+
 def same(table, other):
     return table.read_bytes() == other.read_bytes() and table.with_suffix(".csv").read_bytes() == other.with_suffix(".csv").read_bytes()
 
@@ -119,22 +134,21 @@ def test_captures_go_to_the_cluster_and_come_back_the_same(cluster, tmp_path, mo
 
 @pytest.mark.parametrize("method", [["nnls"], ["nnls", "--nnls-iterations", "30"], ["dictionary", "--dictionary", "dictionary.h5"]], ids=["converged", "stopped", "dictionary"])
 def test_batches_of_the_lenslets_of_one_capture_give_the_bytes_of_one_process(cluster, tmp_path, monkeypatch, method):
-    from plenocli.stages import per_lenslet, reconstruct
-
     known, workers = cluster
     workers(2)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(per_lenslet, "BATCH", dict.fromkeys(per_lenslet.BATCH, 2))  # nine lenslets: five batches
     described(tmp_path)
     assert run(["simulate-pif", "camera.toml", "--model", "fresnel", "--superpixels", "1x1", "-o", "pif.h5"]) == 0
     assert run(["capture-sim", "camera.toml", "--pif", "pif.h5", "--scene", "skimage:coins", "--snr", "50dB", "-o", "view.h5"]) == 0
     if method[0] == "dictionary":
         assert run(["learn-dict", "skimage:camera", "skimage:brick", "--pif", "pif.h5", "--iterations", "1", "--atoms", "20", "--batch", "60", "-o", "dictionary.h5"]) == 0
-    spread, send = [], reconstruct._spread
-    monkeypatch.setattr(reconstruct, "_spread", lambda recipe, pool, solve, batches, options: spread.append(batches) or send(recipe, pool, solve, batches, options))
+    sent = {}
     for name, options in {"here": [], "there": ["--scheduler", str(known)], "beside": ["--workers", "2"]}.items():
-        assert run(["reconstruct", "view.h5", "--pif", "pif.h5", "--method", *method, *options, "-o", f"{name}.h5"]) == 0
-    assert [len(batches) for batches in spread] == [5, 5], "only the two with workers send batches out"
+        words = ["reconstruct", "view.h5", "--pif", "pif.h5", "--method", *method, *options, "-o", f"{name}.h5"]
+        done = subprocess.run([sys.executable, "-c", TWO_A_BATCH, *words], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=200)
+        assert done.returncode == 0, done.stderr
+        sent[name] = done.stdout.split()[-1]
+    assert sent == {"here": "0", "there": "5", "beside": "5"}, "only the two with workers send batches out"
     assert len({Path(f"{name}.h5").read_bytes() for name in ("here", "there", "beside")}) == 1
 
 

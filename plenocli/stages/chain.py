@@ -78,6 +78,7 @@ def _digest(value, files):
     from plenocli import __version__
 
     def content(part):
+        """`part` with every path in its strings replaced by what the file holds."""
         if isinstance(part, dict):
             return {key: content(inner) for key, inner in part.items()}
         if isinstance(part, (list, tuple)):

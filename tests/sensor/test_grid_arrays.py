@@ -33,7 +33,15 @@ def mean_pitch(index, centres):
     return np.hypot(*np.linalg.lstsq(design, centres, rcond=None)[0][1:].T)
 
 
-def check(array):
+QUICK = [6, 10, 14, 15, 33, 37, 41, 45]
+
+
+def name(array):
+    return f"{array.kind}-{array.pitch:g}px-{array.angle:g}deg-{'cfa' if array.gains else array.falloff}"
+
+
+@pytest.mark.parametrize("array", [pytest.param(a, id=name(a), marks=() if n in QUICK else pytest.mark.slow) for n, a in enumerate(arrays())])
+def test_every_lenslet_is_found_where_it_is(array):
     white, _ = render(array)
     index, centres = true_centres(array)
     inside = whole(centres, array)
@@ -47,24 +55,6 @@ def check(array):
     np.testing.assert_allclose(mean_pitch(index, found[which]), mean_pitch(index, centres), rtol=1e-5)
     if not (array.perspective or array.cubic):
         np.testing.assert_allclose(grid.pitch, array.pitch, rtol=1e-5)
-
-
-QUICK = [6, 10, 14, 15, 33, 37, 41, 45]
-
-
-def name(array):
-    return f"{array.kind}-{array.pitch:g}px-{array.angle:g}deg-{'cfa' if array.gains else array.falloff}"
-
-
-@pytest.mark.parametrize("array", [arrays()[n] for n in QUICK], ids=name)
-def test_some_arrays(array):
-    check(array)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("array", [a for n, a in enumerate(arrays()) if n not in QUICK], ids=name)
-def test_all_other_arrays(array):
-    check(array)
 
 
 def test_the_rendering_itself():

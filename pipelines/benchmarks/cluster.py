@@ -2,8 +2,8 @@
 
 python pipelines/benchmarks/cluster.py --run runs/bench-cluster [--config sample_configs/seed_spatial.toml] [--captures 4] [--rounds 2] [--workers 1 2]
 
-Several captures are tasks each; of one capture (--captures 1) batches of its lenslets are. The method is converged non-negative
-least squares, or what stands in METHOD for several captures. Clusters take turns after a round that warms them (each worker factors
+Several captures are tasks each; of one capture (--captures 1) batches of its lenslets are. The method is non-negative least
+squares with a fixed number of steps. Clusters take turns after a round that warms them (each worker factors
 the matrix once); with --rounds 1 there is none. CPU time is that of the workers: where other programs want the cores too, it says
 more than the clock. What was measured is kept in RUN/cluster.json, so that --workers 1 and --workers 2 may run apart.
 """
@@ -19,8 +19,8 @@ import sys
 import time
 from pathlib import Path
 
-METHOD = {False: ["--method", "nnls", "--nnls-iterations", "300"], True: ["--method", "nnls"]}
-"""By whether there is one capture alone."""
+STEPS = {False: 300, True: 2000}
+"""Steps of the solver, by whether there is one capture alone: enough to outweigh the start of a worker, which factors the matrix."""
 
 
 def plenocli(*arguments):
@@ -77,12 +77,13 @@ def main():
 
     kept = run / f"cluster-{options.captures}.json"
     known = json.loads(kept.read_text()) if kept.exists() else {"wall": {}, "cpu": {}, "bytes": []}
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # no cluster stays behind
     clusters = {n: Cluster(run, n) for n in options.workers}
     try:
         for round_ in range(options.rounds + (options.rounds > 1)):
             for n in options.workers if round_ % 2 else options.workers[::-1]:
                 start, spent, out = time.monotonic(), clusters[n].cpu(), run / (f"pictures-{n}" if len(captures) > 1 else f"picture-{n}.h5")
-                plenocli("reconstruct", *captures, "--pif", pif, *METHOD[len(captures) == 1], "--scheduler", clusters[n].known, "--overwrite", "-o", out)
+                plenocli("reconstruct", *captures, "--pif", pif, "--method", "nnls", "--nnls-iterations", STEPS[len(captures) == 1], "--scheduler", clusters[n].known, "--overwrite", "-o", out)
                 files = [out / c.name for c in captures] if len(captures) > 1 else [out]
                 known["bytes"] = sorted({*known["bytes"], hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()})
                 if round_ or options.rounds == 1:

@@ -12,7 +12,7 @@ from plenocli.stages.progress import note
 
 SPLIT = ("nnls", "dictionary")
 """Methods whose lenslets are solved in batches."""
-BATCH = {"nnls": 128, "nnls converged": 4, "dictionary": 128}
+BATCH = {"nnls": 64, "nnls converged": 4, "dictionary": 128}
 """Lenslets of a batch: some seconds of work. The same however many work, as the last digits depend on it."""
 HINDSIGHT = "oracle: least error against the truth, which no camera has"
 

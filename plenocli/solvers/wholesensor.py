@@ -69,8 +69,9 @@ def plug_and_play(term, start, denoise, taus):
     return x
 
 
-def total_variation(term, start, error, *, rounds=TV_ROUNDS):
-    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by `rounds` of ADMM from x = start.
+def total_variation(term, start, error, rounds=range(TV_ROUNDS)):
+    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by a round of ADMM for each of `rounds`
+    from x = start.
 
     error: root mean square error expected of `start`; it also scales the penalty, tau = error.
     """
@@ -81,7 +82,7 @@ def total_variation(term, start, error, *, rounds=TV_ROUNDS):
 
     x = start
     dual = np.zeros_like(x)
-    for _ in range(rounds):
+    for _ in rounds:
         v = flatter(x + dual) if x.ndim == 2 else np.stack([flatter(plane) for plane in x + dual])
         dual = dual + x - v
         x = term.proximal(v - dual, error)

@@ -6,7 +6,7 @@ import numpy as np
 
 from plenocli.errors import InputError, NumericsError, UsageError
 from plenocli.stages.mosaics import check_exposure_times, read_exposures, true_centres
-from plenocli.stages.progress import note
+from plenocli.stages.progress import bar, note
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _response(data, attrs, bands, radiances, white, dark, bad, noise, asked, gri
     wavelengths = list(dict.fromkeys(w for w, _ in bands))
     reference, cfa = white[0].seconds, white[0].cfa
     gathered = Gathered(data["response/origin"], tuple(data["response/window"]), data["grid/valid"], len(wavelengths))
-    for k, wavelength in enumerate(wavelengths):
+    for k, wavelength in enumerate(bar(wavelengths, len(wavelengths), "bands")):
         group = read_exposures([path for w, path in bands if w == wavelength], white[0], cfa)
         check_exposure_times([white[0], *group])
         noise = _told_by(group, dark, noise)

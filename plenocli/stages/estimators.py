@@ -241,7 +241,8 @@ class Estimators:
             held = edge, x.copy()
         term = wholesensor.DataTerm(self.svd, shape, y, sigma, 2 * error, held)
         if method == "tv":
-            picture = wholesensor.total_variation(term, to_plane(x, shape), error)
+            rounds = range(wholesensor.TV_ROUNDS)
+            picture = wholesensor.total_variation(term, to_plane(x, shape), error, bar(rounds, len(rounds), "rounds"))
             report["rule"] = "isotropic total variation, weight by the error that lmmse expects"
         else:
             taus = wholesensor.schedule(error)

@@ -85,7 +85,7 @@ def test_total_variation_is_the_minimum(sensor):
         grad[:, 1:] += right[:, :-1]
         return value, grad.ravel()
 
-    found = wholesensor.total_variation(wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e3), np.full((12, 8), 0.3), error, rounds=120)
+    found = wholesensor.total_variation(wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e3), np.full((12, 8), 0.3), error, rounds=range(120))
     best = np.full(96, 0.3)
     for smooth in (1e-1, 1e-2, 1e-3, 1e-4):
         best = minimize(objective, best, (smooth,), jac=True, method="L-BFGS-B", options={"maxiter": 1000, "maxfun": 1500, "ftol": 1e-14, "gtol": 1e-8}).x

@@ -42,6 +42,9 @@ def test_completion_knows_commands_options_values_and_files(tmp_path):
             subprocess.run([shell, "-n", str(tmp_path / shell)], check=True)
     installed = subprocess.run(["bash", "-c", 'eval "$(_PLENOCLI_COMPLETE=bash_source plenocli)"; complete -p plenocli'], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert "_plenocli_completion" in installed.stdout
+    if shutil.which("fish"):
+        asked = f"source {tmp_path / 'fish'}; complete -C 'plenocli reconstruct --method t'"
+        assert subprocess.run(["fish", "-c", asked], env=ENVIRONMENT, capture_output=True, text=True, check=True).stdout.split() == ["tikhonov", "tsvd", "tv"]
 
 
 def on_a_terminal(command, folder, environment):

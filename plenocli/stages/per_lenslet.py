@@ -15,6 +15,10 @@ SPLIT = ("nnls", "dictionary")
 BATCH = {"nnls": 64, "nnls converged": 4, "dictionary": 128}
 """Lenslets of a batch: some seconds of work. The same however many work, as the last digits depend on it."""
 HINDSIGHT = "oracle: least error against the truth, which no camera has"
+LOUDER_POWER = 1.75
+"""Lambda grows with the noise to this power, by validation; 2 would be the most probable code of coefficients with one Laplacian density."""
+TOO_LOUD = 50
+"""Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
 
 def block_mean(camera, y, sigma, truth, report):
@@ -77,12 +81,14 @@ def dictionary(camera, y, sigma, truth, report):
     scale = float(svd.s[0])
     learnt = float(attrs["parameters"]["sigma"])
     louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
-    lam = asked if asked is not None else float(attrs["lambda"]) * louder
+    lam = asked if asked is not None else float(attrs["lambda"]) * louder**LOUDER_POWER
+    if louder > TOO_LOUD:
+        note(f"the dictionary was learnt for {louder:.3g} times less noise than this capture has: --method lmmse is as good or better here")
     kept = min(svd.rank(), attrs["parameters"].get("directions", len(svd.s)))
     z = svd.compress(y)[:kept] / scale
     found = camera.in_batches(dictionary_batch, z, BATCH["dictionary"], lam)
     nonzeros = sum(n * part.shape[1] for part, _, n in found) / z.shape[1]
-    rule = "given" if asked is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder:.3g} for more noise"
+    rule = "given" if asked is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder**LOUDER_POWER:.3g} for {louder:.3g} times the noise"
     report |= {"lambda": lam, "rule": rule, "average": "over the mirror images of the dictionary", "worst_gap": max(gap for _, gap, _ in found), "nonzeros": nonzeros}
     return np.concatenate([x for x, _, _ in found], axis=1)
 

@@ -177,9 +177,9 @@ def test_light_that_no_photograph_explains_is_not_amplified(tmp_path, stray, gai
         assert "only if sigma =" in capsys.readouterr().err
 
 
-def test_dictionary_chain(single, capsys):
+def test_dictionary_chain(single, tmp_path, capsys):
     folder, truth = single
-    learn = ["learn-dict", "skimage:camera", "skimage:coffee", "skimage:coins", "--pif", str(folder / "pif.h5"), "--batch", "150", "--lambda", "1e-5"]
+    learn = ["learn-dict", "skimage:camera", "skimage:coffee", "skimage:coins", "--pif", str(folder / "pif.h5"), "--batch", "150", "--lambda", "1e-6"]
     for name, iterations, more in (("a", 2, []), ("b", 4, ["--resume", str(folder / "a.h5")]), ("c", 4, [])):
         assert run([*learn, "--iterations", str(iterations), *more, "-o", str(folder / f"{name}.h5"), "--json"]) == 0
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -192,6 +192,12 @@ def test_dictionary_chain(single, capsys):
     floor = psnr(reconstruct(folder, "--method", "block-mean").data["image/value"], truth)
     assert psnr(image.data["image/value"], truth) > floor + 2
     assert image.attrs["image"]["parameters"]["worst_gap"] <= 1e-6
+    assert "less noise" not in capsys.readouterr().err
+    noisy = make_files(tmp_path, noise=20.0)  # lambda must follow, or the code paints noise: 11 dB
+    quality = {m: psnr(reconstruct(tmp_path, "--method", m, *more).data["image/value"], noisy)
+               for m, more in (("lmmse", ()), ("dictionary", ("--dictionary", str(folder / "c.h5"))))}
+    assert quality["dictionary"] > quality["lmmse"] - 1.5, quality
+    assert "less noise than this capture has" in capsys.readouterr().err
 
 
 def test_several_captures_go_to_a_folder(single, tmp_path, capsys):

@@ -7,6 +7,7 @@ the worst column against it.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -61,8 +62,11 @@ def _square_cost(camera, view, band, shape, double):
     grid = grid_of(shape[1])
     terms, even = 1 if is_separable(camera) else band.terms, is_symmetric(camera)
     real = even and view.blur == 0
-    pairs, lines = distinct(camera, view, shape)[1], view.pixel_shape[0] * band.pixel_nodes
-    fine = lines * view.pixel_shape[1] * band.pixel_nodes
+    (own, pairs), pixels, lines = distinct(camera, view, shape), view.pixel_shape[0] * view.pixel_shape[1], view.pixel_shape[0] * band.pixel_nodes
+    narrow = narrows(view, band, grid, double)
+    beside = band.beside[0] if narrow and band.beside else band.pixel_nodes
+    # of all columns on all superpixels: nodes of the sensor
+    fine = pixels * (own * band.pixel_nodes**2 + (pairs - own) * beside**2)
     item, axes = (16 if double else 8), (1 if real else 2)
     lit = grid[0] if band.window is None else 2 * band.window + 1
     few = lit * min(psf_nodes(view, view.lenslet_width / 2), band.lenslet_nodes)
@@ -73,17 +77,17 @@ def _square_cost(camera, view, band, shape, double):
     setup = field_seconds(camera, view, band) + axes * (
         1.6e-8 * points * few * half + 8e-8 * (2 * lit - 1) * lines * band.lenslet_nodes + 1e-8 * table + 2.5e-11 * (1 if real else 2) * carried * (2 if double else 1))
     size = int(np.prod(shape[1:]))
-    if narrows(view, band, grid, double):  # superpixels keep half to three quarters of the terms
+    if narrow:  # superpixels keep half to three quarters of the terms
         setup += 1.5e-9 * len({max(a, b) for a in range(grid[0]) for b in range(grid[1])}) * table / grid[0] * terms**0.5
         terms *= 0.65
-    return {"operations": 8.0 * 1.2 * fine * terms * pairs,
-            "seconds": setup + pairs * (2.5e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9) + 0.005,
+    return {"operations": 8.0 * 1.2 * fine * terms,
+            "seconds": setup + pairs * 2.5e-5 + fine * (4e-9 if double else 3e-9) + size * (2e-8 if double else 7e-9) + 0.005,
             "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (3 << 22)}
 
 
 RUNGS = (
     Rung("rays", "ray", rays.valid_for, _ray_error, rays.size_band, rays.cost),
-    Rung("fresnel, low rank", "fresnel", _square_only, _paraxial_error, size_band, _square_cost),
+    Rung("fresnel, low rank", "fresnel", _square_only, _paraxial_error, partial(size_band, dim=True), _square_cost),
     Rung("fresnel, triple product", "fresnel", shaped.valid_for, _paraxial_error, size_band, shaped.cost),
     Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, exact.cost),
 )

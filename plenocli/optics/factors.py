@@ -5,14 +5,14 @@ The field of the point (row r, column c) on superpixel (sy, sx) is
     U[v, u] = sum_j high[sy, r, v, j] wide[sx, c, u, j]
 
 on quadrature nodes v, u of the pixels, so all fields of an object column are one matrix product. The product is made in
-pieces that stay in the cache, real and imaginary parts side by side, and is squared and summed over the nodes of each
+pieces that stay in the caches, real and imaginary parts side by side, and is squared and summed over the nodes of each
 pixel before it leaves it.
 """
 
 import numpy as np
 
-WORK_BYTES = 3 << 17
-"""Size of the product before it is squared: about what a core's own cache holds beside the factors."""
+WORK_BYTES = 1 << 22
+"""Size of the product before it is squared: small beside the shared cache, large enough that the right-hand side is packed for several points."""
 
 
 class Factors:

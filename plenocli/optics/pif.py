@@ -51,6 +51,8 @@ class PifBuilder:
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = plan, geometry(camera, wavelength, plan.pixel_shift), np.dtype(dtype)
         camera = at_wavelength(camera, wavelength)
+        if plan.model == "exact":
+            import scipy.linalg  # noqa: F401  a library can be told to stay on one thread only once it is loaded
         with one_thread():
             self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
         self._sampling = band.sampling
@@ -277,7 +279,6 @@ def _complete(planes, share, count):
 def one_thread():
     """A context in which products and decompositions of matrices stay on the thread that asks for them: idle threads that wait for
     the next product cost many times its processor time."""
-    import scipy.linalg  # noqa: F401  its library can be told so only once it is loaded
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(1, "blas")

@@ -14,6 +14,11 @@ from plenocli.optics.quadrature import band_rule, nodes_for
 FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
 """Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N the lenslet's diffraction cells (measured,
 worst column, N from 1.3 to 140; beyond the table as its end)."""
+WHOLE, BESIDE = (1.0, 1.0, 1.0), (0.65, 0.65, 0.3)
+"""Shares of these in a column and in what superpixels beside its own hold of it in focus: fringes of one lenslet, of it with the next, with
+others (measured on four cameras of 17 to 140 diffraction cells: at most 0.5, 0.62 and 0.2)."""
+BESIDE_CELLS = 15
+"""Diffraction cells of a lenslet from which BESIDE holds."""
 FITTED_CELLS = 210
 """Diffraction cells of a lenslet up to which pixel_error was compared with columns."""
 RULES, MAX_RULE = 8, 20
@@ -26,7 +31,7 @@ CUT = 0.3
 class BandPlan:
     """Node counts of one wavelength. `window`: see coherent_window; `half`: half width (m) on which the spread
     function is needed; `sampling`: estimated relative error of the worst column from these counts; `pixel_rule`: which rule the
-    pixels' nodes follow (quadrature.band_rule)."""
+    pixels' nodes follow (quadrature.band_rule); `beside`: nodes and rule on superpixels beside the object's own, where these are fewer."""
 
     wavelength: float
     window: int | None
@@ -37,6 +42,7 @@ class BandPlan:
     half: float
     sampling: float = 0.0
     pixel_rule: int = 0
+    beside: tuple | None = None
 
 
 @dataclass(frozen=True)
@@ -115,8 +121,11 @@ def coherent_window(view, grid, ring):
     return None if ring == 0 else max(math.ceil(max(view.reach(grid))), blur_ring(view)) + ring
 
 
-def size_band(view, grid, ring, accuracy, tolerance):
-    """Node counts at one wavelength; the phase across a lenslet counts the far edge of the outermost superpixel it lights."""
+def size_band(view, grid, ring, accuracy, tolerance, dim=False):
+    """Node counts at one wavelength; the phase across a lenslet counts the far edge of the outermost superpixel it lights.
+
+    dim: whether superpixels beside the object's own may have fewer nodes, where so little light falls on them that it does not tell.
+    """
     half_width, window = max(view.lenslet_extent), coherent_window(view, grid, ring)
     lit = max(view.reach(grid, window))
     far = 0 if window is None else max(view.reach(grid)) + lit
@@ -129,11 +138,15 @@ def size_band(view, grid, ring, accuracy, tolerance):
     count = psf_nodes(view, half)
     terms = expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance)
     # a point between lenslets that do not touch is dim, and what is missed weighs more in its column
-    dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
+    faint = 1 + 5 * (1 - view.lenslet_width / view.D2)
     light = own, joint, view.diffraction_cells, view.blur / view.D2
-    nodes, rule = pixel_nodes(accuracy / dim, *light)
-    sampling = math.hypot(dim * pixel_error(nodes, rule, *light), CUT * tolerance)
-    return BandPlan(view.wavelength, window, nodes_for(slope), nodes, count, terms, half, sampling, rule)
+    nodes, rule = pixel_nodes(accuracy / faint, *light)
+    errors, beside = [CUT * tolerance, faint * pixel_error(nodes, rule, *light)], None
+    if dim and window is not None and view.blur == 0 and view.diffraction_cells > BESIDE_CELLS:
+        fewer = pixel_nodes(accuracy / faint, *light, BESIDE)
+        if fewer[0] < nodes:  # a point at a corner lights two of them
+            beside, errors = fewer, [*errors, math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE)]
+    return BandPlan(view.wavelength, window, nodes_for(slope), nodes, count, terms, half, math.hypot(*errors), rule, beside)
 
 
 def expected_terms(phase, tolerance):
@@ -183,14 +196,14 @@ def distinct(camera, view, shape):
 
 
 @lru_cache(maxsize=1024)
-def pixel_nodes(accuracy, own, joint, cells, blur):
+def pixel_nodes(accuracy, own, joint, cells, blur, shares=WHOLE):
     """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy` (half, for rules that err all over their
     band), and the step of quadrature.band_rule.
 
     own: cycles a pixel up to which one lenslet's light makes fringes; joint: up to which all lenslets together do; cells:
-    diffraction cells of a lenslet; blur: of a point out of focus, in lenslets.
+    diffraction cells of a lenslet; blur: of a point out of focus, in lenslets; shares: WHOLE or BESIDE.
     """
-    light = own, joint, cells, blur
+    light = own, joint, cells, blur, shares
     count = next((n for n in range(2, 200) if pixel_error(n, 0, *light) <= accuracy / 1.5), None)
     if count is None:
         raise NumericsError(f"{joint:.0f} interference fringes a pixel cannot be integrated", "sensor.pixel_pitch", "use smaller pixels")
@@ -205,7 +218,7 @@ def pixel_nodes(accuracy, own, joint, cells, blur):
     return best
 
 
-def pixel_error(count, rule, own, joint, cells, blur):
+def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
     """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis, at the step `rule` of band_rule.
 
     The light of two lenslets n apart makes fringes of (n - 1) own to (n + 1) own cycles a pixel, most of them in the middle.
@@ -216,7 +229,7 @@ def pixel_error(count, rule, own, joint, cells, blur):
     spread = (1 + min(own / 2, 2.0) if rule >= 5 else 1.0) * (1.3 if rule and blur else 1.0)
     # beyond the cells that were compared more was missed than they let expect: 2 % at 412 cells, where this has 2.5
     spread *= max(1.0, cells / FITTED_CELLS) ** 2
-    worst = (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * _fringe_error(count, rule, own, 0)
+    worst = shares[0] * (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * _fringe_error(count, rule, own, 0)
     for apart in range(1, round(joint / own)):
         size, power = FRINGES[min(apart, len(FRINGES)) - 1]
         weight = size * cells**-power
@@ -225,7 +238,7 @@ def pixel_error(count, rule, own, joint, cells, blur):
             weight = max(weight, 0.35 * min(1.0, blur / 2) ** 1.8)
         elif apart <= blur:
             weight = max(weight, FRINGES[0][0] / (cells * apart**2))
-        worst = max(worst, min(0.5, weight) * _fringe_error(count, rule, own, apart))
+        worst = max(worst, shares[min(apart, 2)] * min(0.5, weight) * _fringe_error(count, rule, own, apart))
     return worst
 
 

@@ -12,8 +12,9 @@ from plenocli.optics.relay import lenslet_kernel, lit_lenslets, sensor_nodes
 
 SLAB = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
-NARROW = 1.0
-"""Root-energy cut of a superpixel's factors over that of the spread function."""
+NARROW = 2.0, 4.0
+"""Root-energy cut of the factors of the object's own superpixel and of others over that of the spread function (columns change by 0.05 to 0.7
+of the latter: 8 cases of 5 cameras)."""
 
 
 class SquareLenslets(Factors):
@@ -24,7 +25,7 @@ class SquareLenslets(Factors):
     """
 
     def __init__(self, camera, geometry, plan, band):
-        self.geometry, self.superpixels, self.pixel_nodes, self._band = geometry, plan.superpixels, band.pixel_nodes, band
+        self.geometry, self.superpixels, self._band = geometry, plan.superpixels, band
         self.dtype, self._real = (np.dtype(t) for t in ((np.complex128, np.float64) if plan.double else (np.complex64, np.float32)))
         # off the sensor's own raster every superpixel has its pixels around its centre
         self._centred = geometry.pixel_shift is None
@@ -32,16 +33,24 @@ class SquareLenslets(Factors):
         self.symmetry, self.notes = field.symmetry, {"separable_terms": field.terms, "field_tail": field.tail}
         self._x, self._w, self._basis = self._lenslet_nodes()
         self._kernels = {}
-        high, down = self._table(field, 0)
+        self._cut = plan.tolerance if narrows(geometry, band, plan.superpixels, plan.double) else None
+        rules = self._rules()
+        high, down = self._tables(field, 0, rules)
         if field.signs is not None and self._axes_agree():
             wide, across, signs = high, down * np.outer(field.signs, field.signs).ravel(), field.signs
         else:
-            (wide, across), signs = self._table(field, 1), None
+            (wide, across), signs = self._tables(field, 1, rules), None
         self._entering = (down @ across.T).real
         self._kernels.clear()
-        super().__init__(high, wide, geometry.pixel_shape, band.pixel_nodes, signs)
-        self._cut = NARROW * plan.tolerance if narrows(geometry, band, plan.superpixels, plan.double) else None
+        super().__init__(high[0], wide[0], geometry.pixel_shape, rules[0][1][0], signs)
+        # the object's own superpixel, where it has more nodes
+        self._own = Factors(high[1], wide[1], geometry.pixel_shape, rules[1][1][0], signs) if len(rules) > 1 else None
         self._roots, self._narrow, self._lock = {}, (None, None), Lock()
+
+    def _rules(self):
+        """[(whether all superpixels or the object's own only, (nodes of a pixel per axis, rule))], all of them first."""
+        own = self._band.pixel_nodes, self._band.pixel_rule
+        return [(True, own)] if self._cut is None or not self._band.beside else [(True, self._band.beside), (False, own)]
 
     def superpixel(self, sy, sx, rows, columns, out):
         """As Factors.superpixel, with no more terms than the light of the neighbourhood needs on this superpixel."""
@@ -54,25 +63,31 @@ class SquareLenslets(Factors):
         return narrow.superpixel(0, 0, rows, columns, out)
 
     def _narrowed(self, sy, sx):
-        """Factors of one superpixel cut at self._cut (root energy of a mean point, points at the lenslet's edge weighing more)."""
+        """Factors of one superpixel cut at NARROW self._cut (root energy of a mean point, points at the lenslet's edge weighing more)."""
+        own, source = (2 * sy + 1, 2 * sx + 1) == self.superpixels, self
         signs = np.ones(self.high.shape[3]) if self.signs is None else self.signs
         left, right = self._root(0, sy), self._root(1, sx) * signs
         u, s, vh = np.linalg.svd(left @ right.T)
-        terms = max(1, int(np.count_nonzero(np.sqrt(np.cumsum(s[::-1] ** 2)[::-1]) > self._cut)))
+        terms = max(1, int(np.count_nonzero(np.sqrt(np.cumsum(s[::-1] ** 2)[::-1]) > NARROW[0 if own else 1] * self._cut)))
         scale = 1 / np.sqrt(s[:terms])
+        if own and self._own:
+            source, sy, sx = self._own, 0, 0
         # each table through the other's strong directions: exact on these, and nothing small is divided by
-        high = self.high[sy] @ (right.T @ vh[:terms].conj().T * scale).astype(self.dtype)
-        wide = self.wide[sx] @ (signs[:, None] * left.T @ u[:, :terms].conj() * scale).astype(self.dtype)
-        return Factors(high[None], wide[None], self.pixel_shape, self.pixel_nodes)
+        high = source.high[sy] @ (right.T @ vh[:terms].conj().T * scale).astype(self.dtype)
+        wide = source.wide[sx] @ (signs[:, None] * left.T @ u[:, :terms].conj() * scale).astype(self.dtype)
+        return Factors(high[None], wide[None], self.pixel_shape, source.pixel_nodes)
 
     def _root(self, axis, s):
-        """R with R^H R the overlaps of the terms on superpixel s for a mean point, on as many of its nodes as tell."""
+        """R with R^H R the overlaps of the terms on superpixel s for a mean point, on half of its nodes."""
+        axis = 0 if self.wide is self.high else axis
         if (axis, s) not in self._roots:
-            step = max(1, self.pixel_nodes // 3)
-            table = (self.wide if axis else self.high)[s][:, step // 2::step] * math.sqrt(step)
-            points = self.geometry.points(axis)
-            weighed = (table * edge_emphasis(self.geometry, points).astype(self._real)[:, None, None]).reshape(-1, table.shape[2]).astype(complex)
-            values, vectors = np.linalg.eigh(weighed.conj().T @ weighed / len(points))
+            table, points = (self.wide if axis else self.high)[s], self.geometry.points(axis)
+            node, pixel = np.divmod(np.arange(table.shape[1]), self.pixel_shape[axis])
+            chosen, gram = (node + pixel) % 2 == 0, 0  # every other node, of the next pixel the others
+            for fields, weight in zip(table, edge_emphasis(self.geometry, points) ** 2 * 2 / len(points)):
+                fields = fields[chosen].astype(complex)
+                gram = gram + weight * (fields.conj().T @ fields)
+            values, vectors = np.linalg.eigh(gram)
             self._roots[axis, s] = np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
         return self._roots[axis, s]
 
@@ -96,32 +111,34 @@ class SquareLenslets(Factors):
         carry = (legendre(tf, few, 1) * degrees) @ (legendre(t, few, 1).T * w)
         return half * t, half * w, (half * tf, (half * wf[:, None] * carry).astype(self._real))
 
-    def _kernel(self, axis, n, place):
+    def _kernel(self, axis, n, place, nodes, rule):
         """The kernel (sensor node, 2, term node), real and imaginary part, from a lenslet to the superpixel n before it, which
         stands at `place` (superpixel pitches; it matters on a sensor's own raster only)."""
-        key = axis, n, None if self._centred else place
+        key = axis, n, None if self._centred else place, nodes, rule
         if key not in self._kernels:
-            v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self._band.pixel_nodes, place, self._band.pixel_rule))
+            v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, nodes, place, rule))
             x, carry = self._basis
             kernel = lenslet_kernel(self.geometry, n, v, wv, x)
             parts = np.stack([kernel.real, kernel.imag], axis=1).astype(self._real)
             self._kernels[key] = parts * carry if carry.ndim == 1 else (parts.reshape(-1, len(x)) @ carry).reshape(*parts.shape[:2], -1)
         return self._kernels[key]
 
-    def _table(self, field, axis):
-        """The factor table along one axis (as Factors takes it), and the (point, term x term) Gram matrices over the lenslets."""
+    def _tables(self, field, axis, rules):
+        """The factor tables along one axis (as Factors takes them), one of each of `rules`, and the (point, term x term) Gram matrices over
+        the lenslets."""
         g, window, terms = self.geometry, self._band.window, field.terms
         reach = (self.superpixels[axis] - 1) // 2
         points = g.points(axis)
         half = (len(points) + 1) // 2 if field.even and self._centred else len(points)
         lenslets = list(lit_lenslets(reach, window))
-        table = np.empty((2 * reach + 1, len(points), self.pixel_nodes * g.pixel_shape[axis], terms), self.dtype)
+        tables = [np.empty((2 * reach + 1 if every else 1, len(points), nodes * g.pixel_shape[axis], terms), self.dtype) for every, (nodes, _) in rules]
         entering = np.empty((len(points), terms * terms), self.dtype if field.rows.dtype.kind == "c" else self._real)
         kernels = []
-        for s in range(-reach, reach + 1):
-            chosen = lenslets if window is not None else [s]
-            whole = np.concatenate([self._kernel(axis, m - s, s) for m in chosen], axis=2)
-            kernels.append((lenslets.index(chosen[0]) * len(self._x), whole.reshape(-1, whole.shape[2])))
+        for table, (every, rule) in zip(tables, rules):
+            for out, s in zip(table, range(-reach, reach + 1) if every else [0]):
+                chosen = lenslets if window is not None else [s]
+                whole = np.concatenate([self._kernel(axis, m - s, s, *rule) for m in chosen], axis=2)
+                kernels.append((out, lenslets.index(chosen[0]) * len(self._x), whole.reshape(-1, whole.shape[2])))
         where = (self._x + np.array(lenslets)[:, None] * g.D2).ravel()
         weight = np.tile(self._w, len(lenslets))[:, None].astype(self._real)
         step = max(1, SLAB // (len(where) * terms))
@@ -129,12 +146,13 @@ class SquareLenslets(Factors):
             block = field.evaluate(where - points[start:min(start + step, half), None], axis).astype(entering.dtype)
             for i, values in enumerate(block, start):
                 entering[i] = (values.T @ (values.conj() * weight)).ravel()
-                for s, (first, kernel) in enumerate(kernels):
-                    _product(kernel, values[first:first + kernel.shape[1]], table[s, i])
+                for out, first, kernel in kernels:
+                    _product(kernel, values[first:first + kernel.shape[1]], out[i])
         if half < len(points):  # the mirror image: points, superpixels and sensor nodes reversed
-            table[:, half:] = table[::-1, :len(points) - half, ::-1][:, ::-1]
+            for table in tables:
+                table[:, half:] = table[::-1, :len(points) - half, ::-1][:, ::-1]
             entering[half:] = entering[:len(points) - half][::-1]
-        return table, entering
+        return tables, entering
 
     def incident(self, rows, columns):
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""

@@ -110,9 +110,10 @@ class Estimators:
         return [solve(self, batch, *options) for batch in bar(batches, len(batches), "batches of lenslets")]
 
     def noise(self, data, report):
-        """Standard deviation of what the estimate of all of the capture takes for noise; the report says which one it is."""
-        if self.coupled and self.settings.noise_sigma is None and data.sigma is not None:
-            return noise_level.told_noise(data.y, data.sigma, report)
+        """Standard deviation of what the estimate of all of the capture takes for noise (stages.noise_level); the report says which it
+        is. A matrix with neighbours is believed first: the joint estimate tells better what is left over than block means do."""
+        if self.coupled and data.sigma is not None:
+            return self._noise(data, data.y, report, look=False)
         return self._noise(data, self.without_stray(data.y), report)
 
     def loss_db(self, data, report, error):
@@ -136,25 +137,15 @@ class Estimators:
         even = np.repeat(self.system.levels(y), int(np.prod(self.system.object_shape)), axis=2)
         return y - self._sensor(y.shape[:2]).neighbours_only().forward(even)
 
-    def _noise(self, data, y, report):
+    def _noise(self, data, y, report, look=True):
+        """The noise of superpixels y (lenslet_row, lenslet_column, pixel); look: for what no object gives."""
+        if self.settings.noise_sigma is not None:
+            report |= {"noise_sigma": float(self.settings.noise_sigma), "noise_source": noise_level.GIVEN}
+            return report["noise_sigma"]
         hint = "" if self.coupled and self.overlap == 3 else ". If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3"
-        sigma = noise_level.own_noise(self.svd, y, data.sigma, self.settings.noise_sigma, report, hint)
-        misfit = data.sigma is not None and report["noise_source"] == noise_level.ESTIMATED
-        return self._explaining(sigma, data.scene, y, report) if misfit else sigma
-
-    def _explaining(self, sigma, scene, y, report):
-        """The noise with which photographs explain superpixels y: `sigma`, doubled as long as they would need more contrast than they have.
-
-        What the matrix cannot produce tells of light that it does not know; what it can produce by chance of such light looks like an
-        enormous contrast, in which every method would drown.
-        """
-        stacked, most = y.reshape(-1, y.shape[-1]).T, sigma
-        while self.prior.lmmse(most, scene).implausible(stacked):
-            most *= 2
-        if most > sigma:
-            note(f"photographs explain this capture only if sigma = {most:.3g}: most of the picture's detail is lost to light that the system matrix does not know")
-            report |= {"noise_sigma": most, "noise_source": "what photographs do not explain"}
-        return most
+        stacked = y.reshape(-1, y.shape[-1]).T
+        return noise_level.believed(y, data.sigma, noise_level.outside(self.svd, y, data.sigma) if look else None, report, hint=hint,
+                                    implausible=lambda sigma: self.prior.lmmse(sigma, data.scene).implausible(stacked))
 
     def _sensor(self, count):
         return BlockToeplitz(self.system.blocks, self.system.offsets, count)
@@ -186,18 +177,14 @@ class Estimators:
         return x.T.reshape(rows, columns, -1), spread.T.reshape(rows, columns, -1)
 
     def _jointly(self, data, report):
-        """(x, sigma) of LMMSE over 3x3 lenslets, the covariance scaled to this picture's contrast; once more with the noise that
-        is left over, where that is MISFIT times larger."""
+        """(x, sigma) of LMMSE over 3x3 lenslets, the covariance scaled to this picture's contrast; once more where a matrix with
+        neighbours leaves more over than the capture's noise."""
         sigma = self.noise(data, report)
         x, spread = self._scaled(data, sigma, report)
-        left = self._left_over(data.y, x)
-        if self.settings.noise_sigma is None:
-            noise_level.excess(report, left, data.sigma)
-        if self.coupled and self.settings.noise_sigma is None and left > noise_level.MISFIT * sigma:
-            note(f"the capture holds {left / sigma:.3g} times more than its noise that the system matrix cannot produce: sigma = {left:.3g} is used")
-            report |= {"noise_sigma": left, "noise_source": "what the estimate leaves over"}
-            x, spread = self._scaled(data, left, report)
-        return x, spread
+        if not self.coupled or report["noise_source"] != noise_level.TOLD:
+            return x, spread
+        more = noise_level.believed(data.y, data.sigma, self._left_over(data.y, x), report)
+        return self._scaled(data, more, report) if more > sigma else (x, spread)
 
     def _scaled(self, data, sigma, report):
         """(x, sigma) of the joint estimate with scale x covariance, one scale a picture; steps of sqrt(2), so that captures of

@@ -1,4 +1,9 @@
-"""The noise that reconstruct believes: given, told by the capture, or estimated from what the system matrix cannot produce."""
+"""The noise that reconstruct believes.
+
+One rule, wherever a method needs it: the noise given by the user; else the capture's own; but where MISFIT times more than that is
+found in what the system matrix cannot produce, what is found, doubled as long as photographs would need more contrast than they
+have to explain the rest.
+"""
 
 import numpy as np
 
@@ -6,57 +11,45 @@ from plenocli.errors import NumericsError
 from plenocli.stages.progress import note
 
 MISFIT = 1.5
-"""Estimated noise over the capture's own from which on the estimate is believed."""
-ESTIMATED = "estimated from what the system matrix cannot produce"
+"""Noise found over the capture's own from which on it is believed: the capture holds light that the matrix does not know."""
+GIVEN, TOLD, FOUND, UNEXPLAINED = "given", "from the capture", "estimated from what the system matrix cannot produce", "what photographs do not explain"
 
 
-def own_noise(svd, y, known, given, report, hint=""):
-    """Standard deviation of what in superpixels y (.., pixel) is not A x; the report says which one it is.
-
-    known: the capture's own or None; given: by the user or None. The estimate also wins over the capture's figure where it is
-    MISFIT times larger: then y holds more than A x and the sensor's noise (neighbours' light, another matrix), which would be
-    amplified if it were trusted as signal.
-    """
-    if given is not None:
-        sigma, source = given, "given"
-    else:
-        sigma, source, found = _estimated(svd, y.reshape(-1, y.shape[-1]).T, known, hint)
-        excess(report, found, known)
-    report |= {"noise_sigma": float(sigma), "noise_source": source}
-    return float(sigma)
-
-
-def excess(report, found, known):
-    """Keeps in the report what is found beyond the known noise, root mean square, where both are known."""
-    if found is not None and known:
-        report["excess"] = float(np.sqrt(max(found**2 - known**2, 0.0)))
-
-
-def told_noise(y, known, report):
-    """The capture's own noise `known`, but not less than rounding, where a matrix models all of the light."""
-    report |= {"noise_sigma": max(known, _floor(y)), "noise_source": "from the capture"}
-    return report["noise_sigma"]
-
-
-def _estimated(svd, stacked, known, hint):
+def outside(svd, y, known):
+    """Root mean square of what no object gives in superpixels y (.., pixel); None where the matrix reaches every direction and the
+    noise is `known` anyway."""
     from plenocli.solvers.linear import estimate_noise
 
-    floor = _floor(stacked)
     try:
-        sigma = max(estimate_noise(svd, stacked), floor)
+        return estimate_noise(svd, y.reshape(-1, y.shape[-1]).T)
     except NumericsError:
         if not known:
             raise
-        return known, "from the capture", None
+        return None
+
+
+def believed(y, known, found, report, *, hint="", implausible=None):
+    """Standard deviation of what in superpixels y (.., pixel) is taken for noise; the report says which it is ("noise_source"), and
+    how much is found beyond the known noise, root mean square, where both are known ("excess").
+
+    known: the capture's own, or None. found: root mean square of what A x does not give, or None where that was not looked at.
+    implausible: says of a noise whether photographs would need more contrast than they have to explain y. What the matrix cannot
+    produce tells of light that it does not know; what it can produce by chance of such light looks like an enormous contrast, in
+    which every method would drown.
+    """
+    floor = max(1e-9 * float(np.abs(y).max(initial=0)), np.finfo(float).tiny)  # rounding of the data
+    sigma, source = max(known or 0.0, floor), TOLD
+    if found is not None and known:
+        report["excess"] = float(np.sqrt(max(max(found, floor) ** 2 - known**2, 0.0)))
     if known is None:
-        note(f"the capture does not say its noise: sigma = {sigma:.3g}, {ESTIMATED}")
-    elif sigma <= MISFIT * max(known, floor):
-        return max(known, floor), "from the capture", sigma
-    else:
-        note(f"the capture holds {sigma / max(known, floor):.3g} times more than its noise that the system matrix cannot produce: sigma = {sigma:.3g} is used{hint}")
-    return sigma, ESTIMATED, sigma
-
-
-def _floor(y):
-    """The least noise that is believed: rounding of the data."""
-    return max(1e-9 * float(np.abs(y).max(initial=0)), np.finfo(float).tiny)
+        sigma, source = max(found, floor), FOUND
+        note(f"the capture does not say its noise: sigma = {sigma:.3g}, {FOUND}")
+    elif found is not None and found > MISFIT * sigma:
+        note(f"the capture holds {found / sigma:.3g} times more than its noise that the system matrix cannot produce: sigma = {found:.3g} is used{hint}")
+        sigma, source = found, FOUND
+        while implausible is not None and implausible(sigma):
+            sigma, source = 2 * sigma, UNEXPLAINED
+        if source == UNEXPLAINED:
+            note(f"photographs explain this capture only if sigma = {sigma:.3g}: most of the picture's detail is lost to light that the system matrix does not know")
+    report |= {"noise_sigma": float(sigma), "noise_source": source}
+    return float(sigma)

@@ -91,13 +91,16 @@ def symmetry_defect(own):
 class Diagnosis:
     """What `describe` finds, gathered from a matrix that comes superpixel by superpixel.
 
-    bands: how many; offsets: (superpixel, 2); object_shape: (rows, columns); symmetry: of A, as PifBuilder has it. Only the first
-    superpixel of each orbit is looked at (optics.pif.superpixel_orbits): the others hold the same light.
+    bands: how many; offsets: (superpixel, 2); pixel_shape, object_shape: (rows, columns); symmetry: of A, as PifBuilder has it. Only the
+    first superpixel of each orbit is looked at (optics.pif.superpixel_orbits), and only half of one that mirrors itself: the others
+    hold the same light.
     """
 
-    def __init__(self, bands, offsets, object_shape, symmetry):
+    def __init__(self, bands, offsets, pixel_shape, object_shape, symmetry):
         from plenocli.optics.pif import superpixel_orbits
 
+        self._pixel_shape = tuple(pixel_shape)
+        self._mirrors = (np.asarray(offsets) == 0) & np.array(symmetry[:2]) & (np.array(self._pixel_shape) % 2 == 0)
         self._own = int(np.flatnonzero((np.asarray(offsets) == 0).all(axis=1))[0])
         self._times = {first: (sum(not how[0] for _, how in members), sum(how[0] for _, how in members))
                        for first, members in superpixel_orbits(offsets, symmetry)}
@@ -110,7 +113,9 @@ class Diagnosis:
         if superpixel == self._own:
             self._defects[band] = symmetry_defect(slab)
         if self._few and superpixel in self._times:
-            self._spectra[band].add(slab, *self._times[superpixel])
+            rows, columns = (n // 2 if mirrors else n for n, mirrors in zip(self._pixel_shape, self._mirrors[superpixel]))
+            part = slab.reshape(*self._pixel_shape, -1)[:rows, :columns]
+            self._spectra[band].add(part, *(n * 2 ** int(self._mirrors[superpixel].sum()) for n in self._times[superpixel]))
 
     def result(self, energy):
         """As `describe`, for column energies (band, point)."""
@@ -127,7 +132,7 @@ def describe(pif):
     """
     points = pif.A.shape[-1]
     if points == int(np.prod(pif.object_shape)) and points > _DIRECT:
-        diagnosis = Diagnosis(len(pif.A), pif.lenslet_offset, pif.object_shape, pif.notes.get("symmetry", (False, False, False)))
+        diagnosis = Diagnosis(len(pif.A), pif.lenslet_offset, pif.pixel_shape, pif.object_shape, pif.notes.get("symmetry", (False, False, False)))
         for band, matrix in enumerate(pif.A):
             for superpixel, slab in enumerate(matrix):
                 diagnosis.add(band, superpixel, slab)

@@ -28,15 +28,17 @@ def sensor_nodes(geometry, axis, count, place=0.0, rule=0):
     return half * t[:, None] + (geometry.pixels(axis) + geometry.window_shift(axis, place)), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
 
 
-def lenslet_kernel(geometry, n, v, weight, x):
-    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and lenslet nodes x: (v, x)."""
+def lenslet_kernel(geometry, n, v, weight, x, dtype=complex):
+    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and lenslet nodes x: (v, x) of `dtype`."""
     g = geometry
     relay = 1 / g.z2 + 1 / g.z3
     phase = n * n * g.D2**2 / 2 * relay - n * g.D2 / g.z3 * v
     phase = phase[:, None] + g.kappa / 2 * x * x - x * (v - n * g.superpixel_pitch)[:, None] / g.z3
-    phase *= g.k
-    amplitude = np.sqrt(weight / (g.wavelength * g.z3))[:, None]
-    kernel = np.empty(phase.shape, complex)
+    kernel = np.empty(phase.shape, dtype)
+    phase /= g.wavelength  # in turns, which single precision can hold once whole ones are gone
+    phase -= np.rint(phase)
+    phase = (2 * np.pi * phase).astype(kernel.real.dtype)
+    amplitude = np.sqrt(weight / (g.wavelength * g.z3))[:, None].astype(phase.dtype)
     kernel.real, kernel.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)  # twice as fast as a complex exponential
     return kernel
 

@@ -118,8 +118,8 @@ class SquareLenslets(Factors):
         if key not in self._kernels:
             v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, nodes, place, rule))
             x, carry = self._basis
-            kernel = lenslet_kernel(self.geometry, n, v, wv, x)
-            parts = np.stack([kernel.real, kernel.imag], axis=1).astype(self._real)
+            kernel = lenslet_kernel(self.geometry, n, v, wv, x, self.dtype)
+            parts = np.stack([kernel.real, kernel.imag], axis=1)
             self._kernels[key] = parts * carry if carry.ndim == 1 else (parts.reshape(-1, len(x)) @ carry).reshape(*parts.shape[:2], -1)
         return self._kernels[key]
 

@@ -55,7 +55,7 @@ def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progres
     diagnosis, tails, last = None, {}, None
     with writing_pif(output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite) as writer:
         for builder, band, superpixel, slab in pif_pieces(camera, plan, progress=progress, workers=workers):
-            diagnosis = diagnosis or Diagnosis(len(plan.bands), builder.offsets, builder.object_shape, builder.symmetry)
+            diagnosis = diagnosis or Diagnosis(len(plan.bands), builder.offsets, builder.pixel_shape, builder.object_shape, builder.symmetry)
             diagnosis.add(band, superpixel, slab)
             writer.put(band, superpixel, slab)
             tails[band], last = builder.notes["field_tail"], builder

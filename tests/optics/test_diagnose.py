@@ -17,7 +17,7 @@ from tests.optics.cameras import small_camera
 def test_orbits_and_parities_give_the_values_of_the_whole(change, monkeypatch):
     pif = system_matrix(small_camera(**change), superpixels=(3, 3), coherent_ring=0, model="fresnel", accuracy=1e-4, dtype=np.float64)
     exact = np.linalg.svd(pif.A[0].reshape(-1, pif.A.shape[3]), compute_uv=False)
-    found = Diagnosis(1, pif.lenslet_offset, pif.object_shape, pif.notes["symmetry"])
+    found = Diagnosis(1, pif.lenslet_offset, pif.pixel_shape, pif.object_shape, pif.notes["symmetry"])
     for superpixel, slab in enumerate(pif.A[0]):
         found.add(0, superpixel, slab)
     values = found.result(pif.column_energy)["singular_values"][0]

@@ -66,14 +66,24 @@ def require_memory(needed, mem_limit, what, where=None, fewer="take less of it")
 
 
 def is_lack_of_memory(error):
-    """Whether an error that is no MemoryError means the same: of a library, of a thread or process that cannot start."""
-    return getattr(error, "errno", None) in (errno.ENOMEM, errno.EAGAIN) or any(sign in str(error).lower() for sign in _SIGNS)
+    """Whether an error means that there is no memory: of ours, of a library, of a thread or process that cannot start, or one that came
+    of such an error, as where a library takes it for another and goes on."""
+    return _lack_behind(error) is not None
+
+
+def _lack_behind(error):
+    while error is not None:
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) in (errno.ENOMEM, errno.EAGAIN) or any(sign in str(error).lower() for sign in _SIGNS):
+            return error
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def lack_of_memory(error):
     """What to say of it."""
-    said = f" ({error})" if str(error) else ""
-    return f"not enough memory{said}; use fewer points, lenslets or wavelengths, another --mem-limit, or raise the limit that the shell or the queue sets (ulimit -v)"
+    said = str(_lack_behind(error) or "")
+    return (f"not enough memory{said and f' ({said})'}; use fewer points, lenslets or wavelengths, another --mem-limit, or raise the limit that the shell or the queue sets "
+            "(ulimit -v)")
 
 
 def size_text(count):

@@ -11,7 +11,7 @@ try:
 except ImportError:
     superpixels = None
 else:
-    _jit = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+    _jit = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 
     @_jit
     def _dot(a, b):

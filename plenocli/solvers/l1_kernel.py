@@ -28,7 +28,7 @@ LOWERING = 0.1
 """The threshold starts at this fraction of the largest |b|, and falls by as much from pass to pass until it is the true one."""
 
 _FLAGS = {"reassoc", "contract", "nsz"}
-_jit = numba.njit(cache=True, fastmath=_FLAGS)
+_jit = numba.njit(cache=True, fastmath=_FLAGS, forceinline=True)
 
 Work = namedtuple("Work", "factor block x sign h d v crossing local active working")
 """Scratch of one thread, `capacity` long or square. factor: upper triangular U with U^T U = G over the active atoms in the

@@ -28,7 +28,7 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
         folder = tmp_path / ("another folder " * (number + 1)).strip()
         folder.mkdir()
         for path in source.iterdir():
-            if path.is_file() and path.stem != Path(result).stem:
+            if path.is_file() and path.name not in results(source / result, result):
                 shutil.copy(path, folder)
                 os.utime(folder / path.name, (1e9, 1e9 + number))
         environment = os.environ | STRANGE | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(77 + number)}
@@ -36,6 +36,19 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
         assert done.returncode == 0, done.stderr
         assert results(folder / result, result) == results(source / result, result), number
     count("stages run again elsewhere", runs=runs, other_bytes=0)
+
+
+@pytest.mark.slow
+def test_the_run_that_compiles_gives_the_bytes_of_all_later_ones(tmp_path, count):
+    """Compiled code comes from a cache but for the first time, where all that was compiled on the way is in memory beside it."""
+    pytest.importorskip("numba")
+    code = ("import sys, numpy as np\nfrom plenocli.solvers.l1 import sparse_code\nrng = np.random.default_rng(1)\nfall = np.logspace(0, -4, 30)[:, None]\n"
+            "D, Y = rng.standard_normal((30, 80)) * fall, rng.standard_normal((30, 64)) * fall\n"
+            "sys.stdout.write(sparse_code(D, Y, 1e-4, free=[0], workers=1).c.tobytes().hex())\n")
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, later = (subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    assert first == later and any(tmp_path.rglob("*.nbc"))
+    count("compiled and cached code", programs=1, other_bytes=0)
 
 
 THREADS = 1e-12
@@ -47,7 +60,7 @@ def test_threads_of_the_linear_algebra_change_the_last_digits_at_most(stages, tm
     source, steps = stages
     arguments, result = steps[name]
     for path in filter(Path.is_file, source.iterdir()):
-        if path.stem != Path(result).stem:
+        if path.name not in results(source / result, result):
             shutil.copy(path, tmp_path)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-m", "plenocli", *arguments, "-o", result], cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -77,7 +90,7 @@ def test_workers_of_one_result_change_nothing(runner, stages, tmp_path, count, n
     source, steps = stages
     arguments, result = steps[name]
     for path in filter(Path.is_file, source.iterdir()):
-        if path.stem != Path(result).stem:
+        if path.name not in results(source / result, result):
             shutil.copy(path, tmp_path)
     outcome = runner.run([*arguments, "--workers", 2, "-o", result], tmp_path, limit=240)
     assert outcome.code == 0 and results(tmp_path / result, result) == results(source / result, result), outcome

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
+from plenocli.stages.plans import require_learning
 from plenocli.stages.progress import bar, note
 from plenocli.stages.seeds import stream
 from plenocli.stages.systems import read_system
@@ -63,6 +64,7 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, checkpoint=Non
     names = sorted({Path(n).name for n, _ in training})
     if earlier and names != earlier[2]:
         raise UsageError(f"the resumed dictionary was trained on {', '.join(earlier[2])}", "--resume", "give the same pictures")
+    require_learning(system, chosen, settings, pif)
     svd = decompose(system.own)
 
     def learner(lam):

@@ -11,6 +11,7 @@ from plenocli.operators import to_blocks, to_plane
 from plenocli.stages.batch import outcomes, plan_batch, summarise
 from plenocli.stages.estimators import Estimators
 from plenocli.stages.per_lenslet import SPLIT
+from plenocli.stages.plans import require_reconstruction
 from plenocli.stages.progress import bar, heard, note
 from plenocli.stages.scheduler import Here, absolute, open_pool, run_all
 from plenocli.stages.superpixels import calibrated, read_superpixels
@@ -147,6 +148,7 @@ def reconstruct_capture(recipe, capture):
         estimators = _estimators(recipe)
         data, block = read_superpixels(capture, estimators.system, recipe.calibration, settings.mem_limit), estimators.system.object_shape
         bands = estimators.system.bands
+        require_reconstruction(estimators, data, capture)
         blocks, spread, report = estimators.solve(data, _truth(settings.truth, block, data.y.shape[:2], max(1, len(bands))))
         picture, sigma = to_plane(blocks, block), None if spread is None else to_plane(spread, block)
         report |= _limits(data, estimators, report)

@@ -20,8 +20,10 @@ TINY = (ROOT / "sample_configs" / "tiny.toml").read_text()
 WATCHED = ("import sys; from plenocli.cli.main import run; code = run(sys.argv[1:])\n"
            "peak = next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
            "print(f'\\nend {code} {peak << 10}')")
-SIZES = {"simulate-pif": (24, 28, 32), "capture-sim": (60, 90, 120), "refocus": (30, 45, 60), "score": (30, 45, 60)}
+SIZES = {"simulate-pif": (24, 28, 32), "capture-sim": (60, 90, 120), "refocus": (30, 45, 60), "score": (30, 45, 60), "reconstruct": (32, 36, 40), "learn-dict": (24, 28, 32)}
 CASES = [pytest.param(stage, size, marks=() if (stage, size) == ("capture-sim", 60) else pytest.mark.slow) for stage, sizes in SIZES.items() for size in sizes]
+BLOCKS = ("simulate-pif", "reconstruct", "learn-dict")
+"""Stages whose memory goes by the size of a superpixel and of its object, not by the number of lenslets."""
 
 
 def watched(folder, *arguments):
@@ -38,8 +40,8 @@ def folder(tmp_path_factory):
 
 
 def camera(folder, stage, size):
-    """Name of a camera whose size grows with `size`: of the matrix for simulate-pif, else of the array."""
-    pixels, count = (size, 9) if stage == "simulate-pif" else (16, size)
+    """Name of a camera whose size grows with `size`: of the matrix for BLOCKS, else of the array."""
+    pixels, count = (size, 9 if stage == "simulate-pif" else 5) if stage in BLOCKS else (16, size)
     name = f"{stage}-{size}.toml"
     (folder / name).write_text(TINY.replace("[8, 8]", f"[{pixels}, {pixels}]").replace("[13, 13]", f"[{pixels}, {pixels}]").replace("[5, 5]", f"[{count}, {count}]")
                                .replace('pixel_pitch = "2 um"', f'pixel_pitch = "{26 / pixels} um"'))
@@ -53,12 +55,14 @@ def command(folder, stage, size):
         return ["simulate-pif", name, "--superpixels", "5x5", "--coherent-ring", "0", "--model", "ray", "-o", "out.h5", "--overwrite"]
     pif, capture, picture = (f"{stage}-{size}-{what}.h5" for what in ("pif", "capture", "image"))
     take = ["capture-sim", name, "--pif", pif, "--scene", "skimage:astronaut", "--snr", "50dB", "--overwrite"]
-    steps = [["simulate-pif", name, "--superpixels", "1x1", "--coherent-ring", "0", "-o", pif], [*take, "-o", capture],
+    steps = [["simulate-pif", name, "--superpixels", "1x1", "--coherent-ring", "0", *(["--model", "ray"] if stage in BLOCKS else []), "-o", pif], [*take, "-o", capture],
              ["reconstruct", capture, "--pif", pif, "--method", "block-mean", "-o", picture]]
-    for step in steps[:{"capture-sim": 1, "refocus": 2, "score": 3}[stage]]:
+    for step in steps[:{"capture-sim": 1, "learn-dict": 1, "refocus": 2, "reconstruct": 2, "score": 3}[stage]]:
         if not (folder / step[-1]).exists():
             assert watched(folder, *step)[0] == 0
     return {"capture-sim": [*take, "-o", "out.h5"], "refocus": ["refocus", capture, "--planes", "3", "-o", "out.h5", "--overwrite"],
+            "reconstruct": ["reconstruct", capture, "--pif", pif, "--method", "lmmse", "-o", "out.h5", "--overwrite"],
+            "learn-dict": ["learn-dict", "--pif", pif, "--lambda", "1e-5", "--iterations", "1", "--workers", "1", "-o", "out.h5", "--overwrite"],
             "score": ["score", picture, "--truth", capture, "-o", "out.json", "--overwrite"]}[stage]
 
 
@@ -77,7 +81,7 @@ def in_bytes(text):
 def test_what_is_needed_is_what_is_said_and_less_is_refused(folder, count, stage, size):
     arguments = command(folder, stage, size)
     # with the limit below, inputs can be read, so that the plan is made
-    code, peak, said, error = watched(folder, *arguments, "--mem-limit", "1MiB" if stage == "simulate-pif" else "26MiB")
+    code, peak, said, error = watched(folder, *arguments, "--mem-limit", {"simulate-pif": "1MiB", "reconstruct": "40MiB"}.get(stage, "26MiB"))
     assert code == 5 and peak < least(folder, stage) + (100 << 20), error
     if stage == "simulate-pif":  # under a limit that holds a part of the matrix it is written in pieces
         code, peak, *_ = watched(folder, *arguments[:-3], "-o", "shards.h5", "--overwrite", "--mem-limit", "32MiB")

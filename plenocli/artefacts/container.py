@@ -334,7 +334,7 @@ def _schema_of(path, root, kind):
     if found not in SCHEMAS:
         raise InputError(f"is of the unknown kind '{found}'", path, f"known kinds: {', '.join(SCHEMAS)}")
     if wanted is not None and found not in wanted:
-        raise InputError(f"is a '{found}' artefact where '{' or '.join(wanted)}' is due", path, "swap or rename the inputs")
+        raise InputError(f"is an artefact of kind '{found}' where '{' or '.join(wanted)}' is due", path, "swap or rename the inputs")
     if version != SCHEMAS[found].version:
         older = isinstance(version, (int, float)) and version < SCHEMAS[found].version
         fix = f"make it again ({root['command']})" if older else "update plenocli"

@@ -7,9 +7,9 @@ from h5py import h5d, h5l, h5t, h5z
 from plenocli.errors import InputError
 from plenocli.memory import size_text
 
-_FIX = "make it with plenocli; files from elsewhere may hold only plain numeric datasets"
+_FIX = "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length (numpy.bytes_), only"
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
-_LINKS = {h5l.TYPE_SOFT: "soft", h5l.TYPE_EXTERNAL: "external"}
+_LINKS = {h5l.TYPE_SOFT: "a soft", h5l.TYPE_EXTERNAL: "an external"}
 _ATTRIBUTE_BYTES = 8 << 20
 _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
@@ -61,7 +61,7 @@ def _text(path, name):
 def _check_link(path, group, link, child):
     kind = group.links.get_info(link).type
     if kind != h5l.TYPE_HARD:
-        raise InputError(f"'/{child}' is a {_LINKS.get(kind, 'user-defined')} link", path, _FIX)
+        raise InputError(f"'/{child}' is {_LINKS.get(kind, 'a user-defined')} link", path, _FIX)
 
 
 def _declaration(path, dataset, name):

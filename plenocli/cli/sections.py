@@ -35,7 +35,7 @@ def _converted(option, value, where):
             raise UsageError(f"{value!r} is not true or false", where, "write it without quotes")
         return value
     if isinstance(value, (bool, dict)):
-        raise UsageError(f"{value!r} is no value of this option", where, option.help)
+        raise UsageError(f"{value!r} is neither text nor a number", where, f"write one; {option.name.replace('_', '-')} is: {option.help}")
     if isinstance(value, list) != option.multiple:
         raise UsageError(f"{value!r} is {'a list' if isinstance(value, list) else 'no list'}", where, "give a list" if option.multiple else "give one value")
     try:

@@ -351,7 +351,7 @@ def _computed(data, key, expression):
             raise ConfigError(f"{expression!r} is no product of keys and numbers", f"follow.{key}", "use * and / only")
         term, unit = _term(data, key, match[2].strip())
         if match[1] == "/" and term == 0:
-            raise ConfigError(f"{match[2].strip()} is 0", f"follow.{key}", "divide by something else")
+            raise ConfigError(f"{expression!r} divides by {match[2].strip()}, which is 0", f"follow.{key}", "divide by something else")
         sign = -1 if match[1] == "/" else 1
         value, power, place = value * term**sign, power + sign * (unit == "m"), match.end()
     if power not in (0, 1):

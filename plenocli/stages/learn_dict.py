@@ -54,6 +54,8 @@ def run_learn_dict(images, output, settings, *, pif, resume=None, checkpoint=Non
     check_output(output, overwrite=overwrite, inputs=[pif, *(files or ()), *([resume] if resume and Path(resume) != Path(output) else [])], suffixes=(".h5",))
     kept = checkpoint is not None and Path(checkpoint).exists()
     if checkpoint is not None:
+        if Path(checkpoint).resolve() == Path(output).resolve():
+            raise UsageError(f"{Path(checkpoint).name} is the result too", "--checkpoint", "give it another name; it is removed at the end")
         check_output(checkpoint, overwrite=True, inputs=[pif, output, *(files or ()), *([resume] if resume else [])], suffixes=(".h5",))
         resume = checkpoint if kept else resume
     system = read_system(pif, settings.mem_limit)

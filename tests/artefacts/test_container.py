@@ -151,7 +151,7 @@ def test_missing_empty_folder_foreign_and_wrong_kind_each_have_their_own_words(t
         with pytest.raises(InputError, match=words) as caught:
             read_artefact(tmp_path / name)
         assert str(tmp_path / name) in str(caught.value) and caught.value.fix
-    with pytest.raises(InputError, match="'spectra' artefact where 'pif or capture' is due"):
+    with pytest.raises(InputError, match="artefact of kind 'spectra' where 'pif or capture' is due"):
         read_artefact(tmp_path / "s.h5", ("pif", "capture"))
 
 

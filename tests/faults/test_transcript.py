@@ -27,13 +27,25 @@ CAMERAS = {
     "hexagonal": ("count = [5, 5]", 'count = [5, 5]\nlattice = "hexagonal"'), "drift": ('superpixel_pitch = "26 um"', 'pitch = "26 um"'), "latin": ("[main_lens]", "[main_lens]\nname = \"\udce9\""),
     
     "other2": ('distance = "55 mm"', 'distance = "56 mm"'), "bayer": ("[sensor]", '[sensor]\ncfa = "RGGB"'), "lens": ("f_number = 8", 'f_number = 8\nprescription = "triplet.toml"'),
+    "wide-lens": ("f_number = 8", 'f_number = 1\nprescription = "triplet.toml"'), "one": ("count = [5, 5]", "count = [1, 1]"),
+    **{f"wavefront-{name}": ("f_number = 8", f'f_number = 8\nwavefront = "wave-{name}.h5"') for name in ("none", "whole", "text", "inches")},
+    "aperture-text": ("f_number = 8", 'f_number = 8\naperture_shape = "image"\naperture_image = "scene.toml"'),
+    "aperture-channels": ("f_number = 8", 'f_number = 8\naperture_shape = "image"\naperture_image = "odd.exr"'),
 }
+HOSTILE = ("external_link", "soft_link", "twice", "loop", "external_storage", "virtual", "objects", "ragged", "compound", "reference", "bomb", "filter", "named_type", "null",
+           "attribute_object", "unknown_dataset", "unknown_attribute", "newer", "other_kind", "no_command", "wrong_shape", "infinite")
+"""Of tests/artefacts/test_container.py: what HDF5 allows and plenocli does not."""
 SWEEPS = {
     "bad": SWEEP.replace("f_number", "f_numbr"), "huge": SWEEP.replace("[7, 8]", "{ from = 1, to = 9, steps = 9000 }\n\"sensor.bits\" = { from = 8, to = 9, steps = 9000 }"),
     "stage": SWEEP.replace("[reconstruct]", "[demux]"), "option": SWEEP.replace("method =", "methd ="), "value": SWEEP.replace('"block-mean"', '"best"'),
     "front": SWEEP + '[front]\nbeauty = "max"\n', "follow": SWEEP + '[follow]\n"sensor.distance" = "lenslet_array.focal_length + 1"\n',
     "power": SWEEP + '[follow]\n"sensor.distance" = "lenslet_array.focal_length * lenslet_array.focal_length"\n', "index": SWEEP.replace("main_lens.f_number", "sensor.pixels_per_lenslet.5"),
     "steps": SWEEP.replace("[7, 8]", "{ from = 7, to = 8 }"), "list": 'camera = "camera.toml"\ndesign = "list"\n[[point]]\n"main_lens.f_number" = 7\n', "toml": SWEEP + "[vary\n",
+    **{name: SWEEP.replace('method = "block-mean"', text) for name, text in
+       {"flag": 'method = "block-mean"\nclip = "yes"', "truth": "method = true", "several": 'method = ["lmmse"]', "table": "method = { a = 1 }"}.items()},
+    **{name: SWEEP + f'[follow]\n"sensor.distance" = "{text}"\n' for name, text in
+       {"empty": "", "sum": "lenslet_array.focal_length - main_lens.f_number", "double": "lenslet_array.focal_length ** 2", "array": "light.wavelengths * 2", "decibel": "sensor.exposure * 2", "zero": "lenslet_array.focal_length / 0", "text": "sensor.cfa * 2", "plain": "2 * 3", "nobody": "lens.nothing * 2"}.items()},
+    "part": SWEEP.replace("main_lens.f_number", "lenslet_array.pitch.0"),
 }
 
 
@@ -68,6 +80,8 @@ def folder(stages, tmp_path_factory):
     (folder / "broken-score" / "score.json").write_text('{"results": [{"name": 3}]}')
     (folder / "device.h5").symlink_to("/dev/null")
     _pictures(folder)
+    _wavefronts(folder)
+    _old_and_hostile(folder)
     _artefacts(folder)
     return folder
 
@@ -79,6 +93,15 @@ def _pictures(folder):
     picture(folder / "noise.png", rng.integers(0, 255, (80, 80)).astype(np.uint8))
     picture(folder / "clipped.png", np.where(rng.random((80, 80)) < 0.9, 255, 10).astype(np.uint8))
     picture(folder / "half.exr", np.full((8, 8, 4), 0.5, np.float32))
+    picture(folder / "odd.exr", np.full((8, 8, 5), 0.5, np.float32))
+    picture(folder / "nan.exr", np.where(np.arange(64).reshape(8, 8) == 5, np.nan, 0.5).astype(np.float32))
+    picture(folder / "negative.exr", np.full((8, 8), -0.5, np.float32))
+    picture(folder / "whole.exr", np.full((8, 8), 3, np.uint32))
+    picture(folder / "two.tif", np.full((8, 8, 2), 9, np.uint8))
+    picture(folder / "long.tif", np.full((8, 8), 9, np.uint32))
+    picture(folder / "labels.png", np.full((6, 7), 99, np.uint8))
+    (folder / "photo.exr").write_bytes((folder / "photo.png").read_bytes())
+    (folder / "cut.png").write_bytes((folder / "photo.png").read_bytes()[:900])
     (folder / "empty.dng").touch()
     white = (folder / "white.dng").read_bytes()
     (folder / "cut.dng").write_bytes(white[:9000])
@@ -86,6 +109,21 @@ def _pictures(folder):
         good = bytearray((folder / {".dng": "white.dng", ".exr": "capture.exr", ".h5": "pif.h5"}[Path(name).suffix]).read_bytes())
         good[at] ^= 64
         (folder / name).write_bytes(good)
+
+
+def _wavefronts(folder):
+    for name, dataset, values, units in (("none", "W", np.zeros((8, 8)), "m"), ("whole", "wavefront", np.zeros((8, 8, 2)), "m"), ("text", "wavefront", np.zeros((8, 8)), "m"), ("inches", "wavefront", np.zeros((8, 8)), "in")):
+        with h5py.File(folder / f"wave-{name}.h5", "w") as file:
+            file[dataset] = values
+            file[dataset].attrs["units"] = units if name == "text" else np.bytes_(units)
+
+
+def _old_and_hostile(folder):
+    from tests.artefacts import test_container as container
+
+    for name in HOSTILE:
+        container.hostile(folder / f"{name.replace('_', '-')}.h5", getattr(container, f"_{name}"))
+    container.hostile(folder / "older.h5", lambda file: file.attrs.__setitem__("schema_version", 0))
 
 
 def _artefacts(folder):
@@ -105,6 +143,19 @@ def _artefacts(folder):
     changed("grid.h5", "calibration.h5", lambda a: [a.attrs.pop("response"), *(a.data.pop(k) for k in list(a.data) if k.startswith("response/"))])
     changed("other-pif.h5", "pif.h5", lambda a: a.data.update({"pif/A": a.data["pif/A"][:, :, :, :49], "pif/column_energy": a.data["pif/column_energy"][:, :49], "pif/object_shape": np.array([7, 7], np.int32)}))
     changed("sceneless.h5", "capture.h5", lambda a: [a.data.pop(k) for k in ("capture/scene", "capture/wavelength") if k in a.data])
+    changed("hexagonal-pif.h5", "pif.h5", lambda a: a.attrs["pif"].update(lattice="hexagonal"))
+    changed("colours.h5", "capture.h5", lambda a: a.data.update({"capture/cfa": "RGGB"}))
+    changed("stateless.h5", "dictionary.h5", lambda a: a.data.pop("dictionary/state/iteration"))
+    changed("cropped.h5", "image.h5", lambda a: a.data.update({k: v[:16, :16] for k, v in a.data.items() if k in ("image/value", "image/sigma")}))
+    changed("noiseless.h5", "capture.h5", lambda a: a.attrs["capture"].pop("noise_sigma", None))
+    changed("windowless.h5", "calibration.h5", lambda a: a.data.pop("response/white"))
+    changed("shifted.h5", "calibration.h5", lambda a: a.data.update({"response/wavelength": a.data["response/wavelength"] * 1.3}))
+    changed("dim.h5", "calibration.h5", lambda a: a.data.update({"response/F": a.data["response/F"] * 0}))
+    changed("flat-pif.h5", "pif.h5", lambda a: a.data.update({"pif/object_shape": np.array([4, 16], np.int32)}))
+    (folder / "pieces").mkdir()
+    for name in ("shards.h5", "shards.000.h5"):
+        shutil.copy(folder / name, folder / "pieces")
+    shutil.copy(folder / "shards.000.h5", folder / "pieces" / "shards.001.h5")
     changed("index.h5", "shards.h5", lambda a: a.attrs["pif"].update({"shards": [{"name": "../x.h5", "sha256": "0" * 64}]}))
 
 

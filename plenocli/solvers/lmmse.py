@@ -13,8 +13,8 @@ import numpy as np
 SCALES = np.geomspace(1e-3, 30, 60)
 """Scales of the covariance that are tried."""
 
-IMPLAUSIBLE = 8
-"""Scale that a whole picture does not have: 2.8 times the contrast of the average photograph in every lenslet."""
+IMPLAUSIBLE = 5
+"""Scale that a whole picture does not have: 2.2 times the contrast of the average photograph in every lenslet. By 22 photographs (docs/model.md)."""
 
 ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""

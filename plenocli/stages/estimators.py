@@ -90,7 +90,10 @@ class Estimators:
             return self._jointly(data, report)
         if not self.coupled or self.overlap == 1 or method == "block-mean":
             return self._whole(method, data, report) if method in WHOLE else self._by_lenslet(method, data, data.y, truth, report)
-        x, spread = self._jointly(data, {})
+        found = {}
+        x, spread = self._jointly(data, found)
+        if data.sigma is not None:
+            report |= {k: found[k] for k in ("noise_sigma", "excess") if k in found}
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         y = self._own_light(data.y, x)
         report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
@@ -138,13 +141,17 @@ class Estimators:
         return y - self._sensor(y.shape[:2]).neighbours_only().forward(even)
 
     def _noise(self, data, y, report, look=True):
-        """The noise of superpixels y (lenslet_row, lenslet_column, pixel); look: for what no object gives."""
+        """The noise of superpixels y (lenslet_row, lenslet_column, pixel); look: for what no object gives. It is not less than what the
+        joint estimate found before, which the report has."""
         if self.settings.noise_sigma is not None:
             report |= {"noise_sigma": float(self.settings.noise_sigma), "noise_source": noise_level.GIVEN}
             return report["noise_sigma"]
         hint = "" if self.coupled and self.overlap == 3 else ". If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3"
         stacked = y.reshape(-1, y.shape[-1]).T
-        return noise_level.believed(y, data.sigma, noise_level.outside(self.svd, y, data.sigma) if look else None, report, hint=hint,
+        if not look:
+            return noise_level.believed(y, data.sigma, None, report)
+        found = max(noise_level.outside(self.svd, y, data.sigma) or 0.0, report.get("noise_sigma", 0.0))
+        return noise_level.believed(y, data.sigma, found, report, hint=hint,
                                     implausible=lambda sigma: self.prior.lmmse(sigma, data.scene).implausible(stacked))
 
     def _sensor(self, count):

@@ -78,7 +78,7 @@ def _square_cost(camera, view, band, shape, double):
         1.6e-8 * points * few * half + 8e-8 * (2 * lit - 1) * lines * band.lenslet_nodes + 1e-8 * table + 2.5e-11 * (1 if real else 2) * carried * (2 if double else 1))
     size = int(np.prod(shape[1:]))
     if narrow:  # superpixels keep half to three quarters of the terms
-        setup += 1.5e-9 * len({max(a, b) for a in range(grid[0]) for b in range(grid[1])}) * table / grid[0] * terms**0.5
+        setup += 1.5e-9 * max(grid) * table / grid[0] * terms**0.5
         terms *= 0.65
     return {"operations": 8.0 * 1.2 * fine * terms,
             "seconds": setup + pairs * 2.5e-5 + fine * (4e-9 if double else 3e-9) + size * (2e-8 if double else 7e-9) + 0.005,

@@ -151,9 +151,13 @@ def cost(camera, view, band, shape, double):
     across = min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + 40)
     few = psf_nodes(view, view.lenslet_width / 2)
     operations, largest = lit * band.terms * sum(rows.values()) * (4 * across + 8 * band.terms), 0.0
+    # by how many axes a superpixel lies aside
+    ranks = [plain * expected_rank(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
+    pairs_of_terms = [plain * expected_products(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
     seconds = 0.01 + 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
     for a, b in tables:
-        rank, products = plain * expected_rank(view, band, parabolic, (a, b)), plain * expected_products(view, band, parabolic, (a, b))
+        aside = (a != 0) + (b != 0)
+        rank, products = ranks[aside], pairs_of_terms[aside]
         both = rows[a] + (0 if even and a == b else rows[b])
         sketch = 1.12 / FILL * rank + 8
         # of many lenslets each brings few terms, so that products are narrow and wait for memory
@@ -166,7 +170,7 @@ def cost(camera, view, band, shape, double):
         largest = max(largest, item * (both * (products + 3 * sketch)))
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
     size = shape[1] * shape[2] * shape[3]
-    mean = plain * np.mean([expected_rank(view, band, parabolic, place) for place in tables])
+    mean = np.mean([ranks[(a != 0) + (b != 0)] for a, b in tables])
     return {"operations": operations + 8.0 * 1.2 * fine * mean * pairs,
             "seconds": seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
             "bytes": int(largest + item * 2 * len(tables) * points * lines * mean) + (1 << 25)}

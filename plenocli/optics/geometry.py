@@ -132,11 +132,17 @@ class Geometry:
         rows, columns = ((n - 1) // 2 for n in grid)
         return {self.centre(r, c): (r + rows, c + columns) for r in range(-rows, rows + 1) for c in range(-columns, columns + 1)}
 
+    def lines(self, grid, axis):
+        """How many different rows (axis 0) or columns (1) the superpixels of `grid` stand in."""
+        aside = axis == 1 and self.lattice == "hexagonal" and grid[0] > 1  # every half pitch
+        return 2 * grid[1] + grid[0] - 2 if aside else grid[axis]
+
     def reach(self, grid, window=None):
         """Farthest that a lenslet whose light counts stands from the object's own, (rows, columns) in pitches: those of the
         neighbourhood, or where window is None those of the superpixels kept."""
         if window is None:
-            return tuple(max(abs(place[axis]) for place in self.places(grid)) for axis in (0, 1))
+            rows, columns = ((n - 1) // 2 for n in grid)
+            return tuple(float(n) for n in self.centre(rows, columns))
         return tuple(max(float(product[axis].max()) for product in self.neighbourhood(window) if product[axis].size) for axis in (0, 1))
 
     def field_half(self, grid, window=None):

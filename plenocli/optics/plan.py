@@ -190,9 +190,8 @@ def distinct(camera, view, shape):
         down, across = (rows + 1) // 2 if flip_rows and y == 0 else rows, (columns + 1) // 2 if flip_columns and x == 0 else columns
         return down * (down + 1) // 2 if turn and y == x else down * across
 
-    places = [(y, x) for y in range(-(grid[0] // 2), grid[0] // 2 + 1) for x in range(-(grid[1] // 2), grid[1] // 2 + 1)]
-    firsts = [(y, x) for y, x in places if (y >= 0 or not flip_rows) and (x >= 0 or not flip_columns) and (y <= x or not turn)]
-    return part(0, 0), sum(part(y, x) for y, x in firsts)
+    ys, xs = (range(0 if flip else -(n // 2), n // 2 + 1) for n, flip in zip(grid, (flip_rows, flip_columns)))
+    return part(0, 0), sum(part(y, x) for y in ys for x in xs if y <= x or not turn)
 
 
 @lru_cache(maxsize=1024)
@@ -218,6 +217,7 @@ def pixel_nodes(accuracy, own, joint, cells, blur, shares=WHOLE):
     return best
 
 
+@lru_cache(maxsize=4096)
 def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
     """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis, at the step `rule` of band_rule.
 
@@ -229,8 +229,10 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
     spread = (1 + min(own / 2, 2.0) if rule >= 5 else 1.0) * (1.3 if rule and blur else 1.0)
     # beyond the cells that were compared more was missed than they let expect: 2 % at 412 cells, where this has 2.5
     spread *= max(1.0, cells / FITTED_CELLS) ** 2
-    worst = shares[0] * (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * _fringe_error(count, rule, own, 0)
-    for apart in range(1, round(joint / own)):
+    share = np.linspace(0, 1, 65)[1:-1]
+    alone = float((rule_error(count, share * own, rule) * (1 - share)).max())
+    worst = shares[0] * (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5) * alone
+    for apart, error in enumerate(_fringe_errors(count, rule, own, round(joint / own)), 1):
         size, power = FRINGES[min(apart, len(FRINGES)) - 1]
         weight = size * cells**-power
         # lenslets that a blurred point lights evenly
@@ -238,14 +240,16 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
             weight = max(weight, 0.35 * min(1.0, blur / 2) ** 1.8)
         elif apart <= blur:
             weight = max(weight, FRINGES[0][0] / (cells * apart**2))
-        worst = max(worst, shares[min(apart, 2)] * min(0.5, weight) * _fringe_error(count, rule, own, apart))
+        worst = max(worst, shares[min(apart, 2)] * min(0.5, weight) * error)
     return worst
 
 
-def _fringe_error(count, rule, own, apart):
-    """The rule's largest error for the fringes of lenslets so far apart, weighted with how many there are of each frequency."""
-    share = np.linspace(-1 if apart else 0, 1, 65)[1:-1]
-    return float((rule_error(count, (apart + share) * own, rule) * (1 - np.abs(share))).max())
+def _fringe_errors(count, rule, own, lenslets):
+    """The rule's largest error for the fringes of lenslets 1, 2, ... below `lenslets` apart, weighted with how many there are of each frequency."""
+    apart, share, (t, w) = np.arange(1, max(lenslets, 1))[:, None], np.linspace(-1, 1, 65)[1:-1], band_rule(count, rule)
+    whole, part = np.pi * own * apart * t, np.pi * own * np.outer(t, share)
+    found = (np.cos(whole) * w) @ np.cos(part) - (np.sin(whole) * w) @ np.sin(part)
+    return (np.abs(found / 2 - np.sinc(own * (apart + share))) * (1 - np.abs(share))).max(axis=1).tolist()
 
 
 def rule_error(count, cycles, rule=0):

@@ -321,7 +321,7 @@ def cost(camera, view, band, shape, double):
     scan = sum(on_scan * len(p[axis]) for p in products)
     chord = sum(on_chords * len(p[1 - axis]) for p in products)
     count, terms = count * len(products), band.terms
-    places = len({place[1 - axis] for place in view.places(grid)}) if band.window is not None else shape[1]
+    places = view.lines(grid, 1 - axis) if band.window is not None else shape[1]
     operations = 8.0 * (1.4 * lanes * places * chord * terms * across + points * places * scan * terms * across
                         + 0.8 * points * scan * across * along * shape[1] + 0.3 * points * scan * terms**2)
     passes = rough * (6.7e-9 * places * across * (lanes * count * terms + points * scan) + 2.6e-9 * points * shape[1] * across * along

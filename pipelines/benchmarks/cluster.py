@@ -19,7 +19,7 @@ import sys
 import time
 from pathlib import Path
 
-STEPS = {False: 300, True: 2000}
+STEPS = {False: 300, True: 5000}
 """Steps of the solver, by whether there is one capture alone: enough to outweigh the start of a worker, which factors the matrix."""
 
 

@@ -21,7 +21,7 @@ DEFINITIONS = {
     "noise_relative": "noise of the capture over its root mean square",
     "model_error_relative": "estimated error of the system matrix against the capture, relative; 0 where the capture was simulated with the same matrix",
     "limited_by": "the larger of the two: noise or model",
-    "loss_at_most_db": "what the error of the system matrix and light that it cannot produce cost at most, by LMMSE's account of the noise they make; dB",
+    "loss_at_most_db": "how much larger the error is at most than what LMMSE expects where the system matrix is right and knows all of the light; dB",
     "seen_share": "share of the directions of a lenslet's object that stand above the capture's noise; the rest lies in the null space and is filled in by the method",
 }
 

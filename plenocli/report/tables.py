@@ -37,7 +37,7 @@ LABELS = {
     "noise_relative": ("noise of the capture, relative", ""),
     "model_error_relative": ("error of the model, relative", ""),
     "limited_by": ("limited by", ""),
-    "loss_at_most_db": ("loss to what is wrong with the model, at most", "dB"),
+    "loss_at_most_db": ("error over what LMMSE expects of a faultless model, at most", "dB"),
     "seen_share": ("share of the object seen", ""),
     "depth_slope": ("slope of the plane", ""),
     "depth_slope_found": ("slope found, median", ""),

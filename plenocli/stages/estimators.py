@@ -16,6 +16,8 @@ WHOLE = ("pnp", "tv")
 """Methods that reconstruct all lenslets together."""
 CONTRAST = 0.1
 """What a point of a photograph differs from its lenslet's brightness, standard deviation: the measure of what noise hides."""
+HIDDEN = 3.0
+"""What is wrong with a capture, over what is found of it: objects imitate the rest (docs/model.md, "Spatial reconstruction")."""
 INNER = (slice(1, -1), slice(1, -1))
 
 
@@ -86,6 +88,8 @@ class Estimators:
         report["overlap"] = self.overlap
         if self.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
+        if method == "lmmse":
+            report["from_lmmse"] = 0.0
         if method == "lmmse" and self.overlap == 3:
             return self._jointly(data, report)
         if not self.coupled or self.overlap == 1 or method == "block-mean":
@@ -93,16 +97,20 @@ class Estimators:
         found = {}
         x, spread = self._jointly(data, found)
         if data.sigma is not None:
-            report |= {k: found[k] for k in ("noise_sigma", "excess") if k in found}
+            report |= {k: found[k] for k in ("noise_sigma", "excess", "scale") if k in found}
         report["neighbours"] = "their light is taken away as LMMSE over 3x3 lenslets sees it"
         y = self._own_light(data.y, x)
         report["border"] = "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light from beyond the array cannot be taken away"
         if min(y.shape[:2]) <= 2:
             return x, spread
+        first = x.copy()
         if method in WHOLE:
-            return self._whole(method, replace(data, y=y), report, (x, spread))
-        x[INNER], _ = self._by_lenslet(method, data, y[INNER], None if truth is None else truth[INNER], report)
-        return x, None
+            x, spread = self._whole(method, replace(data, y=y), report, (x, spread))
+        else:
+            x[INNER], _ = self._by_lenslet(method, data, y[INNER], None if truth is None else truth[INNER], report)
+            spread = None
+        report["from_lmmse"] = _rms(x - first)
+        return x, spread
 
     def in_batches(self, solve, z, size, *options):
         """What solve(camera, batch, *options), a function of stages.per_lenslet, gives for z (row, signal), `size` signals at a time, in
@@ -120,18 +128,19 @@ class Estimators:
         return self._noise(data, self.without_stray(data.y), report)
 
     def loss_db(self, data, report, error):
-        """What it costs at most that the capture is not A x and noise alone, dB, as LMMSE expects; None where that is not known, or
-        where the method has no use for the statistics of photographs.
+        """How much larger than what LMMSE expects of a capture that is A x and noise alone the error of the picture is at most, dB; None
+        where that is not known, or where the method has no use for the statistics of photographs.
 
-        error: of the matrix, root mean square of a pixel. It and what the capture holds beyond noise (report["excess"]) may all
-        fall upon the few directions that are seen, where noise has only their share of the pixels.
+        error: of the matrix, root mean square of a pixel. HIDDEN times it and what the capture holds beyond noise (report["excess"])
+        may all fall upon the few directions that are seen, where noise has only their share of the pixels: with so much more
+        noise LMMSE's error is reckoned. The picture of another method is off by no more than that and its distance from LMMSE's.
         """
-        if "excess" not in report or "prior" not in vars(self):
+        if "excess" not in report or "from_lmmse" not in report:
             return None
         share = max(1, np.count_nonzero(self.svd.s * CONTRAST > data.sigma)) / len(self.svd.u)
-        wrong = np.hypot(report["excess"], error) / np.sqrt(share)
+        wrong = HIDDEN * np.hypot(report["excess"], error) / np.sqrt(share)
         now, known = (self.prior.lmmse(float(sigma), data.scene).expected(report.get("scale", 1.0)) for sigma in (np.hypot(data.sigma, wrong), data.sigma))
-        return 20 * float(np.log10(now / known))
+        return 20 * float(np.log10((now + report["from_lmmse"]) / known))
 
     def without_stray(self, y):
         """y without the neighbours' light, as block means tell it: enough to estimate noise and contrast."""
@@ -211,7 +220,7 @@ class Estimators:
     def _left_over(self, y, x):
         """Root mean square of y - A x over the lenslets that have all their neighbours (all, where none has)."""
         rest = y - self._sensor(y.shape[:2]).forward(x)
-        return float(np.sqrt(np.mean((rest[INNER] if rest[INNER].size else rest) ** 2)))
+        return _rms(rest[INNER] if rest[INNER].size else rest)
 
     def _whole(self, method, data, report, known=None):
         """(x, sigma) of a method that sees the whole picture; sigma is that of LMMSE, from which it starts: an upper estimate.
@@ -226,7 +235,7 @@ class Estimators:
         sigma = self._noise(data, y[inner], report)
         x, spread = known or np.empty((2, *y.shape[:2], self.svd.vt.shape[1]))
         x[inner], spread[inner] = self._adaptive(sigma, data.scene, y[inner])
-        error = float(np.sqrt(np.mean(np.square(spread[inner]))))
+        error = _rms(spread[inner])
         report["start"] = f"lmmse, which expects an error of {error:.3g}"
         held = None
         if known is not None:
@@ -242,4 +251,11 @@ class Estimators:
             taus = wholesensor.schedule(error)
             picture = wholesensor.plug_and_play(term, to_plane(x, shape), wholesensor.denoiser(self.prior.bands()), bar(taus, len(taus), "rounds"))
             report["rule"] = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
-        return to_blocks(picture, shape), spread
+        found = to_blocks(picture, shape)
+        if known is None:
+            report["from_lmmse"] = _rms(found - x)
+        return found, spread
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -32,7 +32,7 @@ def make_files(folder, coupled=False, noise=60.0, stray=1.0, beyond=0, **attrs):
     blocks, offsets = matrices(coupled)
     data = {"pif/A": blocks[None], "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": offsets, "pif/pixel_shape": np.array([PIXELS] * 2),
             "pif/object_shape": np.array([N] * 2), "pif/column_energy": blocks.sum(axis=(0, 1))[None]}
-    write_artefact(folder / "pif.h5", Artefact("pif", data, {}, Provenance("test")), overwrite=True)
+    write_artefact(folder / "pif.h5", Artefact("pif", data, {}, Provenance("test", accuracy={"estimated": 1e-6, "model": "fresnel"})), overwrite=True)
     side, inside = COUNT + 2 * beyond, slice(beyond, beyond + COUNT)
     picture = np.asarray(sample_picture(luminance(embedded_photograph("astronaut")), side * N, side * N), float)
     y = BlockToeplitz(blocks * np.where(offsets.any(axis=1), stray, 1)[:, None, None], offsets, (side, side)).forward(to_blocks(picture, (N, N)))[inside, inside]
@@ -175,6 +175,20 @@ def test_light_that_no_photograph_explains_is_not_amplified(tmp_path, stray, gai
         assert psnr(image.data["image/value"], truth) > floor + gain, method
         assert image.attrs["image"]["parameters"]["noise_source"] == "what photographs do not explain"
         assert "only if sigma =" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("stray", [1.2, 1.5])
+def test_light_that_the_matrix_lacks_costs_no_more_than_is_said(tmp_path, stray):
+    """Against the picture of LMMSE from a capture without fault: what is said of that is small."""
+    faultless = make_files(tmp_path, coupled=True)
+    image = reconstruct(tmp_path, "--method", "lmmse")
+    best, said = psnr(image.data["image/value"], faultless), image.attrs["image"]["parameters"]["limits"]["loss_at_most_db"]
+    assert 0 <= said < 1
+    truth = make_files(tmp_path, coupled=True, stray=stray)
+    for method in ("lmmse", "tikhonov", "tv", "pnp"):
+        image = reconstruct(tmp_path, "--method", method)
+        loss = image.attrs["image"]["parameters"]["limits"]["loss_at_most_db"]
+        assert best - psnr(image.data["image/value"], truth) <= loss, method
 
 
 def test_dictionary_chain(single, tmp_path, capsys):

@@ -199,7 +199,8 @@ class Learner:
             centred = self.seen - self.seen.mean(axis=1, keepdims=True)
             strength, basis = np.linalg.svd(centred, full_matrices=False)[1:]
             self._step_basis = strength**2, basis.T
-        gram, right = moments(patches - patches.mean(axis=0), c)
+        gram, right = moments(patches, c)
+        right -= right.mean(axis=0)  # as if every patch had mean zero
         if self.settings.gradient_steps:
             return gradient_step(*self._step_basis, gram, right, self.settings.delta, atoms, self.settings.gradient_steps)
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)

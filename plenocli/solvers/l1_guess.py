@@ -42,7 +42,7 @@ def guess(problem, threshold):
     c, rows = np.zeros((count, atoms)), problem.d.shape[0]
     unit, level = np.max(np.abs(problem.d / threshold), initial=0), np.max(np.abs(problem.y), initial=0)
     with np.errstate(over="ignore"):
-        largest = np.max(np.abs(problem.b / threshold), initial=0)
+        largest = np.max(np.maximum(problem.b.max(axis=0, initial=0), -problem.b.min(axis=0, initial=0)) / threshold, initial=0)
     # unit and level in their own units below, so that squares stay within range
     if count * SMALL < rows**3 or not (unit > 0 and level > np.finfo(float).tiny and unit * level < 1e30 and 1 < largest < SINGLE):
         return c

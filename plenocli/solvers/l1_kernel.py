@@ -361,7 +361,8 @@ def _resume(w, gram, index, value):
 def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
     """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,), which are overwritten.
 
-    Not finished: the workspace is too small for the working set; call again with a larger one.
+    Not finished: the workspace is too small for the working set; call again with a larger one. The last pass allowed is not judged:
+    objective and gap are those before it.
     """
     index = np.flatnonzero(c)
     n = size = index.shape[0]
@@ -391,6 +392,8 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
         n = _solve_working_set(w, n, b[working], q[working], raised * threshold[working], 0.25 * tol)
         index = working[w.local[:n]]
         _spread(w.x, index, c)
+        if passes == pass_limit:
+            break
         _copy(b, q.shape[0], q)
         _subtract(q, w.x, n, gram, index)
         if raised == 1.0:

@@ -1,5 +1,6 @@
-"""Values as JSON knows them."""
+"""Values as JSON knows them, shapes and values as a person writes them."""
 
+import json
 import math
 
 
@@ -14,3 +15,13 @@ def plain(value):
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if isinstance(value, (str, int, bool, type(None))) else str(value)
+
+
+def by(shape):
+    """"4 x 6" of (4, 6)."""
+    return " x ".join(str(int(n)) for n in shape)
+
+
+def shown(value):
+    """A value of a TOML file as it may stand there."""
+    return json.dumps(value, ensure_ascii=False, default=str)

@@ -22,8 +22,8 @@ def all_places():
 
 
 def shown_places(reached):
-    """Which of all_places are among "file:line" words."""
-    lines = {(file, int(line)) for file, _, line in (word.rpartition(":") for word in reached)}
+    """Which of all_places are among "file:line" words; other words do not count."""
+    lines = {(file, int(line)) for file, _, line in (word.rpartition(":") for word in reached if ":" in word)}
     return {place for place, last in all_places().items() for file, _, first in [place.rpartition(":")] if any((file, n) in lines for n in range(int(first), last + 1))}
 
 

@@ -19,7 +19,6 @@ from plenocli.errors import InputError, OutputError
 
 DIGEST = "plenocli:sha256"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
-_MAX_CHANNELS = 2048
 _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
 
 
@@ -177,10 +176,6 @@ def _check_header(path, source, spec, mem_limit):
 
     if spec.deep:
         raise InputError("is a deep EXR", path, "flatten it first")
-    if spec.depth > 1 or min(spec.width, spec.height) < 1:
-        raise InputError(f"has the shape {spec.width} x {spec.height} x {spec.depth}", path, "give a flat picture")
-    if spec.nchannels > _MAX_CHANNELS:
-        raise InputError(f"has {spec.nchannels} channels, more than {_MAX_CHANNELS}", path, "split it")
     require_room(path, spec.width * spec.height * spec.nchannels * 4, mem_limit)
     formats = spec.channelformats or (spec.format,) * spec.nchannels
     if any(f.basetype not in (oiio.FLOAT, oiio.HALF) for f in formats):
@@ -192,11 +187,11 @@ def _check_header(path, source, spec, mem_limit):
 
 
 def oiio_error(handle):
-    """The pending message of an OpenImageIO object (or of the library, for None), in one line; fetching clears it."""
+    """The pending message of an OpenImageIO object (or of the library, for None), its first line; fetching clears it."""
     import OpenImageIO as oiio
 
     try:
         own = handle.geterror() if handle is not None else ""
-        return (own or oiio.geterror()).strip().replace("\n", "; ")
+        return (own or oiio.geterror()).strip().partition("\n")[0]
     except UnicodeDecodeError:  # the message quotes a name that is not text
         return "a name in its header is not text"

@@ -11,6 +11,7 @@ from plenocli.artefacts.pictures import file_type, read_stored
 from plenocli.artefacts.provenance import require_file
 from plenocli.artefacts.structure import read_attribute, survey
 from plenocli.errors import InputError
+from plenocli.plain import by
 
 MAX_BYTES = 64 << 20
 """No map of at most 1024 x 1024 values is longer."""
@@ -74,7 +75,7 @@ def _from_hdf5(path, content):
                 raise InputError(f"has no dataset wavefront, only {', '.join(list(declared)[:8]) or 'none'}", path, "store W in metres as /wavefront")
             shape, dtype = declared["wavefront"]
             if dtype.kind not in "iuf" or len(shape) != 2:
-                raise InputError(f"holds /wavefront of type {dtype} and shape {shape}", path, "store a square grid of floats")
+                raise InputError(f"holds {by(shape)} values of the type {dtype} in /wavefront", path, "store a square grid of floats")
             require_room(path, 8 * int(np.prod(shape)), MAX_BYTES)
             dataset = file["wavefront"]
             units = read_attribute(path, dataset, "units") if "units" in dataset.attrs else "m"

@@ -44,7 +44,7 @@ def read_picture(path, *, mem_limit=None):
     if stored.dtype.kind == "f":
         return Picture(_finite(path, stored.astype(np.float32)))
     if stored.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"holds {stored.dtype}", path, "give 8 or 16 bit, or float")
+        raise InputError(f"holds values of the type {stored.dtype}", path, "give 8 or 16 bits, or float")
     table = srgb_to_linear(np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max).astype(np.float32)
     return Picture(table[stored])
 

@@ -76,7 +76,7 @@ def read_spectral_exr(path, quantity=None, *, mem_limit=None):
     if not there:
         raise InputError("holds no spectral channels such as T.450,000000nm or S0.450,000000nm", path, "give a spectral EXR")
     if quantity is None and len(there) > 1:
-        raise InputError("holds both radiance and reflectance", path, "say which is meant")
+        raise InputError("holds both radiance and reflectance", path, "keep the channels of one of them")
     quantity = quantity or there[0]
     if quantity not in there:
         raise InputError(f"holds {there[0]}, not {quantity}", path, "give another file")

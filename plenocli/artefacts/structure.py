@@ -55,7 +55,7 @@ def _text(path, name):
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"holds an object whose name {name!r} is not UTF-8", path, _FIX) from error
+        raise InputError(f"holds an object whose name '{name.decode('utf-8', 'replace')}' is not UTF-8", path, _FIX) from error
 
 
 def _check_link(path, group, link, child):

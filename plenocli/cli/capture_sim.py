@@ -15,7 +15,7 @@ from plenocli.cli import options
 @click.option("--noise", type=click.Choice(["sensor", "none"]), default="sensor", show_default=True, help="Shot, read and quantisation noise of [sensor], or none (real numbers, relative to white).")
 @click.option("--exposure", type=options.DURATION, help="Exposure time, such as 2.5ms; default the camera's white_exposure, at which white reaches 80 % of full well.")
 @click.option("--sampling", type=click.Choice(["fit", "crop"]), default="fit", show_default=True, help="A photograph is fitted to the object grid by area averages, or cropped at native resolution.")
-@click.option("--refine", type=click.IntRange(1, 8), default=1, show_default=True, help="Object points per side for each point of [object]: simulate finer than you invert.")
+@click.option("--refine", type=options.Whole(1, 8), default=1, show_default=True, help="Object points per side for each point of [object]: simulate finer than you invert.")
 @click.option("--bandwidth", type=options.LENGTH, default=None, help="Full width at half maximum of each line of light, such as 10nm; default one exact wavelength.")
 @click.option("--spectral-step", type=options.LENGTH, default=None, help="Spacing of wavelengths for cameras with colour; default half of the narrowest filter.")
 @options.superpixels("Superpixels that one lenslet's light may reach")

@@ -19,19 +19,19 @@ class Lambda(click.ParamType):
 @click.argument("images", nargs=-1, metavar="[IMAGE]...")
 @click.option("--pif", required=True, type=options.FILE, help="System matrix A (from simulate-pif).")
 @options.output
-@click.option("--atoms", type=click.IntRange(2), help="Atoms L; default one for each object point.")
-@click.option("--batch", type=click.IntRange(1), help="Patches an iteration; default 4 an atom, as in the paper.")
-@click.option("--iterations", type=click.IntRange(0, 100000), default=10, show_default=True, help="Iterations in all, those of --resume included.")
+@click.option("--atoms", type=options.Whole(2), help="Atoms L; default one for each object point.")
+@click.option("--batch", type=options.Whole(1), help="Patches an iteration; default 4 an atom, as in the paper.")
+@click.option("--iterations", type=options.Whole(0, 100000), default=10, show_default=True, help="Iterations in all, those of --resume included.")
 @click.option("--snr", "snr_db", type=options.DECIBEL, default="60dB", show_default=True, help="Noise of the measurements: sigma^2 = mean(y^2) 10^(-SNR/10).")
 @click.option("--lambda", "lam", type=Lambda(), help="Weight of |c|_1 with A scaled to unit spectral norm, or `noise`: what codes noise as zero; default chosen on held-out patches.")
 @click.option("--delta", type=options.NON_NEGATIVE, default="0.001", show_default=True, help="Weight of |A Phi|^2, which keeps A and the atoms incoherent.")
 @click.option("--init", "initial", type=click.Choice(["patches", "pca", "random"]), default="patches", show_default=True, help="Starting atoms; random is the paper's.")
-@click.option("--gradient-steps", type=click.IntRange(0), default=0, show_default=True, help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.")
+@click.option("--gradient-steps", type=options.Whole(0), default=0, show_default=True, help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.")
 @click.option("--synthesis", is_flag=True, help="Also regress atoms that paint what the learnt ones code; reconstruct uses them.")
 @click.option("--resume", type=options.FILE, help="Go on from this dictionary; the result equals that of one long run.")
 @click.option("--checkpoint", type=options.FILE, help="Keep the state here after every iteration, and go on from it if there is one: the same command, given again after an interruption, loses no more than an iteration. Removed at the end.")
 @options.seed
-@click.option("--workers", type=click.IntRange(1, 1024), default=None, help="Threads of the compiled solver; default all cores. The result does not depend on it.")
+@click.option("--workers", type=options.Whole(1, 1024), default=None, help="Threads of the compiled solver; default all cores. The result does not depend on it.")
 @options.mem_limit
 @options.overwrite
 @options.as_json

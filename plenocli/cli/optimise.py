@@ -8,8 +8,8 @@ from plenocli.cli import options
 @click.command("optimise", short_help="Search a design space for the best cameras.")
 @options.input_path("description", metavar="SWEEP.toml")
 @options.table_output
-@click.option("--trials", type=click.IntRange(1, 100_000), default=100, show_default=True, help="Points to try in all, those of earlier runs included.")
-@click.option("--batch", type=click.IntRange(1, 1000), default=4, show_default=True, help="Points proposed at a time, and so the most that run side by side; another number is another search.")
+@click.option("--trials", type=options.Whole(1, 100_000), default=100, show_default=True, help="Points to try in all, those of earlier runs included.")
+@click.option("--batch", type=options.Whole(1, 1000), default=4, show_default=True, help="Points proposed at a time, and so the most that run side by side; another number is another search.")
 @options.front_plot
 @options.seed
 @options.workers

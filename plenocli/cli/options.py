@@ -51,6 +51,20 @@ def positive(text):
 FRACTION = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30, 1.0))
 
 
+class Whole(click.IntRange):
+    """A whole number within bounds."""
+
+    name = "integer"
+
+    def convert(self, value, param, ctx):
+        """An int; other text is refused with an example."""
+        try:
+            int(value)
+        except ValueError:
+            self.fail(f"{value!r} is no whole number; write for example {max(1, self.min)}", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 class Grid(click.ParamType):
     """Two whole numbers such as 3x3, or one of the given words."""
 
@@ -140,8 +154,8 @@ table_output = click.option("-o", "--output", required=True, type=FILE, metavar=
 front_plot = click.option("--plot", type=FILE, help="Also draw the front, such as front.png; needs matplotlib.")
 overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
-seed = click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
-workers = click.option("--workers", type=click.IntRange(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
+seed = click.option("--seed", type=Whole(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
+workers = click.option("--workers", type=Whole(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
 scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler instead, such as tcp://10.0.0.1:8786, or the file it wrote; the results are the same.")
 
 

@@ -18,9 +18,9 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")
 @click.option("--noise-sigma", type=options.POSITIVE, help="Standard deviation of the noise, relative like A x; default what the capture says, else estimated.")
 @click.option("--alpha", type=options.NON_NEGATIVE, help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.")
-@click.option("--rank", type=click.IntRange(1), help="Directions kept by tsvd; default by the least estimated error.")
+@click.option("--rank", type=options.Whole(1), help="Directions kept by tsvd; default by the least estimated error.")
 @click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 for dictionary; default as learnt.")
-@click.option("--nnls-iterations", type=click.IntRange(1), help="Stop nnls after so many gradient steps; default converged.")
+@click.option("--nnls-iterations", type=options.Whole(1), help="Stop nnls after so many gradient steps; default converged.")
 @click.option("--clip", is_flag=True, help="Set negative values to zero; their share is reported either way.")
 @options.file_type("h5", "exr")
 @options.output

@@ -27,8 +27,8 @@ class _Slope(click.ParamType):
 @click.option("--camera", type=options.FILE, help="Camera description (.toml): turns slopes into distances.")
 @click.option("--distance", "distances", multiple=True, type=options.DISTANCE, help="Plane to focus on, in front of the main lens, such as 500mm. Repeatable; needs --camera.")
 @click.option("--slope", "slopes", multiple=True, type=_Slope(), help="Plane by its parallax: 0 is the plane focused on the lenslets, 1 has one lenslet of parallax across the pupil, nearer ones are above 0. Repeatable.")
-@click.option("--planes", type=click.IntRange(1, 1000), default=13, show_default=True, help="Planes from slope -3 to 3 where neither --distance nor --slope is given.")
-@click.option("--views", type=click.IntRange(0, 15), default=3, show_default=True, help="Parts of the pupil along each side whose views are kept.")
+@click.option("--planes", type=options.Whole(1, 1000), default=13, show_default=True, help="Planes from slope -3 to 3 where neither --distance nor --slope is given.")
+@click.option("--views", type=options.Whole(0, 15), default=3, show_default=True, help="Parts of the pupil along each side whose views are kept.")
 @options.output
 @options.mem_limit
 @options.overwrite

@@ -6,6 +6,7 @@ import importlib
 import click
 
 from plenocli.errors import UsageError
+from plenocli.plain import shown
 
 _OURS = {"output", "overwrite", "as_json", "workers", "scheduler", "mem_limit", "explain", "suffix", "report", "metrics", "scene_out", "pif", "calibration", "truth",
          "reference", "camera", "grid", "whites", "darks", "bands", "radiances", "patches", "capture", "block", "near"}
@@ -32,12 +33,12 @@ def read_options(stage, values):
 def _converted(option, value, where):
     if option.is_flag:
         if not isinstance(value, bool):
-            raise UsageError(f"{value!r} is not true or false", where, "write it without quotes")
+            raise UsageError(f"{shown(value)} is not true or false", where, "write it without quotes")
         return value
     if isinstance(value, (bool, dict)):
-        raise UsageError(f"{value!r} is neither text nor a number", where, f"write one; {option.name.replace('_', '-')} is: {option.help}")
+        raise UsageError(f"{shown(value)} is neither text nor a number", where, f"write one; {option.name.replace('_', '-')} is: {option.help}")
     if isinstance(value, list) != option.multiple:
-        raise UsageError(f"{value!r} is {'a list' if isinstance(value, list) else 'no list'}", where, "give a list" if option.multiple else "give one value")
+        raise UsageError(f"{shown(value)} is {'a list' if isinstance(value, list) else 'no list'}", where, "give a list" if option.multiple else "give one value")
     try:
         made = [option.type.convert(str(v), option, None) for v in (value if option.multiple else [value])]
     except click.UsageError as error:

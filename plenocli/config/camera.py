@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
 from plenocli.errors import ConfigError, InputError
+from plenocli.plain import by
 
 MAX_BYTES = 1 << 20
 """No camera description is longer; what is, is some other file."""
@@ -393,7 +394,7 @@ MAX_WAVEFRONT = 1e-3
 def _trouble(name, values):
     """Why values cannot be an aperture image or a wavefront, in words; None where they can."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.dtype.kind not in "biuf":
-        return f"must be a square grid of numbers, not of shape {values.shape}"
+        return f"must be a square grid of numbers, not {by(values.shape)}"
     least = 4 if name == "wavefront" else 1
     if not least <= len(values) <= MAX_SAMPLES:
         return f"must have {least} to {MAX_SAMPLES} values a side, not {len(values)}"

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from plenocli.config.camera import Camera, FileName, Section, known_keys, parse_toml, read_text
 from plenocli.config.units import UnitError, format_duration, format_length, parse_duration, parse_length
 from plenocli.errors import ConfigError
+from plenocli.plain import shown
 
 STAGES = ("simulate-pif", "capture-sim", "reconstruct", "simulate-response", "calibrate", "demux", "score")
 """Stages whose options may be set and varied."""
@@ -274,7 +275,7 @@ def _flat(table, before=""):
 def _measure(value):
     """(number in SI, unit) of a number or of text with a unit; ValueError for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ValueError(f"{value!r} is no number and no number with a unit")
+        raise ValueError(f"{shown(value)} is no number and no number with a unit")
     if not isinstance(value, str):
         if not np.isfinite(value):
             raise ValueError(f"{value!r} is not finite")
@@ -380,5 +381,5 @@ def _term(data, key, text):
     except ValueError as error:
         raise ConfigError(f"{text}: {error}", f"follow.{key}", "use lengths and plain numbers") from None
     if unit not in (None, "m"):
-        raise ConfigError(f"{text} is {found!r}: only lengths and plain numbers can be followed", f"follow.{key}")
+        raise ConfigError(f"{text} is {shown(found)}", f"follow.{key}", "use lengths and plain numbers")
     return value, unit

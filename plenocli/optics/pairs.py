@@ -106,7 +106,7 @@ class Pair:
         g = self.row.geometry
         left, field, right = self._terms(tolerance / 2)
         residual = Residual((self.row.offset, self.column.offset), reach, g.lenslet_width / 2, g.z3, g.k, None if self.row.parabolic else g.f2,
-                            min(0.5, tolerance / (3 * self.weight)), self.symmetric)
+                            min(0.5, tolerance / (3 * self.weight)) if self.weight else 0.5, self.symmetric)
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
         kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15) for axis in (0, 1)]
@@ -126,7 +126,7 @@ class Pair:
             return split(self._field, tolerance, symmetric=True)
         rows, columns = self.row.weigh, self.column.weigh
         u, s, v = split(rows @ self._field @ columns.T, tolerance)
-        s = np.diag(s)
+        s = np.maximum(np.diag(s), np.finfo(float).tiny)  # no light passes a shut filter
         # S through the directions that reach it on either side: exact on these
         return self._field @ columns.T @ v.conj() / s, np.diag(s), (u.conj().T @ rows @ self._field).T / s
 

@@ -24,7 +24,7 @@ def front_picture(artefact):
     objectives = dict(attrs["objectives"])
     names = [name for name in objectives if name in columns and np.isfinite(columns[name][1]).any()]
     if not names:
-        raise InputError("has no point with the figures of its front", "sweep", "inspect says why its points were refused")
+        raise InputError("the sweep has no point with the figures of its front", fix="inspect says why its points were refused")
     ahead = artefact.data["sweep/front"].astype(bool)
     across = names[1:3] or [None]
     with drawing(4.0 * len(across) + 0.6, 3.6) as made:

@@ -117,7 +117,7 @@ def camera_sensitivity(name, wavelengths):
     """
     if name not in camera_names():
         raise ConfigError(
-            f"no sensitivity is known of a camera called {name!r}", fix=f"use one of: {', '.join(camera_names())}"
+            f"no sensitivity is known of a camera called {name!r}", "sensor.camera", f"use one of: {', '.join(camera_names())}"
         )
     wavelengths = _checked(wavelengths)
     own, letters, rows = (_tables()[f"camera/{name}/{part}"] for part in ("wavelength_nm", "letters", "sensitivity"))

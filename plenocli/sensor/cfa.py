@@ -37,7 +37,4 @@ def sensitivity(camera, wavelengths):
 
     curves = camera_sensitivity(camera.sensor.camera, wavelengths)
     letters = tuple(dict.fromkeys(camera.sensor.cfa))
-    missing = [letter for letter in letters if letter not in curves]
-    if missing:
-        raise ConfigError(f"camera {camera.sensor.camera!r} has no sensitivity for {', '.join(missing)}", "sensor.cfa")
     return letters, efficiency * np.stack([curves[letter] for letter in letters])

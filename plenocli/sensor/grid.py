@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.errors import InputError, NumericsError
+from plenocli.plain import by
 from plenocli.sensor import distortion, lattice, spots, template
 
 STRUCTURED = 0.2
@@ -95,7 +96,7 @@ def prepare(white, cfa="mono", dark=None):
     """Float image with dark removed, CFA positions equalised, dead and hot pixels replaced, background at zero."""
     white = np.asarray(white)
     if white.ndim != 2 or min(white.shape) < 24:
-        raise InputError(f"a white image must be a single plane of at least 24 x 24 px, this is {white.shape}")
+        raise InputError(f"a white image must be a single plane of at least 24 x 24 px, this has {by(white.shape)}")
     image = white.astype(np.float32)
     if dark is not None:
         image -= np.asarray(dark, np.float32)

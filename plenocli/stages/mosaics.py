@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError
+from plenocli.plain import by
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def read_exposure(path, like=None, cfa=None):
     black = np.broadcast_to(np.asarray(0.0 if m.black is None else m.black, float), (2, 2))
     exposure = Exposure(Path(path), np.asarray(m.values), m.cfa, black, white, m.gain, m.exposure_s, m.units, m.band_m, float(sigma) if sigma else None)
     if like is not None:
-        for what, ours, theirs in (("size", exposure.values.shape, like.values.shape), ("colour filter array", exposure.cfa, like.cfa), ("unit", exposure.units, like.units)):
+        for what, ours, theirs in (("size", by(exposure.values.shape), by(like.values.shape)), ("colour filter array", exposure.cfa, like.cfa), ("unit", exposure.units, like.units)):
             if ours != theirs:
                 raise InputError(f"has another {what} ({ours}) than {like.path.name} ({theirs})", path, "use captures of one camera at one setting")
     return exposure

@@ -166,7 +166,7 @@ def readout(exposure, c, path):
     if exposure.units != c.units:
         raise InputError(f"is in {exposure.units}, the calibration in {c.units}", path, "make all captures in the same way")
     if (exposure.seconds is None) != (c.exposure is None):
-        raise InputError("and the calibration do not both know their exposure time", path, "use files of one kind for all captures")
+        raise InputError(f"{'does not say' if exposure.seconds is None else 'says'} its exposure time, the calibration {'does not' if c.exposure is None else 'does'}", path, "use files of one kind for all captures")
     scale = 1.0 if c.exposure is None else c.exposure / exposure.seconds
     top = exposure.white if np.isfinite(exposure.white) else c.white_level
     signal = Readout(exposure.values, c.dark, exposure.seconds, exposure.black, top, scale, ready=c.levels)

@@ -105,20 +105,13 @@ def read_scene(name, *, sampling="fit", spectral=False):
 @lru_cache(maxsize=16)
 def embedded_photograph(name):
     """A photograph that ships inside scikit-image, linear float32 (row, column, channel). UsageError for unknown names."""
+    from importlib.util import find_spec
+
     from plenocli.artefacts import read_picture
 
-    folder = _embedded_folder()
+    folder = Path(find_spec("skimage").submodule_search_locations[0]) / "data"
     for suffix in (".png", ".jpg"):
         if (folder / f"{name}{suffix}").is_file():
             return read_picture(folder / f"{name}{suffix}").values
     known = ", ".join(sorted(p.stem for p in folder.iterdir() if p.suffix in (".png", ".jpg")))
     raise UsageError(f"scikit-image ships no photograph {name!r}", EMBEDDED + name, f"choose one of {known}")
-
-
-def _embedded_folder():
-    from importlib.util import find_spec
-
-    found = find_spec("skimage")
-    if found is None:
-        raise InputError("scikit-image is not installed", fix="install plenocli with its dependencies")
-    return Path(found.submodule_search_locations[0]) / "data"

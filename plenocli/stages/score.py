@@ -54,8 +54,6 @@ def run_score(
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
-    if report is not None and Path(report) == Path(output):
-        raise UsageError("--output and --report name the same file", output, "give the report another name, such as report.html")
     system = read_pif(pif, mem_limit) if pif else None
     context = _Context(truth, whites, patches, system, capture, block, sampling, light, camera, mem_limit)
     scored, pictures, errors = [], [], []
@@ -150,7 +148,7 @@ def _score_one(path, context):
         raise UsageError("the truth is missing", path, "name it with --truth: a capture, photograph, spectral EXR, image, spectra or colorchecker")
     truth = read_truth(context.truth, result, context.sampling, context.camera)
     if not np.isfinite(truth).any():
-        raise InputError("holds no finite value", context.truth)
+        raise InputError("holds no finite value", context.truth, "name a truth that has values")
     picture = {"result": result, "truth": truth}
     if result.wavelengths is None:
         require_memory(POINT_BYTES * truth.size, context.mem_limit, "the comparison", path, "score a part of it")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
+from plenocli.plain import by
 
 CHART = "colorchecker"
 _CHART_OVERSAMPLING = 20  # chart samples per lenslet and side when the truth of a mixed lenslet is averaged
@@ -254,6 +255,6 @@ def read_whites(paths, mem_limit=None):
         frame = read_result(path, ("spectra",), mem_limit)
         group = groups.setdefault(frame.method, [])
         if group and frame.values.shape != group[0].values.shape:
-            raise UsageError(f"is {frame.values.shape}, {group[0].name} is {group[0].values.shape}", path, "give white targets demultiplexed with one calibration")
+            raise UsageError(f"has {by(frame.values.shape)} values (band x row x column), {group[0].name} {by(group[0].values.shape)}", path, "give white targets demultiplexed with one calibration")
         group.append(frame)
     return {method: (np.array([frame.values for frame in group]), group[0].sigma) for method, group in groups.items()}

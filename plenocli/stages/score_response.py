@@ -3,6 +3,7 @@
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
+from plenocli.plain import by
 
 
 def score_calibration(path, truth, mem_limit=None):
@@ -23,7 +24,7 @@ def paired_responses(path, truth, mem_limit=None):
     """
     first, second = (_read(name, mem_limit) for name in (path, truth))
     if first["window"] != second["window"]:
-        raise InputError(f"has windows of {_by(first['window'])} px, {truth} of {_by(second['window'])}", path, "compare calibrations of one camera")
+        raise InputError(f"has windows of {by(first['window'])} px, {truth} of {by(second['window'])}", path, "compare calibrations of one camera")
     near = [(i, j) for i, w in enumerate(first["wavelength"]) for j, v in enumerate(second["wavelength"]) if abs(w - v) < 0.05e-9]
     if not near:
         raise InputError("has no band of the other calibration", path, "predict the bands that were measured: --wavelength")
@@ -31,7 +32,7 @@ def paired_responses(path, truth, mem_limit=None):
     a, b = first["response"][..., ours], second["response"][..., theirs]
     if a.ndim == 4 and b.ndim == 4:
         if a.shape != b.shape:
-            raise InputError(f"has {_by(a.shape[:2])} lenslets, {truth} {_by(b.shape[:2])}", path, "predict on the measured grid: simulate-response --grid")
+            raise InputError(f"has {by(a.shape[:2])} lenslets, {truth} {by(b.shape[:2])}", path, "predict on the measured grid: simulate-response --grid")
         valid = first["valid"] & second["valid"]
         a, b = a[valid], b[valid]
     elif a.ndim == 4:
@@ -59,7 +60,3 @@ def _inner(valid):
     inner = np.zeros_like(valid)
     inner[1:-1, 1:-1] = valid[1:-1, 1:-1]
     return inner if inner.any() else valid
-
-
-def _by(shape):
-    return " x ".join(map(str, shape))

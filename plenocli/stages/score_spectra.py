@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from plenocli.errors import UsageError
+from plenocli.errors import InputError, UsageError
+from plenocli.plain import by
 from plenocli.stages.score_inputs import CHART, read_labels
 
 WHITE_LABEL = 19  # of the chart's patches row by row, the first of the last row
@@ -52,7 +53,7 @@ def _reflectance(path, result, context):
         return result.values
     white = whites[0].mean(axis=0)
     if white.shape != result.values.shape:
-        raise UsageError(f"is {result.values.shape}, the white target {white.shape}", path, "demultiplex both with one calibration")
+        raise UsageError(f"has {by(result.values.shape)} values (band x row x column), the white target {by(white.shape)}", path, "demultiplex both with one calibration")
     return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * REFERENCE_REFLECTANCE
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError, UsageError
+from plenocli.plain import by
 
 
 CAPTION, LINE = 16, 24
@@ -35,8 +36,6 @@ def run_show(files, output=None, *, truth=None, calibration=None, points=(), len
     else:
         choice = _Choice(centres, points or None, lenslets or None, next((a for kind, a in found if kind == "pif"), None), mem_limit)
         figures = [figure for file, (kind, artefact) in zip(files, found) for figure in _FIGURES[kind](Path(file), artefact, choice)]
-    if not figures:
-        raise InputError("holds nothing that can be drawn", files[0], "inspect shows what it holds")
     publish(output, stacked(figures), overwrite=overwrite)
     return {"output": str(output), "files": [str(f) for f in files], "kinds": kinds, "captions": [caption for _, caption in figures]}
 
@@ -155,7 +154,7 @@ def _compared(files, truth, mem_limit):
     true = read_truth(truth, results[0])
     for file, result in zip(files, results):
         if result.values.shape != true.shape:
-            raise InputError(f"is a picture of {result.values.shape}, the first of {true.shape}", file, "compare pictures of one size")
+            raise InputError(f"is a picture of {by(result.values.shape)}, the first of {by(true.shape)}", file, "compare pictures of one size")
     entries = [(r.method or r.name, r.values, f"{psnr(r.values, true):.2f} dB") for r in results]
     figures = [(reconstructions(entries, true), "Each result above its error.")]
     block = block_of(results[0], truth)

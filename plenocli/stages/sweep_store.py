@@ -50,8 +50,8 @@ class Store:
             raise OutputError(f"cannot be made ({error.strerror})", folder, "check the folder and its permissions") from None
 
     def close(self):
-        """Let go of the folder; scratch files go."""
-        shutil.rmtree(self.folder / "scratch", ignore_errors=True)
+        """Let go of the folder; scratch files go, and all of it where no point was finished."""
+        shutil.rmtree(self.folder / "scratch" if self.journal.records else self.folder, ignore_errors=True)
         self.journal.close()
 
     def evaluate(self, rows, pool, files=(), mem_limit=None, label="points"):

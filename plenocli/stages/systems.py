@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.errors import InputError
+from plenocli.plain import by
 from plenocli.stages.progress import note
 
 
@@ -57,7 +58,7 @@ def read_system(path, mem_limit=None, *, by_band=False):
     shapes = [tuple(int(n) for n in artefact.data[f"pif/{name}_shape"]) for name in ("pixel", "object")]
     matrices = artefact.data["pif/A"]
     if matrices.shape[2:] != (np.prod(shapes[0]), np.prod(shapes[1])):
-        raise InputError(f"has matrices of {matrices.shape[2:]} for superpixels {shapes[0]} and object blocks {shapes[1]}", path, "run simulate-pif again")
+        raise InputError(f"has matrices of {by(matrices.shape[2:])} for superpixels of {by(shapes[0])} pixels and blocks of {by(shapes[1])} points", path, "run simulate-pif again")
     bands, weights, illuminant = _bands(artefact, path) if by_band else ((), None, None)
     if weights is None:
         if len(matrices) > 1:

@@ -65,17 +65,17 @@ def make_all(folder, runner):
     for name, (arguments, result) in _steps().items():
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
         assert outcome.code == 0, (name, outcome.text)
-    _write_shards(folder)
+    write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
     (folder / "done").touch()
 
 
-def _write_shards(folder):
-    """The 3x3 matrix in two files and their index: cameras for which the stage does so are too large for these tests."""
+def write_shards(folder, name, groups):
+    """The 3x3 matrix in a file for each group of its lenslets, and their index: cameras for which the stage does so are too large for these tests."""
     from plenocli.artefacts import read_pif, writing_pif
 
     whole = read_pif(folder / "pif-3x3.h5")
     A = whole.data["pif/A"]
-    with writing_pif(folder / "shards.h5", A.shape, A.dtype, groups=(tuple(range(5)), tuple(range(5, 9)))) as writer:
+    with writing_pif(folder / name, A.shape, A.dtype, groups=groups) as writer:
         for band in range(A.shape[0]):
             for lenslet in range(9):
                 writer.put(band, lenslet, A[band, lenslet])

@@ -1,9 +1,10 @@
 """Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line. See harness.py.
 
-A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, "lasting": whether all later
-calls fail too}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "memory", "nth":
+A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, or "False" for what it returns, "lasting": whether all later
+calls fail too, "of": another module that holds the function}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "memory", "nth":
 bytes of memory beyond what is in use}; {"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a part;
-{"call": "places"}, no fault: where messages are made, as file:line words.
+{"call": "without", "module": name}, a module that is not installed. With {"places": True} the notes also say where messages
+are made, as file:line words.
 """
 
 import errno
@@ -100,13 +101,21 @@ def _child(request, said, fired):
 
 def _arm(fault, fired):
     """Make the nth call of a function fail, before the command starts."""
-    number = getattr(errno, fault.get("error", "ENOSPC"))
+    if fault.get("places"):
+        from tests.messages import listen
+
+        listen(lambda place: _real_write(fired, f"{place} ".encode()))
+    if "call" not in fault:
+        return None
+    number = getattr(errno, fault.get("error", "ENOSPC"), None)
+    if fault["call"] == "without":
+        return sys.modules.update({fault["module"]: None})
     if fault["call"] == "bytes":
         return _arm_bytes(fault["nth"], number, fired)
     if fault["call"] == "filesize":
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (fault["nth"], resource.RLIM_INFINITY))
-        return _real_write(fired, b"x")
+        return _real_write(fired, b"x ")
     if fault["call"] == "memory":
         with open("/proc/self/status") as table:
             used = next(int(line.split()[1]) << 10 for line in table if line.startswith("VmData"))
@@ -116,11 +125,8 @@ def _arm(fault, fired):
         return _arm_arrays(fault["nth"], fault.get("lasting"), fired)
     if fault["call"] == "short":
         return _arm_short(fired)
-    if fault["call"] == "places":
-        from tests.messages import listen
-
-        return listen(lambda place: _real_write(fired, f"{place} ".encode()))
-    real, seen = getattr(os, fault["call"]), 0
+    home = importlib.import_module(fault.get("of", "os"))
+    real, seen = getattr(home, fault["call"]), 0
 
     def failing(*arguments, **named):
         nonlocal seen
@@ -128,11 +134,13 @@ def _arm(fault, fired):
             return real(*arguments, **named)
         seen += 1
         if seen == fault["nth"] or (fault.get("lasting") and seen > fault["nth"]):
-            _real_write(fired, b"x")
+            _real_write(fired, b"x ")
+            if number is None:
+                return False
             raise OSError(number, os.strerror(number))
         return real(*arguments, **named)
 
-    setattr(os, fault["call"], failing)
+    setattr(home, fault["call"], failing)
 
 
 _real_write = os.write
@@ -153,7 +161,7 @@ def _arm_bytes(room, number, fired):
             if _is_console(descriptor):
                 return real(descriptor, view, *rest)
             if left <= 0 and len(view):
-                _real_write(fired, b"x")
+                _real_write(fired, b"x ")
                 raise OSError(number, os.strerror(number))
             written = real(descriptor, memoryview(view).cast("B")[:left], *rest)
             left -= written
@@ -178,7 +186,7 @@ def _arm_arrays(nth, lasting, fired):
         seen += 1
         refused = seen == nth or (lasting and seen > nth)
         if seen == nth:
-            _real_write(fired, b"x")
+            _real_write(fired, b"x ")
         return not refused
 
     kinds = {"malloc": (address, size), "calloc": (address, size, size), "realloc": (address, address, size), "free": (address, address, size)}
@@ -215,7 +223,7 @@ def _arm_short(fired):
             count[0] += 1
             if _is_console(descriptor):
                 return real(descriptor, view, *rest)
-            _real_write(fired, b"x")
+            _real_write(fired, b"x ")
             return real(descriptor, memoryview(view).cast("B")[:1 + count[0] * 997 % 7000], *rest)
 
         setattr(os, name, short)

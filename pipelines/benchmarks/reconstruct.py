@@ -56,14 +56,19 @@ def system_of(config, shape):
 
 
 def capture(system, count, scene, snr, seed):
-    """(Superpixels, true blocks) of a scene at `snr` dB of white noise, over the mean square of the capture."""
+    """(Superpixels, true blocks) of a scene at `snr` dB of white noise, over the mean square of the capture.
+
+    count: (rows, columns) of the camera's lenslets, of the whole scene; and of those in its middle, which are captured.
+    """
     from plenocli.operators import to_blocks
     from plenocli.scene.sample import luminance, sample_picture
     from plenocli.stages.superpixels import Superpixels
     from plenocli.stages.training import _values
 
-    rows, columns = (int(n) * m for n, m in zip(count, system.object_shape))
+    whole, kept = count
+    rows, columns = (int(n) * m for n, m in zip(whole, system.object_shape))
     truth = to_blocks(np.asarray(sample_picture(luminance(_values(scene)), rows, columns), float), system.object_shape)
+    truth = truth[tuple(slice((n - k) // 2, (n - k) // 2 + k) for n, k in zip(whole, kept))]
     y = truth @ system.own.T
     sigma = float(np.sqrt(np.mean(y**2)) * 10 ** (-snr / 20))
     return Superpixels(y + sigma * np.random.default_rng(seed).standard_normal(y.shape), sigma, scene), truth
@@ -97,13 +102,13 @@ def compare(args):
             pictures = first.prior.pictures(scene)
             for snr in args.snr:
                 for seed in range(args.seeds):
-                    data, truth = capture(system, args.count or count, scene, snr, seed)
+                    data, truth = capture(system, (count, args.count or count), scene, snr, seed)
                     for method in args.methods:
                         options = METHODS[method]
                         if options["method"] == "dictionary" and lenslets not in dictionaries:
                             continue
                         settings = {k: v for k, v in options.items() if k != "oracle"}
-                        if options["method"] == "dictionary":
+                        if options["method"] in ("dictionary", "auto") and lenslets in dictionaries:
                             settings["dictionary"] = Path(dictionaries[lenslets])
                         one = Estimators(replace(system), Settings(seed=seed, **settings))
                         one.svd, one.prior.pictures_of[scene] = first.svd, pictures
@@ -138,12 +143,12 @@ def main():
     parser.add_argument("--run", type=Path, default=Path("runs/bench-reconstruct"), help="folder for the results")
     parser.add_argument("--config", default=str(ROOT / "sample_configs" / "seed_spatial.toml"), help="camera")
     parser.add_argument("--lenslets", nargs="+", default=["square", "circle"], choices=["square", "circle"], help="shapes of the lenslets")
-    parser.add_argument("--count", nargs=2, type=int, help="rows and columns of lenslets instead of the camera's")
+    parser.add_argument("--count", nargs=2, type=int, help="rows and columns of lenslets, in the middle of the camera's, instead of all")
     parser.add_argument("--scene", nargs="+", default=SCENES, help="photographs or skimage:NAME; validation scenes by default")
     parser.add_argument("--snr", nargs="+", type=float, default=[60, 40, 30, 20], help="noise levels in dB")
     parser.add_argument("--seeds", type=int, default=1, help="noise draws of each capture")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=[m for m in METHODS if m != "nnls, converged"], help="converged nnls takes minutes a capture")
-    parser.add_argument("--dictionary", nargs="+", help="a dictionary for each of --lenslets, without which that method is left out")
+    parser.add_argument("--dictionary", nargs="+", help="a dictionary for each of --lenslets, for auto too; without it that method is left out")
     args = parser.parse_args()
     rows = compare(args)
     args.run.mkdir(parents=True, exist_ok=True)

@@ -156,13 +156,11 @@ def read_response(path):
 
 
 def readout(exposure, c, path):
-    """(Readout at the calibration's exposure, (gain, read variance) that hold for it, or None where they are not known)."""
+    """(Readout of an exposure with the calibration's colour filter array at its exposure time, (gain, read variance) that hold for it, or None where they are not known)."""
     from plenocli.sensor.readout import Readout
 
     if exposure.values.shape != c.dark.mean.shape:
         raise InputError(f"is {exposure.values.shape[0]} x {exposure.values.shape[1]} px, the calibration {c.dark.mean.shape[0]} x {c.dark.mean.shape[1]}", path, "use captures of the calibrated camera")
-    if exposure.cfa != c.cfa:
-        raise InputError(f"has the colour filter array {exposure.cfa}, the calibration {c.cfa}", path, "use captures of the calibrated camera")
     if exposure.units != c.units:
         raise InputError(f"is in {exposure.units}, the calibration in {c.units}", path, "make all captures in the same way")
     if (exposure.seconds is None) != (c.exposure is None):

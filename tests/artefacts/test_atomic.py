@@ -117,3 +117,11 @@ def test_names_that_cannot_be_and_suffixes_that_mislead(tmp_path):
     with pytest.raises(UsageError, match="written as .h5"):
         check_output(tmp_path / "camera.toml", overwrite=True, suffixes=(".h5",))
     check_output(tmp_path / "pif.h5", suffixes=(".h5",))
+
+
+def test_a_file_that_appears_meanwhile_stays(tmp_path):
+    with pytest.raises(UsageError, match="appeared while the result was computed"):
+        with atomic.replacement(tmp_path / "a") as (_, descriptor):
+            os.write(descriptor, b"ours")
+            (tmp_path / "a").write_bytes(b"theirs")
+    assert (tmp_path / "a").read_bytes() == b"theirs" and os.listdir(tmp_path) == ["a"]

@@ -185,3 +185,31 @@ def test_preview_shows_white_as_white_and_bands_in_their_colour():
             for name, at in {"red": 630e-9, "green": 535e-9, "blue": 450e-9}.items()}
     assert peak == {"red": 0, "green": 1, "blue": 2}
     np.testing.assert_allclose(preview([550e-9], 3 * np.ones((1, 2, 2))), 3.0)
+
+
+class Library:
+    """OpenImageIO's readers and writers, one of which has a fault."""
+
+    def __init__(self, monkeypatch, kind, name, made):
+        import OpenImageIO as oiio
+
+        monkeypatch.setattr(oiio, kind, type(kind, (), {name: staticmethod(made(getattr(getattr(oiio, kind), name)))}))
+
+
+def _other_values(real):
+    def opened(path):
+        source = real(path)
+        fake = type("Reader", (), {"__getattr__": lambda self, name: getattr(source, name), "read_image": lambda self, kind: source.read_image(kind) + 1})
+        return fake()
+
+    return opened
+
+
+@pytest.mark.parametrize("kind, name, made, words", [
+    ("ImageOutput", "create", lambda real: lambda kind: None, "cannot write it"), ("ImageInput", "open", lambda real: lambda path: None, "cannot be read back"),
+    ("ImageInput", "open", _other_values, "does not hold what was written")])
+def test_a_library_that_fails_leaves_no_file(tmp_path, monkeypatch, kind, name, made, words):
+    Library(monkeypatch, kind, name, made)
+    with pytest.raises(OutputError, match=words):
+        write_exr(tmp_path / "x.exr", {"Y": cube()[0]})
+    assert os.listdir(tmp_path) == []

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from plenocli.config import camera_schema, load_camera, parse_camera
@@ -108,3 +109,8 @@ def test_a_band_of_light_instead_of_lines(shape):
 def test_bands_that_cannot_be(light, words):
     with pytest.raises(ConfigError, match=words):
         parse_camera(TINY.replace('wavelengths = ["550 nm"]', light))
+
+
+def test_values_without_a_file_in_the_description_are_refused():
+    with pytest.raises(ConfigError, match="main_lens.wavefront: names no file"):
+        parse_camera(TINY).attach(wavefront=np.zeros((8, 8)))

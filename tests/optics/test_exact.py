@@ -340,3 +340,9 @@ def test_pixels_that_hold_eight_fringes_of_a_lenslet_of_412_cells():
         found.append(PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(points)[0])
     for asked, other in zip((1e-2, 1e-3), found[1:]):
         assert (np.linalg.norm(other - found[0], axis=0) <= asked * np.linalg.norm(found[0], axis=0)).all()
+
+
+@pytest.mark.parametrize("superpixels", [(1, 1), (3, 3)])
+def test_a_shut_filter_lets_no_light_through(superpixels):
+    camera = small_camera(filter_array={"layout": (1, 1), "filters": [{"center": 300e-9, "fwhm": 1e-9}]})
+    assert not columns(camera, [0, 5], superpixels=superpixels, model="exact").any()

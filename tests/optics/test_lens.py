@@ -210,3 +210,13 @@ def test_a_lens_cannot_be_opened_beyond_its_stop_or_focus_behind_itself():
         camera_lens(triplet(), 0.55, 3 * widest, 550e-9)
     with pytest.raises(ConfigError, match="no real image"):
         camera_lens(triplet(), 0.04, 1e-3, 550e-9)
+
+
+def test_rays_that_do_not_get_through_are_told_with_their_number_and_angle():
+    with pytest.raises(NumericsError, match="64 rays get through, too few for 40 Zernike terms"):
+        noll_coefficients(triplet(), D_LINE, 40, rings=4)
+    with pytest.raises(NumericsError, match="chief ray at 80 degrees"):
+        wavefront(singlet(math.inf, 6e-3, 4e-3, 1.5, 1e-4), D_LINE, POINTS, angle=math.radians(80))
+    inside = camera_lens(triplet(), 0.55, 8e-3, 550e-9)
+    with pytest.raises(NumericsError, match="rays at the rim of the aperture"):
+        replace(inside, lens=replace(inside.lens, stop_radius=12e-3)).aberrations(550e-9)

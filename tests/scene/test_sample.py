@@ -61,3 +61,8 @@ def test_block_mean():
     np.testing.assert_array_equal(sample.block_mean(values, (2, 3)), [[4, 7], [16, 19]])
     with pytest.raises(ValueError, match="whole number"):
         sample.block_mean(values, (3, 3))
+
+
+def test_a_picture_without_pixels_is_refused():
+    with pytest.raises(InputError, match="has no pixels"):
+        sample.sample_picture(np.zeros((0, 5)), 2, 2)

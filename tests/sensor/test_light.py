@@ -71,3 +71,8 @@ def test_one_wavelength_a_filter_stands_for_all_that_it_passes():
 def test_without_filters_lines_are_equally_strong():
     bands, weights = band_weights(parse_camera(CAMERA), [450e-9, 540e-9, 650e-9], power)
     assert bands.shape == (1,) and weights.tolist() == [[1 / 3] * 3]
+
+
+def test_light_without_power_is_refused():
+    with pytest.raises(UsageError, match="has no power between 400 and 700 nm"):
+        broadband(parse_camera(CAMERA + FILTERS), lambda wavelengths: 0 * wavelengths)

@@ -146,6 +146,11 @@ def neighbours(coupled):
     return (blocks, RING) if coupled else (blocks[4:5], RING[4:5])
 
 
+def test_joint_lmmse_needs_noise():
+    with pytest.raises(NumericsError, match="positive noise level, not 0"):
+        overlap.prepare_joint(None, *neighbours(True), (N, N), 0.4, None, 0)
+
+
 @pytest.mark.parametrize(("coupled", "bands"), [(False, np.eye(1)), (True, np.eye(1)), (True, BANDS[1:, 1:])])
 def test_joint_lmmse_is_the_full_covariance(coupled, bands):
     blocks, offsets = neighbours(coupled)

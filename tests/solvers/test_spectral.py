@@ -173,3 +173,8 @@ def test_bias_of_a_noisy_calibration_is_the_one_of_repeated_calibrations(system)
     np.testing.assert_allclose(measured, bias, atol=0.2 * np.abs(bias).max())  # second order: the next one is 15 % here
     few = response[[0, 5, 20, 35]]  # as many pixels as bands: no attenuation, amplification is left
     assert (np.diag(spectral.calibration_bias(few, variance[:4])) > 0).all()
+
+
+def test_lmmse_without_a_prior_is_refused():
+    with pytest.raises(NumericsError, match="mean and covariance"):
+        spectral.demultiplex(np.eye(3), np.ones(3), "lmmse", variance=1.0)

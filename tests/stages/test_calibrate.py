@@ -237,3 +237,13 @@ def test_refusals_say_what_is_wrong(files, calibration, tmp_path):
     with pytest.raises((UsageError, OutputError)):
         run_calibrate(calibration[0], whites=files["white"])
     assert not (tmp_path / "o.h5").exists()
+
+
+def test_a_sensor_smaller_than_a_lenslet_is_refused():
+    from types import SimpleNamespace
+
+    from plenocli.stages.calibrate import _describe_grid
+
+    grid = SimpleNamespace(kind="square", centres=np.full((1, 1, 2), 4.5), valid=np.ones((1, 1), bool))
+    with pytest.raises(NumericsError, match="no lenslet lies wholly"):
+        _describe_grid(grid, (20, 20), (10, 10))

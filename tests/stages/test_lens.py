@@ -5,13 +5,14 @@ import math
 import sys
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from plenocli.cli.main import run
 from plenocli.config.lens import lens_toml, load_lens, parse_lens
-from plenocli.errors import ConfigError
+from plenocli.errors import ConfigError, InputError
 from plenocli.optics.geometry import geometry
 from plenocli.optics.lens import at_wavelength, first_order
 from plenocli.optics.pupil import wavefront
@@ -281,3 +282,34 @@ def _paraxially_aimed(ours, lens, wavelength, points, angle):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ours, "aim", launch)
         return ours.wavefront(lens, wavelength, points, angle)
+
+
+@pytest.mark.parametrize("change, words", [
+    ({"surfaces": []}, "no surface between"), ({"is_stop": False}, "has 0 stops"), ({"interaction_model": SimpleNamespace(is_reflective=True)}, "surface 1 is a mirror"),
+    ({"geometry": SimpleNamespace(cs=SimpleNamespace(x=0, y=1, z=0, rx=0, ry=0, rz=0))}, "of the kind SimpleNamespace"),
+    ({"geometry": type("Plane", (), {"cs": SimpleNamespace(x=0, y=1, z=0, rx=0, ry=0, rz=0)})()}, "tilted or off axis")])
+def test_import_says_which_surface_is_none_of_ours(tmp_path, monkeypatch, change, words):
+    """As optiland's objects are, without it."""
+    from plenocli.stages import lens as stage
+
+    straight = SimpleNamespace(x=0, y=0, z=0, rx=0, ry=0, rz=0)
+    flat = type("Plane", (), {"cs": straight, "radius": math.inf})()
+    plain = {"geometry": flat, "interaction_model": None, "is_stop": True, "aperture": None, "material_post": type("IdealMaterial", (), {"index": 1.0})()}
+    surfaces = [SimpleNamespace(**plain | {"is_stop": False}), SimpleNamespace(**plain | change), SimpleNamespace(**plain | {"is_stop": False})]
+    monkeypatch.setattr(stage, "_read", lambda path: (SimpleNamespace(surfaces=change.get("surfaces", surfaces)), []))
+    (tmp_path / "a.seq").write_text("x")
+    with pytest.raises(InputError, match=words):
+        stage.import_lens(tmp_path / "a.seq")
+
+
+def test_what_optiland_cannot_read_is_an_input_error(tmp_path, monkeypatch):
+    from plenocli.stages import lens as stage
+
+    def load(path):
+        raise IndexError("list index out of range")
+
+    fileio = SimpleNamespace(load_zemax_file=load, load_codev_file=load, load_optiland_file=load)
+    monkeypatch.setitem(sys.modules, "optiland", SimpleNamespace(fileio=fileio))
+    (tmp_path / "a.zmx").write_text("x")
+    with pytest.raises(InputError, match="a.zmx: optiland cannot read it .IndexError"):
+        stage.import_lens(tmp_path / "a.zmx")

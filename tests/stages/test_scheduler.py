@@ -177,3 +177,10 @@ def test_a_cluster_that_is_not_there_is_a_usage_error(address):
 def test_partial_functions_travel(tasks):
     with open_pool(2) as pool:
         assert dict(run_all(pool, [(0, partial(pow, 3), 4)])) == {0: 81}
+
+
+def test_a_worker_without_what_the_task_needs_is_told_to_install_it():
+    from plenocli.stages.scheduler import _trouble
+
+    error = _trouble(ModuleNotFoundError("No module named 'plenocli'"))
+    assert isinstance(error, UsageError) and "cannot load the task (No module named 'plenocli')" in str(error) and "install" in error.fix

@@ -346,3 +346,22 @@ def test_values_are_written_as_given_and_read_as_numbers(whole):
     assert {r["capture-sim.snr"] for r in rows} == {"30 dB", "50 dB"} and {r["sensor.pixels_per_lenslet"] for r in rows} == {"[7, 7]", "[9, 9]"}
     values = read_artefact(whole[1], "sweep").data["sweep/parameter"]
     assert [number(r["capture-sim.snr"]) for r in rows] == values[:, 2].tolist()
+
+
+def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
+    from plenocli.stages.design_space import Row
+    from plenocli.stages.scheduler import Lost
+    from plenocli.stages.sweep_store import open_store
+
+    class Pool:
+        far, room, asked = False, True, []
+
+        def submit(self, token, function, task):
+            self.asked.append(token)
+
+        def next(self):
+            self.room = bool(self.asked)
+            return self.asked.pop(), Lost("the worker died")
+
+    with open_store(tmp_path / "out.h5", None, False, []) as store, pytest.raises(OutputError, match="1 of 1 points have no result: the worker died.*run the command again"):
+        store.evaluate([Row(0, {}, {}, "a", "m")], Pool())

@@ -48,8 +48,9 @@ def pytest_terminal_summary(terminalreporter):
     if reached:
         shown = shown_places(reached)
         totals["messages for users that tests saw made"] = {"places": len(shown), "in the code": len(all_places())}
-        if terminalreporter.verbosity > 0:
-            terminalreporter.line("never made: " + " ".join(sorted(set(all_places()) - shown)))
+        never = sorted(set(all_places()) - shown)
+        if terminalreporter.verbosity > 0 or len(never) < 20:
+            terminalreporter.line("never made: " + " ".join(never))
     if totals:
         terminalreporter.section("counts")
     for what, numbers in sorted(totals.items()):

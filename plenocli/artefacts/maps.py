@@ -40,7 +40,8 @@ def read_transmittance(path):
 def read_wavefront(path):
     """Wavefront error in metres (rows, columns) float64, from the dataset "wavefront" of an HDF5 file or the one channel of an EXR.
 
-    A dataset may say its unit in the attribute "units", which must be m. Raises InputError.
+    A dataset may say its unit in the attribute "units", which must be m, as text of fixed length: HDF5 may read a damaged one of
+    variable length for ever. Raises InputError.
     """
     _require_small(path)
     content = Path(path).read_bytes()

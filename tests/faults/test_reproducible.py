@@ -19,6 +19,12 @@ LONG = ("simulate-pif", "capture-sim exr", "simulate-response", "calibrate", "de
 STRANGE = {"TZ": "Pacific/Kiritimati", "LC_ALL": "C", "LANG": "C", "PYTHONHASHSEED": "77", "COLUMNS": "50", "OMP_NUM_THREADS": "1"}
 
 
+def copy_inputs(source, folder, result):
+    """Copy all files of a folder but a stage's result; the copies."""
+    made = results(source / result, result)
+    return [Path(shutil.copy(path, folder)) for path in source.iterdir() if path.is_file() and path.name not in made]
+
+
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)])
 def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, name):
     source, steps = stages
@@ -27,10 +33,8 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
     for number in range(runs):
         folder = tmp_path / ("another folder " * (number + 1)).strip()
         folder.mkdir()
-        for path in source.iterdir():
-            if path.is_file() and path.name not in results(source / result, result):
-                shutil.copy(path, folder)
-                os.utime(folder / path.name, (1e9, 1e9 + number))
+        for path in copy_inputs(source, folder, result):
+            os.utime(path, (1e9, 1e9 + number))
         environment = os.environ | STRANGE | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(77 + number)}
         done = subprocess.run([sys.executable, "-m", "plenocli", *arguments, "-o", result], cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -59,9 +63,7 @@ THREADS = 1e-12
 def test_threads_of_the_linear_algebra_change_the_last_digits_at_most(stages, tmp_path, count, name):
     source, steps = stages
     arguments, result = steps[name]
-    for path in filter(Path.is_file, source.iterdir()):
-        if path.name not in results(source / result, result):
-            shutil.copy(path, tmp_path)
+    copy_inputs(source, tmp_path, result)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-m", "plenocli", *arguments, "-o", result], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -89,9 +91,7 @@ def largest_difference(one, two):
 def test_workers_of_one_result_change_nothing(runner, stages, tmp_path, count, name):
     source, steps = stages
     arguments, result = steps[name]
-    for path in filter(Path.is_file, source.iterdir()):
-        if path.name not in results(source / result, result):
-            shutil.copy(path, tmp_path)
+    copy_inputs(source, tmp_path, result)
     outcome = runner.run([*arguments, "--workers", 2, "-o", result], tmp_path, limit=240)
     assert outcome.code == 0 and results(tmp_path / result, result) == results(source / result, result), outcome
     count("stages with two workers", stages=1, other_bytes=0)

@@ -31,7 +31,6 @@ CAMERAS = {
     "lens-near": ('distance = "550 mm"', 'distance = "40 mm"', "f_number = 8", 'f_number = 20\nprescription = "triplet.toml"'),
     "lens-long": ('focal_length = "50 mm"', 'focal_length = "60 mm"\nprescription = "triplet.toml"'),
     "infrared": ("[sensor]", '[sensor]\ncfa = "RGGB"\ncamera = "Sigma SDMerill (NPL)"', '"550 nm"', '"750 nm"'), "stranger": ("[sensor]", '[sensor]\ncfa = "RGGB"\ncamera = "Nobody"'),
-    "blocked": ("[sensor]", '[filter_array]\nlayout = [1, 1]\nfilters = [{ center = "300 nm", fwhm = "1 nm" }]\n[sensor]'),
     "band": ('wavelengths = ["550 nm"]', 'band = { center = "550 nm", fwhm = "100 nm" }'),
     "aperture-channels": ("f_number = 8", 'f_number = 8\naperture_shape = "image"\naperture_image = "odd.exr"'),
 }
@@ -279,6 +278,7 @@ def _artefacts(folder):
     changed("colours.h5", "capture.h5", lambda a: a.data.update({"capture/cfa": "RGGB"}))
     changed("stateless.h5", "dictionary.h5", lambda a: a.data.pop("dictionary/state/iteration"))
     changed("cropped.h5", "image.h5", lambda a: a.data.update({k: v[:16, :16] for k, v in a.data.items() if k in ("image/value", "image/sigma")}))
+    changed("bands.h5", "image.h5", lambda a: [a.data.pop("image/sigma", None), a.data.update({"image/value": np.stack([a.data["image/value"]] * 2), "image/wavelength": np.array([5e-7, 6e-7])})])
     changed("noiseless.h5", "capture.h5", lambda a: a.attrs["capture"].pop("noise_sigma", None))
     changed("windowless.h5", "calibration.h5", lambda a: a.data.pop("response/white"))
     changed("shifted.h5", "calibration.h5", lambda a: a.data.update({"response/wavelength": a.data["response/wavelength"] * 1.3}))

@@ -217,6 +217,9 @@ def test_rays_that_do_not_get_through_are_told_with_their_number_and_angle():
         noll_coefficients(triplet(), D_LINE, 40, rings=4)
     with pytest.raises(NumericsError, match="chief ray at 80 degrees"):
         wavefront(singlet(math.inf, 6e-3, 4e-3, 1.5, 1e-4), D_LINE, POINTS, angle=math.radians(80))
+    telecentric = Prescription((Surface(100.0, 0.0, glass(1.5)), Surface(0.0, 0.02), Surface(0.0, 5e-3)), 2, 1e-3)
+    with pytest.raises(NumericsError, match="telecentric entrance pupils"):
+        wavefront(telecentric, D_LINE, POINTS)
     inside = camera_lens(triplet(), 0.55, 8e-3, 550e-9)
     with pytest.raises(NumericsError, match="rays at the rim of the aperture"):
         replace(inside, lens=replace(inside.lens, stop_radius=12e-3)).aberrations(550e-9)

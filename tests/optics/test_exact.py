@@ -346,3 +346,9 @@ def test_pixels_that_hold_eight_fringes_of_a_lenslet_of_412_cells():
 def test_a_shut_filter_lets_no_light_through(superpixels):
     camera = small_camera(filter_array={"layout": (1, 1), "filters": [{"center": 300e-9, "fwhm": 1e-9}]})
     assert not columns(camera, [0, 5], superpixels=superpixels, model="exact").any()
+
+
+def test_a_field_of_too_many_terms_is_refused_before_it_is_computed(monkeypatch):
+    monkeypatch.setattr(exact, "MAX_SKETCH", 9)
+    with pytest.raises(NumericsError, match="about .* separable terms, more than"):
+        exact.exact_band(geometry(small_camera(), WAVELENGTH), (1, 1), 0, 1e-4, 1e-4)

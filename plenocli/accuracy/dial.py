@@ -26,6 +26,10 @@ BAND_SHARE = 0.5
 """Share of the accuracy that the wavelengths of a band may use up."""
 STEPS = 6
 """Halvings, on a logarithmic scale, of the range in which the finest accuracy that can be reached is sought."""
+STEEPEST = 1.75
+"""Tangent of the angle from a lenslet's axis up to which the exact model takes coherent neighbours in by itself."""
+COARSEST = 0.5
+"""A default accuracy beyond this is refused: such columns are not the camera's. Who can use them asks for them."""
 SHARE = 0.2
 """Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
 
@@ -156,8 +160,7 @@ def _consider(request, rung):
     fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
              "storage": 3e-8 if request.dtype == np.float32 else 0.0}
     tried = []
-    # rays end where the blur ends
-    for ring in request.rings if rung.model != "ray" else request.rings[:1]:
+    for ring in _rings_of(request, rung):
         outside = 0.0 if rung.model == "ray" else max(window_error(v, request.grid, ring) for v in request.depths)
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, rung, ring)
@@ -170,6 +173,16 @@ def _consider(request, rung):
     # none serves: the fewest rings that come as near as any
     least = min(c.error for c in tried)
     return next(c for c in tried if c.error <= 1.1 * least)
+
+
+def _rings_of(request, rung):
+    """The rings of coherent neighbours to choose from: of the least number only for rays, which end where the blur ends."""
+    if rung.model == "ray" or len(request.rings) == 1:
+        return request.rings[:1]
+    if rung.model != "exact":
+        return request.rings
+    # what lies outside is known from the paraxial model, which says less than a third of it 64 degrees aside
+    return [ring for ring in request.rings if ring == 1 or max(coherent_window(v, request.grid, ring) * v.D2 / v.z3 for v in request.views) <= STEEPEST]
 
 
 def _band_nodes(request, rung, ring):
@@ -223,23 +236,32 @@ def _cheapest(found):
 
 
 def _fall_back(request, found):
-    """Where nothing serves: the best there is for a default accuracy, exit 5 for one that was asked for."""
+    """Where nothing serves: the best there is for a default accuracy, unless that is beyond COARSEST; exit 5 for one that was asked for."""
     asked, possible = request.accuracy, [c for c in found if math.isfinite(c.error)]
     least = min((math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible), default=math.inf)
     reached, again, best = _finest_served(request, found, max(asked, min(1.3 * least + 1.1 * BEST_ACCURACY, 0.99)))
     if best is None:
-        reasons = "; ".join(f"{c.name}: {c.why}" for c in found)
-        raise NumericsError(f"no model serves this camera ({reasons})", "model", "change the camera, or leave --model at auto")
+        what = "model 'auto'" if request.model == "auto" else f"model {request.model!r}"
+        raise NumericsError(f"{what} does not serve this camera ({_reasons(found)})", "model",
+                            "change the camera, or " + ("name a model, such as --model ray, to be exact within it only" if request.model == "auto" else "leave --model at auto"))
     why = next(c.why for c in found if c.name == best.name)
     if request.explicit:
         advice = f"ask for {reached:.2g} or coarser"
         if request.model == "auto" and best.split["model"] > 0.5 * best.error:
             advice += f", or name a model (--model {best.model}) to ask for accuracy within that model only"
         raise NumericsError(f"accuracy {asked:g} cannot be reached: the best is about {reached:.2g} ({best.name}: {why})", "accuracy", advice)
+    if reached > COARSEST:
+        raise NumericsError(f"no model comes nearer to this camera than {reached:.2g} ({_reasons(found)})", "accuracy", f"change the camera, or ask for {reached:.2g}")
     request.warnings.append(f"the {request.asked_by} calls for accuracy {asked:.1g}; the best there is for this camera is "
                             f"about {reached:.1g} ({best.name}: {why})")
     request.accuracy = reached
     return request, again, best
+
+
+def _reasons(found):
+    """Why each rung does not serve, rungs with the same reason together."""
+    reasons = dict.fromkeys(c.why for c in found)
+    return "; ".join(f"{' and '.join(c.name for c in found if c.why == why)}: {why}" for why in reasons)
 
 
 def _finest_served(request, found, limit):

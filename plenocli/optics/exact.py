@@ -144,38 +144,42 @@ def cost(camera, view, band, shape, double):
     lit = 1 if band.window is None else 2 * band.window + 1
     points, lines = max(view.object_shape), band.pixel_nodes * max(view.pixel_shape)
     nodes, item = band.sensor_count or lines, 16 if double else 8
-    places = range(0 if even else -(grid[0] // 2), grid[0] // 2 + 1)
-    rows = {s: nodes * ((points + 1) // 2 if even and s == 0 else points) for s in places}
-    tables = [(a, b) for a in places for b in places if b <= a or not even]
+    beside = grid[0] // 2 if even else grid[0] - 1
+    rows = [nodes * ((points + 1) // 2 if even else points), nodes * points, nodes * points]
+    # superpixels (row, column) that stand for all of their kind: on no axis of symmetry, on one or two, on a diagonal
+    kinds = {(0, 0): 1, (1, 0): beside, (1, 1): beside, (2, 1): beside * (beside - 1) // 2} if even else {(0, 0): 1, (1, 0): 2 * beside, (2, 1): beside**2}
     # as far as light comes: the lenslets beside the superpixel
     across = min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + 40)
     few = psf_nodes(view, view.lenslet_width / 2)
-    operations, largest = lit * band.terms * sum(rows.values()) * (4 * across + 8 * band.terms), 0.0
+    operations, largest = lit * band.terms * (rows[0] + beside * rows[1]) * (4 * across + 8 * band.terms), 0.0
     # by how many axes a superpixel lies aside
     ranks = [plain * expected_rank(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
     pairs_of_terms = [plain * expected_products(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
     seconds = 0.01 + 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
-    for a, b in tables:
+    for (a, b), count in kinds.items():
+        if count == 0:
+            continue
         aside = (a != 0) + (b != 0)
         rank, products = ranks[aside], pairs_of_terms[aside]
         both = rows[a] + (0 if even and a == b else rows[b])
         sketch = 1.12 / FILL * rank + 8
         # of many lenslets each brings few terms, so that products are narrow and wait for memory
-        operations += both * (products * ((16 if lit == 1 else 26) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3
-        operations += 0 if not band.sensor_count else 4 * both * lines * rank
+        operations += count * (both * (products * ((16 if lit == 1 else 26) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3)
+        operations += count * 4 * both * lines * rank if band.sensor_count else 0
         # coarse cuts drop most lenslets
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * max(0.0, math.log10(COARSE / band.cut)))
-        seconds += 0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products
-        seconds += 0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across)
+        seconds += count * (0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products)
+        seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
         largest = max(largest, item * (both * (products + 3 * sketch)))
     # the coupling of the own lenslet's terms is dense before it is looked at: measured at f/2.2, 340 to 3200 of them
     coupling = 1.25 * item * (plain * expected_products(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)) ** 2
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
     size = shape[1] * shape[2] * shape[3]
-    mean = np.mean([ranks[(a != 0) + (b != 0)] for a, b in tables])
+    tables = sum(kinds.values())
+    mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
     return {"operations": operations + 8.0 * 1.2 * fine * mean * pairs,
             "seconds": seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
-            "bytes": int(largest + coupling + item * 2 * len(tables) * points * lines * mean) + (3 << 24)}
+            "bytes": int(largest + coupling + item * 2 * tables * points * lines * mean) + (3 << 24)}
 
 
 class ExactSquareLenslets:

@@ -77,9 +77,13 @@ def legendre(t, count, step):
 
 
 def psf_nodes(geometry, half):
-    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number."""
+    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number; NumericsError for more than MAX_NODES."""
     # the functions are interpolated, not only integrated: a few degrees more than the integration rule
     count = nodes_for(2 * geometry.k * geometry.D1 / 2 * half / geometry.z2) + 14
+    if count > MAX_NODES:
+        raise NumericsError(
+            f"the field on the array needs {count} nodes per axis, more than {MAX_NODES}",
+            "main_lens and lenslet_array", "take fewer superpixels, a longer wavelength or a slower lens")
     return count + count % 2
 
 
@@ -144,14 +148,9 @@ def edge_emphasis(geometry, points):
 def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of at most `tolerance`.
 
-    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field. NumericsError where the node rule
-    asks for more than MAX_NODES.
+    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field. NumericsError as psf_nodes.
     """
     count = psf_nodes(geometry, half)
-    if count > MAX_NODES:
-        raise NumericsError(
-            f"the field on the array needs {count} nodes per axis, more than {MAX_NODES}",
-            "main_lens and lenslet_array", "take fewer superpixels, a longer wavelength or a slower lens")
     t, w = gauss(count)
     h = sample(camera, geometry, half * t, half * t)
     scale = np.abs(h).max()

@@ -6,15 +6,13 @@ from threading import Lock
 import numpy as np
 
 from plenocli.optics.factors import Factors
+from plenocli.optics.plan import NARROW
 from plenocli.optics.psf import edge_emphasis, legendre, psf_nodes, separable_field
 from plenocli.optics.quadrature import gauss
 from plenocli.optics.relay import lenslet_kernel, lit_lenslets, sensor_nodes
 
 SLAB = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
-NARROW = 2.0, 4.0
-"""Root-energy cut of the factors of the object's own superpixel and of others over that of the spread function (columns change by 0.05 to 0.7
-of the latter: 8 cases of 5 cameras)."""
 
 
 class SquareLenslets(Factors):
@@ -45,7 +43,7 @@ class SquareLenslets(Factors):
         super().__init__(high[0], wide[0], geometry.pixel_shape, rules[0][1][0], signs)
         # the object's own superpixel, where it has more nodes
         self._own = Factors(high[1], wide[1], geometry.pixel_shape, rules[1][1][0], signs) if len(rules) > 1 else None
-        self._roots, self._narrow, self._lock = {}, (None, None), Lock()
+        self._roots, self._narrow, self._least, self._lock = {}, (None, None), None, Lock()
 
     def _rules(self):
         """[(whether all superpixels or the object's own only, (nodes of a pixel per axis, rule))], all of them first."""
@@ -63,12 +61,13 @@ class SquareLenslets(Factors):
         return narrow.superpixel(0, 0, rows, columns, out)
 
     def _narrowed(self, sy, sx):
-        """Factors of one superpixel cut at NARROW self._cut (root energy of a mean point, points at the lenslet's edge weighing more)."""
+        """Factors of one superpixel, without the terms that its light does not need."""
+        if self._least is None:
+            self._least = self._least_term()
         own, source = (2 * sy + 1, 2 * sx + 1) == self.superpixels, self
-        signs = np.ones(self.high.shape[3]) if self.signs is None else self.signs
-        left, right = self._root(0, sy), self._root(1, sx) * signs
+        left, right, signs = self._roots_of(sy, sx)
         u, s, vh = np.linalg.svd(left @ right.T)
-        terms = max(1, int(np.count_nonzero(np.sqrt(np.cumsum(s[::-1] ** 2)[::-1]) > NARROW[0 if own else 1] * self._cut)))
+        terms = max(1, int(np.count_nonzero(s > self._least)))
         scale = 1 / np.sqrt(s[:terms])
         if own and self._own:
             source, sy, sx = self._own, 0, 0
@@ -76,6 +75,22 @@ class SquareLenslets(Factors):
         high = source.high[sy] @ (right.T @ vh[:terms].conj().T * scale).astype(self.dtype)
         wide = source.wide[sx] @ (signs[:, None] * left.T @ u[:, :terms].conj() * scale).astype(self.dtype)
         return Factors(high[None], wide[None], self.pixel_shape, source.pixel_nodes)
+
+    def _least_term(self):
+        """The terms up to which size (root energy of a mean point, points at the lenslet's edge weighing more) all superpixels
+        together lose NARROW self._cut without."""
+        sizes = []
+        for place in np.ndindex(*self.superpixels):
+            left, right, _ = self._roots_of(*place)
+            sizes.append(np.linalg.svd(left @ right.T, compute_uv=False))
+        sizes = np.sort(np.concatenate(sizes))
+        lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROW * self._cut) ** 2))
+        return sizes[lost - 1] if lost else 0.0
+
+    def _roots_of(self, sy, sx):
+        """(_root of superpixel row sy, of column sx with the signs of the terms, these signs)."""
+        signs = np.ones(self.high.shape[3]) if self.signs is None else self.signs
+        return self._root(0, sy), self._root(1, sx) * signs, signs
 
     def _root(self, axis, s):
         """R with R^H R the overlaps of the terms on superpixel s for a mean point, on half of its nodes."""

@@ -84,6 +84,23 @@ def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
         plan_pif(small_camera(), accuracy=1e-3)
 
 
+FAR_OUT = {"main_lens__aperture_diameter": 55e-3, "object__distance": 0.15, "lenslet_array__pitch": 60e-6, "sensor__pixels_per_lenslet": (3, 3), "sensor__pixel_pitch": 20e-6}
+
+
+def test_a_field_that_cannot_be_sampled_is_left_to_rays_before_any_work():
+    camera = small_camera(**FAR_OUT)
+    plan = plan_pif(camera)
+    assert plan.rung == "rays" and plan.estimated <= plan.accuracy <= dial.COARSEST and any("best there is" in warning for warning in plan.warnings)
+    assert all("nodes per axis" in c.why for c in plan.candidates if c.model != "ray")
+    with pytest.raises(NumericsError, match="best is about 0.32"):
+        plan_pif(camera, accuracy=1e-3)
+    # nor is a default that has little to do with the camera taken silently
+    with pytest.raises(NumericsError, match="no model comes nearer"):
+        plan_pif(small_camera(**FAR_OUT, light__wavelengths=(2e-6,)))
+    with pytest.raises(NumericsError, match="fresnel, low rank and fresnel, triple product: the field"):
+        plan_pif(camera, model="fresnel")
+
+
 def test_what_too_many_terms_refuse_may_be_had_coarser(monkeypatch):
     """The message and the default name what the fine rung can do, not the coarse rung's error."""
     def size(view, grid, ring, accuracy, tolerance):

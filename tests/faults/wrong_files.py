@@ -21,7 +21,6 @@ CAMERAS = {
     "wavefront": ("f_number = 8", 'f_number = 8\nwavefront = "capture.h5"'), "wavefront-toml": ("f_number = 8", 'f_number = 8\nwavefront = "scene.toml"'),
     "no-aperture": ("f_number = 8", 'f_number = 8\naperture_shape = "image"\naperture_image = "none.png"'), "other": ('"26 um"', '"25 um"'), "blue": ('"550 nm"', '"450 nm"'),
     "hexagonal": ("count = [5, 5]", 'count = [5, 5]\nlattice = "hexagonal"'), "drift": ('superpixel_pitch = "26 um"', 'pitch = "26 um"'), "latin": ("[main_lens]", "[main_lens]\nname = \"\udce9\""),
-    
     "other2": ('distance = "55 mm"', 'distance = "56 mm"'), "bayer": ("[sensor]", '[sensor]\ncfa = "RGGB"'), "lens": ("f_number = 8", 'f_number = 8\nprescription = "triplet.toml"'),
     "wide-lens": ("f_number = 8", 'f_number = 1\nprescription = "triplet.toml"'), "one": ("count = [5, 5]", "count = [1, 1]"),
     **{f"wavefront-{name}": ("f_number = 8", f'f_number = 8\nwavefront = "wave-{name}.h5"') for name in ("none", "whole", "text", "inches", "cut", "tall", "good")},
@@ -39,10 +38,8 @@ LENSES = {
     "afocal": '[lens]\nstop = 1\nstop_diameter = "5 mm"\n' + SURFACE.format("20 mm", "0 mm") + 'glass = "N-BK7"\n' + SURFACE.format("20 mm", "50 mm"),
     "plate": '[lens]\nstop = 1\nstop_diameter = "5 mm"\n' + SURFACE.format("flat", "2 mm") + 'glass = "N-BK7"\n' + SURFACE.format("flat", "50 mm"),
     "strange-glass": '[lens]\nstop = 1\nstop_diameter = "5 mm"\n' + SURFACE.format("20 mm", "2 mm") + 'glass = "own"\n' + SURFACE.format("flat", "50 mm") + '[glass.own]\nsellmeier = [[-5, 0.01]]\nrange = ["300 nm", "1 um"]\n',
-    "telecentric": '[lens]\nstop = 3\nstop_diameter = "5 mm"\n' + SURFACE.format("10 mm", "0 mm") + 'glass = "own"\n' + SURFACE.format("flat", "20 mm") + SURFACE.format("flat", "5 mm")
-                   + '[glass.own]\npolynomial = [[2.25, 0]]\nrange = ["300 nm", "1 um"]\n',
 }
-HOSTILE = ("external_link", "soft_link", "twice", "loop", "external_storage", "virtual", "objects", "ragged", "compound", "reference", "bomb", "filter", "named_type", "null",
+HOSTILE = ("external_link", "soft_link", "twice", "external_storage", "virtual", "objects", "compound", "bomb", "filter", "named_type", "null",
            "attribute_object", "unknown_dataset", "unknown_attribute", "newer", "other_kind", "no_command", "wrong_shape", "infinite")
 """Of tests/artefacts/test_container.py: what HDF5 allows and plenocli does not."""
 SWEEPS = {
@@ -135,7 +132,6 @@ def _pictures(folder):
     (folder / "garbage.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(60))
     (folder / "garbage.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(60))
     (folder / "many.exr").write_bytes(bombs._exr(8, 8, [f"c{n:05d}" for n in range(2100)]))
-    (folder / "backwards.exr").write_bytes(bombs._exr(-5, -5))
     (folder / "empty.exr").write_bytes(bombs._exr(8, 8))
     (folder / "latin.exr").write_bytes((folder / "strange.exr").read_bytes().replace(b"\0Q\0", b"\0\xe9\0"))
     picture(folder / "labels.png", np.full((6, 7), 99, np.uint8))
@@ -292,11 +288,9 @@ def _artefacts(folder):
     y, x = np.mgrid[:120, :140]
     lit = (np.indices(white.shape) % 2).any(axis=0)
     flicker = np.kron(np.random.default_rng(8).uniform(0.6, 1, (6, 7)), np.ones((20, 20)))
-    for name, values in {"redless": white * lit, "flicker": white * flicker, "oblong": 2000 * (2 + np.cos(y * np.pi / 5) + np.cos(x * np.pi / 9)),
-                         "speck": 9 * (np.hypot(y % 60 - 30, x % 70 - 35) < 3)}.items():
+    for name, values in {"redless": white * lit, "flicker": white * flicker, "oblong": 2000 * (2 + np.cos(y * np.pi / 5) + np.cos(x * np.pi / 9))}.items():
         picture(folder / f"{name}.tif", values.astype(np.uint16))
     picture(folder / "little.tif", white[:50, :50].copy())
-    picture(folder / "rolled.tif", np.roll(white, (9, 9), (0, 1)))
     picture(folder / "burnt.tif", np.full((120, 140), 65535, np.uint16))
     picture(folder / "sixty.exr", np.full((60, 60), 0.5, np.float32), ("Y",))
     (folder / "pieces").mkdir()

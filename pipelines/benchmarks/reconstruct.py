@@ -99,7 +99,7 @@ def compare(args):
         first = Estimators(system, Settings())
         _ = first.svd
         for scene in args.scene:
-            pictures = first.prior.pictures(scene)
+            first.prior.pictures(scene)
             for snr in args.snr:
                 for seed in range(args.seeds):
                     data, truth = capture(system, (count, args.count or count), scene, snr, seed)
@@ -111,7 +111,7 @@ def compare(args):
                         if options["method"] in ("dictionary", "auto") and lenslets in dictionaries:
                             settings["dictionary"] = Path(dictionaries[lenslets])
                         one = Estimators(replace(system), Settings(seed=seed, **settings))
-                        one.svd, one.prior.pictures_of[scene] = first.svd, pictures
+                        one.svd, one.prior.pictures_of[scene] = first.svd, first.prior.pictures_of[scene]
                         found = measure(one, data, truth, options)
                         rows.append({"lenslets": lenslets, "scene": scene, "snr_db": snr, "seed": seed, "method": method} | found)
                         print(f"{lenslets} {scene} {snr:g} dB, {method}: {found['psnr_db']:.2f} dB, SSIM {found['ssim']:.3f}, {found['seconds']:.1f} s ({found['took']})", flush=True)

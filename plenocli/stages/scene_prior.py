@@ -1,5 +1,7 @@
 """What photographs look like to one camera: training pictures, their statistics, and the LMMSE estimators that rest on them."""
 
+from pathlib import Path
+
 import numpy as np
 
 from plenocli.stages.seeds import stream
@@ -21,12 +23,12 @@ class ScenePrior:
         self.system, self.svd, self.training, self.seed = system, svd, training, seed
         self.pictures_of, self._statistics, self._estimators = {}, {}, {}
 
-    def pictures(self, scene):
-        """Linear luminance pictures (row, column) at several scales."""
+    def pictures(self, scene, without=()):
+        """Linear luminance pictures (row, column) at several scales; without: file names of those that are left out."""
         if scene not in self.pictures_of:
             shape = self.system.object_shape
-            self.pictures_of[scene] = [p for _, p in at_scales(read_training(self.training, shape, not_scene=scene), shape)]
-        return self.pictures_of[scene]
+            self.pictures_of[scene] = at_scales(read_training(self.training, shape, not_scene=scene), shape)
+        return [picture for name, picture in self.pictures_of[scene] if Path(name).name not in without]
 
     def bands(self):
         """Covariance (band, band) of the system's bands at a point, its diagonal 1 on average: of the reflectance of surfaces."""

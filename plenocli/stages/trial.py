@@ -20,15 +20,14 @@ def choose(camera, data, kept):
 
     What is compared is measured, not promised: TRIALS pieces of training pictures, of about the capture's contrast, are captured
     by the own block of `camera` (Estimators) with the noise of this capture, relative to the signal, and reconstructed by each
-    candidate. lmmse has seen these pictures in its covariance, so that a method that wins wins in earnest. kept: a dict, where
-    trials are kept for captures to come.
+    candidate. lmmse has seen these pictures in its covariance, so that a method that wins wins in earnest; what a dictionary was
+    learnt from flatters it and is left out. kept: a dict, where trials are kept for captures to come.
     """
-    candidates = ["lmmse", "pnp", *(["dictionary"] if camera.settings.dictionary is not None else [])]
     sigma = camera.noise(data, {})
     loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)  # an empty capture is all noise
     key = (float(f"{sigma / loudness:.1e}"), _contrast(camera, data, sigma), data.scene)
     if key not in kept:
-        kept[key] = _trial(camera, candidates, *key)
+        kept[key] = _trial(camera, *key)
     quality = kept[key]
     if not quality:
         return {"method": "lmmse", "reason": "the training pictures are too small for a trial of others"}
@@ -62,13 +61,28 @@ def _coloured(truth, bands, rng):
     return (truth[:, :, None, :] * colours[:, :, None]).reshape(*truth.shape[:2], -1)
 
 
-def _trial(camera, candidates, relative, contrast, scene):
-    """Mean PSNR (dB) of each candidate over pieces of about this contrast, {} where no picture is large enough."""
+def _trial(camera, relative, contrast, scene):
+    """PSNR (dB) of each candidate over pieces of about this contrast, {} where no picture is large enough.
+
+    A dictionary's is that of lmmse and what it gains over lmmse on pictures it was not learnt from.
+    """
+    quality = _compare(camera, ("lmmse", "pnp"), (), relative, contrast, scene)
+    if camera.settings.dictionary is not None:
+        fresh = _compare(camera, ("lmmse", "dictionary"), camera.learnt[2]["parameters"].get("training", ()), relative, contrast, scene)
+        if not fresh:
+            note("auto does not try the dictionary: it was learnt from all training pictures that are large enough (give others with --training, or --method dictionary)")
+        elif quality:
+            quality["dictionary"] = quality["lmmse"] + fresh["dictionary"] - fresh["lmmse"]
+    return quality
+
+
+def _compare(camera, candidates, without, relative, contrast, scene):
+    """Mean PSNR (dB) of each candidate over pieces of about this contrast from pictures but those named in `without`, {} where none is large enough."""
     from plenocli.solvers.natural import draw_patches
 
     shape = camera.system.object_shape
     side = tuple(SIDE * n for n in shape)
-    large = [p for p in camera.prior.pictures(scene) if p.shape[0] >= side[0] and p.shape[1] >= side[1]]
+    large = [p for p in camera.prior.pictures(scene, without) if p.shape[0] >= side[0] and p.shape[1] >= side[1]]
     if not large:
         return {}
     rng = stream(camera.settings.seed, "trial")

@@ -212,6 +212,11 @@ def test_dictionary_chain(single, tmp_path, capsys):
                for m, more in (("lmmse", ()), ("dictionary", ("--dictionary", str(folder / "c.h5"))))}
     assert quality["dictionary"] > quality["lmmse"] - 1.5, quality
     assert "less noise than this capture has" in capsys.readouterr().err
+    given = ["--method", "auto", "--dictionary", str(folder / "c.h5")]
+    assert set(reconstruct(folder, *given).attrs["image"]["parameters"]["trial_db"]) == {"lmmse", "pnp", "dictionary"}
+    capsys.readouterr()
+    known = reconstruct(folder, *given, "--training", "skimage:camera", "--training", "skimage:coffee")  # what it was learnt from would flatter it
+    assert set(known.attrs["image"]["parameters"]["trial_db"]) == {"lmmse", "pnp"} and "does not try the dictionary" in capsys.readouterr().err
 
 
 def test_several_captures_go_to_a_folder(single, tmp_path, capsys):

@@ -30,6 +30,7 @@ CAMERAS = {
     "lens-near": ('distance = "550 mm"', 'distance = "40 mm"', "f_number = 8", 'f_number = 20\nprescription = "triplet.toml"'),
     "lens-long": ('focal_length = "50 mm"', 'focal_length = "60 mm"\nprescription = "triplet.toml"'),
     "infrared": ("[sensor]", '[sensor]\ncfa = "RGGB"\ncamera = "Sigma SDMerill (NPL)"', '"550 nm"', '"750 nm"'), "stranger": ("[sensor]", '[sensor]\ncfa = "RGGB"\ncamera = "Nobody"'),
+    "coarse": ('"26 um"', '"2.6 mm"', '"208 um"', '"20.8 mm"', '"2 um"', '"200 um"'),
     "band": ('wavelengths = ["550 nm"]', 'band = { center = "550 nm", fwhm = "100 nm" }'),
     "aperture-channels": ("f_number = 8", 'f_number = 8\naperture_shape = "image"\naperture_image = "odd.exr"'),
 }

@@ -23,6 +23,8 @@ FITTED_CELLS = 210
 """Diffraction cells of a lenslet up to which pixel_error was compared with columns."""
 FEW_FRINGES = 3.0, 1.0
 """Cycles a pixel of one lenslet's light, in focus and out of it, up to which the light's own size does not matter to the pixels' nodes."""
+LATE = 8.0
+"""How much more lenslets that a blurred point lights interfere in such pixels than FRINGES has it: up to the end of their band."""
 RULES, MAX_RULE = 8, 20
 """Steps of quadrature.band_rule that are tried, and the most nodes for which they are."""
 MANY = 512
@@ -252,6 +254,8 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
             weight = max(weight, 0.35 * min(1.0, blur / 2) ** 1.8)
         elif apart <= blur:
             weight = max(weight, FRINGES[0][0] / (cells * apart**2))
+        if blur and own > FEW_FRINGES[0]:
+            weight *= LATE
         worst = max(worst, shares[min(apart, 2)] * min(0.5, weight) * error)
     return worst
 

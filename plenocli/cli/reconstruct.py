@@ -12,7 +12,7 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @click.option("--pif", type=options.FILE, help="System matrix A (from simulate-pif).")
 @click.option("--calibration", type=options.FILE, help="Lenslet grid and white reference of a real camera (from calibrate).")
 @click.option("--method", type=click.Choice(METHODS), default="auto", show_default=True, help="auto: the best of lmmse, pnp and (where one is given) dictionary on pieces of training photographs at the capture's noise.")
-@click.option("--dictionary", type=options.FILE, help="Dictionary for --method dictionary (from learn-dict).")
+@click.option("--dictionary", type=options.FILE, help="Dictionary (from learn-dict) for --method dictionary; auto tries it too.")
 @click.option("--overlap", type=click.Choice(["1", "3"]), help="Superpixels looked at for each block: its own, or 3x3; default 3x3 where the pif holds neighbours. tv and pnp see the whole sensor.")
 @click.option("--training", multiple=True, metavar="IMAGE", help="Photograph or skimage:NAME for the statistics of lmmse and the trial of auto. Repeatable; default those of scikit-image, without the astronaut.")
 @click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")

@@ -243,7 +243,8 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
     share = np.linspace(0, 1, 65)[1:-1]
     alone = float((rule_error(count, share * own, rule) * (1 - share)).max())
     alone *= (1 + 0.6 * blur) * min(0.5, 1.6 * spread * (1 + 5 / cells) / (1 + own) * cells**-0.5)
-    if own > FEW_FRINGES[blur > 0]:
+    many = own > FEW_FRINGES[blur > 0]
+    if many:
         alone = max(alone, _patch_error(count, rule, own, cells, blur))
     worst = shares[0] * alone
     for apart, error in _fringe_errors(count, rule, own, round(joint / own)):
@@ -254,7 +255,7 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
             weight = max(weight, 0.35 * min(1.0, blur / 2) ** 1.8)
         elif apart <= blur:
             weight = max(weight, FRINGES[0][0] / (cells * apart**2))
-        if blur and own > FEW_FRINGES[0]:
+        if many and blur:
             weight *= LATE
         worst = max(worst, shares[min(apart, 2)] * min(0.5, weight) * error)
     return worst

@@ -69,7 +69,7 @@ def test_random_cameras_hold(cameras, count):
             continue
         if error is not None:
             found.append(error)
-    held = sum(error <= 1 for error in found)
+    held = sum(bool(error <= 1) for error in found)
     count("random cameras at the accuracy asked", computed=len(found), held=held, refused=refused)
     # errors are estimated, not bounded: pixels of more than twenty fringes may miss by half
     assert len(found) > cameras / 3 and held > 0.985 * len(found) and max(found) < 1.6 and refused < len(found) / 10

@@ -241,8 +241,7 @@ def _fall_back(request, found):
     least = min((math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible), default=math.inf)
     reached, again, best = _finest_served(request, found, max(asked, min(1.3 * least + 1.1 * BEST_ACCURACY, 0.99)))
     if best is None:
-        what = "model 'auto'" if request.model == "auto" else f"model {request.model!r}"
-        raise NumericsError(f"{what} does not serve this camera ({_reasons(found)})", "model",
+        raise NumericsError(f"model {request.model!r} does not serve this camera ({_reasons(found)})", "model",
                             "change the camera, or " + ("name a model, such as --model ray, to be exact within it only" if request.model == "auto" else "leave --model at auto"))
     why = next(c.why for c in found if c.name == best.name)
     if request.explicit:

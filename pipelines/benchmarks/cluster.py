@@ -5,7 +5,7 @@ python pipelines/benchmarks/cluster.py --run runs/bench-cluster [--config sample
 Several captures are tasks each; of one capture (--captures 1) batches of its lenslets are. The method is non-negative least
 squares with a fixed number of steps. Clusters take turns after a round that warms them (each worker factors
 the matrix once); with --rounds 1 there is none. CPU time is that of the workers: where other programs want the cores too, it says
-more than the clock. What was measured is kept in RUN/cluster.json, so that --workers 1 and --workers 2 may run apart.
+more than the clock. What was measured is kept in RUN/cluster-N.json for N captures, so that --workers 1 and --workers 2 may run apart.
 """
 
 import argparse

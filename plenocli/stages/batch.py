@@ -83,7 +83,11 @@ def summarise(batch, outcomes):
     order = {capture: number for number, (capture, _) in enumerate(batch.jobs)}
     reports, errors = (sorted(part, key=lambda pair: order[pair[0]]) for part in (reports, errors))
     if errors:
-        worst = max((error for _, error in errors), key=lambda error: error.exit_code)
-        raise type(worst)(f"{len(errors)} of {len(batch.jobs)} captures failed: {', '.join(c.name for c, _ in errors)}", batch.output,
-                          f"{len(batch.jobs) - len(errors)} are done; see the messages above")
+        raise failed_together(errors, len(batch.jobs), "captures", batch.output, f"{len(batch.jobs) - len(errors)} are done; see the messages above")
     return {"output": str(batch.output), "done": len(reports), "skipped": len(batch.jobs) - len(batch.todo), "captures": [report for _, report in reports]}
+
+
+def failed_together(errors, total, things, where, fix):
+    """One error for the (path, PlenoError) pairs of the `things` that failed, each told already; its exit code is that of the worst."""
+    worst = max((error for _, error in errors), key=lambda error: error.exit_code)
+    return type(worst)(f"{len(errors)} of {total} {things} failed: {', '.join(Path(path).name for path, _ in errors)}", where, fix)

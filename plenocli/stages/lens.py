@@ -45,7 +45,7 @@ def run_lens_show(path, *, wavelengths=(), fields=(0.0,), object_distance=None):
 
 def _chromatic(lens, wavelength, shift):
     data = first_order(lens, wavelength)
-    return {"wavelength_m": wavelength, "focal_length_m": data.focal_length, "back_focus_m": data.back_focus, "focal_shift_m": shift, "f_number": data.f_number,
+    return {"wavelength_m": wavelength, "focal_length_m": data.focal_length, "back_focus_m": data.back_focus, "focal_shift_m": shift, "f_number": _f_number(data),
             "front_principal_m": data.front_principal, "rear_principal_m": data.rear_principal,
             "entrance_pupil": {"position_m": _finite(data.entrance_pupil.position), "radius_m": _finite(data.entrance_pupil.radius)},
             "exit_pupil": {"position_m": _finite(data.exit_pupil.position), "radius_m": _finite(data.exit_pupil.radius)}}
@@ -53,6 +53,11 @@ def _chromatic(lens, wavelength, shift):
 
 def _finite(value):
     return value if math.isfinite(value) else None
+
+
+def _f_number(data):
+    """f over the entrance pupil's diameter; None where that pupil lies at infinity."""
+    return data.f_number if math.isfinite(data.entrance_pupil.radius) else None
 
 
 def _field(lens, wavelengths, angle, distance):
@@ -86,7 +91,7 @@ def describe(report):
              "  wavelength   focal length   back focus     focal shift   F-number  entrance pupil: place, diameter   exit pupil: place, diameter"]
     for row in report["wavelengths"]:
         lines.append(f"  {row['wavelength_m'] * 1e9:7.2f} nm  {row['focal_length_m'] * 1e3:10.5f} mm  {row['back_focus_m'] * 1e3:9.5f} mm  {row['focal_shift_m'] * 1e6:+9.2f} um  "
-                     f"{row['f_number']:8.4f}  {_pupil(row['entrance_pupil'])}  {_pupil(row['exit_pupil'])}")
+                     f"{_shown(row['f_number']):>8}  {_pupil(row['entrance_pupil'])}  {_pupil(row['exit_pupil'])}")
     for field in report["fields"]:
         head = f"  field {math.degrees(field['angle_rad']):.4g} deg: "
         if "trouble" in field:
@@ -96,6 +101,10 @@ def describe(report):
         lines += [f"    {row['wavelength_m'] * 1e9:7.2f} nm  W rms {row['wavefront_rms_waves']:.4f} waves = {row['wavefront_rms_m'] * 1e9:.1f} nm  image height "
                   f"{row['image_height_m'] * 1e3:.5f} mm  lateral colour {row['lateral_colour_m'] * 1e6:+.2f} um" for row in field["wavelengths"]]
     return "\n".join(lines)
+
+
+def _shown(value, form=".4f"):
+    return "-" if value is None else f"{value:{form}}"
 
 
 def _pupil(pupil):
@@ -122,12 +131,12 @@ def run_lens_import(path, output, *, focal_length=None, overwrite=False):
     data = first_order(lens, lens.design_wavelength)
     publish(output, lens_toml(lens, [f"from {path.name}", *notes]).encode(), overwrite=overwrite)
     return {"output": str(output), "input": path.name, "surfaces": len(lens.surfaces), "glasses": sorted({s.medium.name for s in lens.surfaces} - {"air"}),
-            "focal_length_m": data.focal_length, "f_number": data.f_number, "notes": notes}
+            "focal_length_m": data.focal_length, "f_number": _f_number(data), "notes": notes}
 
 
 def line(report):
     """The report of `run_lens_import` as one line, and one for each note."""
-    return "\n".join([f"{report['output']}: {report['surfaces']} surfaces, f = {report['focal_length_m'] * 1e3:.6g} mm, F/{report['f_number']:.4g}, "
+    return "\n".join([f"{report['output']}: {report['surfaces']} surfaces, f = {report['focal_length_m'] * 1e3:.6g} mm, F/{_shown(report['f_number'], '.4g')}, "
                       f"glasses {', '.join(report['glasses'])}", *(f"  note: {note}" for note in report["notes"])])
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from plenocli.errors import InputError, PlenoError, UsageError
 from plenocli.plain import plain
+from plenocli.stages.batch import failed_together
 from plenocli.stages.progress import note
 from plenocli.stages.score_depth import score_lightfield
 from plenocli.stages.score_inputs import CHART, block_of, read_result, read_truth, read_whites
@@ -44,8 +45,8 @@ def run_score(
     results: paths. truth: path or scene name, needed but for dictionaries. whites: spectra of a white target, frames.
     patches: label map or "colorchecker". pif: system matrix (dictionaries need it). capture: for its sensor-model SNR.
     block: object samples per lenslet (h, w), else from the files. light: for colour differences. camera: TOML, through whose
-    filters spectra see the truth. One bad result does not stop the others: its message stands in its place and is raised at the
-    end.
+    filters spectra see the truth. One bad result does not stop the others: its message is printed and stands in its place; an error with
+    the exit code of the worst is raised at the end.
     """
     from plenocli.artefacts import check_output, describe_inputs, publish, read_pif
 
@@ -76,7 +77,7 @@ def run_score(
                 raise
             scored[i], pictures[i] = _failed(path, error, errors), None
     if len(errors) == len(results):
-        raise errors[0]
+        raise failed_together(errors, len(results), "results", None, "nothing is written; see the messages above")
     _name_apart(scored, results)
     document = {
         "metrics": next(entry["metrics"] for entry in scored if "error" not in entry),
@@ -95,14 +96,14 @@ def run_score(
 
         publish(report, score_page(document, pictures).encode(), overwrite=overwrite)
     if errors:
-        raise errors[0]
+        raise failed_together(errors, len(results), "results", output, "the others are scored; see the messages above")
     return document
 
 
 def _failed(path, error, errors):
     """The entry of a result that cannot be scored; its error is told and kept."""
     note(f"error: {error}")
-    errors.append(error)
+    errors.append((path, error))
     return {"name": Path(path).name, "error": str(error).replace(str(path), Path(path).name), "metrics": {}}
 
 

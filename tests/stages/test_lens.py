@@ -14,7 +14,9 @@ from plenocli.cli.main import run
 from plenocli.config.lens import lens_toml, load_lens, parse_lens
 from plenocli.errors import ConfigError, InputError
 from plenocli.optics.geometry import geometry
+from plenocli.optics.glass import medium
 from plenocli.optics.lens import at_wavelength, first_order
+from plenocli.optics.prescription import Prescription, Surface
 from plenocli.optics.pupil import wavefront
 from plenocli.optics.raytrace import Rays, entrance_pupil
 from tests.optics.cameras import small_camera
@@ -104,6 +106,18 @@ def test_show_says_where_a_field_does_not_get_through_and_refuses_what_it_cannot
     assert "such as 5deg" in capfd.readouterr().err
     file.write_text("[lens]\n")
     assert run(["lens", "show", str(file)]) == 2
+
+
+def test_a_telecentric_lens_has_no_f_number(tmp_path, capfd):
+    """A stop in the rear focus: the entrance pupil lies at infinity, and no quotient with its diameter means anything."""
+    file = tmp_path / "telecentric.toml"
+    n = medium("N-BK7").index(D_LINE)
+    file.write_text(lens_toml(Prescription((Surface(100.0, 2e-3, medium("N-BK7")), Surface(0.0, 0.01 / (n - 1) - 2e-3 / n), Surface(0.0, 5e-3)), 2, 1e-3, D_LINE)))
+    assert run(["lens", "show", str(file), "--wavelength", "587.5618nm"]) == 0
+    line = capfd.readouterr().out.splitlines()[3]
+    assert line.split("um")[1].split()[:3] == ["-", "at", "infinity"]
+    assert run(["lens", "show", str(file), "--wavelength", "587.5618nm", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["wavelengths"][0]["f_number"] is None
 
 
 # --- in a camera ---------------------------------------------------------------------------------------------------------

@@ -66,14 +66,18 @@ def test_only_the_metrics_asked_for(picture):
     assert not (folder / "t.json").exists()
 
 
-def test_one_bad_result_does_not_stop_the_others(picture):
+def test_one_bad_result_does_not_stop_the_others(picture, capfd):
     folder, capture, good, *_ = picture
     (folder / "torn.h5").write_bytes((folder / "poor.h5").read_bytes()[:-100])
-    with pytest.raises(InputError, match="torn"):
+    with pytest.raises(InputError, match="1 of 2 results failed: torn.h5; the others are scored"):
         run_score([folder / "torn.h5", good], folder / "s.json", truth=capture)
     document = json.loads((folder / "s.json").read_text())
     assert "error" in document["results"][0] and str(folder) not in document["results"][0]["error"]
     assert document["metrics"]["psnr_db"] == pytest.approx(40, abs=1e-4)
+    capfd.readouterr()
+    with pytest.raises(InputError, match="2 of 2 results failed: torn.h5, none.h5; nothing is written"):
+        run_score([folder / "torn.h5", folder / "none.h5"], folder / "never.json", truth=capture)
+    assert capfd.readouterr().err.count("error: ") == 2 and not (folder / "never.json").exists()
 
 
 def test_another_grid_is_refused(picture):

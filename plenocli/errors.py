@@ -17,6 +17,10 @@ class PlenoError(Exception):
         text = f"{self.where}: {self.what}" if self.where else self.what
         return f"{text}; {self.fix}" if self.fix else text
 
+    def at(self, where):
+        """The same error, with the place that whoever raised it could not know."""
+        return type(self)(self.what, where, self.fix)
+
 
 class UsageError(PlenoError):
     """The command line asks for something that makes no sense."""

@@ -103,7 +103,7 @@ def _grid(signal, white, lattice, near):
     try:
         return find_grid(np.where(np.isnan(signal), np.nanmax(signal), signal), white.cfa, None, lattice, near)
     except (NumericsError, InputError) as error:
-        raise type(error)(error.what, white.path, error.fix) from None
+        raise error.at(white.path) from None
 
 
 def _window(grid):

@@ -103,7 +103,10 @@ def _measure(data, rates, sites, settings, folder):
     fields = {"none": np.ones_like(rates)}
     blocks = None
     if settings.flatten == "paper":
-        fields["paper"], blocks = paper_field(rates, sites, outside(chart, data.labels.shape))
+        try:
+            fields["paper"], blocks = paper_field(rates, sites, outside(chart, data.labels.shape))
+        except NumericsError as error:
+            raise error.at(folder) from None
     truth, six = next(iter(truths.values())), [patch_index(name) for name in SIX_PATCHES]
     names = colorchecker()[0]
     document = {"bands_nm": np.round(bands * 1e9, 6).tolist(), "patch_names": names, "six": six, "truth": truth, "target": next(iter(truths)), "paper_blocks": blocks, "methods": {}}

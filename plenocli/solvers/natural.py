@@ -36,7 +36,9 @@ def autocovariance(images, reach):
     """(mean, C) of the images taken as one stationary field: C[dr + reach, dc + reach], lags up to `reach` each way.
 
     Each image's overlap-normalised autocovariance about the common mean, weighted by its pixels, made symmetric under
-    reversal of either axis. Lags beyond half an image's side rest on few pairs, and are tapered to zero from there.
+    reversal of either axis. Lags beyond half an image's side rest on few pairs, and are tapered to zero from there. What is measured
+    so is not quite an autocovariance: as one period of a periodic field its spectrum dips below zero (for photographs by a thousandth
+    of the variance or less in all). It is cut there, the variance kept, so that points with all their lags within `reach` have a covariance.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -54,4 +56,6 @@ def autocovariance(images, reach):
     field = (field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]) / 4
     half = np.median([min(i.shape) for i in images]) / 2
     taper = np.cos(np.pi / 2 * np.clip((np.abs(lags) - half) / max(reach - half, 1), 0, 1)) ** 2 if reach > half else 1.0 + 0 * lags
-    return float(mean), field * taper[:, None] * taper[None, :]
+    field *= taper[:, None] * taper[None, :]
+    cut = np.fft.fftshift(np.fft.ifft2(np.maximum(np.fft.fft2(np.fft.ifftshift(field)).real, 0)).real)
+    return float(mean), cut * (field[reach, reach] / max(cut[reach, reach], np.finfo(float).tiny))

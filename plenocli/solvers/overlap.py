@@ -32,7 +32,6 @@ class JointLmmse:
     cross: np.ndarray
     data: np.ndarray
     variance: np.ndarray
-    noise: float
 
     def apply(self, y):
         """(lenslet_row, lenslet_column, pixel) -> (x, sigma), both (lenslet_row, lenslet_column, point).
@@ -40,7 +39,7 @@ class JointLmmse:
         Beyond the array's border there is nothing to look at: blocks there use the superpixels that exist. Light from
         outside the array is taken to have the scene's mean and covariance.
         """
-        from scipy.linalg import solve_triangular
+        from scipy.linalg import cholesky, solve_triangular
 
         rows, columns = y.shape[:2]
         z = y @ self.analysis.T - self.offset
@@ -55,7 +54,7 @@ class JointLmmse:
         for inside, lenslets in windows.items():
             keep = np.flatnonzero(np.repeat(inside, used))
             cross = self.cross[:, keep]
-            factor = _factor(self.data[np.ix_(keep, keep)], self.noise**2)
+            factor = cholesky(self.data[np.ix_(keep, keep)], lower=True)
             whitened = solve_triangular(factor, cross.T, lower=True)
             near = [d for d, there in zip(ring, inside) if there]
             seen = np.stack([np.concatenate([z[r + dr, c + dc] for dr, dc in near]) for r, c in lenslets], axis=1)
@@ -64,22 +63,6 @@ class JointLmmse:
             for k, (r, c) in enumerate(lenslets):
                 x[r, c], sigma[r, c] = estimate[:, k], error
         return x, sigma
-
-
-def _factor(covariance, least):
-    """Lower Cholesky factor of a covariance of data whose noise has the variance `least`.
-
-    An autocovariance that was measured and cut off is not quite one: its spectrum may dip below zero by more than little noise
-    makes up for. Directions in which it does get their size, and at least the noise, as variance.
-    """
-    from scipy.linalg import cholesky, eigh
-
-    try:
-        return cholesky(covariance, lower=True)
-    except np.linalg.LinAlgError:
-        values, vectors = eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(np.abs(values), least))
-        return np.linalg.qr(root.T, mode="r").T
 
 
 def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigma, bands=((1.0,),), *, most=MOST):
@@ -125,11 +108,13 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
     pairs = {(dr, dc): flat @ shifted(dr, dc).reshape(used, -1).T for dr in range(-2 * RING, 2 * RING + 1) for dc in range(-2 * RING, 2 * RING + 1)}
     data = np.block([[pairs[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
     data = (data + data.T) / 2
-    data[np.diag_indices(len(data))] += sigma**2
+    # what rounding may have taken away, in proportion to each coordinate's light: almost without noise data would be no covariance
+    rounding = len(data) * np.finfo(float).eps * np.abs(autocovariance).sum() * np.linalg.eigvalsh(bands)[-1] * np.einsum("ij,ij->i", flat, flat)
+    data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(ring))
     own = np.s_[:, reach * rows : (reach + 1) * rows, reach * columns : (reach + 1) * columns]
     cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
     middle = autocovariance.shape[0] // 2
-    return JointLmmse(mean, analysis, mean * response.sum(axis=(0, 2)), cross, data, np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns), float(sigma))
+    return JointLmmse(mean, analysis, mean * response.sum(axis=(0, 2)), cross, data, np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns))
 
 
 def needed_reach(object_shape, offsets):

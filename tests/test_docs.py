@@ -161,6 +161,16 @@ def test_command_lines_stand_in_blocks_that_are_run():
         assert {line.split("#")[0].strip() for block in other for line in re.findall(r"^(?:plenocli|make) .*", block, re.M)} <= {"make demo", "make test"}, page
 
 
+def test_the_plan_that_the_page_shows_is_the_plan(monkeypatch, capsys):
+    """Its errors and memory; the times are those of some machine."""
+    monkeypatch.chdir(ROOT)
+    assert run(["simulate-pif", "sample_configs/seed_spatial.toml", "--explain"]) == 0
+    printed = capsys.readouterr().out
+    shown, = re.findall(r"^```\n(asked: .*?)^```", (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8"), re.S | re.M)
+    found, page = ([re.sub(r"[\d.]+ s |\s+", " ", line).split() for line in text.splitlines()] for text in (printed, shown))
+    assert len(page) == 8 and found[:8] == page
+
+
 def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
     from plenocli.cli.sections import read_options
     from plenocli.config.sweep import points

@@ -2,6 +2,9 @@
 
 from plenocli.accuracy.dial import seconds_here
 
+LONG = 20.0
+"""Seconds at nominal speed from which on a plan is told before the work starts."""
+
 
 def explain(plan, memory=None):
     """Several lines of text about a PifPlan: the rungs considered, the error by source, what was left out, warnings. memory: bytes that
@@ -38,14 +41,38 @@ def candidates(plan):
     return found
 
 
+def expectation(plan, memory=None, times=1):
+    """One line about work that takes long, and the rung that would take much less; None where it does not. memory: bytes, where known;
+    times: how often such a plan is carried out."""
+    chosen = next(c for c in plan.candidates if c.why is None)
+    if times * chosen.seconds() < LONG:
+        return None
+    text = f"about {_duration(times * seconds_here(chosen))} on one core" + ("" if memory is None else f" and {_size(memory)} of memory") + f" ({chosen.name}, error {chosen.error:.1g})"
+    quicker = [c for c in plan.candidates if c.model != chosen.model and c.split is not None and c.error < 0.5 and c.seconds() < chosen.seconds() / 4]
+    if not quicker:
+        return text
+    other = min(quicker, key=lambda c: (c.error, c.seconds()))
+    return f"{text}; --model {other.model} takes {_duration(times * seconds_here(other))} at an error of {other.error:.1g}"
+
+
 def _table(rows):
     cells = [("rung", "error", "time", "memory", "")]
     for r in rows:
         known = r["error"] is not None
-        cells.append((r["rung"], f"{r['error']:.1g}" if known else "-", f"{r['seconds']:.2g} s" if known else "-", _size(r["bytes"]) if known else "-",
+        cells.append((r["rung"], f"{r['error']:.1g}" if known else "-", _duration(r["seconds"]) if known else "-", _size(r["bytes"]) if known else "-",
                       "chosen" if r["chosen"] else r["reason"]))
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
     return ["  ".join((row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in (1, 2, 3)), row[4])).rstrip() for row in cells]
+
+
+def _duration(seconds):
+    """Seconds in a unit that a person would take."""
+    for unit, size, most in (("s", 1, 100), ("min", 60, 100), ("h", 3600, 72)):
+        if seconds < (most - 0.5) * size:
+            break
+    else:
+        unit, size = "days", 86400
+    return f"{seconds / size:.2g} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
 
 
 def _size(count):

@@ -194,11 +194,16 @@ def _request(settings):
 
 
 def _accuracy(camera, settings, wavelengths):
-    """The accuracy record of a capture that computes its own system matrices: that of the middle wavelength's plan."""
+    """The accuracy record of a capture that computes its own system matrices: that of the middle wavelength's plan. Says how long all will take."""
     from plenocli.accuracy import plan_pif
+    from plenocli.accuracy.explain import expectation
     from plenocli.stages.simulate_pif import accuracy_record
 
-    return accuracy_record(plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(settings)))
+    plan = plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(settings))
+    expected = expectation(plan, times=len(wavelengths) * settings.refine**2)
+    if expected:
+        note(expected)
+    return accuracy_record(plan)
 
 
 def _truth(camera, scene, grid, refine):

@@ -33,6 +33,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     """
     from plenocli.artefacts import Artefact, Provenance, check_output, describe_inputs, write_artefact
     from plenocli.accuracy import plan_pif
+    from plenocli.accuracy.explain import expectation
     from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.optics.diagnose import describe
     from plenocli.optics.pif import build_pif
@@ -50,8 +51,9 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     if explain:
         return _explained(plan, pif_pieces.cost(plan, settings.mem_limit)[1])
     chosen = pif_pieces.layout(plan, settings.mem_limit, camera_path)
-    for warning in plan.warnings:
-        note(warning)
+    for line in (*plan.warnings, expectation(plan, pif_pieces.cost(plan, settings.mem_limit)[1])):
+        if line:
+            note(line)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
     provenance = Provenance(command, describe_inputs(camera_files(camera_path, camera) | {"scene": scene}), None, camera.text, accuracy_record(plan))
 

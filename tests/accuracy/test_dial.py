@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from plenocli.accuracy import dial, plan_pif
-from plenocli.accuracy.explain import candidates, explain
+from plenocli.accuracy.explain import _duration, candidates, expectation, explain
 from plenocli.accuracy.needs import Needs, sensor_noise
 from plenocli.accuracy.rungs import Rung
 from plenocli.errors import NumericsError, UsageError
@@ -152,3 +152,17 @@ def test_plans_do_not_depend_on_the_machine(ladder, monkeypatch):
     monkeypatch.setattr("plenocli.accuracy.explain.seconds_here", lambda candidate: 1e9)
     assert plan_pif(small_camera(), accuracy=1e-3) == first
     assert replace(first) == first
+
+
+def test_long_work_is_announced_with_what_would_take_less(ladder, monkeypatch):
+    monkeypatch.setattr("plenocli.accuracy.explain.seconds_here", lambda candidate: 2 * candidate.seconds())
+    camera = small_camera()
+    assert expectation(plan_pif(camera, accuracy=2e-3)) is None  # ten seconds
+    assert expectation(plan_pif(camera, accuracy=2e-3), times=3) == "about 60 s on one core (middle, error 0.001); --model ray takes 6 s at an error of 0.1"
+    assert expectation(plan_pif(camera, accuracy=2e-4), 3 << 30) == "about 3.3 min on one core and 3.00 GiB of memory (fine, error 0.0002); --model fresnel takes 20 s at an error of 0.001"
+    assert expectation(plan_pif(camera, accuracy=2e-3, model="fresnel"), times=3) == "about 60 s on one core (middle, error 0.001)"
+
+
+@pytest.mark.parametrize("seconds, words", [(0.0123, "0.012 s"), (9.96, "10 s"), (99.4, "99 s"), (99.6, "1.7 min"), (5969, "99 min"), (5971, "1.7 h"), (71.4 * 3600, "71 h"), (1e7, "116 days")])
+def test_durations_as_people_say_them(seconds, words):
+    assert _duration(seconds) == words

@@ -118,4 +118,5 @@ def test_bands_with_the_neighbours_light(folder, tmp_path):
         error[name] = np.sqrt(np.mean(rms(image.data["image/value"] - truth) ** 2))
         if name == "joint":
             assert 0.6 < np.sqrt(np.mean(image.data["image/sigma"] ** 2)) / error[name] < 1.6
-    assert error["joint"] < 0.5 * error["alone"] and error["tikhonov"] < 1.15 * error["joint"] and error["pnp"] < error["joint"], error
+    # alone, the neighbours' light is taken for noise
+    assert error["joint"] < 0.65 * error["alone"] and error["tikhonov"] < 1.15 * error["joint"] and error["pnp"] < error["joint"], error

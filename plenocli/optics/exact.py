@@ -170,7 +170,9 @@ def cost(camera, view, band, shape, double):
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * max(0.0, math.log10(COARSE / band.cut)))
         seconds += count * (0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products)
         seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
-        largest = max(largest, item * (both * (products + 3 * sketch)))
+        # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
+        more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, math.log10(COARSE / band.cut) - 1) * math.sqrt(view.diffraction_cells / 100)
+        largest = max(largest, item * (both * (products * (1 + more) + 3 * sketch)))
     # the coupling of the own lenslet's terms is dense before it is looked at: measured at f/2.2, 340 to 3200 of them
     coupling = 1.25 * item * (plain * expected_products(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)) ** 2
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2

@@ -88,6 +88,8 @@ class Estimators:
         report["overlap"] = self.overlap
         if self.overlap == 3 and not self.coupled and method != "lmmse":
             note("--overlap 3: the pif holds own superpixels only, so there is no neighbours' light to take away (simulate-pif --superpixels 3x3)")
+        if self.overlap == 1 and self.coupled and method != "block-mean":
+            note("--overlap 1: the neighbours' light, which the pif knows, stays in the superpixels and is taken for the object's; --overlap 3 takes it away")
         if method == "lmmse":
             report["from_lmmse"] = 0.0
         if method == "lmmse" and self.overlap == 3:

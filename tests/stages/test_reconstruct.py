@@ -138,8 +138,10 @@ def test_neighbours_light_is_noticed_and_taken_away(tmp_path, capsys):
     quality = {}
     for method in ("tikhonov", "lmmse", "tsvd", "pnp"):
         alone = reconstruct(tmp_path, "--method", method, "--overlap", "1")
-        assert "3x3" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "3x3" in said and "which the pif knows, stays in the superpixels" in said
         joint = reconstruct(tmp_path, "--method", method)
+        assert "stays in the superpixels" not in capsys.readouterr().err
         quality[method] = [psnr(i.data["image/value"], truth) for i in (alone, joint)]
         assert quality[method][1] > quality[method][0] + 1, quality
     assert quality["pnp"][1] > quality["lmmse"][1] + 0.2, quality  # the border's lenslets are those of lmmse

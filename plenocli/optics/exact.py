@@ -150,6 +150,7 @@ def cost(camera, view, band, shape, double):
     kinds = {(0, 0): 1, (1, 0): beside, (1, 1): beside, (2, 1): beside * (beside - 1) // 2} if even else {(0, 0): 1, (1, 0): 2 * beside, (2, 1): beside**2}
     # as far as light comes: the lenslets beside the superpixel
     across = min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + 40)
+    decades = max(0.0, math.log10(COARSE / band.cut))
     few = psf_nodes(view, view.lenslet_width / 2)
     operations, largest = lit * band.terms * (rows[0] + beside * rows[1]) * (4 * across + 8 * band.terms), 0.0
     # by how many axes a superpixel lies aside
@@ -167,11 +168,11 @@ def cost(camera, view, band, shape, double):
         operations += count * (both * (products * ((16 if lit == 1 else 26) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3)
         operations += count * 4 * both * lines * rank if band.sensor_count else 0
         # coarse cuts drop most lenslets
-        sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * max(0.0, math.log10(COARSE / band.cut)))
+        sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
         seconds += count * (0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products)
         seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
-        more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, math.log10(COARSE / band.cut) - 1) * math.sqrt(view.diffraction_cells / 100)
+        more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
         largest = max(largest, item * (both * (products * (1 + more) + 3 * sketch)))
     # the coupling of the own lenslet's terms is dense before it is looked at: measured at f/2.2, 340 to 3200 of them
     coupling = 1.25 * item * (plain * expected_products(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)) ** 2

@@ -20,7 +20,7 @@ from plenocli.optics.raytrace import Pupil, aim, entrance_pupil, exit_pupil, par
 @dataclass(frozen=True)
 class FirstOrder:
     """Paraxial data at one wavelength, m: effective focal length, back focus (last vertex to rear focus), principal points
-    (from the first and from the last vertex), pupils, and the F-number f/(2 entrance pupil radius)."""
+    (from the first and from the last vertex), pupils, and the F-number f/(2 entrance pupil radius), NaN where that pupil lies at infinity."""
 
     focal_length: float
     back_focus: float
@@ -39,7 +39,7 @@ def first_order(lens, wavelength):
     n = _last_index(lens, wavelength)
     entrance = entrance_pupil(lens, wavelength)
     return FirstOrder(float(-n / c), float(-n * a / c), float((d - 1) / c), float(n * (1 - a) / c), entrance, exit_pupil(lens, wavelength),
-                      float(abs(n / c) / (2 * entrance.radius)))
+                      float(abs(n / c) / (2 * entrance.radius)) if math.isfinite(entrance.radius) else math.nan)
 
 
 def paraxial_image(lens, wavelength, object_distance=math.inf):

@@ -83,7 +83,8 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
     rows, columns = object_shape
     bands = np.asarray(bands, float)
     count = len(bands)
-    strength = svd.s**2 * np.abs(autocovariance).max() * np.linalg.eigvalsh(bands)[-1] * rows * columns
+    brightest = np.linalg.eigvalsh(bands)[-1]
+    strength = svd.s**2 * np.abs(autocovariance).max() * brightest * rows * columns
     used = max(1, min(int(np.count_nonzero(strength > 1e-4 * sigma**2)), most, svd.rank()))
     analysis = svd.u[:, :used].T
     response = np.stack([analysis @ block for block in blocks])
@@ -109,7 +110,7 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
     data = np.block([[pairs[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
     data = (data + data.T) / 2
     # what rounding may have taken away, in proportion to each coordinate's light: almost without noise data would be no covariance
-    rounding = len(data) * np.finfo(float).eps * np.abs(autocovariance).sum() * np.linalg.eigvalsh(bands)[-1] * np.einsum("ij,ij->i", flat, flat)
+    rounding = len(data) * np.finfo(float).eps * np.abs(autocovariance).sum() * brightest * np.einsum("ij,ij->i", flat, flat)
     data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(ring))
     own = np.s_[:, reach * rows : (reach + 1) * rows, reach * columns : (reach + 1) * columns]
     cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T

@@ -45,7 +45,7 @@ def run_lens_show(path, *, wavelengths=(), fields=(0.0,), object_distance=None):
 
 def _chromatic(lens, wavelength, shift):
     data = first_order(lens, wavelength)
-    return {"wavelength_m": wavelength, "focal_length_m": data.focal_length, "back_focus_m": data.back_focus, "focal_shift_m": shift, "f_number": _f_number(data),
+    return {"wavelength_m": wavelength, "focal_length_m": data.focal_length, "back_focus_m": data.back_focus, "focal_shift_m": shift, "f_number": _finite(data.f_number),
             "front_principal_m": data.front_principal, "rear_principal_m": data.rear_principal,
             "entrance_pupil": {"position_m": _finite(data.entrance_pupil.position), "radius_m": _finite(data.entrance_pupil.radius)},
             "exit_pupil": {"position_m": _finite(data.exit_pupil.position), "radius_m": _finite(data.exit_pupil.radius)}}
@@ -53,11 +53,6 @@ def _chromatic(lens, wavelength, shift):
 
 def _finite(value):
     return value if math.isfinite(value) else None
-
-
-def _f_number(data):
-    """f over the entrance pupil's diameter; None where that pupil lies at infinity."""
-    return data.f_number if math.isfinite(data.entrance_pupil.radius) else None
 
 
 def _field(lens, wavelengths, angle, distance):
@@ -131,7 +126,7 @@ def run_lens_import(path, output, *, focal_length=None, overwrite=False):
     data = first_order(lens, lens.design_wavelength)
     publish(output, lens_toml(lens, [f"from {path.name}", *notes]).encode(), overwrite=overwrite)
     return {"output": str(output), "input": path.name, "surfaces": len(lens.surfaces), "glasses": sorted({s.medium.name for s in lens.surfaces} - {"air"}),
-            "focal_length_m": data.focal_length, "f_number": _f_number(data), "notes": notes}
+            "focal_length_m": data.focal_length, "f_number": _finite(data.f_number), "notes": notes}
 
 
 def line(report):

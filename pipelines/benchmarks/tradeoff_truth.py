@@ -25,9 +25,12 @@ WAVES, FLOPS = 1e9, 2e10
 """Values of the exact kernel (as summed by rayleigh.rayleigh_products), and operations in products, a second of one core: to say
 beforehand how long the sums take."""
 AFFORDED = 5e9, 4e10
-"""Values of the exact kernel that a camera's columns may take: of isolated lenslets, and with neighbours."""
+"""Values of the exact kernel that a camera's columns may take: of isolated lenslets, and with neighbours (for each row of superpixels that
+the light is spread over)."""
 FEW = 12
 """Pixels that an exact column is compared on at the least."""
+FINE = 3e-7
+"""Accuracy of paraxial columns from which on fringes of lenslets far apart count."""
 SMALL = {"object.samples_per_lenslet": (16, 16)}
 CAMERAS = {
     "seed_spatial": ("seed_spatial", {}),
@@ -76,25 +79,30 @@ def blur(camera):
     return defocus * camera.main_lens.aperture_diameter * camera.lenslet_array.distance / camera.lenslet_array.pitch
 
 
-def wide_window(camera):
-    """Lenslets either side of the object's own that count as all there are: what is beyond changes columns by about 1e-6."""
+def wide_window(camera, fine=False):
+    """Lenslets either side of the object's own that count as all there are: what is beyond changes columns by about 1e-6, or by less if `fine`."""
     count = cells(camera)
-    return math.ceil(blur(camera) / 2) + (3 if count > 150 else 4 if count > 110 else 6 if count > 60 else 10)
+    return math.ceil(blur(camera) / 2) + (3 if count > 150 else 4 if count > 110 else 6 if count > 60 else 10) + 2 * fine
 
 
 class Truth:
     """Columns by brute force of one camera: `columns()` and `change()`, how far they are from those with every lenslet there is.
 
     model: fresnel or exact; window: lenslets either side whose fields add, or None for isolated lenslets; superpixels: list of
-    (row, column), of which the exact model has the own one only; folder: where results are kept, by `key`.
+    (row, column), of which the exact model has those that the geometric blur lights; folder: where results are kept, by `key`;
+    fine: every fringe is resolved, as accuracies beyond 1e-6 need.
     """
 
-    def __init__(self, camera, model, window, superpixels, folder):
-        self.camera, self.model, self.window, self.folder = camera, model, window, folder
-        self.superpixels = [(0, 0)] if model == "exact" else _some(superpixels, cells(camera))
+    def __init__(self, camera, model, window, superpixels, folder, fine=False):
+        self.camera, self.model, self.window, self.folder, self.fine = camera, model, window, folder, fine
+        # superpixels either side of the own one that are lit, and among the given ones
+        self.spread = 0 if window is None else min(round(blur(camera) / 2), max(abs(n) for place in superpixels for n in place))
+        side = range(-self.spread, self.spread + 1)
+        self.lit = [(r, c) for r in side for c in side]
+        self.superpixels = self.lit if model == "exact" else _some(superpixels, 200 if fine else cells(camera))
         self.rows, self.columns_of_pixels = self._pixels()
-        parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4]
-        if model == "exact" and self.columns_of_pixels is not None:
+        parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4, fine]
+        if model == "exact":
             parts.append([self.rows, self.columns_of_pixels])
         self.key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
 
@@ -102,8 +110,9 @@ class Truth:
         """What of a matrix's columns, (point, superpixel, pixel) with superpixels `reach`, is compared: (point, number)."""
         blocks = np.stack([blocks[:, reach.index(place)] for place in self.superpixels], axis=1)
         if self.model == "exact":
-            blocks = blocks.reshape(len(blocks), *self.camera.sensor.pixels_per_lenslet)[:, self.rows]
-            blocks = blocks if self.columns_of_pixels is None else blocks[:, :, self.columns_of_pixels]
+            (rows, columns), side = self.camera.sensor.pixels_per_lenslet, 2 * self.spread + 1
+            patch = blocks.reshape(-1, side, side, rows, columns).transpose(0, 1, 3, 2, 4).reshape(-1, side * rows, side * columns)
+            blocks = patch[:, self.rows][:, :, self.columns_of_pixels]
         return blocks.reshape(len(blocks), -1)
 
     @property
@@ -112,14 +121,14 @@ class Truth:
 
     def affordable(self):
         """Whether at least a few pixels can be summed."""
-        return self.model == "fresnel" or self.columns_of_pixels is None or len(self.rows) * len(self.columns_of_pixels) >= FEW
+        return self.model == "fresnel" or len(self.rows) * len(self.columns_of_pixels) >= min(FEW, math.prod(self.camera.sensor.pixels_per_lenslet))
 
     def seconds(self):
         """Seconds of one core that `columns` and `change` will take, 0 for kept ones."""
         if self.path.exists():
             return 0.0
         if self.model == "exact":
-            count = len(self.rows) * len(self.columns_of_pixels or range(self.camera.sensor.pixels_per_lenslet[1]))
+            count = len(self.rows) * len(self.columns_of_pixels)
             return 5 + self._values_per_pixel() * count / WAVES + sum(other.seconds() for other in self._others())
         camera, reach = self.camera, {place[0] for place in self.superpixels}
         rule = _Rule(camera, camera.light.wavelengths[0], self.window, self.superpixels, self._pixel_nodes(), 1.0)
@@ -149,14 +158,16 @@ class Truth:
         # the exact sum affords few lenslets: what those further out do is taken from the paraxial model
         near, *far = (truth.columns() for truth in self._others())
         far = far[0] if far else found[:, self.superpixels.index((0, 0))].reshape(3, -1)
-        return float(max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(far, near)))
+        return _change(far, near)
 
     def _others(self):
-        """Own superpixels with fewer lenslets (and with all, where these are not at hand): the difference is the change."""
+        """The same with fewer lenslets, on the own superpixel (for the exact model on all that are lit, and with all lenslets): the
+        difference is the change."""
         if self.window is None:
             return []
-        windows = (self.window, wide_window(self.camera)) if self.model == "exact" else (self.window - 2,)
-        return [Plain(self.camera, "fresnel", window, [(0, 0)], self.folder) for window in windows]
+        if self.model == "exact":
+            return [Plain(self.camera, "fresnel", window, self.lit, self.folder) for window in (self.window, wide_window(self.camera))]
+        return [Plain(self.camera, "fresnel", self.window - 2, [(0, 0)], self.folder, self.fine)]
 
     def _pixel_nodes(self):
         """Nodes per pixel for fringes from opposite ends of the coherent window (or of one lenslet), to 1e-10; where lenslets hold
@@ -167,7 +178,7 @@ class Truth:
         if self.window is None:
             return math.ceil(1.7 * cell + 9)
         across = 2 * self.window + 1
-        most = across if cells(camera) < 15 else 3 if self.model == "exact" and cells(camera) > 50 else 5
+        most = across if self.fine or cells(camera) < 15 else 3 if self.model == "exact" and cells(camera) > 50 else 5
         return math.ceil(1.7 * cell * min(across, most) + 5)
 
     def _image_points(self):
@@ -185,24 +196,29 @@ class Truth:
     # exact
 
     def _pixels(self):
-        """(rows, columns) of the pixels compared; columns None: all of them."""
-        count, across = self.camera.sensor.pixels_per_lenslet
-        rows = sorted({int(count * f) for f in (0.04, 0.36, 0.68)})
+        """(rows, columns) of the pixels that exact columns are compared on, counted over the superpixels that are lit."""
         if self.model != "exact":
-            return rows, None
-        most = int(AFFORDED[self.window is not None] / self._values_per_pixel() / len(rows))
-        return (rows, None) if most >= across else (rows, sorted({int(across * (i + 0.5) / most) for i in range(most)}))
+            return None, None
+        side, lines = 2 * self.spread + 1, 2 * self.spread + 3
+        count, across = (n * side for n in self.camera.sensor.pixels_per_lenslet)
+        most = min(across, int(AFFORDED[self.window is not None] * side / self._values_per_pixel() / lines))
+        return sorted({int(count * (i + 0.1) / lines) for i in range(lines)}), sorted({int(across * (i + 0.5) / most) for i in range(most)})
+
+    @property
+    def far(self):
+        """Lenslets either side of the middle one whose fields are summed exactly: the window of every superpixel that is lit."""
+        return (self.window or 0) + self.spread
 
     def _values_per_pixel(self):
         """Values of the kernel that one pixel takes, all lenslets together."""
-        far = self.window or 0
+        far = self.far
         own = [len(self._lenslet_nodes(m)[0]) for m in range(-far, far + 1)]
         return self._pixel_nodes() ** 2 * sum(own) ** 2
 
     def _lenslet_nodes(self, m):
         """Positions from the middle of the lenslet m off the axis, and weights, that resolve lens, pupil and way to the superpixel."""
         camera, array = self.camera, self.camera.lenslet_array
-        half, reach = array.pitch * array.fill_factor / 2, camera.sensor.pixel_pitch * max(camera.sensor.pixels_per_lenslet) / 2
+        half, reach = array.pitch * array.fill_factor / 2, (self.spread + 0.5) * camera.sensor.pixel_pitch * max(camera.sensor.pixels_per_lenslet)
         edge = np.linspace(-half, half, 41)
         d = edge - np.array([[-reach], [reach]]) + m * array.pitch
         bend = edge / array.focal_length if array.profile == "parabolic" else edge / np.hypot(edge, array.focal_length)
@@ -213,11 +229,13 @@ class Truth:
     def _exact(self):
         camera, array, sensor = self.camera, self.camera.lenslet_array, self.camera.sensor
         k, nodes = 2 * np.pi / camera.light.wavelengths[0], self._pixel_nodes()
-        (v, wv), (u, wu) = sensor_nodes((0, 0), sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch * math.sqrt(sensor.pixel_fill_factor), nodes)
-        across = self.columns_of_pixels or list(range(sensor.pixels_per_lenslet[1]))
-        (v, wv), (u, wu) = ([a[(np.asarray(chosen)[:, None] * nodes + np.arange(nodes)).ravel()] for a in pair]
-                            for pair, chosen in (((v, wv), self.rows), ((u, wu), across)))
-        far, total = self.window or 0, 0
+        pitch = array.pitch * (1 + sensor.distance / array.distance)
+        patch = [sensor_nodes((s * pitch, s * pitch), sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch * math.sqrt(sensor.pixel_fill_factor), nodes)
+                 for s in range(-self.spread, self.spread + 1)]
+        # of each axis, nodes and weights of all superpixels in a row; of these the chosen pixels
+        (v, wv), (u, wu) = ([np.concatenate([one[axis][i] for one in patch]).reshape(-1, nodes)[chosen].ravel() for i in (0, 1)]
+                            for axis, chosen in enumerate((self.rows, self.columns_of_pixels)))
+        far, total = self.far, 0
         wave = rayleigh.main_lens_field(camera, (far + 1.5) * array.pitch)
         for row in range(-far, far + 1):
             for column in range(-far, far + 1):
@@ -229,7 +247,7 @@ class Truth:
                 sums = [rayleigh.rayleigh_products(fields * lens, y, x, line, u, sensor.distance, k) for line in np.split(v, len(self.rows))]
                 total = total + np.concatenate(sums, axis=1)
         energy = np.abs(total) ** 2 * wv[:, None] * wu
-        return energy.reshape(3, len(self.rows), nodes, len(across), nodes).sum(axis=(2, 4))
+        return energy.reshape(3, len(self.rows), nodes, len(self.columns_of_pixels), nodes).sum(axis=(2, 4))
 
 
 def _some(superpixels, count):
@@ -251,27 +269,31 @@ class Plain(Truth):
         return 0.0
 
 
-def truth_for(camera, model, window, superpixels, accuracy, folder, kept_only=False):
-    """The Truth against which a matrix of `accuracy` with a coherent `window` (None: isolated) is held.
+def _change(columns, others):
+    """Relative difference of the worst column."""
+    return float(max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(columns, others)))
+
+
+def truth_for(camera, model, neighbours, superpixels, accuracy, folder, kept_only=False):
+    """The Truth against which a matrix of `accuracy`, of isolated lenslets or with coherent `neighbours`, is held.
 
     Paraxial: every lenslet there is. Exact: the fewest lenslets that leave out a tenth of the accuracy (as the paraxial model
     has it), or as many as can be afforded; None where not even the nearest can. kept_only: compute nothing, and None where something is
     not at hand.
     """
-    if window is None or model == "fresnel":
-        return Truth(camera, model, None if window is None else wide_window(camera), superpixels, folder)
+    if model == "fresnel" or not neighbours:
+        fine = neighbours and accuracy < FINE
+        return Truth(camera, model, wide_window(camera, fine) if neighbours else None, superpixels, folder, fine)
     affordable = [t for t in (Truth(camera, model, w, superpixels, folder) for w in range(1, wide_window(camera) + 1)) if t.affordable()]
     if not affordable:
         return None
-    wide = Plain(camera, "fresnel", wide_window(camera), [(0, 0)], folder)
+    wide = Plain(camera, "fresnel", wide_window(camera), affordable[0].lit, folder)
     if kept_only and not wide.path.exists():
         return None
     for truth in affordable:
-        near = Plain(camera, "fresnel", truth.window, [(0, 0)], folder)
+        near = Plain(camera, "fresnel", truth.window, truth.lit, folder)
         if kept_only and not near.path.exists():
             return None
-        change = max(np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(wide.columns(), near.columns()))
-        if change < 0.1 * accuracy:
+        if _change(wide.columns(), near.columns()) < 0.1 * accuracy:
             return truth
     return affordable[-1]
-

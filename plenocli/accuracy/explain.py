@@ -44,7 +44,7 @@ def candidates(plan):
 def expectation(plan, memory=None, times=1):
     """One line about work that takes long, and the rung that would take much less; None where it does not. memory: bytes, where known;
     times: how often such a plan is carried out."""
-    chosen = next(c for c in plan.candidates if c.why is None)
+    chosen = plan.chosen
     if times * chosen.seconds() < LONG:
         return None
     text = f"about {_duration(times * seconds_here(chosen))} on one core" + ("" if memory is None else f" and {_size(memory)} of memory") + f" ({chosen.name}, error {chosen.error:.1g})"

@@ -89,6 +89,11 @@ class PifPlan:
     pixel_shift: tuple | None = None
     band_nodes: int = 0
 
+    @property
+    def chosen(self):
+        """The candidate that is carried out."""
+        return next(c for c in self.candidates if c.why is None)
+
 
 def window_error(view, grid, ring):
     """Estimated relative error of a column because lenslets beyond the coherent window are left out; 0 if ring is 0 by choice.

@@ -36,7 +36,7 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
     from plenocli.accuracy.explain import expectation
     from plenocli.stages.cameras import camera_files, read_camera
     from plenocli.optics.diagnose import describe
-    from plenocli.optics.pif import build_pif
+    from plenocli.optics.pif import build_pif, one_thread
     from plenocli.stages import pif_pieces
     from plenocli.stages.needs import read_needs
 
@@ -64,7 +64,8 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
             attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
         return Artefact("pif", data, attrs, provenance)
 
-    with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
+    # the diagnosis too: its singular values must not depend on the cores of a machine
+    with one_thread(), bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
         options = dict(progress=lambda done, total: progress.update(done - progress.n), workers=workers)
         if chosen.streamed:
             pif, found = pif_pieces.stream_pif(camera, plan, output, chosen, finish, overwrite=overwrite, **options)
@@ -139,7 +140,7 @@ def _summary(output, pif, found, plan):
     return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
             "wavelengths": pif.wavelength.tolist(), "model": plan.model, "rung": plan.rung, "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
             "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],
-            "bytes": plan.bytes, "nominal_seconds": next(c for c in plan.candidates if c.why is None).seconds(),
+            "bytes": plan.bytes, "nominal_seconds": plan.chosen.seconds(),
             "quartic_phase_rad": pif.notes["quartic_phase_rad"], "warnings": [*plan.warnings, *found["warnings"]], **keep}
 
 

@@ -31,6 +31,20 @@ def test_artefact_summary_and_bytes(tmp_path, capsys):
     assert "pif" in artefact.provenance.command and artefact.provenance.accuracy["asked"] == 1e-4
 
 
+def test_the_diagnosis_stays_on_one_thread(tmp_path, monkeypatch):
+    # two threads that wait for each other cost a fifth of the command, and round singular values as the machine's cores have it
+    threadpoolctl = pytest.importorskip("threadpoolctl")
+    from plenocli.optics.diagnose import Spectrum
+
+    seen, values = [], Spectrum.values
+    monkeypatch.setattr(Spectrum, "values", lambda self: seen.append(threadpoolctl.threadpool_info()) or values(self))
+    with threadpoolctl.threadpool_limits(4, "blas"):
+        camera = tmp_path / "many.toml"
+        camera.write_text(TINY.read_text().replace("samples_per_lenslet = [8, 8]", "samples_per_lenslet = [21, 21]"))
+        assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--model", "fresnel", "--accuracy", "1e-3"]) == 0
+    assert seen and all(library["num_threads"] == 1 for info in seen for library in info if library["user_api"] == "blas")
+
+
 def test_options_reach_the_matrix(tmp_path, capsys):
     out = tmp_path / "pif.h5"
     code = run(["simulate-pif", str(TINY), "-o", str(out), "--wavelength", "650nm", "--wavelength", "450nm", "--superpixels", "1x1",

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import sys
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ AFFORDED = 5e9, 4e10
 """Values of the exact kernel that a camera's columns may take: of isolated lenslets, and with neighbours (for each row of superpixels that
 the light is spread over)."""
 FEW = 12
-"""Pixels that an exact column is compared on at the least."""
+"""Pixels that an exact column is compared on at the least, for each row of superpixels that the light is spread over."""
 FINE = 3e-7
 """Accuracy of paraxial columns from which on fringes of lenslets far apart count."""
 SMALL = {"object.samples_per_lenslet": (16, 16)}
@@ -99,20 +100,20 @@ class Truth:
         self.spread = 0 if window is None else min(round(blur(camera) / 2), max(abs(n) for place in superpixels for n in place))
         side = range(-self.spread, self.spread + 1)
         self.lit = [(r, c) for r in side for c in side]
-        self.superpixels = self.lit if model == "exact" else _some(superpixels, 200 if fine else cells(camera))
-        self.rows, self.columns_of_pixels = self._pixels()
+        self.superpixels = self.lit if model == "exact" or superpixels == self.lit else _some(superpixels, 200 if fine else cells(camera))
+        self.counts = self._counts()
         parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4, fine]
         if model == "exact":
-            parts.append([self.rows, self.columns_of_pixels])
+            # which pixels of many superpixels these are follows from the paraxial columns
+            parts.append(self.counts if self.spread else [chosen.tolist() for chosen in self.pixels[0]])
         self.key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
 
     def pick(self, blocks, reach):
         """What of a matrix's columns, (point, superpixel, pixel) with superpixels `reach`, is compared: (point, number)."""
         blocks = np.stack([blocks[:, reach.index(place)] for place in self.superpixels], axis=1)
         if self.model == "exact":
-            (rows, columns), side = self.camera.sensor.pixels_per_lenslet, 2 * self.spread + 1
-            patch = blocks.reshape(-1, side, side, rows, columns).transpose(0, 1, 3, 2, 4).reshape(-1, side * rows, side * columns)
-            blocks = patch[:, self.rows][:, :, self.columns_of_pixels]
+            (rows, columns), roots = self.pixels
+            blocks = self._patch(blocks)[:, rows][:, :, columns] * roots
         return blocks.reshape(len(blocks), -1)
 
     @property
@@ -121,15 +122,14 @@ class Truth:
 
     def affordable(self):
         """Whether at least a few pixels can be summed."""
-        return self.model == "fresnel" or len(self.rows) * len(self.columns_of_pixels) >= min(FEW, math.prod(self.camera.sensor.pixels_per_lenslet))
+        return self.model == "fresnel" or math.prod(self.counts) >= min(FEW * (2 * self.spread + 1), math.prod(self.camera.sensor.pixels_per_lenslet))
 
     def seconds(self):
         """Seconds of one core that `columns` and `change` will take, 0 for kept ones."""
         if self.path.exists():
             return 0.0
         if self.model == "exact":
-            count = len(self.rows) * len(self.columns_of_pixels)
-            return 5 + self._values_per_pixel() * count / WAVES + sum(other.seconds() for other in self._others())
+            return 5 + self._values_per_pixel() * math.prod(self.counts) / WAVES + sum(other.seconds() for other in self._others())
         camera, reach = self.camera, {place[0] for place in self.superpixels}
         rule = _Rule(camera, camera.light.wavelengths[0], self.window, self.superpixels, self._pixel_nodes(), 1.0)
         lines, lit = camera.sensor.pixels_per_lenslet[0] * self._pixel_nodes(), 1 if self.window is None else 2 * self.window + 1
@@ -195,14 +195,36 @@ class Truth:
 
     # exact
 
-    def _pixels(self):
-        """(rows, columns) of the pixels that exact columns are compared on, counted over the superpixels that are lit."""
+    def _counts(self):
+        """How many rows and columns of pixels exact columns are compared on."""
         if self.model != "exact":
-            return None, None
-        side, lines = 2 * self.spread + 1, 2 * self.spread + 3
-        count, across = (n * side for n in self.camera.sensor.pixels_per_lenslet)
-        most = min(across, int(AFFORDED[self.window is not None] * side / self._values_per_pixel() / lines))
-        return sorted({int(count * (i + 0.1) / lines) for i in range(lines)}), sorted({int(across * (i + 0.5) / most) for i in range(most)})
+            return None
+        side, across = 2 * self.spread + 1, self.camera.sensor.pixels_per_lenslet[1]
+        lines = 2 * side if self.spread else 3
+        return lines, min(across, int(AFFORDED[self.window is not None] * side / self._values_per_pixel() / lines))
+
+    @cached_property
+    def pixels(self):
+        """((rows, columns) of the pixels that exact columns are compared on, counted over the superpixels that are lit; roots of their
+        weights (row, column), which make sums over them those over all pixels).
+
+        Evenly in one superpixel; of several, each lit on a small part, more often where there is light by the paraxial model.
+        """
+        side = 2 * self.spread + 1
+        sizes = [n * side for n in self.camera.sensor.pixels_per_lenslet]
+        if not self.spread:
+            return [_evenly(np.ones(size), count, start) for size, count, start in zip(sizes, self.counts, (0.1, 0.5))], 1.0
+        paraxial = Plain(self.camera, "fresnel", wide_window(self.camera), self.lit, self.folder)
+        power = self._patch(paraxial.columns().reshape(3, len(self.lit), -1)) ** 2
+        power = (power / power.sum(axis=(1, 2), keepdims=True)).mean(axis=0)
+        often = [0.8 * power.sum(axis=1 - axis) + 0.2 / size for axis, size in enumerate(sizes)]
+        chosen = [_evenly(share, count, 0.5) for share, count in zip(often, self.counts)]
+        return chosen, np.sqrt(1 / np.outer(often[0][chosen[0]], often[1][chosen[1]]))
+
+    def _patch(self, blocks):
+        """Superpixels (point, superpixel in the order of `lit`, pixel) side by side: (point, pixel row, pixel column)."""
+        (rows, columns), side = self.camera.sensor.pixels_per_lenslet, 2 * self.spread + 1
+        return blocks.reshape(-1, side, side, rows, columns).transpose(0, 1, 3, 2, 4).reshape(-1, side * rows, side * columns)
 
     @property
     def far(self):
@@ -234,7 +256,7 @@ class Truth:
                  for s in range(-self.spread, self.spread + 1)]
         # of each axis, nodes and weights of all superpixels in a row; of these the chosen pixels
         (v, wv), (u, wu) = ([np.concatenate([one[axis][i] for one in patch]).reshape(-1, nodes)[chosen].ravel() for i in (0, 1)]
-                            for axis, chosen in enumerate((self.rows, self.columns_of_pixels)))
+                            for axis, chosen in enumerate(self.pixels[0]))
         far, total = self.far, 0
         wave = rayleigh.main_lens_field(camera, (far + 1.5) * array.pitch)
         for row in range(-far, far + 1):
@@ -244,10 +266,18 @@ class Truth:
                 y, x = y + row * array.pitch, x + column * array.pitch
                 fields = np.array([wave(point, y, x) for point in self._image_points()])
                 # rows of pixels by themselves: the shorter the intervals, the fewer products
-                sums = [rayleigh.rayleigh_products(fields * lens, y, x, line, u, sensor.distance, k) for line in np.split(v, len(self.rows))]
+                sums = [rayleigh.rayleigh_products(fields * lens, y, x, line, u, sensor.distance, k) for line in np.split(v, self.counts[0])]
                 total = total + np.concatenate(sums, axis=1)
         energy = np.abs(total) ** 2 * wv[:, None] * wu
-        return energy.reshape(3, len(self.rows), nodes, len(self.columns_of_pixels), nodes).sum(axis=(2, 4))
+        return energy.reshape(3, self.counts[0], nodes, self.counts[1], nodes).sum(axis=(2, 4)) * self.pixels[1]
+
+
+def _evenly(share, count, start):
+    """`count` different indices, as often as their `share` has it, the first one `start` of a step from the beginning."""
+    places = np.cumsum(share) / np.sum(share)
+    chosen = sorted({int(np.searchsorted(places, (i + start) / count, side="right")) for i in range(count)})
+    rest = [i for i in np.argsort(-share, kind="stable").tolist() if i not in chosen]
+    return np.array(sorted([*chosen, *rest[:count - len(chosen)]]))
 
 
 def _some(superpixels, count):

@@ -110,7 +110,7 @@ class Pair:
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
         kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15) for axis in (0, 1)]
-        coupling = _coupled(thin(residual.core), thin(field), kept).astype(self.row.dtype)
+        coupling = _coupled(*(thin(a.astype(self.row.dtype)) for a in (residual.core, field)), kept)
         x = self.row.sheet(self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0])
         y = x if self.symmetric else self.column.sheet(self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1])
         # now that it is seen what each term brings: residuals send light where the separable part does not
@@ -140,7 +140,10 @@ def _coupled(core, field, kept):
         whole = sparse.kron(core, field, format="csr")
         return sparse.csr_array(whole)[r * field.shape[0] + i][:, s * field.shape[1] + j]
     core, field = (a.toarray() if sparse.issparse(a) else a for a in (core, field))
-    return core[r[:, None], s] * field[i[:, None], j]
+    out = core[r[:, None], s]
+    for start in range(0, len(out), SLAB):  # the largest array there is, no second one beside it
+        out[start:start + SLAB] *= field[i[start:start + SLAB, None], j]
+    return out
 
 
 def _norms(interval, mixing):

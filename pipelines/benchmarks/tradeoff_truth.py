@@ -22,7 +22,7 @@ from tests.reference import rayleigh  # noqa: E402
 from tests.reference.fresnel import sensor_nodes  # noqa: E402
 from tests.reference.window import _Rule, energies  # noqa: E402
 
-WAVES, FLOPS = 1e9, 2e10
+WAVES, FLOPS = 6e8, 2e10
 """Values of the exact kernel (as summed by rayleigh.rayleigh_products), and operations in products, a second of one core: to say
 beforehand how long the sums take."""
 AFFORDED = 5e9, 4e10

@@ -174,15 +174,20 @@ def cost(camera, view, band, shape, double):
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
         more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
         largest = max(largest, item * (both * (products * (1 + more) + 3 * sketch)))
-    # the coupling of the own lenslet's terms is dense before it is looked at: measured at f/2.2, 340 to 3200 of them
-    coupling = 1.25 * item * (plain * expected_products(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)) ** 2
+    # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from superpixels beside it: measured
+    # at f/2.2, 340 to 3500 of them
+    own = _own_terms(view, band)
+    coupling = item * ((1.12 if lit == 1 else 2.8) * plain * expected_products(view, replace(band, window=None, terms=own), parabolic)) ** 2
+    # what is there from first to last: the field on the array as it is decomposed, and its terms on all intervals
+    field = 60 * (band.psf_nodes / (2 if even else 1)) ** 2
+    intervals = item / 2 * (beside + 1) * lit * across * points * 0.56 * own
     pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
     size = shape[1] * shape[2] * shape[3]
     tables = sum(kinds.values())
     mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
     return {"operations": operations + 8.0 * 1.2 * fine * mean * pairs,
             "seconds": seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
-            "bytes": int(largest + coupling + item * 2 * tables * points * lines * mean) + (3 << 24)}
+            "bytes": int(largest + coupling + field + intervals + item * 2 * tables * points * lines * mean) + (3 << 24)}
 
 
 class ExactSquareLenslets:

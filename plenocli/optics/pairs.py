@@ -116,8 +116,8 @@ class Pair:
         # now that it is seen what each term brings: residuals send light where the separable part does not
         brings = [_energy(x) / len(self.row.way.points)]
         brings += brings if self.symmetric else [_energy(y) / len(self.column.way.points)]
-        (some,) = _strong(brings[0] * (abs(coupling) ** 2 @ brings[1]), tolerance / 4)
-        x, coupling = x[:, some], coupling[some][:, some]
+        (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 4)
+        x, coupling = x[:, some], coupling[np.ix_(some, some)]
         return x, x if self.symmetric else y[:, some], coupling
 
     def _terms(self, tolerance):
@@ -144,6 +144,12 @@ def _coupled(core, field, kept):
     for start in range(0, len(out), SLAB):  # the largest array there is, no second one beside it
         out[start:start + SLAB] *= field[i[start:start + SLAB, None], j]
     return out
+
+
+def _weighed(coupling, power):
+    """|coupling|^2 @ power, with no second array of that size."""
+    parts = range(0, coupling.shape[0], SLAB)
+    return np.concatenate([abs(coupling[start:start + SLAB]) ** 2 @ power for start in parts])
 
 
 def _norms(interval, mixing):

@@ -28,8 +28,8 @@ beforehand how long the sums take."""
 AFFORDED = 5e9, 4e10
 """Values of the exact kernel that a camera's columns may take: of isolated lenslets, and with neighbours (for each row of superpixels that
 the light is spread over)."""
-FEW = 12
-"""Pixels that an exact column is compared on at the least, for each row of superpixels that the light is spread over."""
+FEW, MANY = 12, 100
+"""Pixels that an exact column is compared on at the least: where its light stays in one superpixel, and where it is spread over several."""
 FINE = 3e-7
 """Accuracy of paraxial columns from which on fringes of lenslets far apart count."""
 SMALL = {"object.samples_per_lenslet": (16, 16)}
@@ -122,7 +122,7 @@ class Truth:
 
     def affordable(self):
         """Whether at least a few pixels can be summed."""
-        return self.model == "fresnel" or math.prod(self.counts) >= min(FEW * (2 * self.spread + 1), math.prod(self.camera.sensor.pixels_per_lenslet))
+        return self.model == "fresnel" or math.prod(self.counts) >= min(FEW if self.spread == 0 else MANY, math.prod(self.camera.sensor.pixels_per_lenslet))
 
     def seconds(self):
         """Seconds of one core that `columns` and `change` will take, 0 for kept ones."""

@@ -211,10 +211,10 @@ def _sized(request, rung, ring, split, nodes):
     double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
         bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in _finest(request, nodes))
+        costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
     except NumericsError as error:
         return Candidate(rung.name, rung.model, error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
-    costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
     if nodes:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize

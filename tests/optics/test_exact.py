@@ -323,6 +323,21 @@ def test_full_size_with_neighbours():
     assert (np.sqrt(missed) <= 1e-3 * np.sqrt((found**2).sum(axis=(1, 2, 3)))).all()
 
 
+@pytest.mark.parametrize("name, wavelength, coarse", [
+    ("f/8", 550e-9, 5e-2), pytest.param("f/4.4", 400e-9, 1e-2, marks=pytest.mark.slow)])
+def test_whole_columns_hold_at_coarse_accuracies(name, wavelength, coarse):
+    """All pixels of all superpixels near a lenslet's corner, whose light is on four of them, each with its error, against the matrix at a fifth."""
+    camera = full_camera(name, "hyperbolic").replace(**{"light.wavelengths": (wavelength,), "light.design_wavelength": wavelength})
+    plans = [accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=(3, 3), coherent_ring=1) for asked in (coarse, coarse / 5)]
+    found, fine = (PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(slice(0, 8)) for plan in plans)
+    assert (np.linalg.norm(found - fine, axis=(0, 1)) <= coarse * np.linalg.norm(fine, axis=(0, 1))).all()
+
+
+def test_too_many_terms_on_superpixels_beside_are_refused_in_the_plan():
+    with pytest.raises(NumericsError, match="separable terms, more than 2125"):
+        accuracy.plan_pif(full_camera("f/2.2", "hyperbolic"), accuracy=1e-4, superpixels=(3, 3))
+
+
 @pytest.mark.slow
 def test_full_size_at_f_2_2():
     camera, points, rows = full_camera("f/2.2", "parabolic"), [0, 137, 820], [3, 26]

@@ -18,6 +18,7 @@ import resource
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -72,6 +73,7 @@ def forced(name):
     dial._cheapest = lambda found: next(c for c in found if c.name == name)
 
 
+@cache
 def code(rung):
     """Digest of the code that computes a rung: its modules without comments, docstrings and planning laws."""
     files = ["pif", "geometry", "psf", "pupil", "quadrature", "relay", "factors"]

@@ -100,7 +100,7 @@ class Truth:
         self.spread = 0 if window is None else min(round(blur(camera) / 2), max(abs(n) for place in superpixels for n in place))
         side = range(-self.spread, self.spread + 1)
         self.lit = [(r, c) for r in side for c in side]
-        self.superpixels = self.lit if model == "exact" or superpixels == self.lit else _some(superpixels, 200 if fine else cells(camera))
+        self.superpixels = self.lit if model == "exact" else self._compared(superpixels)
         self.counts = self._counts()
         parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4, fine]
         if model == "exact":
@@ -115,6 +115,10 @@ class Truth:
             (rows, columns), roots = self.pixels
             blocks = self._patch(blocks)[:, rows][:, :, columns] * roots
         return blocks.reshape(len(blocks), -1)
+
+    def _compared(self, superpixels):
+        """Those of a matrix's superpixels that paraxial columns are compared on."""
+        return _some(superpixels, 200 if self.fine else cells(self.camera))
 
     @property
     def path(self):
@@ -290,7 +294,10 @@ def _some(superpixels, count):
 
 
 class Plain(Truth):
-    """A Truth whose own change is not asked for."""
+    """A Truth on all of its superpixels, whose own change is not asked for."""
+
+    def _compared(self, superpixels):
+        return superpixels
 
     def _others(self):
         return []

@@ -91,7 +91,7 @@ class Truth:
 
     model: fresnel or exact; window: lenslets either side whose fields add, or None for isolated lenslets; superpixels: list of
     (row, column), of which the exact model has those that the geometric blur lights; folder: where results are kept, by `key`;
-    fine: every fringe is resolved, as accuracies beyond 1e-6 need.
+    fine: every fringe is resolved, as accuracies below FINE need.
     """
 
     def __init__(self, camera, model, window, superpixels, folder, fine=False):

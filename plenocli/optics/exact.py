@@ -32,6 +32,7 @@ CUT, CUT_EFFECT = 0.42, 1.3
 
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
+
 COARSE = 5e-3
 """The coarsest cut at which terms were counted."""
 

@@ -33,7 +33,7 @@ def test_artefact_summary_and_bytes(tmp_path, capsys):
 
 def test_the_diagnosis_stays_on_one_thread(tmp_path, monkeypatch):
     # two threads that wait for each other cost a fifth of the command, and round singular values as the machine's cores have it
-    threadpoolctl = pytest.importorskip("threadpoolctl")
+    import threadpoolctl
     from plenocli.optics.diagnose import Spectrum
 
     seen, values = [], Spectrum.values

@@ -1,7 +1,8 @@
 """A large product M = sum_ab X_a K_ab X_b^T of known factors, compressed to its own rank without being formed.
 
-The range is found by random combinations of M's columns (Halko, Martinsson, Tropp 2011), which cost as little as the factors
-have terms; the factors seen through an orthonormal basis of it give a small core, whose singular values say where to cut.
+Random combinations of M's rows and columns (Halko, Martinsson, Tropp 2011) make it small enough to be decomposed: that tells how
+many terms it has, and which combinations of its columns span its range. Only these go through the factors, once; what is seen
+through an orthonormal basis of them is the core whose singular values say where to cut.
 """
 
 import numpy as np
@@ -10,6 +11,10 @@ from plenocli.errors import NumericsError
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
+OVER = 2.0
+"""Random combinations that a sketch is chosen from, over its columns."""
+NARROW = 3
+"""A product is narrowed where its terms fit a sketch of its factors' over this."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""
 MAX_SKETCH = 2500
@@ -23,6 +28,7 @@ class Product:
     def __init__(self, left, right, couplings, symmetric):
         self.left, self.right = left, right
         self.couplings, self.symmetric = {key: thin(k) for key, k in couplings.items()}, symmetric
+        self.limit = min(len(left[0]), len(right[0]))
         self.rng = np.random.default_rng(20130701)
 
     def _through(self, side, blocks):
@@ -31,63 +37,88 @@ class Product:
             return [sum(k @ blocks[b] for (i, b), k in self.couplings.items() if i == a) for a in range(len(self.left))]
         return [sum(k.T @ blocks[a] for (a, i), k in self.couplings.items() if i == b) for b in range(len(self.right))]
 
-    def _sketch(self, side, count):
-        """`count` random combinations of the columns of M (side 0) or of M^T (1), every one of which goes into one of them."""
-        mine, other = (self.left, self.right) if side == 0 else (self.right, self.left)
-        order = self.rng.permutation(len(other[0]))
-        signs = self.rng.choice(np.array([-1, 1], other[0].real.dtype), len(order))
+    def _times(self, side, seen):
+        """M (side 0) or M^T (1) times combinations of its columns, given as what the other side's factors make of them: (rows, combinations)."""
+        mine = self.right if side else self.left
+        out = np.zeros((len(mine[0]), seen[0].shape[1]), mine[0].dtype)
+        for x, y in zip(mine, self._through(side, seen)):
+            _add_product(out, x, y)
+        return out
+
+    def _mixed(self, side, count):
+        """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of rows, every one of which goes into one of them."""
+        factors = self.right if side else self.left
+        order = self.rng.permutation(len(factors[0]))
+        signs = self.rng.choice(np.array([-1, 1], factors[0].real.dtype), len(order))
         mixed = []
-        for x in other:
+        for x in factors:
             total = np.zeros((count, x.shape[1]), x.dtype)
             for start in range(0, len(order), count):
                 some = slice(start, start + count)
                 total[:len(order[some])] += x[order[some]] * signs[some, None]
             mixed.append(total.T)
-        out = np.zeros((len(mine[0]), count), mine[0].dtype)
-        for x, y in zip(mine, self._through(side, mixed)):
-            _add_product(out, x, y)
-        return out
+        return mixed
 
-    def _extend(self, side, count, basis, inner):
-        """A basis of the range of M (side 0) or M^T (1) with `count` more columns, and X^T times it for each factor of that side."""
-        columns = self._sketch(side, count)
-        if basis is not None:
-            for _ in range(2):
-                columns -= basis @ (basis.conj().T @ columns)
-        new = orthonormal(columns)
-        if basis is not None:
-            # what was numerically nothing is no direction of its own
-            new = orthonormal(new - basis @ (basis.conj().T @ new))
-        turned = new.conj()
-        seen = [x.T @ turned for x in (self.right if side else self.left)]
-        if basis is None:
-            return new, seen
-        return np.hstack([basis, new]), [np.hstack(pair) for pair in zip(inner, seen)]
+    def _directions(self, cut, count):
+        """Combinations of M's columns that span its range up to `cut`, at most `count`, as X_b^T times them for each factor; and the terms that M has.
+
+        Found where M is small: through random combinations of its rows and columns, OVER times as many as asked for."""
+        many = min(int(OVER * count), self.limit)
+        right = self._mixed(1, many)
+        left = right if self.symmetric else self._mixed(0, many)
+        core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
+        # a step of a power iteration, which parts large values from small ones
+        basis = orthonormal(core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, min(count, many))))
+        basis = orthonormal(core.conj().T @ basis)
+        image = core @ basis
+        rest = np.linalg.norm((core - image @ basis.conj().T).ravel())
+        _, s, vh = np.linalg.svd(_triangle(image)[1])
+        # the k largest also fit what is random here, so that less than all of the rest is seen
+        share = 1 - np.arange(len(s)) * (1 / many - 1 / self.limit)
+        terms = _rank(s, cut * share, rest)
+        basis = basis @ vh[:int(terms / FILL) + 8].conj().T
+        return [m @ basis for m in right], terms
+
+    def _found(self, directions):
+        """(Q, P, K) with M = Q K P^T on the range of M times `directions`, Q orthonormal; P is Q where M is symmetric, and K None where it is 1."""
+        q = orthonormal(self._times(0, directions))
+        turned = q.conj()
+        seen = [x.T @ turned for x in self.left]
+        if self.symmetric:
+            return q, q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
+        return q, self._times(1, seen), None
+
+    def narrowed(self, cut):
+        """(Q, P, K) with M = Q K P^T up to `cut` (root sum of squares), Q orthonormal, P = Q where M is symmetric; or None: M has no far
+        fewer terms than its factors."""
+        count = max(x.shape[1] for x in self.left) // NARROW
+        if not 8 <= count < self.limit:
+            return None
+        directions, terms = self._directions(cut, count)
+        if terms > FILL * count:
+            return None
+        q, p, core = self._found(directions)
+        if self._missed(q if core is None else q @ core, p) > 2 * cut:
+            return None
+        return q, p, np.eye(q.shape[1], dtype=q.dtype) if core is None else core
 
     def factors(self, cut, count):
         """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
 
         NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
-        limit = min(len(self.left[0]), len(self.right[0]))
-        add, q, p, outer, inner = min(count, limit, MAX_SKETCH), None, None, None, None
+        size = min(count, self.limit, MAX_SKETCH)
         while True:
-            q, outer = self._extend(0, add, q, outer)
-            p, inner = (q, outer) if self.symmetric else self._extend(1, add, p, inner)
-            size = q.shape[1]
-            core = sum(o.T @ c for o, c in zip(outer, self._through(0, inner)))
-            u, s, vh = np.linalg.svd(core)
-            tails = np.sqrt(np.cumsum(s.astype(float)[::-1] ** 2)[::-1])
-            terms = max(1, int(np.count_nonzero(tails > cut)))
-            root = np.sqrt(s[:terms])
-            high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
-            if size >= limit or (terms <= FILL * size and self._missed(high, wide) <= 2 * cut):
-                return high, wide
-            if size >= MAX_SKETCH:
+            directions, terms = self._directions(cut, size)
+            if terms <= FILL * size or size == self.limit:
+                high, wide = _balanced(*self._found(directions), cut)
+                if size == self.limit or self._missed(high, wide) <= 2 * cut:
+                    return high, wide
+            if size == MAX_SKETCH:
                 raise NumericsError(
                     f"the exact field has more than {int(FILL * size)} separable terms",
                     "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
-            add = min(MAX_SKETCH, limit, max(size // 4, int(terms / FILL) - size + 8) + size) - size
+            size = min(MAX_SKETCH, self.limit, max(size + size // 4, int(terms / FILL) + 8))
 
     def _missed(self, high, wide):
         """Root sum of squares of M - H B^T, estimated on random entries."""
@@ -95,6 +126,24 @@ class Product:
         exact = sum(x[rows] @ c for x, c in zip(self.left, self._through(0, [x[columns].T for x in self.right])))
         difference = exact - high[rows] @ wide[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
+
+
+def _balanced(q, p, core, cut):
+    """(H, B) with H B^T = Q K P^T up to `cut`, of as few terms as can be."""
+    if core is None:
+        p, core = _triangle(p)
+        core = core.T
+    u, s, vh = np.linalg.svd(core)
+    terms = _rank(s, cut)
+    root = np.sqrt(s[:terms])
+    return q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
+
+
+def _rank(values, cut, rest=0.0):
+    """How many of the singular values `values` it takes to leave no more than `cut` (root sum of squares, `rest` beside them included), one at
+    the least."""
+    tails = np.sqrt(np.cumsum(values.astype(float)[::-1] ** 2)[::-1] + rest**2)
+    return max(1, int(np.count_nonzero(tails > cut)))
 
 
 def _add_product(out, x, y):
@@ -121,6 +170,11 @@ def thin(matrix):
 
 def orthonormal(columns):
     """An orthonormal basis of the columns."""
+    return _triangle(columns)[0]
+
+
+def _triangle(columns):
+    """(Q, R) with columns = Q R, Q orthonormal, R triangular."""
     from scipy.linalg import qr
 
-    return qr(columns, mode="economic", check_finite=False)[0]
+    return qr(columns, mode="economic", check_finite=False)

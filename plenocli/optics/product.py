@@ -1,8 +1,8 @@
 """A large product M = sum_ab X_a K_ab X_b^T of known factors, compressed to its own rank without being formed.
 
-Random combinations of M's rows and columns (Halko, Martinsson, Tropp 2011) make it small enough to be decomposed: that tells how
-many terms it has, and which combinations of its columns span its range. Only these go through the factors, once; what is seen
-through an orthonormal basis of them is the core whose singular values say where to cut.
+The range is found by random combinations of M's columns (Halko, Martinsson, Tropp 2011), which cost as little as the factors
+have terms; what is seen of M through an orthonormal basis of it is a small core, whose singular values say where to cut. Where
+factors have many more terms than M, combinations of both rows and columns show first how many of them it takes, and which.
 """
 
 import numpy as np
@@ -11,10 +11,8 @@ from plenocli.errors import NumericsError
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
-OVER = 2.0
-"""Random combinations that a sketch is chosen from, over its columns."""
-NARROW = 3
-"""A product is narrowed where its terms fit a sketch of its factors' over this."""
+NARROW, OVER = 3, 2
+"""A product is narrowed where its terms fit a sketch of its factors' over the first; random combinations that this is told from, over that."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""
 MAX_SKETCH = 2500
@@ -59,66 +57,88 @@ class Product:
             mixed.append(total.T)
         return mixed
 
-    def _directions(self, cut, count):
-        """Combinations of M's columns that span its range up to `cut`, at most `count`, as X_b^T times them for each factor; and the terms that M has.
-
-        Found where M is small: through random combinations of its rows and columns, OVER times as many as asked for."""
-        many = min(int(OVER * count), self.limit)
-        right = self._mixed(1, many)
-        left = right if self.symmetric else self._mixed(0, many)
-        core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
-        # a step of a power iteration, which parts large values from small ones
-        basis = orthonormal(core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, min(count, many))))
-        basis = orthonormal(core.conj().T @ basis)
-        image = core @ basis
-        rest = np.linalg.norm((core - image @ basis.conj().T).ravel())
-        _, s, vh = np.linalg.svd(_triangle(image)[1])
-        # the k largest also fit what is random here, so that less than all of the rest is seen
-        share = 1 - np.arange(len(s)) * (1 / many - 1 / self.limit)
-        terms = _rank(s, cut * share, rest)
-        basis = basis @ vh[:int(terms / FILL) + 8].conj().T
-        return [m @ basis for m in right], terms
-
-    def _found(self, directions):
-        """(Q, P, K) with M = Q K P^T on the range of M times `directions`, Q orthonormal; P is Q where M is symmetric, and K None where it is 1."""
-        q = orthonormal(self._times(0, directions))
+    def _through_basis(self, q):
+        """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is symmetric, else M^T q* alone."""
         turned = q.conj()
         seen = [x.T @ turned for x in self.left]
-        if self.symmetric:
-            return q, q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
-        return q, self._times(1, seen), None
+        return seen if self.symmetric else [self._times(1, seen)]
 
-    def narrowed(self, cut):
-        """(Q, P, K) with M = Q K P^T up to `cut` (root sum of squares), Q orthonormal, P = Q where M is symmetric; or None: M has no far
-        fewer terms than its factors."""
-        count = max(x.shape[1] for x in self.left) // NARROW
-        if not 8 <= count < self.limit:
-            return None
-        directions, terms = self._directions(cut, count)
-        if terms > FILL * count:
-            return None
-        q, p, core = self._found(directions)
-        if self._missed(q if core is None else q @ core, p) > 2 * cut:
-            return None
-        return q, p, np.eye(q.shape[1], dtype=q.dtype) if core is None else core
+    def _core(self, q, seen):
+        """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
+        if self.symmetric:
+            return q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
+        p, triangle = _triangle(seen[0])
+        return p, triangle.T
 
     def factors(self, cut, count):
         """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
 
         NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
-        size = min(count, self.limit, MAX_SKETCH)
+        add, q, seen = min(count, self.limit, MAX_SKETCH), None, None
         while True:
-            directions, terms = self._directions(cut, size)
-            if terms <= FILL * size or size == self.limit:
-                high, wide = _balanced(*self._found(directions), cut)
-                if size == self.limit or self._missed(high, wide) <= 2 * cut:
+            columns = self._times(0, self._mixed(1, add))
+            if q is None:
+                q = orthonormal(columns)
+                seen = self._through_basis(q)
+            else:
+                for _ in range(2):
+                    columns -= q @ (q.conj().T @ columns)
+                new = orthonormal(columns)
+                # what was numerically nothing is no direction of its own
+                new = orthonormal(new - q @ (q.conj().T @ new))
+                seen = [np.hstack(pair) for pair in zip(seen, self._through_basis(new))]
+                q = np.hstack([q, new])
+            size = q.shape[1]
+            p, core = self._core(q, seen)
+            u, s, vh = np.linalg.svd(core)
+            terms = _rank(s, cut)
+            if terms <= FILL * size or size >= self.limit:
+                root = np.sqrt(s[:terms])
+                high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
+                if size >= self.limit or self._missed(high, wide) <= 2 * cut:
                     return high, wide
-            if size == MAX_SKETCH:
+            if size >= MAX_SKETCH:
                 raise NumericsError(
                     f"the exact field has more than {int(FILL * size)} separable terms",
                     "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
-            size = min(MAX_SKETCH, self.limit, max(size + size // 4, int(terms / FILL) + 8))
+            add = min(MAX_SKETCH, self.limit, max(size // 4, int(terms / FILL) - size + 8) + size) - size
+
+    def narrowed(self, cut):
+        """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than M's factors have terms, X orthonormal and Y = X
+        where M is symmetric; or None: M does not have so few terms."""
+        count = max(x.shape[1] for x in self.left) // NARROW
+        if not 8 <= count < self.limit:
+            return None
+        directions, terms = self._directions(cut, count)
+        if terms > FILL * count:
+            return None
+        q = orthonormal(self._times(0, directions))
+        seen = self._through_basis(q)
+        if self.symmetric:
+            p, core = self._core(q, seen)
+        else:
+            p, core = seen[0], np.eye(q.shape[1], dtype=q.dtype)
+        return (q, p, core) if self._missed(q @ core if self.symmetric else q, p) <= 2 * cut else None
+
+    def _directions(self, cut, count):
+        """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each factor, and the terms that M has; no more than
+        `count` of either. Found where M is small: through random combinations of its rows and of its columns, OVER times as many."""
+        many = min(int(OVER * count), self.limit)
+        right = self._mixed(1, many)
+        left = right if self.symmetric else self._mixed(0, many)
+        core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
+        # a step of a power iteration, which parts large values from small ones
+        basis = orthonormal(core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, count)))
+        basis = orthonormal(core.conj().T @ basis)
+        image = core @ basis
+        rest = np.linalg.norm((core - image @ basis.conj().T).ravel())
+        _, s, vh = np.linalg.svd(_triangle(image)[1])
+        # the k largest also fit what is random here, so that less than all of the rest is seen
+        share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
+        terms = _rank(s, cut * share, rest)
+        basis = basis @ vh[:int(terms / FILL) + 8].conj().T
+        return [m @ basis for m in right], terms
 
     def _missed(self, high, wide):
         """Root sum of squares of M - H B^T, estimated on random entries."""
@@ -126,17 +146,6 @@ class Product:
         exact = sum(x[rows] @ c for x, c in zip(self.left, self._through(0, [x[columns].T for x in self.right])))
         difference = exact - high[rows] @ wide[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
-
-
-def _balanced(q, p, core, cut):
-    """(H, B) with H B^T = Q K P^T up to `cut`, of as few terms as can be."""
-    if core is None:
-        p, core = _triangle(p)
-        core = core.T
-    u, s, vh = np.linalg.svd(core)
-    terms = _rank(s, cut)
-    root = np.sqrt(s[:terms])
-    return q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
 
 
 def _rank(values, cut, rest=0.0):

@@ -63,6 +63,19 @@ class Product:
         seen = [x.T @ turned for x in self.left]
         return seen if self.symmetric else [self._times(1, seen)]
 
+    def _extend(self, q, seen, count):
+        """The basis q of M's range with `count` more columns (None: with these alone), and what is seen of M through it."""
+        columns = self._times(0, self._mixed(1, count))
+        if q is None:
+            q = orthonormal(columns)
+            return q, self._through_basis(q)
+        for _ in range(2):
+            columns -= q @ (q.conj().T @ columns)
+        new = orthonormal(columns)
+        # what was numerically nothing is no direction of its own
+        new = orthonormal(new - q @ (q.conj().T @ new))
+        return np.hstack([q, new]), [np.hstack(pair) for pair in zip(seen, self._through_basis(new))]
+
     def _core(self, q, seen):
         """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
         if self.symmetric:
@@ -77,18 +90,7 @@ class Product:
         """
         add, q, seen = min(count, self.limit, MAX_SKETCH), None, None
         while True:
-            columns = self._times(0, self._mixed(1, add))
-            if q is None:
-                q = orthonormal(columns)
-                seen = self._through_basis(q)
-            else:
-                for _ in range(2):
-                    columns -= q @ (q.conj().T @ columns)
-                new = orthonormal(columns)
-                # what was numerically nothing is no direction of its own
-                new = orthonormal(new - q @ (q.conj().T @ new))
-                seen = [np.hstack(pair) for pair in zip(seen, self._through_basis(new))]
-                q = np.hstack([q, new])
+            q, seen = self._extend(q, seen, add)
             size = q.shape[1]
             p, core = self._core(q, seen)
             u, s, vh = np.linalg.svd(core)
@@ -113,18 +115,15 @@ class Product:
         directions, terms = self._directions(cut, count)
         if terms > FILL * count:
             return None
-        q = orthonormal(self._times(0, directions))
-        seen = self._through_basis(q)
-        if self.symmetric:
-            p, core = self._core(q, seen)
-        else:
-            p, core = seen[0], np.eye(q.shape[1], dtype=q.dtype)
-        return (q, p, core) if self._missed(q @ core if self.symmetric else q, p) <= 2 * cut else None
+        x = orthonormal(self._times(0, directions))
+        seen = self._through_basis(x)
+        y, core = self._core(x, seen) if self.symmetric else (seen[0], np.eye(x.shape[1], dtype=x.dtype))
+        return (x, y, core) if self._missed(x @ core if self.symmetric else x, y) <= 2 * cut else None
 
     def _directions(self, cut, count):
         """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each factor, and the terms that M has; no more than
         `count` of either. Found where M is small: through random combinations of its rows and of its columns, OVER times as many."""
-        many = min(int(OVER * count), self.limit)
+        many = min(OVER * count, self.limit)
         right = self._mixed(1, many)
         left = right if self.symmetric else self._mixed(0, many)
         core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))

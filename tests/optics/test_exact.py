@@ -253,6 +253,28 @@ def test_compression_keeps_what_was_asked():
     assert high.shape[1] <= np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > 1e-2) + 1
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
+    rng = np.random.default_rng(7)
+    left, right, core = _random_product(rng, 900, 400, 0.15)
+    core = core.astype(np.complex64)
+    left, right = ((x / np.sqrt(len(x))).astype(np.complex64) for x in (left, left if symmetric else right))
+    right = left if symmetric else right
+    cut = 1e-5 * np.linalg.norm(core)
+    x, y, k = product.Product([left], [right], {(0, 0): core}, symmetric).narrowed(cut)
+    full = left.astype(complex) @ core @ right.T.astype(complex)
+    terms = np.count_nonzero(np.sqrt(np.cumsum(np.linalg.svd(full, compute_uv=False)[::-1] ** 2))[::-1] > cut)
+    # single precision has 1e-7 of the whole; squares of what is small would be lost in it
+    assert np.linalg.norm(x.astype(complex) @ k @ y.T - full) < 1.5 * cut
+    assert terms <= x.shape[1] < 1.4 * terms + 10 and np.allclose(x.conj().T @ x, np.eye(x.shape[1]), atol=1e-5)
+    assert (y is x) == symmetric
+
+
+def test_a_product_of_many_terms_is_left_as_it_is():
+    left, right, core = _random_product(np.random.default_rng(8), 900, 300, 0.01)
+    assert product.Product([left], [right], {(0, 0): core}, False).narrowed(1e-3 * np.linalg.norm(core)) is None
+
+
 def test_too_many_terms_are_refused(monkeypatch):
     monkeypatch.setattr(product, "MAX_SKETCH", 20)
     left, right, core = _random_product(np.random.default_rng(6), 90, 60, 0.01)

@@ -190,7 +190,9 @@ def cost(camera, view, band, shape, double):
         seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
         more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
-        largest = max(largest, item * (both * (products * (1 + more) + 3 * sketch)))
+        # fine fields have far fewer terms a lenslet than products, and are narrowed to them
+        narrowed = 1.0 if lit == 1 else 1 - 0.35 * min(1.0, decades)
+        largest = max(largest, item * (both * (narrowed * products * (1 + more) + 3 * sketch)))
     # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from superpixels beside it: measured
     # at f/2.2, 340 to 3500 of them
     own = _own_terms(view, band)

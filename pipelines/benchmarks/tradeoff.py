@@ -190,7 +190,7 @@ def run_case(run, case, budget, race, kept_only=False):
     chosen, others = case["_chosen"], case["_others"]
     truth = truth_of(run, case, kept_only)
     if kept_only and not (truth and record_path(run, case, chosen, truth).exists()):
-        return case | {"not_run": f"estimated {dial.seconds_here(chosen):.2g} s"}
+        return case | {"not_run": f"estimated {dial.seconds_here(chosen):.0f} s"}
     if truth is None:
         return case | {"not_run": "brute force cannot be afforded"}
     found = measured(run, case, chosen, truth)
@@ -274,7 +274,7 @@ def _cell(case):
         return "refused" if "refused" in case else f"({case['not_run'].replace('estimated ', '')})" if "not_run" in case else "FAILED"
     letter = {"rays": "R", "fresnel, low rank": "F", "fresnel, triple product": "T"}.get(case["rung"], "E")
     mark = {"held": "", "open": " ?", "missed": " **missed**"}[verdict(case)]
-    return f"{case['achieved']:.0e}{mark}, {case['seconds']:.2g} s {letter}"
+    return f"{case['achieved']:.0e}{mark}, {case['seconds']:{'.0f' if case['seconds'] >= 10 else '.2g'}} s {letter}"
 
 
 def plot(cases, path):

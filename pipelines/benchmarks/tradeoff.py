@@ -39,7 +39,7 @@ ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
 NEAR = 3.0
 """A rung that was passed over is timed if its estimated error is at most so many times what was asked."""
-LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_products", "expected_rank", "_own_terms", "exact_band", "size_band", "_chord_counts"}
+LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_products", "expected_rank", "_own_terms", "_require_sketch", "exact_band", "size_band", "_chord_counts"}
 """Functions that plan and do not compute: what was measured outlives their changes."""
 
 

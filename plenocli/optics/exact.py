@@ -33,9 +33,6 @@ CUT, CUT_EFFECT = 0.42, 1.3
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
 
-SMALL = 150
-"""Terms of a lenslet's light that are not worth narrowing."""
-
 COARSE = 5e-3
 """The coarsest cut at which terms were counted."""
 
@@ -311,7 +308,7 @@ class ExactSquareLenslets:
             pair, first = pairs[m, n], len(left)
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
             x, y, coupling = pair.factors(max(self._extent), tolerance)
-            if coupling.shape[0] > SMALL and (m, n) != kept[-1]:  # its own rank may be far lower
+            if (m, n) != kept[-1]:  # its own rank may be far lower
                 x, y, coupling = Product([x], [y], {(0, 0): coupling}, pair.symmetric).narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
             if symmetric and not pair.symmetric:  # the lenslet mirrored by the diagonal brings the transpose
                 left += [x, y]

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from plenocli.optics.product import thin
-from plenocli.optics.psf import legendre
+from plenocli.optics.psf import legendre, terms_within
 from plenocli.optics.quadrature import gauss, nodes_for
 from plenocli.optics.residual import Residual, path, split
 
@@ -186,8 +186,7 @@ class LocalTerms:
         values = [root * field.evaluate(self.middle + self.half * t, a) for a in (0, 1)]
         # the partner of a term has the norm sqrt(s), which weighs it
         u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
-        tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
-        basis = u[:, : max(1, int(np.count_nonzero(tails > tolerance)))]
+        basis = u[:, :terms_within(s, tolerance)]
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
         self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))

@@ -8,11 +8,14 @@ factors have many more terms than M, combinations of both rows and columns show 
 import numpy as np
 
 from plenocli.errors import NumericsError
+from plenocli.optics.psf import terms_within
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
 NARROW, OVER = 3, 2
 """A product is narrowed where its terms fit a sketch of its factors' over the first; random combinations that this is told from, over that."""
+SMALL = 150
+"""Terms of factors that are not worth narrowing."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""
 MAX_SKETCH = 2500
@@ -64,8 +67,8 @@ class Product:
         return seen if self.symmetric else [self._times(1, seen)]
 
     def _extend(self, q, seen, count):
-        """The basis q of M's range with `count` more columns (None: with these alone), and what is seen of M through it."""
-        columns = self._times(0, self._mixed(1, count))
+        """The basis q of M's range (None: not begun) with columns added up to `count`, and what is seen of M through it."""
+        columns = self._times(0, self._mixed(1, count if q is None else count - q.shape[1]))
         if q is None:
             q = orthonormal(columns)
             return q, self._through_basis(q)
@@ -88,29 +91,29 @@ class Product:
 
         NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
-        add, q, seen = min(count, self.limit, MAX_SKETCH), None, None
+        most = min(self.limit, MAX_SKETCH)
+        size, q, seen = min(count, most), None, None
         while True:
-            q, seen = self._extend(q, seen, add)
-            size = q.shape[1]
+            q, seen = self._extend(q, seen, size)
             p, core = self._core(q, seen)
             u, s, vh = np.linalg.svd(core)
-            terms = _rank(s, cut)
-            if terms <= FILL * size or size >= self.limit:
-                root = np.sqrt(s[:terms])
-                high, wide = q @ (u[:, :terms] * root), p @ (vh[:terms].T * root)
-                if size >= self.limit or self._missed(high, wide) <= 2 * cut:
-                    return high, wide
+            terms = terms_within(s, cut)
+            root = np.sqrt(s[:terms])
+            u, v = u[:, :terms] * root, vh[:terms].T * root
+            if size >= self.limit or (terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut):
+                return q @ u, p @ v
             if size >= MAX_SKETCH:
                 raise NumericsError(
                     f"the exact field has more than {int(FILL * size)} separable terms",
                     "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
-            add = min(MAX_SKETCH, self.limit, max(size // 4, int(terms / FILL) - size + 8) + size) - size
+            size = min(most, max(size + size // 4, int(terms / FILL) + 8))
 
     def narrowed(self, cut):
         """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than M's factors have terms, X orthonormal and Y = X
-        where M is symmetric; or None: M does not have so few terms."""
-        count = max(x.shape[1] for x in self.left) // NARROW
-        if not 8 <= count < self.limit:
+        where M is symmetric; or None: M does not have so few terms, or its factors have few enough."""
+        given = sum(x.shape[1] for x in self.left)
+        count = given // NARROW
+        if given <= SMALL or count >= self.limit:
             return None
         directions, terms = self._directions(cut, count)
         if terms > FILL * count:
@@ -118,7 +121,7 @@ class Product:
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
         y, core = self._core(x, seen) if self.symmetric else (seen[0], np.eye(x.shape[1], dtype=x.dtype))
-        return (x, y, core) if self._missed(x @ core if self.symmetric else x, y) <= 2 * cut else None
+        return (x, y, core) if self._missed(x, core, y) <= 2 * cut else None
 
     def _directions(self, cut, count):
         """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each factor, and the terms that M has; no more than
@@ -131,27 +134,20 @@ class Product:
         basis = orthonormal(core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, count)))
         basis = orthonormal(core.conj().T @ basis)
         image = core @ basis
-        rest = np.linalg.norm((core - image @ basis.conj().T).ravel())
+        rest = np.linalg.norm(core - image @ basis.conj().T)
         _, s, vh = np.linalg.svd(_triangle(image)[1])
         # the k largest also fit what is random here, so that less than all of the rest is seen
         share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
-        terms = _rank(s, cut * share, rest)
+        terms = terms_within(s, cut * share, rest)
         basis = basis @ vh[:int(terms / FILL) + 8].conj().T
         return [m @ basis for m in right], terms
 
-    def _missed(self, high, wide):
-        """Root sum of squares of M - H B^T, estimated on random entries."""
+    def _missed(self, x, core, y):
+        """Root sum of squares of M - X K Y^T, estimated on random entries."""
         rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
-        exact = sum(x[rows] @ c for x, c in zip(self.left, self._through(0, [x[columns].T for x in self.right])))
-        difference = exact - high[rows] @ wide[columns].T
-        return float(np.sqrt((np.abs(difference) ** 2).mean() * len(high) * len(wide)))
-
-
-def _rank(values, cut, rest=0.0):
-    """How many of the singular values `values` it takes to leave no more than `cut` (root sum of squares, `rest` beside them included), one at
-    the least."""
-    tails = np.sqrt(np.cumsum(values.astype(float)[::-1] ** 2)[::-1] + rest**2)
-    return max(1, int(np.count_nonzero(tails > cut)))
+        exact = sum(a[rows] @ c for a, c in zip(self.left, self._through(0, [b[columns].T for b in self.right])))
+        difference = exact - x[rows] @ core @ y[columns].T
+        return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
 
 
 def _add_product(out, x, y):

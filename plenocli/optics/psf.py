@@ -165,18 +165,24 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
         h = h.real
     root = np.sqrt(w * half)
     u, s, v, signs = _factors(root[:, None] * h * root, same[2])
-    tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
-    terms = max(1, int(np.count_nonzero(tails > tolerance)))
+    terms = terms_within(s, tolerance)
     s_root = np.sqrt(s[:terms])
     a = u[:, :terms] * s_root / root[:, None]
     b = a if signs is not None else v[:terms].T * s_root / root[:, None]
-    tail = float(tails[terms]) if terms < len(s) else 0.0
+    tail = float(np.linalg.norm(s[terms:]))
     step = 2 if even else 1
     project = legendre(t, len(t), step).T * w * ((2 * step * np.arange(len(t)) + 1) / 2)[:, None]
     rows = project @ a
     signs = None if signs is None else signs[:terms]
     columns = project @ b if signs is None else rows * signs
     return SeparableField(half, rows, columns, even, tuple(bool(x) for x in same), tail, signs)
+
+
+def terms_within(values, tolerance, rest=0.0):
+    """How many of the singular values `values`, the largest first, it takes to leave no more than `tolerance` (root sum of squares, with `rest`
+    that is left in any case), one at the least. A tolerance for each number of terms may be given."""
+    tails = np.sqrt(np.cumsum(values.astype(float)[::-1] ** 2)[::-1] + rest**2)
+    return max(1, int(np.count_nonzero(tails > tolerance)))
 
 
 def _factors(matrix, symmetric):

@@ -14,7 +14,7 @@ hyperbolic profile leaves an ell(y, x) of the same form. Their product on all di
 
 import numpy as np
 
-from plenocli.optics.psf import legendre
+from plenocli.optics.psf import legendre, terms_within
 from plenocli.optics.quadrature import gauss
 
 
@@ -89,8 +89,7 @@ def split(matrix, tolerance, symmetric=False):
     """(A, K, B) with orthonormal columns and matrix = A K B^T up to `tolerance` (root sum of squares); K is diagonal, or where the
     matrix is `symmetric` and A = B as nearly so as equal singular values allow."""
     u, s, vh = np.linalg.svd(matrix, full_matrices=False)
-    tails = np.sqrt(np.cumsum(s[::-1] ** 2)[::-1])
-    terms = max(1, int(np.count_nonzero(tails > tolerance)))
+    terms = terms_within(s, tolerance)
     u = u[:, :terms]
     if symmetric:
         return u, u.conj().T @ matrix @ u.conj(), u

@@ -257,8 +257,7 @@ def test_compression_keeps_what_was_asked():
 def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
     rng = np.random.default_rng(7)
     left, right, core = _random_product(rng, 900, 400, 0.15)
-    core = core.astype(np.complex64)
-    left, right = ((x / np.sqrt(len(x))).astype(np.complex64) for x in (left, left if symmetric else right))
+    left, right, core = (x.astype(np.complex64) for x in (left / np.sqrt(900), right / np.sqrt(900), core))
     right = left if symmetric else right
     cut = 1e-5 * np.linalg.norm(core)
     x, y, k = product.Product([left], [right], {(0, 0): core}, symmetric).narrowed(cut)

@@ -23,8 +23,9 @@ from plenocli.optics.pairs import Interval, Pair, Way
 from plenocli.optics.plan import BandPlan, distinct, grid_of, is_symmetric, size_band
 from plenocli.optics.plan import expected_terms as psf_terms
 from plenocli.optics.product import FILL, MAX_SKETCH, Product
-from plenocli.optics.psf import edge_emphasis, legendre, psf_nodes, separable_field
-from plenocli.optics.quadrature import gauss
+from plenocli.optics.prolate import prolate, prolate_count
+from plenocli.optics.psf import edge_emphasis, psf_nodes, separable_field
+from plenocli.optics.quadrature import gauss, nodes_for
 from plenocli.optics.relay import lit_lenslets, sensor_nodes
 
 CUT, CUT_EFFECT = 0.42, 1.3
@@ -39,8 +40,8 @@ COARSE = 5e-3
 
 @dataclass(frozen=True)
 class ExactBand(BandPlan):
-    """A BandPlan of the exact rung. cut: root-energy error of a mean point's field; sensor_count: Gauss-Legendre nodes across a
-    superpixel that carry the field before it goes to the pixels' nodes, 0: the pixels' nodes serve."""
+    """A BandPlan of the exact rung. cut: root-energy error of a mean point's field; sensor_count: prolate functions across
+    a superpixel that carry the field before it goes to the pixels' nodes, 0: the pixels' nodes serve."""
 
     cut: float = 1e-5
     sensor_count: int = 0
@@ -54,12 +55,11 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of what was asked from 3e-3 to 5e-2, on 3 cameras
     finer = 1 + SIDES * min(1.0, max(0.0, math.log10(accuracy / 1e-3))) if ring else 1.0
     base = size_band(view, grid, ring, accuracy / finer, tolerance)
-    phase = view.k * view.lenslet_width / 2 * max(view.pixel_shape) * view.pixel_pitch / 2 / view.z3
-    count = int(math.ceil(phase + 5 * np.cbrt(phase) + 4 + 2 * max(0.0, -math.log10(accuracy) - 5)))
-    count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
+    count = prolate_count(_sensor_phase(view), cut / 300)
+    count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     _require_sketch(expected_terms(view, base.terms, cut, True))
     return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)}, cut=cut, sensor_count=count)
 
@@ -69,6 +69,16 @@ def _require_sketch(terms):
     if terms > FILL * MAX_SKETCH:
         raise NumericsError(f"the exact field has about {terms:.0f} separable terms, more than {int(FILL * MAX_SKETCH)}", "model",
                             "ask for a looser accuracy or the paraxial model")
+
+
+def _extent(view, pixels):
+    """Half width (m) of a superpixel of so many pixels, wherever the raster puts it."""
+    return (pixels + (view.pixel_shift is not None)) * view.pixel_pitch / 2
+
+
+def _sensor_phase(view):
+    """Largest phase (rad) that a lenslet's field runs through over half a superpixel, its own curvature taken out: steeper rays come from no point of it."""
+    return view.k * view.lenslet_width / 2 * _extent(view, max(view.pixel_shape)) / view.z3
 
 
 def valid_for(camera, view):
@@ -219,7 +229,7 @@ class ExactSquareLenslets:
         self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, geometry.mirrors(plan.superpixels)))
         alike = geometry.pixel_shape[0] == geometry.pixel_shape[1] and geometry.object_shape[0] == geometry.object_shape[1]
         self._turn = alike and self.symmetry[2]
-        self._extent = [(n + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2 for n in geometry.pixel_shape]
+        self._extent = [_extent(geometry, n) for n in geometry.pixel_shape]
         self._ways, self._intervals = {}, {}
         self._entering = self._light()
         self._tables, counts = {}, []
@@ -261,13 +271,16 @@ class ExactSquareLenslets:
         """The Way to superpixel s."""
         if (s, axis) not in self._ways:
             g = self.geometry
-            if self.band.sensor_count:
-                t, w = gauss(self.band.sensor_count)
+            modes, count, phase = None, self.band.sensor_count, _sensor_phase(g)
+            if count:
+                # functions beyond the bandwidth's own swing faster than it
+                t, w = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
+                modes = prolate(t, phase, count).T * np.sqrt(w)
                 u, w = self._extent[axis] * t, self._extent[axis] * w
             else:
                 u, w = (a.ravel() for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule))
             points = self._points(s, axis)
-            self._ways[s, axis] = Way(u, np.sqrt(w), points, edge_emphasis(g, points))
+            self._ways[s, axis] = Way(u, np.sqrt(w), points, edge_emphasis(g, points), modes)
         return self._ways[s, axis]
 
     def _interval(self, s, m, axis):
@@ -327,19 +340,15 @@ class ExactSquareLenslets:
         return expected_rank(self.geometry, self.band, self._parabolic, (sy, sx))
 
     def _to_pixels(self, factor, s, axis):
-        """(sensor nodes x points, terms) to (points, pixel nodes, terms)."""
-        way = self._way(s, axis)
-        u, root, points = way.u, way.root, len(way.points)
-        factor = factor.reshape(len(u), -1)
-        if self.band.sensor_count:
-            v, w = sensor_nodes(self.geometry, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-            t, wt = gauss(len(u))
-            degrees = np.arange(len(u))
-            back = legendre(t, len(u), 1).T * wt * ((2 * degrees + 1) / 2)[:, None]
-            matrix = np.sqrt(w.ravel())[:, None] * (legendre(v.ravel() / self._extent[axis], len(u), 1) @ back) / root
+        """(lines of the sensor x points, terms) to (points, pixel nodes, terms)."""
+        g, way = self.geometry, self._way(s, axis)
+        factor = factor.reshape(way.lines, -1)
+        if way.modes is not None:
+            v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
+            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], _sensor_phase(g), way.lines)
             real = factor.real.dtype
             factor = (matrix.astype(real) @ factor.view(real)).view(factor.dtype)
-        factor = factor.reshape(len(factor), points, -1).transpose(1, 0, 2)
+        factor = factor.reshape(len(factor), len(way.points), -1).transpose(1, 0, 2)
         return factor / way.emphasis.astype(factor.real.dtype)[:, None, None]
 
     # what the builder asks for

@@ -24,10 +24,21 @@ SLAB = 256
 
 class Way:
     """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m, from its centre) and the roots of
-    their weights; points (m, on the array) that are computed, and their weights in what is left out."""
+    their weights; points (m, on the array) that are computed, and their weights in what is left out; modes: (lines, nodes), what
+    the field on the nodes, weighted, is carried by, or None: the nodes themselves."""
 
-    def __init__(self, u, root, points, emphasis):
-        self.u, self.root, self.points, self.emphasis = u, root, points, emphasis
+    def __init__(self, u, root, points, emphasis, modes=None):
+        self.u, self.root, self.points, self.emphasis, self.modes = u, root, points, emphasis, modes
+
+    @property
+    def lines(self):
+        """How many numbers carry the field of one point."""
+        return len(self.u if self.modes is None else self.modes)
+
+    def carry(self, wave):
+        """A kernel (nodes, x), roots of weights folded in, as (lines, x)."""
+        real = wave.real.dtype
+        return wave if self.modes is None else (self.modes.astype(real) @ wave.view(real)).view(wave.dtype)
 
 
 class Interval:
@@ -65,7 +76,7 @@ class Interval:
     @cached_property
     def gram(self):
         """Overlaps, for a mean point, of what each term alone brings to the superpixel through the separable part: (term, term)."""
-        sheet = _times(self.wave(0.0).astype(self.dtype), self.values.reshape(len(self.x), -1)).reshape(-1, self.values.shape[2])
+        sheet = _times(self.way.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)).reshape(-1, self.values.shape[2])
         gram = (sheet.conj().T @ sheet).astype(complex) / len(self.way.points)
         return gram if np.iscomplexobj(self.values) else gram.real
 
@@ -77,15 +88,15 @@ class Interval:
 
     def sheet(self, other, functions, mixing, kept):
         """X for the pairs kept = (r, i) of `functions`(u, x) -> (r, u, x) and the columns i of `mixing`, terms of this interval:
-        (sensor nodes x points, kept)."""
+        (lines of the sensor x points, kept)."""
         wave, (kept_r, kept_i) = self.wave(other), kept
         values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(*self.values.shape[:2], -1)
-        out = np.empty((len(self.way.u), len(self.way.points), len(kept_r)), self.dtype)
+        out = np.empty((self.way.lines, len(self.way.points), len(kept_r)), self.dtype)
         for r, term in enumerate(functions(self.way.u, self.x)):
             some = np.flatnonzero(kept_r == r)
             if len(some):
                 flat = values[:, :, kept_i[some]].reshape(len(self.x), -1)
-                out[:, :, some[0]:some[-1] + 1] = _times((wave * term).astype(self.dtype), flat).reshape(len(out), -1, len(some))
+                out[:, :, some[0]:some[-1] + 1] = _times(self.way.carry((wave * term).astype(self.dtype)), flat).reshape(len(out), -1, len(some))
         return out.reshape(len(out) * out.shape[1], -1)
 
 

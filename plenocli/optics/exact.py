@@ -58,7 +58,7 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
-    count = prolate_count(_sensor_phase(view), cut / 300)
+    count = prolate_count(_sensor_phase(view), cut / 100)
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     _require_sketch(expected_terms(view, base.terms, cut, True))
     return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)}, cut=cut, sensor_count=count)
@@ -77,8 +77,11 @@ def _extent(view, pixels):
 
 
 def _sensor_phase(view):
-    """Largest phase (rad) that a lenslet's field runs through over half a superpixel, its own curvature taken out: steeper rays come from no point of it."""
-    return view.k * view.lenslet_width / 2 * _extent(view, max(view.pixel_shape)) / view.z3
+    """Bandwidth (rad over half a superpixel) of a lenslet's field there, its own curvature taken out: steeper rays come from no point of the
+    lenslet. Up to 5 % are added for slopes that change on the way: without them, functions fall short of waves that reach the band's end."""
+    reach = _extent(view, max(view.pixel_shape))
+    bent = 1.5 * ((view.lenslet_width / 2 + reach) / (2 * view.z3)) ** 2
+    return view.k * view.lenslet_width / 2 * reach / view.z3 * (1 + min(0.05, bent))
 
 
 def valid_for(camera, view):

@@ -185,7 +185,8 @@ def cost(camera, view, band, shape, double):
         # fine fields take more of them than that (1.2 to 1.6 times at f/4.4 and 1e-5)
         ranks = [rank * (1 + 0.35 * max(0.0, decades - 2) * math.sqrt(view.diffraction_cells / 100)) for rank in ranks]
     pairs_of_terms = [plain * expected_products(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
-    seconds = 0.01 + 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
+    begun = 0.01 + 0.015 * sum(kinds.values())  # calls, whatever the precision
+    seconds = 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
     for (a, b), count in kinds.items():
         if count == 0:
             continue
@@ -198,7 +199,7 @@ def cost(camera, view, band, shape, double):
         operations += count * 4 * both * lines * rank if band.sensor_count else 0
         # coarse cuts drop most lenslets
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
-        seconds += count * (0.015 + (6e-9 if lit == 1 else 3.3e-8) * both * products)
+        seconds += count * (4e-9 if lit == 1 else 3.3e-8) * both * products
         seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
         more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
@@ -217,7 +218,7 @@ def cost(camera, view, band, shape, double):
     tables = sum(kinds.values())
     mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
     return {"operations": operations + 8.0 * 1.2 * fine * mean * pairs,
-            "seconds": seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
+            "seconds": begun + seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
             "bytes": int(largest + coupling + field + intervals + item * 2 * tables * points * lines * mean) + (3 << 24)}
 
 

@@ -121,6 +121,18 @@ def test_a_window_of_pixels_off_the_superpixel_s_centre():
     assert errors(columns(camera, points, pixel_shift=shift), truth).max() <= 1e-4
 
 
+@pytest.mark.parametrize("change", [{}, {"main_lens__aperture_shape": "square"}, {"object__distance": 0.5, "lenslet_array__fill_factor": 0.7}], ids=str)
+@pytest.mark.parametrize("f_number", [1.5, 3, 10])
+def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(f_number, change):
+    pitch, pixels = 62e-6, 31
+    camera = fast_camera(f_number, lenslet_array__pitch=pitch, sensor__pixels_per_lenslet=(pixels, pixels),
+                         lenslet_array__focal_length=pitch * f_number, sensor__distance=pitch * f_number, **change)
+    plan = accuracy.plan_pif(camera, model="exact", accuracy=1e-7, superpixels=(1, 1), coherent_ring=0)
+    assert 0 < plan.bands[0].sensor_count < 0.6 * pixels * plan.bands[0].pixel_nodes
+    found, true = (columns(camera, range(64), asked=1e-7, bands=[replace(plan.bands[0], sensor_count=count)]) for count in (plan.bands[0].sensor_count, 0))
+    assert errors(found, true).max() < 0.3e-7
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_neighbours_add_before_the_square(profile):
     camera, points = fast_camera(lenslet_array__profile=profile), [0, 4, 27]

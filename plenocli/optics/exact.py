@@ -296,8 +296,9 @@ class ExactSquareLenslets:
 
     def _light(self):
         """Share of the light of a point (row, column) that enters the lenslets of the neighbourhood."""
-        grams = [self._gram(axis) for axis in (0, 1)]
-        return (grams[0].reshape(len(grams[0]), -1) @ grams[1].reshape(len(grams[1]), -1).T).real
+        rows, signs = self._gram(0), self._field.signs
+        columns = rows * np.outer(signs, signs) if self._turn and signs is not None else self._gram(1)
+        return (rows.reshape(len(rows), -1) @ columns.reshape(len(columns), -1).T).real
 
     def _gram(self, axis):
         """(point, term, term): overlaps of the terms of h over the lenslets."""
@@ -346,14 +347,14 @@ class ExactSquareLenslets:
     def _to_pixels(self, factor, s, axis):
         """(lines of the sensor x points, terms) to (points, pixel nodes, terms)."""
         g, way = self.geometry, self._way(s, axis)
-        factor = factor.reshape(way.lines, -1)
+        real = factor.real.dtype
+        factor = factor.reshape(way.lines, len(way.points), -1) / way.emphasis.astype(real)[:, None]
+        factor = factor.view(real).transpose(1, 0, 2)
         if way.modes is not None:
             v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
             matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], _sensor_phase(g), way.lines)
-            real = factor.real.dtype
-            factor = (matrix.astype(real) @ factor.view(real)).view(factor.dtype)
-        factor = factor.reshape(len(factor), len(way.points), -1).transpose(1, 0, 2)
-        return factor / way.emphasis.astype(factor.real.dtype)[:, None, None]
+            factor = matrix.astype(real) @ factor
+        return np.ascontiguousarray(factor).view(self.dtype)
 
     # what the builder asks for
 

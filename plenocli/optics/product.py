@@ -48,17 +48,13 @@ class Product:
 
     def _mixed(self, side, count):
         """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of rows, every one of which goes into one of them."""
+        from scipy import sparse
+
         factors = self.right if side else self.left
-        order = self.rng.permutation(len(factors[0]))
-        signs = self.rng.choice(np.array([-1, 1], factors[0].real.dtype), len(order))
-        mixed = []
-        for x in factors:
-            total = np.zeros((count, x.shape[1]), x.dtype)
-            for start in range(0, len(order), count):
-                some = slice(start, start + count)
-                total[:len(order[some])] += x[order[some]] * signs[some, None]
-            mixed.append(total.T)
-        return mixed
+        rows = len(factors[0])
+        order, signs = self.rng.permutation(rows), self.rng.choice(np.array([-1, 1], factors[0].real.dtype), rows)
+        combine = sparse.csr_array((signs, (np.arange(rows) % count, order)), (count, rows))
+        return [(combine @ x).T for x in factors]
 
     def _through_basis(self, q):
         """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is symmetric, else M^T q* alone."""

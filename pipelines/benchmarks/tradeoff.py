@@ -77,7 +77,7 @@ def forced(name):
 def code(rung):
     """Digest of the code that computes a rung: its modules without comments, docstrings and planning laws."""
     files = ["pif", "geometry", "psf", "pupil", "quadrature", "relay", "factors"]
-    files += {"rays": ["rays"], "fresnel, low rank": ["square"], "fresnel, triple product": ["shaped"]}.get(rung, ["exact", "pairs", "residual", "debye", "product"])
+    files += {"rays": ["rays"], "fresnel, low rank": ["square"], "fresnel, triple product": ["shaped"]}.get(rung, ["exact", "pairs", "prolate", "residual", "debye", "product"])
     parts = []
     for file in files:
         path = ROOT / "plenocli" / "optics" / f"{file}.py"

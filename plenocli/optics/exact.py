@@ -195,12 +195,12 @@ def cost(camera, view, band, shape, double):
         both = rows[a] + (0 if even and a == b else rows[b])
         sketch = 1.12 / FILL * rank + 8
         # of many lenslets each brings few terms, so that products are narrow and wait for memory
-        operations += count * (both * (products * ((16 if lit == 1 else 26) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3)
+        operations += count * (both * (products * ((16 if lit == 1 else 22) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3)
         operations += count * 4 * both * lines * rank if band.sensor_count else 0
         # coarse cuts drop most lenslets
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
-        seconds += count * (4e-9 if lit == 1 else 3.3e-8) * both * products
-        seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.004 + 0.001 * corner_phase(view) + 3.6e-7 * nodes * across))
+        seconds += count * (4e-9 if lit == 1 else 2.8e-8) * both * products
+        seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across))
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
         more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
         # fine fields have far fewer terms a lenslet than products, and are narrowed to them

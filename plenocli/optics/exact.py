@@ -1,6 +1,7 @@
 """Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first integral as low rank.
 
-The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor. The kernel's path along
+The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor, or of an isolated lenslet as
+prolate functions across the superpixel (optics.prolate), which are fewer. The kernel's path along
 each axis, the lens and the curvature of h separate; the rest is the short sum of residual.Residuals, and so is h
 (debye.spherical_field), hence
 
@@ -58,7 +59,7 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
-    count = prolate_count(_sensor_phase(view), cut / 100)
+    count = prolate_count(_bandwidth(view, grid), cut / 100)
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     _require_sketch(expected_terms(view, base.terms, cut, True))
     return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)}, cut=cut, sensor_count=count)
@@ -76,12 +77,14 @@ def _extent(view, pixels):
     return (pixels + (view.pixel_shift is not None)) * view.pixel_pitch / 2
 
 
-def _sensor_phase(view):
-    """Bandwidth (rad over half a superpixel) of a lenslet's field there, its own curvature taken out: steeper rays come from no point of the
-    lenslet. Up to 5 % are added for slopes that change on the way: without them, functions fall short of waves that reach the band's end."""
-    reach = _extent(view, max(view.pixel_shape))
-    bent = 1.5 * ((view.lenslet_width / 2 + reach) / (2 * view.z3)) ** 2
-    return view.k * view.lenslet_width / 2 * reach / view.z3 * (1 + min(0.05, bent))
+def _bandwidth(view, grid):
+    """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that of its middle's path taken out, among `grid`
+    superpixels: steeper rays come from no point of the lenslet. Up to 5 % are added for slopes that change on the way: without them,
+    prolate functions fall short of waves that reach the band's end."""
+    reach, aside = _extent(view, max(view.pixel_shape)), (max(grid) - 1) / 2 * (view.superpixel_pitch - view.D2)
+    source = view.lenslet_width / 2 + aside
+    bent = 1.5 * ((source + reach) / (2 * view.z3)) ** 2
+    return view.k * source * reach / view.z3 * (1 + min(0.05, bent))
 
 
 def valid_for(camera, view):
@@ -275,7 +278,7 @@ class ExactSquareLenslets:
         """The Way to superpixel s."""
         if (s, axis) not in self._ways:
             g = self.geometry
-            modes, count, phase = None, self.band.sensor_count, _sensor_phase(g)
+            modes, count, phase = None, self.band.sensor_count, _bandwidth(g, self.superpixels)
             if count:
                 # functions beyond the bandwidth's own swing faster than it
                 t, w = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
@@ -352,7 +355,7 @@ class ExactSquareLenslets:
         factor = factor.view(real).transpose(1, 0, 2)
         if way.modes is not None:
             v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], _sensor_phase(g), way.lines)
+            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], _bandwidth(g, self.superpixels), way.lines)
             factor = matrix.astype(real) @ factor
         return np.ascontiguousarray(factor).view(self.dtype)
 

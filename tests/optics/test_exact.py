@@ -133,6 +133,23 @@ def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(f_number,
     assert errors(found, true).max() < 0.3e-7
 
 
+@pytest.mark.parametrize("place", [(0, 1), (-1, 1)], ids=str)
+def test_oblique_light_of_isolated_lenslets(place):
+    """The main lens so near that a lenslet's light comes to its superpixel at an angle as large as it has itself."""
+    camera = fast_camera(3.0, lenslet_array__pitch=42e-6, sensor__pixels_per_lenslet=(21, 21), lenslet_array__focal_length=126e-6, sensor__distance=126e-6,
+                         main_lens__focal_length=0.5e-3, object__distance=5e-3, lenslet_array__distance=0.5e-3 / 0.9, main_lens__aperture_diameter=0.5e-3 / 3)
+    pitch, rows, points = geometry(camera, WAVELENGTH).superpixel_pitch, [2, 11], [0, 7, 27]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), [place], tuple(pitch * n for n in place), pixel_nodes=13, rows=rows)
+    own = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    for asked in (1e-2, 1e-4, 1e-6):
+        (y, x), superpixels = place, (3, 3)
+        plan = accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=0)
+        assert plan.bands[0].sensor_count or asked > 1e-4
+        found = columns(camera, points, superpixel=3 * (y + 1) + x + 1, superpixels=superpixels, asked=asked)
+        missed = np.sqrt(((found[:, rows] - truth) ** 2).sum(axis=(1, 2)) / (own**2).sum(axis=(1, 2)))
+        assert missed.max() <= asked
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_neighbours_add_before_the_square(profile):
     camera, points = fast_camera(lenslet_array__profile=profile), [0, 4, 27]

@@ -188,7 +188,7 @@ def cost(camera, view, band, shape, double):
         # fine fields take more of them than that (1.2 to 1.6 times at f/4.4 and 1e-5)
         ranks = [rank * (1 + 0.35 * max(0.0, decades - 2) * math.sqrt(view.diffraction_cells / 100)) for rank in ranks]
     pairs_of_terms = [plain * expected_products(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
-    begun = 0.01 + 0.015 * sum(kinds.values())  # calls, whatever the precision
+    begun = 0.01 + (0.008 if lit == 1 else 0.015) * sum(kinds.values())  # calls, whatever the precision
     seconds = 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
     for (a, b), count in kinds.items():
         if count == 0:
@@ -203,7 +203,7 @@ def cost(camera, view, band, shape, double):
         # coarse cuts drop most lenslets
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
         seconds += count * (4e-9 if lit == 1 else 2.8e-8) * both * products
-        seconds += count * (0.012 * corner_phase(view) if lit == 1 else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across))
+        seconds += count * (0.007 * corner_phase(view) if lit == 1 else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across))
         # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
         more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
         # fine fields have far fewer terms a lenslet than products, and are narrowed to them

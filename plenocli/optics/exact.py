@@ -300,7 +300,8 @@ class ExactSquareLenslets:
     def _light(self):
         """Share of the light of a point (row, column) that enters the lenslets of the neighbourhood."""
         rows, signs = self._gram(0), self._field.signs
-        columns = rows * np.outer(signs, signs) if self._turn and signs is not None else self._gram(1)
+        alike = self._turn and signs is not None and self.superpixels[0] == self.superpixels[1]
+        columns = rows * np.outer(signs, signs) if alike else self._gram(1)
         return (rows.reshape(len(rows), -1) @ columns.reshape(len(columns), -1).T).real
 
     def _gram(self, axis):

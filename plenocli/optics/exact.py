@@ -35,6 +35,13 @@ CUT, CUT_EFFECT = 0.42, 1.3
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
 
+FAINT, LEAST = 0.1, 1e-10
+"""Share of the brightest point's light below which a point's own light is what its column's error is measured by; least share, and cut of the
+main lens's field, that this is done for."""
+
+GAPS = 3.0
+"""By how much finer fields are cut where lenslets leave gaps."""
+
 COARSE = 5e-3
 """The coarsest cut at which terms were counted."""
 
@@ -59,6 +66,8 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
+    if view.lenslet_width < 0.999 * view.D2:  # points beside a lenslet: edges are all that their columns have
+        cut /= GAPS
     count = prolate_count(_bandwidth(view, grid), cut / 100)
     count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
     _require_sketch(expected_terms(view, base.terms, cut, True))
@@ -232,13 +241,9 @@ class ExactSquareLenslets:
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
-        self._field = separable_field(camera, geometry, band.half, band.cut / 2, spherical_field)
-        self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, geometry.mirrors(plan.superpixels)))
-        alike = geometry.pixel_shape[0] == geometry.pixel_shape[1] and geometry.object_shape[0] == geometry.object_shape[1]
-        self._turn = alike and self.symmetry[2]
+        self._illuminate(camera, band.cut / 2)
         self._extent = [_extent(geometry, n) for n in geometry.pixel_shape]
         self._ways, self._intervals = {}, {}
-        self._entering = self._light()
         self._tables, counts = {}, []
         for sy, sx in self._pairs():
             self._tables[sy, sx], products = self._compressed(sy, sx)
@@ -246,6 +251,24 @@ class ExactSquareLenslets:
         self._intervals = {}
         self.notes = {"separable_terms": max(t.high.shape[3] for t in self._tables.values()), "field_tail": self._field.tail,
                       "psf_terms": self._field.terms, "products": max(counts)}
+
+    def _illuminate(self, camera, tolerance):
+        """The main lens's field, its symmetries, and the light of points that enters, down to that of the faintest point."""
+        g = self.geometry
+        while True:
+            self._field = separable_field(camera, g, self.band.half, tolerance, spherical_field)
+            self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels)))
+            alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
+            self._turn = alike and self.symmetry[2]
+            self._entering = self._light()
+            brightest = self._entering.max()
+            least = max(LEAST, self._entering.min() / brightest) if brightest > 0 else 1.0
+            faint = math.sqrt(least) if least < FAINT else 1.0
+            if tolerance <= 1.01 * faint * self.band.cut / 2 or tolerance <= LEAST:
+                break
+            # what is cut may itself be as bright as the faintest
+            tolerance = max(LEAST, tolerance / 30 if least < 100 * self._field.tail**2 else faint * self.band.cut / 2)
+        self._faint = faint
 
     # which lenslets light which superpixels
 
@@ -287,14 +310,18 @@ class ExactSquareLenslets:
             else:
                 u, w = (a.ravel() for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule))
             points = self._points(s, axis)
-            self._ways[s, axis] = Way(u, np.sqrt(w), points, edge_emphasis(g, points), modes)
+            emphasis = edge_emphasis(g, points)
+            if self._faint < 1:
+                light = self._entering.max(axis=1 - axis)[:len(points)] / self._entering.max()
+                emphasis = np.maximum(emphasis, 1 / np.sqrt(np.maximum(light, LEAST)))
+            self._ways[s, axis] = Way(u, np.sqrt(w), points, emphasis, modes, self._faint)
         return self._ways[s, axis]
 
     def _interval(self, s, m, axis):
         axis = 0 if self._turn else axis
         if (s, m, axis) not in self._intervals:
             self._intervals[s, m, axis] = Interval(self.geometry, self._field, axis, s, m, self._way(s, axis), self._parabolic,
-                                                   self.band.cut / 3, self.dtype)
+                                                   self.band.cut / 3 * self._faint, self.dtype)
         return self._intervals[s, m, axis]
 
     def _light(self):

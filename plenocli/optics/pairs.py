@@ -25,10 +25,11 @@ SLAB = 256
 class Way:
     """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m, from its centre) and the roots of
     their weights; points (m, on the array) that are computed, and their weights in what is left out; modes: (lines, nodes), what
-    the field on the nodes, weighted, is carried by, or None: the nodes themselves."""
+    the field on the nodes, weighted, is carried by, or None: the nodes themselves; faint: root of the faintest point's light over the
+    brightest's."""
 
-    def __init__(self, u, root, points, emphasis, modes=None):
-        self.u, self.root, self.points, self.emphasis, self.modes = u, root, points, emphasis, modes
+    def __init__(self, u, root, points, emphasis, modes=None, faint=1.0):
+        self.u, self.root, self.points, self.emphasis, self.modes, self.faint = u, root, points, emphasis, modes, faint
 
     @property
     def lines(self):
@@ -134,7 +135,7 @@ class Pair:
     def _terms(self, tolerance):
         """(A, K, B): A K B^T are the terms S of the main lens's field, but for what does not reach the superpixel."""
         if self.symmetric:
-            return split(self._field, tolerance, symmetric=True)
+            return split(self._field, tolerance * self.row.way.faint, symmetric=True)
         rows, columns = self.row.weigh, self.column.weigh
         u, s, v = split(rows @ self._field @ columns.T, tolerance)
         s = np.maximum(np.diag(s), np.finfo(float).tiny)  # no light passes a shut filter

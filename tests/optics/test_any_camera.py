@@ -73,3 +73,28 @@ def test_random_cameras_hold(cameras, count):
     count("random cameras at the accuracy asked", computed=len(found), held=held, refused=refused)
     # errors are estimated, not bounded: pixels of more than twenty fringes may miss by half
     assert len(found) > cameras / 3 and held > 0.985 * len(found) and max(found) < 1.6 and refused < len(found) / 10
+
+
+@pytest.mark.parametrize("model", ["exact", "fresnel"])
+@pytest.mark.parametrize("cameras", [6, pytest.param(60, marks=pytest.mark.slow)])
+def test_lenslets_that_leave_gaps_hold(cameras, model, count):
+    """Points between lenslets have 1e-5 to 1e-1 of the brightest one's light; each column is judged by its own."""
+    rng, found = np.random.default_rng(cameras), []
+    while len(found) < 5 * cameras:
+        f_number, pixels, fill = float(np.exp(rng.uniform(np.log(1.5), np.log(16)))), int(rng.integers(5, 24)), float(rng.choice([0.6, 0.8, 0.9, 0.97]))
+        pitch = 2e-6 * pixels
+        pupil = str(rng.choice(["circle", "square"]))
+        if pitch < 5 * 550e-9 * f_number:
+            continue
+        gaps = camera(pitch / 550e-9 / f_number, pixels, 0, pupil, f_number, pitch).replace(**{"lenslet_array.fill_factor": fill})
+
+        def matrix(accuracy, gaps=gaps):
+            plan = plan_pif(gaps, model=model, accuracy=accuracy, superpixels=(1, 1), coherent_ring=0)
+            return PifBuilder(gaps, plan.bands[0].wavelength, plan, dtype=np.float64).columns(range(25)).reshape(-1, 25)
+
+        true = matrix(1e-8)
+        for asked in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+            found.append((np.linalg.norm(matrix(asked) - true, axis=0) / np.linalg.norm(true, axis=0)).max() / asked)
+    held = sum(bool(error <= 1) for error in found)
+    count(f"cameras with gaps at the accuracy asked, {model}", computed=len(found), held=held)
+    assert held > 0.95 * len(found) and max(found) < 1.6

@@ -150,6 +150,19 @@ def test_oblique_light_of_isolated_lenslets(place):
         assert missed.max() <= asked
 
 
+@pytest.mark.parametrize("shape, f_number, fill", [("square", 2.5, 0.6), ("circle", 2.5, 0.6), ("square", 4.0, 0.8)])
+def test_points_between_lenslets_hold_in_their_own_columns(shape, f_number, fill):
+    """The faintest column has 1e-4 to 2e-2 of the brightest one's light, and is as accurate as that."""
+    camera = fast_camera(f_number, lenslet_array__pitch=30e-6, sensor__pixels_per_lenslet=(15, 15), lenslet_array__focal_length=30e-6 * f_number,
+                         sensor__distance=30e-6 * f_number, main_lens__aperture_shape=shape, lenslet_array__fill_factor=fill)
+    points, rows = [0, 3, 27], [0, 6, 7, 11]
+    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=11, rows=rows)
+    light = truth.sum(axis=(1, 2))
+    assert light[0] < 0.04 * light[2]
+    for asked in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6):
+        assert errors(columns(camera, points, asked=asked)[:, rows], truth).max() <= asked
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_neighbours_add_before_the_square(profile):
     camera, points = fast_camera(lenslet_array__profile=profile), [0, 4, 27]

@@ -151,7 +151,7 @@ def size_band(view, grid, ring, accuracy, tolerance, dim=False):
     count = psf_nodes(view, half)
     terms = expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance)
     # a point between lenslets that do not touch is dim, and what is missed weighs more in its column
-    faint = 1 + min(8.0, 80 * (1 - view.lenslet_width / view.D2))
+    faint = 1 + min(20.0, 80 * (1 - view.lenslet_width / view.D2))
     light = own, joint, view.diffraction_cells, view.blur / view.D2
     nodes, rule = pixel_nodes(accuracy / faint, *light)
     errors, beside = [CUT * tolerance, faint * pixel_error(nodes, rule, *light)], None

@@ -1,9 +1,8 @@
 """Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first integral as low rank.
 
 The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor, or of an isolated lenslet as
-prolate functions across the superpixel (optics.prolate), which are fewer. The kernel's path along
-each axis, the lens and the curvature of h separate; the rest is the short sum of residual.Residuals, and so is h
-(debye.spherical_field), hence
+prolate functions across the superpixel (optics.prolate), which are fewer. The kernel's path along each axis, the lens and the
+curvature of h separate; the rest is the short sum of residual.Residuals, and so is h (debye.spherical_field), hence
 
     M = sum over lenslets m, n of X_m (C_mn (x) S_mn) X_n^T,
     X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
@@ -242,7 +241,7 @@ class ExactSquareLenslets:
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
         self._illuminate(camera, band.cut / 2)
-        self._extent = [_extent(geometry, n) for n in geometry.pixel_shape]
+        self._extent, self._bandwidth = [_extent(geometry, n) for n in geometry.pixel_shape], _bandwidth(geometry, plan.superpixels)
         self._ways, self._intervals = {}, {}
         self._tables, counts = {}, []
         for sy, sx in self._pairs():
@@ -255,10 +254,10 @@ class ExactSquareLenslets:
     def _illuminate(self, camera, tolerance):
         """The main lens's field, its symmetries, and the light of points that enters, down to that of the faintest point."""
         g = self.geometry
+        alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         while True:
             self._field = separable_field(camera, g, self.band.half, tolerance, spherical_field)
             self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels)))
-            alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
             self._turn = alike and self.symmetry[2]
             self._entering = self._light()
             brightest = self._entering.max()
@@ -301,7 +300,7 @@ class ExactSquareLenslets:
         """The Way to superpixel s."""
         if (s, axis) not in self._ways:
             g = self.geometry
-            modes, count, phase = None, self.band.sensor_count, _bandwidth(g, self.superpixels)
+            modes, count, phase = None, self.band.sensor_count, self._bandwidth
             if count:
                 # functions beyond the bandwidth's own swing faster than it
                 t, w = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
@@ -383,7 +382,7 @@ class ExactSquareLenslets:
         factor = factor.view(real).transpose(1, 0, 2)
         if way.modes is not None:
             v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], _bandwidth(g, self.superpixels), way.lines)
+            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], self._bandwidth, way.lines)
             factor = matrix.astype(real) @ factor
         return np.ascontiguousarray(factor).view(self.dtype)
 

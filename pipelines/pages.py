@@ -13,8 +13,8 @@ from plenocli.cli.main import COMMANDS, Pipeline, cli
 
 def pages():
     """Relative path -> Markdown text of every generated page."""
-    from plenocli.artefacts.kinds import SCHEMAS
-    from plenocli.artefacts.schema import markdown
+    from plenocli.files.artefacts.kinds import SCHEMAS
+    from plenocli.files.artefacts.schema import markdown
 
     made = {f"commands/{name}.md": _page(name) for name in COMMANDS}
     links = "\n".join(f"- [{name}]({name}.md): {_command(name).get_short_help_str(200)}" for name in COMMANDS)

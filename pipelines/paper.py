@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.artefacts import publish, read_artefact, read_mosaic, read_pif
-from plenocli.config import parse_camera
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.shards import read_pif
+from plenocli.files.atomic import publish
+from plenocli.files.images.mosaic import read_mosaic
+from plenocli.files.config.camera_file import parse_camera
 from plenocli.report import figures, pictures, spectral_pictures
 from plenocli.report.drawing import drawing, show_picture
 from plenocli.report.page import Page
-from plenocli.stages.score_inputs import block_of, read_result, read_truth
+from plenocli.files.read.results import block_of, read_result, read_truth
 
 SAYS = {
     "Fig. 3": "The pupil image function varies strongly under one lenslet: of a point on the axis, and of points a little off it, the sensor sees quite different patterns, which no geometric model gives.",

@@ -31,7 +31,7 @@ def listen(tell):
     """From now on every message that is made says tell("file:line") for each frame of the package on its way."""
     import click
 
-    from plenocli.errors import PlenoError
+    from plenocli.base.errors import PlenoError
 
     home = f"{PACKAGE}/"
 

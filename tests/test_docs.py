@@ -41,7 +41,7 @@ def kit(tmp_path_factory):
     from PIL import Image
     from skimage import data
 
-    from plenocli.artefacts import read_mosaic
+    from plenocli.files.images.mosaic import read_mosaic
     from tests.reference.chart import paint_folder
 
     folder = tmp_path_factory.mktemp("kit")
@@ -173,8 +173,8 @@ def test_the_plan_that_the_page_shows_is_the_plan(monkeypatch, capsys):
 
 def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
     from plenocli.cli.sections import read_options
-    from plenocli.config.sweep import points
-    from plenocli.stages.design_space import open_space
+    from plenocli.files.config.sweep_file import points
+    from plenocli.stages.sweep.space import open_space
 
     (tmp_path / "sweeps").mkdir()
     shutil.copy(ROOT / "sample_configs" / "tiny.toml", tmp_path)

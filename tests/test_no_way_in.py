@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, read_pif, write_artefact
-from plenocli.errors import InputError
-from plenocli.stages.report import run_report
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.shards import read_pif
+from plenocli.base.errors import InputError
+from plenocli.stages.evaluation.report import run_report
 
 PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal", "yaml", "joblib", "jsonpickle", "xmlrpc"}
@@ -45,7 +47,7 @@ def test_no_module_runs_what_a_file_says(count):
 def test_libraw_runs_in_the_limited_child_only():
     importing = {path.name: {a.name.split(".")[0] for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import) for a in node.names} for path in PACKAGE.rglob("*.py")}
     assert [name for name, modules in importing.items() if "rawpy" in modules] == ["raw_child.py"]
-    child = (PACKAGE / "artefacts" / "raw_child.py").read_text()
+    child = (PACKAGE / "files" / "images" / "raw_child.py").read_text()
     assert all(limit in child for limit in ("RLIMIT_AS", "RLIMIT_CPU", "RLIMIT_FSIZE")) and child.index("setrlimit") < child.index("rawpy.imread")
     assert not [path.name for path in PACKAGE.rglob("*.py") if "import raw_child" in path.read_text() or "raw_child import" in path.read_text()]
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from plenocli.artefacts.kinds import SCHEMAS
+from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.cli.main import COMMANDS
 from pipelines.pages import pages
 

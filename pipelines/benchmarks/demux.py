@@ -71,10 +71,10 @@ def make(run):
 
 def captures(run):
     """White, dark, narrow-band and scene captures: predicted superpixels on a sensor of SIZE, with the sensor's noise."""
-    from plenocli.artefacts import write_dng
-    from plenocli.config import load_camera
-    from plenocli.scene.tables import surfaces
-    from plenocli.sensor.noise import SensorModel
+    from plenocli.files.images.dng import write_dng
+    from plenocli.files.config.camera_file import load_camera
+    from plenocli.forward.scene.tables import surfaces
+    from plenocli.forward.sensor.noise import SensorModel
 
     camera = load_camera(ROOT / "sample_configs" / "dslr.toml").replace(**{"lenslet_array.count": (2, 2)})
     light, moved = (np.stack(part) for part in zip(*(superpixel(camera, f"mono:{band}") for band in BANDS)))
@@ -101,8 +101,8 @@ def superpixel(camera, target):
     """Light (rows, columns) of one superpixel on the mosaic for a uniform object, as capture-sim carries it, and moved by SHIFT."""
     from scipy.ndimage import shift
 
-    from plenocli.sensor.cfa import cfa_map
-    from plenocli.stages.capture_sim import Settings, _carry, _source
+    from plenocli.forward.sensor.cfa import cfa_map
+    from plenocli.stages.forward.capture_sim import Settings, _carry, _source
 
     settings = Settings(target=target, superpixels=(3, 3), model="fresnel", accuracy=1e-3)
     (letters, _), whites, _ = _carry(camera, *_source(camera, settings, None), settings, None)
@@ -143,9 +143,9 @@ def measure(run, kind, rounds):
     """Seconds of every part, and peak memory, of demultiplexing one capture with one kind of calibration."""
     import rawpy
 
-    from plenocli.artefacts import describe_inputs
-    from plenocli.stages.demux import Demultiplexer, Settings
-    from plenocli.stages.mosaics import read_exposure
+    from plenocli.files.artefacts.provenance import describe_inputs
+    from plenocli.stages.inverse.demux import Demultiplexer, Settings
+    from plenocli.files.read.mosaics import read_exposure
 
     clock, shot = Clock(), run / "shot.dng"
 

@@ -17,7 +17,6 @@ import os
 import sys
 import time
 import warnings
-from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -182,8 +181,9 @@ LIBRARIES = {
 
 def ours(camera, accuracy, rung, symmetric):
     """A function that computes the whole matrix: (A, seconds of the set-up, of the columns, separable terms, the BandPlan)."""
-    from plenocli.accuracy import dial, plan_pif
-    from plenocli.optics.pif import PifBuilder
+    from plenocli.forward.accuracy import dial
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.forward.propagation.system_matrix import PifBuilder
 
     kept, dial.RUNGS = dial.RUNGS, tuple(r for r in dial.RUNGS if r.name == rung)
     try:
@@ -246,7 +246,7 @@ def measure(rounds, columns):
     """Every method in turns: the rows of the table, and the rates of this machine."""
     from threadpoolctl import threadpool_limits
 
-    from plenocli.config import load_camera
+    from plenocli.files.config.camera_file import load_camera
 
     camera = load_camera(CONFIG)
     grid, truth, (_, count) = Grid(camera), reference(camera), camera.object.samples_per_lenslet

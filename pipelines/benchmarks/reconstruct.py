@@ -44,10 +44,10 @@ METHODS = {
 
 def system_of(config, shape):
     """stages.systems.System of one isolated lenslet of a configuration, square or circular."""
-    from plenocli.accuracy import plan_pif
-    from plenocli.config import load_camera
-    from plenocli.optics.pif import build_pif
-    from plenocli.stages.systems import System
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.files.config.camera_file import load_camera
+    from plenocli.forward.propagation.system_matrix import build_pif
+    from plenocli.files.read.system_matrices import System
 
     camera = load_camera(config)
     camera = camera.model_copy(update={"lenslet_array": camera.lenslet_array.model_copy(update={"aperture_shape": shape})})
@@ -60,10 +60,10 @@ def capture(system, count, scene, snr, seed):
 
     count: (rows, columns) of the camera's lenslets, of the whole scene; and of those in its middle, which are captured.
     """
-    from plenocli.operators import to_blocks
-    from plenocli.scene.sample import luminance, sample_picture
-    from plenocli.stages.superpixels import Superpixels
-    from plenocli.stages.training import _values
+    from plenocli.base.tiling import to_blocks
+    from plenocli.forward.scene.sample import luminance, sample_picture
+    from plenocli.files.read.captures import Superpixels
+    from plenocli.files.read.training import _values
 
     whole, kept = count
     rows, columns = (int(n) * m for n, m in zip(whole, system.object_shape))
@@ -76,8 +76,8 @@ def capture(system, count, scene, snr, seed):
 
 def measure(estimators, data, truth, options):
     """{"psnr_db", "ssim", "seconds", "took"} of one method on one capture."""
-    from plenocli.metrics.quality import psnr, ssim
-    from plenocli.operators import to_plane
+    from plenocli.evaluation.metrics.quality import psnr, ssim
+    from plenocli.base.tiling import to_plane
 
     shape = estimators.system.object_shape
     began = time.process_time()
@@ -89,8 +89,8 @@ def measure(estimators, data, truth, options):
 
 def compare(args):
     """[{"lenslets", "scene", "snr_db", "seed", "method", ...}], one a run."""
-    from plenocli.stages.estimators import Estimators
-    from plenocli.stages.reconstruct import Settings
+    from plenocli.inverse.picture.estimators import Estimators
+    from plenocli.stages.inverse.reconstruct import Settings
 
     rows = []
     dictionaries = dict(zip(args.lenslets, args.dictionary or []))

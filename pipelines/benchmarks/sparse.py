@@ -38,13 +38,13 @@ PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior poin
 
 def problem(config, iterations, count, seed):
     """dict: D (row, atom), Y (row, signal) and the same without noise, lambda, and the validation table that chose it."""
-    from plenocli.accuracy import plan_pif
-    from plenocli.config import load_camera
-    from plenocli.optics.pif import build_pif
-    from plenocli.solvers.dictionary import Learner, Settings
-    from plenocli.solvers.linear import decompose
-    from plenocli.solvers.natural import draw_patches
-    from plenocli.stages.training import at_scales, read_training, split_by_scene
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.files.config.camera_file import load_camera
+    from plenocli.forward.propagation.system_matrix import build_pif
+    from plenocli.inverse.sparse.dictionary import Learner, Settings
+    from plenocli.inverse.picture.least_squares import decompose
+    from plenocli.inverse.prior.natural_images import draw_patches
+    from plenocli.files.read.training import at_scales, read_training, split_by_scene
 
     camera = load_camera(config)
     shape = camera.object.samples_per_lenslet
@@ -73,19 +73,19 @@ def problem(config, iterations, count, seed):
 
 
 def ours(d, y, lam):
-    from plenocli.solvers.l1 import sparse_code
+    from plenocli.inverse.sparse.l1.solve import sparse_code
 
     return sparse_code(d, y, lam, tol=1e-6, workers=1).c
 
 
 def fista(d, y, lam):
-    from plenocli.solvers.l1 import fista
+    from plenocli.inverse.sparse.l1.solve import fista
 
     return fista(d, y, lam, iterations=300).c
 
 
 def interior(d, y, lam):
-    from plenocli.solvers.l1_interior import interior_point
+    from plenocli.inverse.sparse.l1.interior import interior_point
 
     return interior_point(d, y, lam).c
 
@@ -126,7 +126,7 @@ SOLVERS = {
 
 def measure(task, rounds, chosen):
     """Rows of the table, and the packages that are missing."""
-    from plenocli.solvers.l1 import duality_gap
+    from plenocli.inverse.sparse.l1.certificate import duality_gap
 
     d, y, lam = task["D"], task["Y"], task["lambda"]
     threshold = np.full(d.shape[1], lam / 2)
@@ -173,7 +173,7 @@ def hard_cases(task):
 
 def measure_hard(task, chosen):
     """[(name, {solver: (median, largest gap) or None where it failed})] of `hard_cases`; a gap that is no number counts as 1."""
-    from plenocli.solvers.l1 import duality_gap
+    from plenocli.inverse.sparse.l1.certificate import duality_gap
 
     out = []
     for name, d, y, lam in hard_cases(task):

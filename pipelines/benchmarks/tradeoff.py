@@ -12,7 +12,6 @@ import argparse
 import ast
 import hashlib
 import json
-import math
 import os
 import resource
 import time
@@ -29,11 +28,13 @@ import numpy as np  # noqa: E402
 import scipy.sparse  # noqa: E402, F401  as all else that is imported, it is there before time is taken
 from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for  # noqa: E402
 
-from plenocli.accuracy import dial, plan_pif  # noqa: E402
-from plenocli.errors import NumericsError  # noqa: E402
-from plenocli.optics.pif import build_pif  # noqa: E402
-from plenocli.stages import pif_pieces  # noqa: E402
-from plenocli.stages.simulate_pif import Settings  # noqa: E402
+from plenocli.files.config.camera_file import to_toml  # noqa: E402
+from plenocli.forward.accuracy import dial  # noqa: E402
+from plenocli.forward.accuracy.dial import plan_pif
+from plenocli.base.errors import NumericsError  # noqa: E402
+from plenocli.forward.propagation.system_matrix import build_pif  # noqa: E402
+from plenocli.files.artefacts import pif_pieces  # noqa: E402
+from plenocli.stages.forward.simulate_pif import Settings  # noqa: E402
 
 ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
@@ -93,7 +94,7 @@ def code(rung):
 
 def record_path(run, case, candidate, truth):
     """Where the measurement of a candidate is kept: by what is computed and what it is compared with."""
-    what = [camera_of(case["camera"]).text, case["superpixels"], case["dtype"], candidate.name, candidate.ring, f"{candidate.sampling:.3g}", candidate.double,
+    what = [to_toml(camera_of(case["camera"])), case["superpixels"], case["dtype"], candidate.name, candidate.ring, f"{candidate.sampling:.3g}", candidate.double,
             repr(candidate.bands), candidate.band_nodes, truth.key, code(candidate.name)]
     return run / "cases" / f"{hashlib.sha256(json.dumps(what).encode()).hexdigest()[:20]}.json"
 

@@ -2,7 +2,7 @@
 
 The columns are those of the points at the corner, at the middle of an edge and at the centre of a lenslet. Paraxial sums take
 every pixel of up to sixteen superpixels. Exact ones, in which every node of the lenslets sends its wave to every node of the sensor
-(summed as matrix products, rayleigh.rayleigh_products), take as many pixels of the own superpixel, spread over it, as they can afford. Nothing here shares code with plenocli.optics.
+(summed as matrix products, rayleigh.rayleigh_products), take as many pixels of the own superpixel, spread over it, as they can afford. Nothing here shares code with plenocli.forward.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from plenocli.config import load_camera  # noqa: E402
+from plenocli.files.config.camera_file import load_camera, to_toml  # noqa: E402
 from tests.reference import rayleigh  # noqa: E402
 from tests.reference.fresnel import sensor_nodes  # noqa: E402
 from tests.reference.window import _Rule, energies  # noqa: E402
@@ -102,7 +102,7 @@ class Truth:
         self.lit = [(r, c) for r in side for c in side]
         self.superpixels = self.lit if model == "exact" else self._compared(superpixels)
         self.counts = self._counts()
-        parts = [camera.text, model, window, self.superpixels, 3 if window is None else 4, fine]
+        parts = [to_toml(camera), model, window, self.superpixels, 3 if window is None else 4, fine]
         if model == "exact":
             # which pixels of many superpixels these are follows from the paraxial columns
             parts.append(self.counts if self.spread else [chosen.tolist() for chosen in self.pixels[0]])

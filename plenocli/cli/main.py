@@ -2,7 +2,6 @@
 
 import difflib
 import errno
-import importlib
 import os
 import sys
 import time
@@ -11,30 +10,9 @@ from functools import partial
 import click
 
 from plenocli import __version__
-from plenocli.errors import PlenoError
-from plenocli.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
-
-COMMANDS = (
-    "simulate-pif",
-    "simulate-response",
-    "capture-sim",
-    "calibrate",
-    "demux",
-    "learn-dict",
-    "reconstruct",
-    "refocus",
-    "score",
-    "report",
-    "sweep",
-    "optimise",
-    "colorchecker",
-    "show",
-    "inspect",
-    "lens",
-    "schema",
-)
-"""The order is that of the pipeline, and of the help."""
-
+from plenocli.base.errors import PlenoError
+from plenocli.cli.commands import COMMANDS, load_command
+from plenocli.base.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -48,7 +26,7 @@ class Pipeline(click.Group):
     def get_command(self, ctx, name):
         if name not in COMMANDS:
             return None
-        return importlib.import_module(f"plenocli.cli.{name.replace('-', '_')}").command
+        return load_command(name)
 
     def resolve_command(self, ctx, args):
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
@@ -79,7 +57,7 @@ def cli(ctx, quiet, verbose):
 
     Every command has --help with examples. Lengths carry their unit: 550nm, "250 um", 50mm.
     """
-    from plenocli.stages import progress
+    from plenocli.base import progress
 
     progress.quiet = quiet
     if verbose:

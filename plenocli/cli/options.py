@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from plenocli.config.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number, parse_wavelength
-from plenocli.plain import plain
+from plenocli.base.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number, parse_wavelength
+from plenocli.base.text import plain
 
 
 class _Quantity(click.ParamType):
-    """A number with its unit, read by one of the parsers of plenocli.config.units."""
+    """A number with its unit, read by one of the parsers of plenocli.base.units."""
 
     def __init__(self, name, parse, minimum=None, exclusive=False, show=lambda value: format(value, ".12g"), limits=(-math.inf, math.inf)):
         self.name, self._parse, self._minimum, self._exclusive, self.show, self._limits = name, parse, minimum, exclusive, show, limits
@@ -160,7 +160,7 @@ scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers
 
 
 def _held(ctx, param, value):
-    from plenocli.memory import hold
+    from plenocli.base.memory import hold
 
     hold(value)
     return value

@@ -1,12 +1,12 @@
 """The options of other commands as sections of a file hold them: [reconstruct] method = "lmmse" is --method lmmse."""
 
 import difflib
-import importlib
 
 import click
 
-from plenocli.errors import UsageError
-from plenocli.plain import shown
+from plenocli.base.errors import UsageError
+from plenocli.base.text import shown
+from plenocli.cli.commands import load_command
 
 _OURS = {"output", "overwrite", "as_json", "workers", "scheduler", "mem_limit", "explain", "suffix", "report", "metrics", "scene_out", "pif", "calibration", "truth",
          "reference", "camera", "grid", "whites", "darks", "bands", "radiances", "patches", "capture", "block", "near"}
@@ -18,7 +18,7 @@ def read_options(stage, values):
 
     values: option without dashes -> text, number, true or false, or a list for an option that may be repeated.
     """
-    command = importlib.import_module(f"plenocli.cli.{stage.replace('-', '_')}").command
+    command = load_command(stage)
     known = {name.lstrip("-"): p for p in command.params if isinstance(p, click.Option) and p.name not in _OURS for name in p.opts}
     found = {}
     for name, value in values.items():

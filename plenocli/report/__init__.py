@@ -1,1 +1,4 @@
-"""Pictures and pages: what a person looks at after a run. Reads what stages read, draws with matplotlib, writes nothing."""
+"""Pictures and pages about results.
+
+Figures are computed in evaluation.
+"""

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from plenocli.errors import UsageError
+from plenocli.base.errors import UsageError
 
 #: Okabe and Ito's palette, told apart with any colour vision, in the order of use.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#555555")
@@ -58,7 +58,7 @@ def drawing(width, height, layout="constrained"):
 
 def show_picture(axes, values, title="", **options):
     """A picture without ticks; a 2-D one as linear light, white at 1, encoded for the screen as sRGB is."""
-    from plenocli.scene.colour import encode_srgb
+    from plenocli.forward.scene.colour import encode_srgb
 
     values = np.asarray(values, dtype=np.float64)
     if values.ndim == 2:
@@ -95,7 +95,7 @@ def bare(axes, title=""):
 
 def thumbnail(values, limit=1100):
     """`values` (row, column) averaged over whole blocks so that neither side exceeds `limit`, and the block size used."""
-    from plenocli.scene.sample import block_mean
+    from plenocli.forward.scene.sample import block_mean
 
     step = max(1, -(-max(values.shape) // limit))
     rows, cols = (n // step * step for n in values.shape)
@@ -111,6 +111,6 @@ def nanometres(wavelength):
 
 def swatch(rgb):
     """Display colour, a tuple for matplotlib, of linear sRGB (3,)."""
-    from plenocli.scene.colour import encode_srgb
+    from plenocli.forward.scene.colour import encode_srgb
 
     return tuple(float(v) for v in encode_srgb(np.asarray(rgb)))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plenocli.errors import InputError
+from plenocli.base.errors import InputError
 from plenocli.report.drawing import COLOURS, LEVEL_MAP, colour_bar, drawing
 
 LABELS = {

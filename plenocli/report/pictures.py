@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from plenocli.report.drawing import (
-    COLOURS, GRID_LINE, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, bare, colour_bar, drawing, nanometres, show_map, show_picture, thumbnail,
-)
+from plenocli.report.drawing import COLOURS, GRID_LINE, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, bare, colour_bar, drawing, nanometres, show_map, show_picture, thumbnail
 
 ZOOMED = 3  # superpixels per side in the close-up
 HISTORY = {"validation_psnr": "PSNR on held-out patches [dB]", "change": "change of the atoms (norm)", "coherence_max": "coherence of A phi, largest", "coherence_mean": "coherence of A phi, mean",

@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from plenocli.report.drawing import (
-    COLOURS, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail,
-)
+from plenocli.report.drawing import COLOURS, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail
 
 
 def calibration_picture(flat, centres, valid, residual=None, predicted=False):
@@ -71,8 +69,8 @@ def filters_picture(camera):
     """The filter array in the pupil of the main lens, and what filters and sensor let through, by wavelength; b"" without filters."""
     from matplotlib.patches import Circle, Rectangle
 
-    from plenocli.optics.pupil import filter_cells, filter_transmittance
-    from plenocli.sensor.cfa import sensitivity
+    from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
+    from plenocli.forward.sensor.cfa import sensitivity
 
     if camera.filter_array is None:
         return b""
@@ -100,7 +98,7 @@ def filters_picture(camera):
 
 def band_pictures(cube, wavelengths, quantity="value", light="D65"):
     """Demultiplexed bands (band, row, column) on one scale, and the colour they make together (white = 1)."""
-    from plenocli.scene.colour import preview_rgb
+    from plenocli.forward.scene.colour import preview_rgb
 
     cube = np.asarray(cube, dtype=np.float64)
     top = float(np.nanpercentile(cube, 99.5)) or 1.0
@@ -158,8 +156,8 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
     entries: sequence of (label, patches) as score lists them: dicts with label, name, mean, std, truth. A colour strip
     beneath each title shows the patch.
     """
-    from plenocli.scene.colour import preview_rgb
-    from plenocli.scene.tables import colorchecker
+    from plenocli.forward.scene.colour import preview_rgb
+    from plenocli.forward.scene.tables import colorchecker
 
     wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
     wanted = {p["label"]: p for _, patches in entries for p in patches if p["one_of_six"] or not only_six}

@@ -1,1 +1,4 @@
-"""One file a command: read artefacts, call kernels, write artefacts. The only room where files meet mathematics."""
+"""One file a command: read files, call the rooms below, write files.
+
+No mathematics and no parsing of command lines.
+"""

@@ -5,7 +5,7 @@ import errno
 import pytest
 
 from plenocli.cli import main as boundary
-from plenocli.errors import ConfigError, InputError, NumericsError, OutputError, PlenoError, UsageError
+from plenocli.base.errors import ConfigError, InputError, NumericsError, OutputError, PlenoError, UsageError
 
 
 @pytest.mark.parametrize(

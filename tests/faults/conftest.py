@@ -71,7 +71,7 @@ def make_all(folder, runner):
 
 def write_shards(folder, name, groups):
     """The 3x3 matrix in a file for each group of its lenslets, and their index: cameras for which the stage does so are too large for these tests."""
-    from plenocli.artefacts import read_pif, writing_pif
+    from plenocli.files.artefacts.shards import read_pif, writing_pif
 
     whole = read_pif(folder / "pif-3x3.h5")
     A = whole.data["pif/A"]

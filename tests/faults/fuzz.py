@@ -21,7 +21,7 @@ LIMITS = ["-timeout=10", "-rss_limit_mb=2048", "-max_len=60000", "-len_control=0
 
 def artefact(path, data):
     """Files as they come: the digest is in the way."""
-    from plenocli.artefacts import read_artefact
+    from plenocli.files.artefacts.container import read_artefact
 
     path.write_bytes(data)
     read_artefact(path)
@@ -29,8 +29,8 @@ def artefact(path, data):
 
 def sealed(path, data):
     """Files of someone who knows how to make a digest: links, filters, sizes and tables are all there is against them."""
-    from plenocli.artefacts import read_artefact
-    from plenocli.artefacts.container import HEADER_BYTES, MAGIC
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC
 
     image = data[HEADER_BYTES:]
     head = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
@@ -39,21 +39,21 @@ def sealed(path, data):
 
 
 def exr(path, data):
-    from plenocli.artefacts import read_exr
+    from plenocli.files.images.exr import read_exr
 
     path.write_bytes(data)
     read_exr(path, mem_limit=1 << 28)
 
 
 def photograph(path, data):
-    from plenocli.artefacts import read_picture
+    from plenocli.files.images.pictures import read_picture
 
     path.write_bytes(data)
     read_picture(path, mem_limit=1 << 28)
 
 
 def notes(path, data):
-    from plenocli.artefacts.dng import read_notes
+    from plenocli.files.images.dng import read_notes
 
     path.write_bytes(data)
     read_notes(path)
@@ -61,11 +61,11 @@ def notes(path, data):
 
 def description(path, data):
     """TOML of cameras, scenes, sweeps and lenses."""
-    from plenocli.config import load_camera
-    from plenocli.config.lens import load_lens
-    from plenocli.config.scene import load_scene
-    from plenocli.config.sweep import load_sweep, points
-    from plenocli.errors import PlenoError
+    from plenocli.files.config.camera_file import load_camera
+    from plenocli.files.config.lens_file import load_lens
+    from plenocli.files.config.scene_file import load_scene
+    from plenocli.files.config.sweep_file import load_sweep, points
+    from plenocli.base.errors import PlenoError
 
     path.write_bytes(data)
     for load in (load_camera, load_scene, load_lens):
@@ -78,7 +78,7 @@ def description(path, data):
 
 
 def score(path, data):
-    from plenocli.stages.run_folder import _score_document
+    from plenocli.files.read.run_folder import _score_document
 
     path.write_bytes(data)
     _score_document(path)
@@ -93,15 +93,15 @@ def work(name, arguments):
     import atheris
 
     with atheris.instrument_imports(include=["plenocli", "json", "tomllib"]):
-        import plenocli.artefacts.container
-        import plenocli.artefacts.dng
-        import plenocli.artefacts.exr
-        import plenocli.artefacts.pictures
-        import plenocli.config.lens
-        import plenocli.config.scene
-        import plenocli.config.sweep
-        import plenocli.stages.run_folder  # noqa: F401
-    from plenocli.errors import PlenoError
+        import plenocli.files.artefacts.container
+        import plenocli.files.images.dng
+        import plenocli.files.images.exr
+        import plenocli.files.images.pictures
+        import plenocli.files.config.lens_file
+        import plenocli.files.config.scene_file
+        import plenocli.files.config.sweep_file
+        import plenocli.files.read.run_folder  # noqa: F401
+    from plenocli.base.errors import PlenoError
 
     read, path = READERS[name][0], Path(tempfile.mkdtemp(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)) / "input"
 

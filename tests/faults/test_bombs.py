@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.artefacts import test_container as hdf5
+from tests.files import test_container as hdf5
 from tests.faults.harness import is_clean_refusal
 
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from tests.faults.harness import is_clean_refusal
 
 CAMERA = """
@@ -76,7 +76,7 @@ def test_energy_is_sound_or_the_camera_is_refused(runner, tmp_path, campaign, co
 @pytest.mark.parametrize("method", ["block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "auto"])
 def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(runner, stages, tmp_path, count, method):
     """All-zero, constant, and clipped captures: a picture without NaN, or a refusal."""
-    from plenocli.artefacts import write_artefact
+    from plenocli.files.artefacts.container import write_artefact
 
     source, _ = stages
     (tmp_path / "pif.h5").symlink_to(source / "pif.h5")

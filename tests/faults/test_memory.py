@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from plenocli.memory import base_memory
+from plenocli.base.memory import base_memory
 from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,7 +101,7 @@ def test_what_is_needed_is_what_is_said_and_less_is_refused(folder, count, stage
 
 
 def test_nobody_gets_more_than_the_limit_and_the_base():
-    code = ("import resource, numpy\nfrom plenocli.memory import base_memory, hold, limits_restored\n"
+    code = ("import resource, numpy\nfrom plenocli.base.memory import base_memory, hold, limits_restored\n"
             "with limits_restored():\n"
             "    hold(100 << 20)\n    few = numpy.ones(90 << 17)\n"
             "    try:\n        numpy.ones((100 << 20) + base_memory() >> 3)\n        raise SystemExit('more than the limit')\n    except MemoryError: pass\n"

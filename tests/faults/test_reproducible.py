@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from tests.faults.harness import results
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +46,7 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
 def test_the_run_that_compiles_gives_the_bytes_of_all_later_ones(tmp_path, count):
     """Compiled code comes from a cache but for the first time, where all that was compiled on the way is in memory beside it."""
     pytest.importorskip("numba")
-    code = ("import sys, numpy as np\nfrom plenocli.solvers.l1 import sparse_code\nrng = np.random.default_rng(1)\nfall = np.logspace(0, -4, 30)[:, None]\n"
+    code = ("import sys, numpy as np\nfrom plenocli.inverse.sparse.l1.solve import sparse_code\nrng = np.random.default_rng(1)\nfall = np.logspace(0, -4, 30)[:, None]\n"
             "D, Y = rng.standard_normal((30, 80)) * fall, rng.standard_normal((30, 64)) * fall\n"
             "sys.stdout.write(sparse_code(D, Y, 1e-4, free=[0], workers=1).c.tobytes().hex())\n")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}

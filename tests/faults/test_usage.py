@@ -1,12 +1,12 @@
 """Every option of every command with values that make no sense: exit 2, the option and a valid example named, no file touched."""
 
-import importlib
 
 import click
 import pytest
 
 from plenocli.cli import options
-from plenocli.cli.main import COMMANDS, run
+from plenocli.cli.commands import COMMANDS, load_command
+from plenocli.cli.main import run
 
 QUANTITIES = {
     "length": ("", "abc", "5", "5kg", "-5nm", "0nm", "nan", "nanm", "inf", "1e999m", "1e-999nm", "5 nm nm"),
@@ -24,7 +24,7 @@ def leaves(command, words):
     return [(words, command)]
 
 
-COMMANDS_AND_OPTIONS = [(words, option) for name in COMMANDS for words, command in leaves(importlib.import_module(f"plenocli.cli.{name.replace('-', '_')}").command, (name,))
+COMMANDS_AND_OPTIONS = [(words, option) for name in COMMANDS for words, command in leaves(load_command(name), (name,))
                         for option in command.params if isinstance(option, click.Option) and not option.is_flag]
 
 

@@ -9,7 +9,8 @@ from unittest import mock
 import h5py
 import numpy as np
 
-from plenocli.artefacts import dng, read_artefact, write_artefact
+from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.images import dng
 from tests.faults import test_bombs as bombs
 from tests.faults.conftest import SAMPLES, SWEEP, write_shards
 from tests.reference import chart
@@ -42,7 +43,7 @@ LENSES = {
 }
 HOSTILE = ("external_link", "soft_link", "twice", "external_storage", "virtual", "objects", "compound", "bomb", "filter", "named_type", "null",
            "attribute_object", "unknown_dataset", "unknown_attribute", "newer", "other_kind", "no_command", "wrong_shape", "infinite")
-"""Of tests/artefacts/test_container.py: what HDF5 allows and plenocli does not."""
+"""Of tests/files/test_container.py: what HDF5 allows and plenocli does not."""
 SWEEPS = {
     "bad": SWEEP.replace("f_number", "f_numbr"), "huge": SWEEP.replace("[7, 8]", "{ from = 1, to = 9, steps = 9000 }\n\"sensor.bits\" = { from = 8, to = 9, steps = 9000 }"),
     "stage": SWEEP.replace("[reconstruct]", "[demux]"), "option": SWEEP.replace("method =", "methd ="), "value": SWEEP.replace('"block-mean"', '"best"'),
@@ -229,7 +230,7 @@ def _wavefronts(folder):
 
 
 def _old_and_hostile(folder):
-    from tests.artefacts import test_container as container
+    from tests.files import test_container as container
 
     for name in HOSTILE:
         container.hostile(folder / f"{name.replace('_', '-')}.h5", getattr(container, f"_{name}"))
@@ -281,7 +282,7 @@ def _artefacts(folder):
     changed("shifted.h5", "calibration.h5", lambda a: a.data.update({"response/wavelength": a.data["response/wavelength"] * 1.3}))
     changed("dim.h5", "calibration.h5", lambda a: a.data.update({"response/F": a.data["response/F"] * 0}))
     changed("flat-pif.h5", "pif.h5", lambda a: a.data.update({"pif/object_shape": np.array([4, 16], np.int32)}))
-    from plenocli.artefacts import read_mosaic
+    from plenocli.files.images.mosaic import read_mosaic
 
     for name in ("white", "dark", "450nm"):
         picture(folder / f"{name}.tif", read_mosaic(folder / f"{name}.dng").values.astype(np.uint16))

@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 
-from plenocli.scene.tables import colorchecker
+from plenocli.forward.scene.tables import colorchecker
 
 SHAPE = (200, 260)
 CHART = np.array([[34.0, 2.0, 14.0], [-1.5, 36.0, 20.0], [0.004, 0.006, 1.0]])  # rows and columns of the picture, projectively

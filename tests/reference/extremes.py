@@ -5,9 +5,10 @@ As in LAPACK's tests, a backward stable method stays below about 30: |residual| 
 
 import numpy as np
 
-from plenocli.errors import NumericsError
-from plenocli.solvers import linear, lmmse, nnls, spectral
-from plenocli.solvers.l1 import sparse_code
+from plenocli.base.errors import NumericsError
+from plenocli.inverse.picture import least_squares as linear, lmmse, nnls
+from plenocli.inverse.spectra import demultiplex as spectral
+from plenocli.inverse.sparse.l1.solve import sparse_code
 
 EPS = np.finfo(float).eps
 SIZES = ((1, 1), (2, 1), (3, 2), (5, 3), (4, 4), (11, 10), (50, 50), (60, 17))

@@ -1,6 +1,6 @@
 """Slow, explicit oracle of the system matrix: two Fresnel integrals by dense quadrature, every lens and kernel phase written out.
 
-It shares no code with plenocli.optics: no shift invariance, no local coordinates. Positions are (y, x) in
+It shares no code with plenocli.forward: no shift invariance, no local coordinates. Positions are (y, x) in
 metres from the optical axis.
 """
 

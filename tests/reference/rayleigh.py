@@ -1,6 +1,6 @@
 """Slow, explicit oracle of the exact model: Rayleigh and Sommerfeld's first integral summed point by point.
 
-It shares no code with plenocli.optics: the field on the array is integrated over the pupil in direction cosines (or, with
+It shares no code with plenocli.forward: the field on the array is integrated over the pupil in direction cosines (or, with
 `spheres`, over spherical waves from each point of the exit pupil), the lenslet's phase is written out, and every node of the
 lenslet sends z/(j lambda R^2) (1 + j/(k R)) exp(j k R) to every node of the sensor. Positions are (y, x) in metres from
 the optical axis.

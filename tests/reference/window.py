@@ -2,7 +2,7 @@
 
 Fresnel's kernel, lens phases and square lenslets are products of an axis each, so light from one line of the pupil goes to the
 sensor through all lenslets by a one-dimensional kernel; a weight matrix joins the two axes over a round pupil. It shares
-no code with plenocli.optics and no idea with its low-rank route. tests/reference/fresnel.py is the plainer, slower oracle.
+no code with plenocli.forward and no idea with its low-rank route. tests/reference/fresnel.py is the plainer, slower oracle.
 """
 
 import numpy as np

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.cli.main import run
-from plenocli.errors import InputError, NumericsError, OutputError, UsageError
-from plenocli.sensor.noise import SensorModel
-from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import Settings, run_demux
+from plenocli.base.errors import InputError, NumericsError, OutputError, UsageError
+from plenocli.forward.sensor.noise import SensorModel
+from plenocli.stages.inverse.calibrate import run_calibrate
+from plenocli.stages.inverse.demux import Settings, run_demux
 
 PITCH, ROWS, COLUMNS, BORDER = 16, 9, 11, 5
 BANDS = [450e-9, 540e-9, 570e-9, 650e-9]
@@ -242,7 +242,7 @@ def test_refusals_say_what_is_wrong(files, calibration, tmp_path):
 def test_a_sensor_smaller_than_a_lenslet_is_refused():
     from types import SimpleNamespace
 
-    from plenocli.stages.calibrate import _describe_grid
+    from plenocli.stages.inverse.calibrate import _describe_grid
 
     grid = SimpleNamespace(kind="square", centres=np.full((1, 1, 2), 4.5), valid=np.ones((1, 1), bool))
     with pytest.raises(NumericsError, match="no lenslet lies wholly"):

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, read_artefact, write_artefact
-from plenocli.errors import NumericsError
-from plenocli.sensor.noise import SensorModel
-from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import Settings, run_demux
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor.noise import SensorModel
+from plenocli.stages.inverse.calibrate import run_calibrate
+from plenocli.stages.inverse.demux import Settings, run_demux
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME, EXTRA = 9, 12, 24.3, 6, 30  # a pitch of broken pixels: every lenslet lies elsewhere within its own

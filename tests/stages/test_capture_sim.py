@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, read_artefact, read_mosaic, write_artefact
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.images.mosaic import read_mosaic
 from plenocli.cli.main import run
-from plenocli.config import load_camera, parse_camera
-from plenocli.accuracy import system_matrix
+from plenocli.files.config.camera_file import load_camera, parse_camera
+from plenocli.forward.accuracy.dial import system_matrix
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
 FILTERS = """
@@ -213,7 +215,7 @@ def test_the_description_of_a_camera_is_in_the_file(camera, tmp_path):
 
 
 def test_light_below_zero_is_refused_by_a_sensor(camera, tmp_path, capsys):
-    from plenocli.artefacts import write_exr
+    from plenocli.files.images.exr import write_exr
 
     write_exr(tmp_path / "negative.exr", {"Y": np.full((20, 20), -1, np.float32)}, {})
     arguments = ["capture-sim", str(camera), "--scene", str(tmp_path / "negative.exr"), "--superpixels", "1x1", "--coherent-ring", "0", "-o", str(tmp_path / "out.h5")]

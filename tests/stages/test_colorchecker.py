@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
-from plenocli.scene.tables import colorchecker
-from plenocli.stages.colorchecker import Settings, run_colorchecker, table
+from plenocli.forward.scene.tables import colorchecker
+from plenocli.stages.evaluation.colorchecker import Settings, run_colorchecker, table
 from tests.reference.chart import paint_folder
 
 pytest.importorskip("PIL.Image")
@@ -39,7 +39,7 @@ def test_the_command_prints_the_table_and_the_scene_serves_capture_sim(folder, t
     assert run(["colorchecker", str(folder), "--cfa", "GBRG", "--flatten", "none", "--grid", "16x24", "-o", str(tmp_path / "chart.h5")]) == 0
     out = capsys.readouterr().out
     assert "bluish green" in out and "paper field" not in out
-    from plenocli.stages.scenes import read_scene
+    from plenocli.files.read.scenes import read_scene
 
     scene = read_scene(tmp_path / "chart.h5", spectral=True)
     assert scene.spectral and scene.at(550e-9, 8, 12)[7, 1] > 3 * scene.at(550e-9, 8, 12)[7, 11]  # white and black

@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, read_artefact, read_spectral_exr, write_artefact
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.images.spectral_exr import read_spectral_exr
 from plenocli.cli.main import run
-from plenocli.errors import InputError, NumericsError, UsageError
-from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import Settings, run_demux
+from plenocli.base.errors import InputError, NumericsError, UsageError
+from plenocli.stages.inverse.calibrate import run_calibrate
+from plenocli.stages.inverse.demux import Settings, run_demux
 
 PITCH, COUNT, BANDS = 12, 7, (480e-9, 620e-9)
 

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from plenocli.artefacts import Artefact, Provenance, write_artefact, write_dng, write_exr, write_spectral_exr
-from plenocli.cli.inspect import command
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.images.dng import write_dng
+from plenocli.files.images.exr import write_exr
+from plenocli.files.images.spectral_exr import write_spectral_exr
+from plenocli.cli.evaluation.inspect import command
 from plenocli.cli.main import run
-from plenocli.errors import InputError
-from plenocli.stages.inspect import describe, run_inspect
+from plenocli.base.errors import InputError
+from plenocli.stages.evaluation.inspect import describe, run_inspect
 
 
 def inspect(path):

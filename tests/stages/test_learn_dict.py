@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, write_artefact
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
 from plenocli.cli.main import run
-from plenocli.errors import InputError
-from plenocli.stages.training import DEFAULT, at_scales, read_training, split_by_scene
+from plenocli.base.errors import InputError
+from plenocli.files.read.training import DEFAULT, at_scales, read_training, split_by_scene
 
 
 def test_the_test_picture_is_never_trained_on(capsys):
@@ -73,7 +74,7 @@ def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
 
 
 def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(pif, tmp_path):
-    from plenocli.artefacts import read_artefact
+    from plenocli.files.artefacts.container import read_artefact
 
     whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
     assert learn(pif, "--iterations", 20, "--synthesis", "-o", whole) == 0
@@ -85,7 +86,7 @@ def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(
 
 
 def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkeypatch, capsys):
-    from plenocli.solvers.dictionary import Learner
+    from plenocli.inverse.sparse.dictionary import Learner
 
     whole, rest, kept = tmp_path / "whole.h5", tmp_path / "rest" / "whole.h5", tmp_path / "kept.h5"
     rest.parent.mkdir()
@@ -106,7 +107,7 @@ def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkey
     capsys.readouterr()
     assert learn(pif, "--iterations", 6, "--checkpoint", kept, "-o", rest) == 0
     assert taken == [0, 1, 2, 3, 3, 4, 5] and not kept.exists()
-    from plenocli.artefacts import read_artefact
+    from plenocli.files.artefacts.container import read_artefact
 
     one, other = (read_artefact(path, "dictionary") for path in (whole, rest))
     assert set(one.data) == set(other.data) and all(one.data[key].tobytes() == other.data[key].tobytes() for key in one.data)
@@ -115,7 +116,7 @@ def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkey
 
 
 def test_a_checkpoint_with_other_defaults_is_not_taken(pif, tmp_path, monkeypatch):
-    from plenocli.solvers.dictionary import Learner
+    from plenocli.inverse.sparse.dictionary import Learner
 
     kept = tmp_path / "kept.h5"
     with monkeypatch.context() as patch:
@@ -130,7 +131,7 @@ def test_a_checkpoint_with_other_defaults_is_not_taken(pif, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
 def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
-    from plenocli.artefacts import write_exr
+    from plenocli.files.images.exr import write_exr
 
     write_exr(tmp_path / "flat.exr", {"Y": np.full((20, 20), level, np.float32)}, {})
     with pytest.raises(InputError, match="no structure"):
@@ -138,7 +139,7 @@ def test_a_picture_without_structure_teaches_nothing(tmp_path, level):
 
 
 def test_a_folder_stands_for_its_pictures(tmp_path, capsys):
-    from plenocli.artefacts import write_exr
+    from plenocli.files.images.exr import write_exr
 
     rng = np.random.default_rng(0)
     (tmp_path / "more").mkdir()
@@ -173,7 +174,7 @@ def test_history_is_told_line_by_line_and_lambda_may_come_from_the_noise(pif, tm
 
 
 def test_atoms_that_paint_are_kept_beside_those_that_code(pif, tmp_path):
-    from plenocli.artefacts import read_artefact
+    from plenocli.files.artefacts.container import read_artefact
 
     assert learn(pif, "--iterations", 1, "--synthesis", "-o", tmp_path / "a.h5") == 0
     assert learn(pif, "--iterations", 1, "-o", tmp_path / "b.h5") == 0

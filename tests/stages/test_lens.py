@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.config.lens import lens_toml, load_lens, parse_lens
-from plenocli.errors import ConfigError, InputError
-from plenocli.optics.geometry import geometry
-from plenocli.optics.glass import medium
-from plenocli.optics.lens import at_wavelength, first_order
-from plenocli.optics.prescription import Prescription, Surface
-from plenocli.optics.pupil import wavefront
-from plenocli.optics.raytrace import Rays, entrance_pupil
-from tests.optics.cameras import small_camera
-from tests.optics.lenses import D_LINE, triplet
+from plenocli.files.config.lens_file import lens_toml, load_lens, parse_lens
+from plenocli.base.errors import ConfigError, InputError
+from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.camera.glass import medium
+from plenocli.forward.camera.lens import at_wavelength, first_order
+from plenocli.forward.camera.prescription import Prescription, Surface
+from plenocli.forward.camera.pupil import wavefront
+from plenocli.forward.camera.raytrace import Rays, entrance_pupil
+from tests.forward.propagation.cameras import small_camera
+from tests.forward.camera.lenses import D_LINE, triplet
 
 TEXT = """
 [lens]
@@ -142,7 +142,8 @@ def test_a_camera_takes_focal_shift_and_wavefront_from_its_lens_file():
 
 def test_the_system_matrix_is_that_of_the_thin_camera_which_the_rays_give(tmp_path):
     """simulate-pif on a camera with a lens file equals simulate-pif on one whose focal length and Noll terms are spelled out."""
-    from plenocli.artefacts import read_artefact
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.config.camera_file import to_toml
 
     camera = camera_with_triplet(light__wavelengths=[450e-9], main_lens__aperture_diameter=4e-3)
     resolved = at_wavelength(camera, 450e-9)
@@ -150,7 +151,7 @@ def test_the_system_matrix_is_that_of_the_thin_camera_which_the_rays_give(tmp_pa
     (tmp_path / "triplet.toml").write_text(lens_toml(triplet()))
     matrices = []
     for name, described in (("lens", camera), ("thin", resolved), ("without", camera.model_copy(update={"main_lens": plain}))):
-        (tmp_path / f"{name}.toml").write_text(described.text)
+        (tmp_path / f"{name}.toml").write_text(to_toml(described))
         assert run(["simulate-pif", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path / f"{name}.h5"), "--superpixels", "1x1", "--dtype", "float64"]) == 0
         matrices.append(read_artefact(tmp_path / f"{name}.h5").data["pif/A"])
     assert matrices[0] == pytest.approx(matrices[1], abs=1e-12 * matrices[1].max())
@@ -252,8 +253,8 @@ def test_rays_wavefront_and_focal_shift_are_optiland_s(shared_data, name):
 
     from optiland.wavefront import Wavefront as Theirs
 
-    from plenocli.optics import lens as ours
-    from plenocli.stages import lens as stage
+    from plenocli.forward.camera import lens as ours
+    from plenocli.stages.forward import lens as stage
 
     path = shared_data / "lens" / "optiland" / name
     found, _ = stage.import_lens(path)
@@ -304,7 +305,7 @@ def _paraxially_aimed(ours, lens, wavelength, points, angle):
     ({"geometry": type("Plane", (), {"cs": SimpleNamespace(x=0, y=1, z=0, rx=0, ry=0, rz=0)})()}, "tilted or off axis")])
 def test_import_says_which_surface_is_none_of_ours(tmp_path, monkeypatch, change, words):
     """As optiland's objects are, without it."""
-    from plenocli.stages import lens as stage
+    from plenocli.stages.forward import lens as stage
 
     straight = SimpleNamespace(x=0, y=0, z=0, rx=0, ry=0, rz=0)
     flat = type("Plane", (), {"cs": straight, "radius": math.inf})()
@@ -317,7 +318,7 @@ def test_import_says_which_surface_is_none_of_ours(tmp_path, monkeypatch, change
 
 
 def test_what_optiland_cannot_read_is_an_input_error(tmp_path, monkeypatch):
-    from plenocli.stages import lens as stage
+    from plenocli.stages.forward import lens as stage
 
     def load(path):
         raise IndexError("list index out of range")

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
-from plenocli.errors import ConfigError, UsageError
-from plenocli.stages import optimise, sweep_store
+from plenocli.base.errors import ConfigError, UsageError
+from plenocli.stages.sweep import optimise, store as sweep_store
 
 pytest.importorskip("optuna")
 ROOT = Path(__file__).resolve().parents[2]

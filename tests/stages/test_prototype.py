@@ -7,13 +7,13 @@ painted in closed form (tests/reference/prototype.py), moved ones too.
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.cli.main import run
-from plenocli.scene.tables import SIX_PATCHES, colorchecker, patch_index
-from plenocli.sensor.noise import SensorModel
-from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.demux import Settings, run_demux
-from plenocli.stages.radiance import Response, estimate, light_prior
+from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
+from plenocli.forward.sensor.noise import SensorModel
+from plenocli.stages.inverse.calibrate import run_calibrate
+from plenocli.stages.inverse.demux import Settings, run_demux
+from plenocli.inverse.spectra.radiance import Response, estimate, light_prior
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME = 6, 9, 52, 6
@@ -100,7 +100,7 @@ def test_every_estimator_meets_its_bar_and_its_prediction(folder, exposure, bar)
 def test_monte_carlo_errors_are_the_predicted_ones_with_everything_estimated(folder):
     """Predicted variance within 5 % of what 10 000 draws show; SNR gain over single pixel within 1 dB of the predicted one.
 
-    The covariances of known noise, off the diagonal too, are tested in tests/solvers/test_spectral.py.
+    The covariances of known noise, off the diagonal too, are tested in tests/inverse/spectra/test_demultiplex.py.
     """
     response = 0.25 * FULL / 16 * superpixels(np.zeros(2), pixels=26, side=22.7, gap=0.75, fall=0.2)
     rng = np.random.default_rng(5)

@@ -5,12 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
 from plenocli.cli.main import run
-from plenocli.metrics.quality import psnr
-from plenocli.operators import BlockToeplitz, to_blocks, to_plane
-from plenocli.scene.sample import luminance, sample_picture
-from plenocli.stages.scenes import embedded_photograph
+from plenocli.evaluation.metrics.quality import psnr
+from plenocli.base.linear_maps import BlockToeplitz
+from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.forward.scene.sample import luminance, sample_picture
+from plenocli.files.read.scenes import embedded_photograph
 
 N, PIXELS, COUNT = 6, 9, 8
 
@@ -71,7 +73,7 @@ def test_methods_order_as_they_should(single):
 
 def test_block_mean_is_the_mean_of_each_block(single):
     folder, truth = single
-    from plenocli.scene.sample import block_mean
+    from plenocli.forward.scene.sample import block_mean
 
     image = reconstruct(folder, "--method", "block-mean").data["image/value"]
     np.testing.assert_allclose(block_mean(image, (N, N)), block_mean(truth, (N, N)), atol=0.08)
@@ -240,7 +242,7 @@ def test_exr_and_determinism(single):
     one = reconstruct(folder, output="one.h5")
     assert one.data["image/value"].tobytes() == reconstruct(folder, output="two.h5").data["image/value"].tobytes()
     assert (folder / "one.h5").read_bytes() == (folder / "two.h5").read_bytes()
-    from plenocli.artefacts import read_exr
+    from plenocli.files.images.exr import read_exr
 
     assert run(["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "pif.h5"), "-o", str(folder / "one.exr")]) == 0
     np.testing.assert_allclose(read_exr(folder / "one.exr")[0]["Y"], one.data["image/value"], rtol=1e-6, atol=1e-7)

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact, read_spectral_exr
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.images.spectral_exr import read_spectral_exr
 from plenocli.cli.main import run
-from plenocli.scene.sample import block_mean
+from plenocli.forward.scene.sample import block_mean
 
 SEED = Path(__file__).resolve().parents[2] / "sample_configs" / "seed_spectral.toml"
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
@@ -99,7 +100,7 @@ def test_the_truth_in_hindsight_has_bands_too(folder):
 def test_another_light_is_told(folder, tmp_path, capsys):
     capture = read_artefact(folder / "capture.h5", "capture")
     capture.attrs["capture"]["illuminant"] = "A"
-    from plenocli.artefacts import write_artefact
+    from plenocli.files.artefacts.container import write_artefact
 
     write_artefact(tmp_path / "lamp.h5", capture)
     assert run(["reconstruct", str(tmp_path / "lamp.h5"), "--pif", str(folder / "pif.h5"), "--method", "block-mean", "-o", str(tmp_path / "out.h5")]) == 0

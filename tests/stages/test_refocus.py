@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
-from plenocli.sensor import lightfield
+from plenocli.inverse.lightfield import refocus as lightfield
 
 CAMERA = """
 [main_lens]

@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, describe_inputs, write_artefact, write_exr
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+from plenocli.files.images.exr import write_exr
 from plenocli.cli.main import run
-from plenocli.errors import InputError
-from plenocli.scene.chart import chart_scene
-from plenocli.stages.report import run_report
-from plenocli.stages.run_folder import RunFolder
-from plenocli.stages.score import run_score
+from plenocli.base.errors import InputError
+from plenocli.forward.scene.chart import chart_scene
+from plenocli.stages.evaluation.report import run_report
+from plenocli.files.read.run_folder import RunFolder
+from plenocli.stages.evaluation.score import run_score
 from tests.reference import browser
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])

@@ -3,11 +3,12 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, write_artefact
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
 from plenocli.cli.main import run
-from plenocli.errors import InputError, UsageError
-from plenocli.scene.chart import chart_labels, chart_scene
-from plenocli.stages.score import run_score, table
+from plenocli.base.errors import InputError, UsageError
+from plenocli.forward.scene.chart import chart_labels, chart_scene
+from plenocli.stages.evaluation.score import run_score, table
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 
@@ -174,7 +175,7 @@ def test_dictionary_needs_its_matrix(tmp_path):
 
 
 def test_exr_results(picture):
-    from plenocli.artefacts import write_exr
+    from plenocli.files.images.exr import write_exr
 
     folder, capture, _, _, truth = picture
     write_exr(folder / "good.exr", {"Y": (truth + 0.01).astype("f4")}, {}, overwrite=False)
@@ -183,7 +184,7 @@ def test_exr_results(picture):
 
 
 def test_spectral_exr_results(chart):
-    from plenocli.artefacts import write_spectral_exr
+    from plenocli.files.images.spectral_exr import write_spectral_exr
 
     folder, _, _, truth = chart
     write_spectral_exr(folder / "c.exr", BANDS, (truth + 0.02).astype("f4"), "reflectance", overwrite=False)
@@ -205,8 +206,8 @@ def test_command_line(picture, capsys):
 
 
 def test_a_picture_is_no_white_target(tmp_path):
-    from plenocli.artefacts import write_exr
-    from plenocli.stages.score_inputs import read_result
+    from plenocli.files.images.exr import write_exr
+    from plenocli.files.read.results import read_result
 
     write_exr(tmp_path / "grey.exr", {"Y": np.ones((4, 4), np.float32)}, {})
     assert read_result(tmp_path / "grey.exr").kind == "image"

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, Provenance, write_artefact
-from plenocli.config import load_camera
-from plenocli.errors import InputError, UsageError
-from plenocli.scene.chart import chart_scene
-from plenocli.scene.tables import colorchecker, illuminant
-from plenocli.stages.score import run_score, table
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.config.camera_file import load_camera
+from plenocli.base.errors import InputError, UsageError
+from plenocli.forward.scene.chart import chart_scene
+from plenocli.forward.scene.tables import colorchecker, illuminant
+from plenocli.stages.evaluation.score import run_score, table
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 CAMERA = Path(__file__).resolve().parents[2] / "sample_configs" / "demo_spectral.toml"

@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import label
 
-from plenocli.artefacts import write_exr
+from plenocli.files.images.exr import write_exr
 from plenocli.cli.main import run
 from plenocli.report.pictures import pif_columns
 from plenocli.report.spectral_pictures import lenslet_spectra
-from plenocli.stages.show import run_show, stacked
+from plenocli.stages.evaluation.show import run_show, stacked
 from tests.stages.test_report import spatial, spectral
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
 from tests.peak import PEAK
 
@@ -34,7 +34,7 @@ def test_artefact_summary_and_bytes(tmp_path, capsys):
 def test_the_diagnosis_stays_on_one_thread(tmp_path, monkeypatch):
     # two threads that wait for each other cost a fifth of the command, and round singular values as the machine's cores have it
     import threadpoolctl
-    from plenocli.optics.diagnose import Spectrum
+    from plenocli.forward.propagation.diagnosis import Spectrum
 
     seen, values = [], Spectrum.values
     monkeypatch.setattr(Spectrum, "values", lambda self: seen.append(threadpoolctl.threadpool_info()) or values(self))
@@ -120,8 +120,8 @@ def test_an_off_axis_lenslet_on_the_sensors_raster(tmp_path, capsys):
 
 def test_pieces_and_shards_hold_what_the_whole_does(tmp_path, monkeypatch, capsys):
     """The same bytes whether A is held or streamed and for any number of threads; shards together are the whole."""
-    from plenocli.artefacts import read_pif
-    from plenocli.stages import pif_pieces
+    from plenocli.files.artefacts.shards import read_pif
+    from plenocli.files.artefacts import pif_pieces
 
     def matrix(name, *options):
         assert run(["simulate-pif", str(TINY), "-o", str(tmp_path / name), "--superpixels", "3x3", "--model", "fresnel", "--accuracy", "1e-4", *options]) == 0
@@ -146,7 +146,7 @@ def test_pieces_and_shards_hold_what_the_whole_does(tmp_path, monkeypatch, capsy
 def test_layouts_follow_the_memory_limit():
     from types import SimpleNamespace
 
-    from plenocli.stages.pif_pieces import Layout, layout
+    from plenocli.files.artefacts.pif_pieces import Layout, layout
 
     def plan(superpixels, bands=1):
         size = bands * superpixels * 2704 * 1600 * 4

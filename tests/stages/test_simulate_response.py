@@ -5,19 +5,18 @@ import json
 import numpy as np
 import pytest
 
-from plenocli.artefacts import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
-from plenocli.config import load_camera
-from plenocli.errors import ConfigError, InputError, UsageError
-from plenocli.scene.tables import camera_sensitivity
-from plenocli.sensor.cfa import cfa_map
-from plenocli.stages.calibrate import run_calibrate
-from plenocli.stages.capture_sim import Settings as Capture
-from plenocli.stages.capture_sim import run_capture_sim
-from plenocli.stages.demux import Settings as Demux
-from plenocli.stages.demux import run_demux
-from plenocli.stages.score import run_score
-from plenocli.stages.simulate_response import Settings, run_simulate_response
+from plenocli.base.errors import ConfigError, InputError, UsageError
+from plenocli.forward.scene.tables import camera_sensitivity
+from plenocli.forward.sensor.cfa import cfa_map
+from plenocli.stages.inverse.calibrate import run_calibrate
+from plenocli.stages.forward.capture_sim import Settings as Capture
+from plenocli.stages.forward.capture_sim import run_capture_sim
+from plenocli.stages.inverse.demux import Settings as Demux
+from plenocli.stages.inverse.demux import run_demux
+from plenocli.stages.evaluation.score import run_score
+from plenocli.stages.forward.simulate_response import Settings, run_simulate_response
 
 BANDS = (450e-9, 540e-9, 570e-9, 650e-9)
 TEXT = """

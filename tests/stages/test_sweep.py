@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.artefacts import read_artefact
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.sections import read_options
-from plenocli.config.sweep import number
-from plenocli.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
-from plenocli.stages import chain
-from plenocli.stages.sweep import run_sweep
-from plenocli.stages.sweep_table import lines
+from plenocli.files.config.sweep_file import number
+from plenocli.base.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
+from plenocli.stages.sweep import point as chain
+from plenocli.stages.sweep.sweep import run_sweep
+from plenocli.stages.sweep.table import lines
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -119,7 +119,7 @@ def test_the_front_is_what_brute_force_finds(whole):
 
 
 def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
-    from plenocli.stages import simulate_pif
+    from plenocli.stages.forward import simulate_pif
 
     calls = []
     real = simulate_pif.run_simulate_pif
@@ -217,7 +217,7 @@ def test_mistakes_in_the_file_end_the_run_before_any_work(tmp_path, old, new, er
 def test_outputs_are_guarded(whole, tmp_path, monkeypatch):
     path, table, _ = whole
     with monkeypatch.context() as without:
-        without.setattr("plenocli.stages.sweep_store.find_spec", lambda name: None)
+        without.setattr("plenocli.stages.sweep.store.find_spec", lambda name: None)
         with pytest.raises(UsageError, match="matplotlib"):
             sweep(path, tmp_path / "out.h5", plot=tmp_path / "front.png")
     with pytest.raises(UsageError, match="exists already"):
@@ -229,7 +229,7 @@ def test_outputs_are_guarded(whole, tmp_path, monkeypatch):
     with pytest.raises(OutputError):
         sweep(path, tmp_path / "no" / "where.h5")
     with pytest.raises(OutputError, match="another run"):
-        from plenocli.stages.journal import Journal
+        from plenocli.execution.journal import Journal
 
         (tmp_path / "held.parts").mkdir()
         held = Journal(tmp_path / "held.parts" / "points.jsonl")
@@ -251,7 +251,7 @@ def test_damaged_lines_of_the_journal_are_computed_again(whole, tmp_path):
 
 
 def test_keys_follow_what_figures_depend_on_and_nothing_else(tmp_path):
-    from plenocli.config import parse_camera
+    from plenocli.files.config.camera_file import parse_camera
 
     camera = parse_camera(camera_text())
     task = chain.task_of("spatial", camera, {"capture-sim": {"snr_db": 50.0}}, 0)
@@ -297,7 +297,7 @@ def test_memory_that_does_not_suffice_is_no_verdict_for_good(tmp_path):
 
 
 def test_files_that_a_worker_does_not_see_are_no_verdict_on_the_design(tmp_path):
-    from plenocli.config import parse_camera
+    from plenocli.files.config.camera_file import parse_camera
 
     task = chain.task_of("spatial", parse_camera(camera_text()), {}, 0)
     for missing in ({"matrix": str(tmp_path / "gone.h5"), "info": {}}, {"files": [str(tmp_path / "gone.png")]}):
@@ -308,8 +308,8 @@ def test_files_that_a_worker_does_not_see_are_no_verdict_on_the_design(tmp_path)
 def test_show_and_report_draw_the_front(whole, tmp_path):
     import shutil
 
-    from plenocli.stages.report import run_report
-    from plenocli.stages.show import run_show
+    from plenocli.stages.evaluation.report import run_report
+    from plenocli.stages.evaluation.show import run_show
 
     ahead = int(read_artefact(whole[1], "sweep").data["sweep/front"].sum())
     assert f"8 designs, 0 of them refused; {ahead} that no other beats" in run_show([whole[1]], tmp_path / "front.png")["captions"][0]
@@ -349,9 +349,9 @@ def test_values_are_written_as_given_and_read_as_numbers(whole):
 
 
 def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
-    from plenocli.stages.design_space import Row
-    from plenocli.stages.scheduler import Lost
-    from plenocli.stages.sweep_store import open_store
+    from plenocli.stages.sweep.space import Row
+    from plenocli.execution.pool import Lost
+    from plenocli.stages.sweep.store import open_store
 
     class Pool:
         far, room, asked = False, True, []

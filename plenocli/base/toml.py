@@ -1,0 +1,76 @@
+"""TOML text against a pydantic class: every violation in words, with its path and the nearest known key."""
+
+import difflib
+import re
+import tomllib
+
+from pydantic import BaseModel, ValidationError
+
+from plenocli.base.errors import ConfigError
+
+_NAME = r"""(?:"[^"\n]*"|'[^'\n]*'|[\w-]+)"""
+
+
+_DEEP_KEY = re.compile(rf"^\s*\[{{0,2}}\s*{_NAME}(?:\s*\.\s*{_NAME}){{20}}", re.MULTILINE)
+
+
+_MOST_LINES = 40
+
+
+def parse_toml(text, where, model):
+    """What the pydantic class `model` makes of TOML text; ConfigError lists every violation with its path."""
+    if _DEEP_KEY.search(text):  # the standard parser takes time as the square of the depth
+        raise ConfigError("is nested too deep", where, "mend the line")
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError("is nested too deep", where, "mend the line") from None
+    except ValueError as error:  # also a number with too many digits
+        raise ConfigError(f"is not TOML: {_short(str(error))}", where, "mend the line") from None
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise violations(error, where, model) from None
+
+
+def violations(error, where, model):
+    """The ConfigError that lists everything a pydantic ValidationError found."""
+    lines = [_short(_sentence(e, model)) for e in error.errors()]
+    count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
+    if len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = ["..."]
+    return ConfigError(f"{count}\n  " + "\n  ".join(lines), where)
+
+
+def _short(text):
+    """A message that quotes what may be a megabyte, in a few lines."""
+    return text if len(text) <= 400 else f"{text[:200]} ... {text[-150:]}"
+
+
+def _sentence(error, model):
+    """One violation in words: path, what is wrong, and the nearest known key where a key is unknown."""
+    path = [str(p) for p in error["loc"]]
+    if error["type"] == "extra_forbidden":
+        known = known_keys(path[:-1], model)
+        near = difflib.get_close_matches(path[-1], known, 1, 0.5)
+        hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+        return f"{'.'.join(path)}: unknown key; {hint}"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "missing":
+        message = "is missing"
+    return f"{'.'.join(path) or model.__name__.lower()}: {message}"
+
+
+def known_keys(path, model):
+    """Names that a section knows; `path` as in a pydantic error location."""
+    for name in path:
+        if name.isdigit() or name not in model.model_fields:
+            continue
+        kinds = [a for a in _leaves(model.model_fields[name].annotation) if isinstance(a, type) and issubclass(a, BaseModel)]
+        model = kinds[0] if kinds else model
+    return list(model.model_fields)
+
+
+def _leaves(annotation):
+    arguments = getattr(annotation, "__args__", ())
+    return [leaf for a in arguments for leaf in _leaves(a)] if arguments else [annotation]

@@ -1,0 +1,29 @@
+"""The commands and where each of them is."""
+
+import importlib
+
+COMMANDS = {
+    "simulate-pif": "forward",
+    "simulate-response": "forward",
+    "capture-sim": "forward",
+    "calibrate": "inverse",
+    "demux": "inverse",
+    "learn-dict": "inverse",
+    "reconstruct": "inverse",
+    "refocus": "inverse",
+    "score": "evaluation",
+    "report": "evaluation",
+    "sweep": "sweep",
+    "optimise": "sweep",
+    "colorchecker": "evaluation",
+    "show": "evaluation",
+    "inspect": "evaluation",
+    "lens": "forward",
+    "schema": "forward",
+}
+"""Name of a command -> folder of its file. The order is that of the pipeline, and of the help."""
+
+
+def load_command(name):
+    """The click command `name`, imported when it is asked for."""
+    return importlib.import_module(f"plenocli.cli.{COMMANDS[name]}.{name.replace('-', '_')}").command

@@ -1,0 +1,4 @@
+"""Commands that look at results.
+
+Parsing and printing only.
+"""

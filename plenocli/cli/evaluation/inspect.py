@@ -1,0 +1,27 @@
+"""`plenocli inspect`: what a file holds."""
+
+import click
+
+from plenocli.cli import options
+
+
+@click.command("inspect", short_help="Verify a file and show what it holds.")
+@options.input_path("file", metavar="FILE")
+@options.mem_limit
+@options.as_json
+def command(file, mem_limit, as_json):
+    """Verify FILE as a stage would and show what it holds: any artefact (.h5), EXR, camera RAW or DNG, PNG, TIFF or JPEG.
+
+    Artefacts: command, inputs, seed, accuracy, every dataset with unit and range. RAW: mosaic size, colour filter array,
+    black and white level in DN, exposure time in seconds. A file that a stage would refuse ends here with the same reason
+    and exit code 3.
+
+    \b
+    Examples:
+      plenocli inspect pif.h5
+      plenocli inspect IMG_0001.NEF --json
+    """
+    from plenocli.stages.evaluation.inspect import describe, run_inspect
+
+    report = run_inspect(file, mem_limit=mem_limit)
+    options.summary(report, as_json, describe(report))

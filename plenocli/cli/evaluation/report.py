@@ -1,0 +1,28 @@
+"""`plenocli report`: one page about a run folder."""
+
+import click
+
+from plenocli.cli import options
+
+
+@click.command("report", short_help="One page with pictures and tables about everything in a run folder.")
+@options.input_path("run_folder")
+@options.output
+@click.option("--title", help="Title of the page; default the name of the folder.")
+@options.overwrite
+@options.as_json
+def command(run_folder, output, title, overwrite, as_json):
+    """Draw what lies in RUN_FOLDER and below (.h5, .exr, .dng, score*.json) on one self-contained HTML page.
+
+    Sections: spatial (system matrix, captures, reconstructions beside their truth, dictionary), spectral (calibration,
+    response, bands, spectra of patches, error and SNR), files with their provenance. Needs matplotlib: the extra [plot].
+
+    \b
+    Example:
+      plenocli report runs/demo -o runs/demo/report.html --overwrite
+    """
+    from plenocli.stages.evaluation.report import run_report
+
+    made = run_report(run_folder, output, title=title, overwrite=overwrite)
+    missing = f", {len(made['unreadable'])} unreadable" if made["unreadable"] else ""
+    options.summary(made, as_json, f"{output}: {', '.join(made['sections']) or 'no pictures'}; {made['files']} files{missing}")

@@ -1,0 +1,4 @@
+"""Commands that model a camera.
+
+Parsing and printing only.
+"""

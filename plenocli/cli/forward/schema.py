@@ -1,0 +1,21 @@
+"""`plenocli schema`: the JSON Schema of a configuration file."""
+
+import json
+
+import click
+
+
+@click.command("schema", short_help="Print the JSON Schema of a camera, scene or lens description.")
+@click.argument("kind", type=click.Choice(["camera", "scene", "lens"]))
+def command(kind):
+    """Print the JSON Schema of a configuration file, for editors and for checking without plenocli.
+
+    \b
+    Example:
+      plenocli schema camera > camera.schema.json
+    """
+    from plenocli.forward.camera.model import Camera
+    from plenocli.files.config.lens_file import LensFile
+    from plenocli.files.config.scene_file import Scene
+
+    click.echo(json.dumps({"camera": Camera, "scene": Scene, "lens": LensFile}[kind].model_json_schema(), indent=2))

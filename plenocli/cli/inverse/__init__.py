@@ -1,0 +1,4 @@
+"""Commands that turn captures into results.
+
+Parsing and printing only.
+"""

@@ -1,0 +1,4 @@
+"""Commands that explore a design space.
+
+Parsing and printing only.
+"""

@@ -1,0 +1,74 @@
+"""Coherence of a dictionary Phi with the system matrix A: what sparse recovery from y = A Phi c can hope for.
+
+Three quantities go by the name; all are reported. D = A Phi is the effective dictionary, what the sensor sees of each
+atom. See docs/model.md, "Spatial reconstruction".
+"""
+
+import math
+
+import numpy as np
+
+from plenocli.inverse.sparse.coherence import column_coherence
+
+DEFINITIONS = {
+    "coherence_raw": "max |<a_i, phi_j>| over rows of A and atoms, nothing normalised (Berkner et al. 2013); depends on the "
+    "scale of A",
+    "coherence_candes_romberg": "sqrt(n) max |<a_i, phi_j>| / (|a_i| |phi_j|), n = object points: 1 (incoherent) to sqrt(n) "
+    "(Candes and Romberg 2007)",
+    "coherence_effective": "mu(D) = max |<d_i, d_j>| / (|d_i| |d_j|) over pairs of different columns of D = A Phi: 0 to 1",
+    "coherence_effective_mean": "mean of the same over all pairs",
+    "welch_bound": "sqrt((L - M) / (M (L - 1))) for L atoms and M pixels: the least mu(D) can be; 0 when L <= M",
+    "exact_recovery_sparsity": "largest k < (1 + 1/mu(D)) / 2: any k atoms are recovered exactly without noise (Donoho and Elad 2003)",
+    "dead_atoms": "atoms of zero norm",
+    "invisible_atoms": "atoms with |A phi| < 1e-6 of the largest: the sensor cannot tell them from nothing; left out of mu(D)",
+}
+
+
+def coherence(system, atoms, block=512):
+    """Measures of DEFINITIONS for A `system` (pixel, point) and Phi `atoms` (point, atom): dict of numbers.
+
+    Beside the inputs and D (pixel, atom) only blocks of `block` columns of products are held. Computed in the precision of
+    the inputs. Measures that need two visible atoms are None without them.
+    """
+    system, atoms = np.asarray(system), np.asarray(atoms)
+    pixels, points = system.shape
+    if atoms.ndim != 2 or atoms.shape[0] != points:
+        raise ValueError(f"A has {points} object points, the dictionary is {atoms.shape}")
+    count = atoms.shape[1]
+    row_norm = np.linalg.norm(system, axis=1)
+    atom_norm = np.linalg.norm(atoms, axis=0)
+    row_scale, atom_scale = (np.where(norm > 0, norm, np.inf) for norm in (row_norm, atom_norm))
+    effective = np.empty((pixels, count), dtype=np.result_type(system, atoms))
+    raw = candes = 0.0
+    for start in range(0, count, block):
+        part = slice(start, start + block)
+        product = system @ atoms[:, part]
+        effective[:, part] = product
+        magnitude = np.abs(product)
+        raw = max(raw, float(magnitude.max(initial=0)))
+        magnitude = magnitude / row_scale[:, None] / atom_scale[part]
+        candes = max(candes, float(magnitude.max(initial=0)))
+    largest, mean, visible = column_coherence(effective, block)
+    return {
+        "coherence_raw": raw,
+        "coherence_candes_romberg": math.sqrt(points) * candes,
+        "coherence_effective": largest,
+        "coherence_effective_mean": mean,
+        "welch_bound": welch_bound(count, pixels),
+        "exact_recovery_sparsity": None if largest is None else exact_recovery_sparsity(largest),
+        "dead_atoms": int((atom_norm == 0).sum()),
+        "invisible_atoms": int((~visible & (atom_norm > 0)).sum()),
+        "atoms": count,
+        "points": points,
+        "pixels": pixels,
+    }
+
+
+def welch_bound(atoms, pixels):
+    """Least possible mutual coherence of `atoms` unit vectors in `pixels` dimensions (Welch 1974)."""
+    return math.sqrt((atoms - pixels) / (pixels * (atoms - 1))) if atoms > pixels else 0.0
+
+
+def exact_recovery_sparsity(mu):
+    """Largest whole k below (1 + 1/mu)/2; None for mu = 0, where no limit follows."""
+    return None if mu <= 0 else math.ceil((1 + 1 / mu) / 2 - 1e-12) - 1

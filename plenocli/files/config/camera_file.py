@@ -1,0 +1,54 @@
+"""The camera's description as TOML, both ways."""
+
+from pathlib import Path
+
+from plenocli.base.toml import parse_toml
+from plenocli.base.units import format_duration, format_length
+from plenocli.files.config.toml_file import read_text
+from plenocli.forward.camera.model import Camera
+
+def load_camera(path):
+    """Read and check a camera description; InputError where the file cannot be read, ConfigError for what it says."""
+    return parse_camera(read_text(Path(path), "camera"), path)
+
+
+def parse_camera(text, where="camera"):
+    """A Camera from TOML text; ConfigError lists every violation with its path."""
+    return parse_toml(text, where, Camera)
+
+
+def camera_schema():
+    """The JSON Schema of a camera description, as a dict."""
+    return Camera.model_json_schema()
+
+
+_UNITS = {"full_well": "e", "read_noise": "e", "gain": "DN/e"}
+
+
+_NUMBERS = {"f_number", "obscuration", "fill_factor", "pixel_fill_factor", "quantum_efficiency", "peak", "blocking"}
+
+
+def to_toml(camera):
+    """TOML text of a resolved camera, one key a line, lengths with units; deterministic."""
+    lines = []
+    for section, values in camera.model_dump(exclude_none=True).items():
+        lines.append(f"[{section}]")
+        lines += [f"{key} = {_toml(key, value)}" for key, value in values.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _toml(key, value):
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {_toml(k, v)}" for k, v in value.items()) + " }"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(_toml(key, v) for v in value) + "]"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, int):
+        return str(value)
+    if key in _UNITS:
+        return f'"{value!r} {_UNITS[key]}"'
+    if key == "white_exposure":
+        return f'"{format_duration(value)}"'
+    return repr(value) if key in _NUMBERS else f'"{format_length(value)}"'

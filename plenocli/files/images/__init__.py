@@ -1,0 +1,4 @@
+"""EXR, camera RAW, DNG and photographs, in and out.
+
+Artefacts of our own are artefacts.
+"""

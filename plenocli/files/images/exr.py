@@ -1,0 +1,197 @@
+"""OpenEXR in and out through OpenImageIO. Channels are always found by name, because EXR sorts them.
+
+What we write carries a SHA-256 of its channels and attributes, because EXR has no checksum of its own; the reader verifies
+it where it is there. The clock is kept out: the same channels give the same bytes.
+"""
+
+import contextlib
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from plenocli import __version__
+from plenocli.files.atomic import check_output, replacement
+from plenocli.base.budget import require_room
+from plenocli.files.artefacts.provenance import first_bytes
+from plenocli.base.errors import InputError, OutputError
+
+DIGEST = "plenocli:sha256"
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
+
+
+def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip"):
+    """Write float32 channels (name -> (row, column) array, all of one shape) and text attributes (name -> str).
+
+    Everything is read back and compared before the file takes its place. Same input, same bytes.
+    Raises ValueError (a bug of the caller: shapes, names), UsageError, OutputError.
+    """
+    planes, attrs = _checked(channels, attrs or {}, compression)
+    check_output(path, overwrite=overwrite)
+    names = sorted(planes)
+    rows, columns = planes[names[0]].shape
+    spec = _spec(names, rows, columns, attrs, compression)
+    spec.attribute(DIGEST, _digest(planes, attrs))
+    pixels = np.ascontiguousarray(np.stack([planes[name] for name in names], axis=-1))
+    with replacement(path, overwrite=overwrite) as (partial, _):
+        import OpenImageIO as oiio
+
+        output = oiio.ImageOutput.create("exr")
+        if output is None or not output.open(str(partial), spec):
+            raise OutputError(f"OpenEXR cannot write it ({oiio_error(output)})", path, "check the folder and the space left")
+        written = output.write_image(pixels)
+        closed = output.close()
+        if not (written and closed):
+            raise OutputError(f"OpenEXR could not write all of it ({oiio_error(output)})", path, "free some space; nothing was changed")
+        _verify(path, partial, pixels, names, attrs, compression)
+
+
+def read_exr(path, *, mem_limit=None):
+    """Channels (name -> (row, column) float32) and text attributes (name -> str) of an EXR file.
+
+    Raises InputError for a file that is missing, damaged, too large, deep, in several parts, or holds integer channels.
+    """
+    with _opened(path) as source:
+        spec = source.spec()
+        _check_header(path, source, spec, mem_limit)
+        pixels = source.read_image("float")
+        if pixels is None:
+            raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
+        attrs = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
+        pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
+        "".join([*spec.channelnames, *attrs, *attrs.values()]).encode()  # damaged text may come as lone surrogates
+        channels = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)}
+    if DIGEST in attrs:
+        ours = {name: value for name, value in attrs.items() if name.startswith("plenocli:") or name in _listed(attrs)}
+        ours.pop(DIGEST)
+        if _digest(channels, {n: v for n, v in ours.items() if n != _LIST}) != attrs[DIGEST]:
+            raise InputError("is damaged or was edited: its SHA-256 is not the one it was written with", path, "make it again")
+    return channels, {name: value for name, value in attrs.items() if name != _LIST}
+
+
+def channel_names(path):
+    """Names of the channels, from the header alone. Raises InputError."""
+    with _opened(path) as source:
+        return list(source.spec().channelnames)
+
+
+# --- writing -----------------------------------------------------------------------------------------------------------
+
+_LIST = "plenocli:attributes"  # the names that the digest covers; OpenImageIO adds attributes of its own
+
+
+def _listed(attrs):
+    try:
+        return set(json.loads(attrs.get(_LIST, "[]")))
+    except ValueError:
+        return set()
+
+
+def _checked(channels, attrs, compression):
+    planes = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()}
+    shapes = {plane.shape for plane in planes.values()}
+    if not planes or len(shapes) != 1 or any(len(s) != 2 or 0 in s for s in shapes):
+        raise ValueError(f"EXR channels must be two-dimensional, not empty and of one shape, not {shapes}")
+    # EXR keeps 255 bytes of a name; OpenImageIO renames empty and repeated ones without a word
+    if any(not name or len(name.encode()) > 255 or "\0" in name for name in planes) or len({n.lower() for n in planes}) != len(planes):
+        raise ValueError(f"EXR channel names must be distinct and not empty: {list(planes)}")
+    if any(not isinstance(v, str) or not n for n, v in attrs.items()):
+        raise ValueError("EXR attributes must be text: OpenImageIO drops other types without a word")
+    if compression not in _COMPRESSIONS:
+        raise ValueError(f"EXR compression {compression!r} is none of {_COMPRESSIONS}")
+    return planes, attrs
+
+
+def _spec(names, rows, columns, attrs, compression):
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(columns, rows, len(names), "float")
+    spec.channelnames = names
+    for name, value in attrs.items():
+        spec.attribute(name, value)
+    spec.attribute(_LIST, json.dumps(sorted(attrs)))
+    spec.attribute("compression", compression)
+    spec.attribute("DateTime", "2000:01:01 00:00:00")  # left out, OpenImageIO writes the clock
+    spec.attribute("Software", f"plenocli {__version__}")
+    return spec
+
+
+def _digest(planes, attrs):
+    digest = hashlib.sha256(json.dumps(sorted(attrs.items())).encode())
+    for name in sorted(planes):
+        digest.update(f"{name} {planes[name].shape}".encode())
+        digest.update(np.ascontiguousarray(planes[name], dtype="<f4"))
+    return digest.hexdigest()
+
+
+def _verify(path, partial, pixels, names, attrs, compression):
+    """Compare the file with what went in: OpenImageIO drops what it cannot store, and misses a disk that gets full, without an error."""
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(str(partial))
+    if source is None:
+        raise OutputError(f"cannot be read back ({oiio_error(None)})", path, "free some space; nothing was changed")
+    spec = source.spec()
+    back, stored = {a.name: a.value for a in spec.extra_attribs}, list(spec.channelnames)
+    wrong = [name for name, value in (attrs | {"compression": compression}).items() if back.get(name) != value]
+    if sorted(stored) != sorted(names) or wrong or spec.format.basetype != oiio.FLOAT:
+        raise OutputError(f"EXR does not keep {wrong or 'the channel names'}", path, "use other names")
+    found = source.read_image("float")
+    trouble = oiio_error(source)
+    source.close()
+    order = [stored.index(name) for name in names]
+    if found is None or trouble or not np.array_equal(found.reshape(pixels.shape)[..., order].view(np.uint32), pixels.view(np.uint32)):
+        raise OutputError(f"does not hold what was written ({trouble or 'other values'})", path, "free some space; nothing was changed")
+
+
+# --- reading -----------------------------------------------------------------------------------------------------------
+
+@contextlib.contextmanager
+def _opened(path):
+    """An open ImageInput of the EXR at `path`, closed afterwards; the type is taken from the content, not from the name."""
+    import OpenImageIO as oiio
+
+    path = Path(path)
+    if first_bytes(path, len(_EXR_MAGIC)) != _EXR_MAGIC:
+        raise InputError("is not an EXR file", path, "give an .exr")
+    try:
+        source = oiio.ImageInput.open(str(path))
+    except UnicodeError:
+        source = None
+    if source is None or source.format_name() != "openexr":
+        raise InputError(f"is no readable EXR: {oiio_error(source)}", path, "make or copy it again")
+    try:
+        yield source
+    except UnicodeError as error:
+        raise InputError("is damaged: an attribute or channel name is not text", path, "make or copy it again") from error
+    finally:
+        source.close()
+        oiio_error(source)  # an error never fetched is printed when the process ends
+
+
+def _check_header(path, source, spec, mem_limit):
+    import OpenImageIO as oiio
+
+    if spec.deep:
+        raise InputError("is a deep EXR", path, "flatten it first")
+    require_room(path, spec.width * spec.height * spec.nchannels * 4, mem_limit)
+    formats = spec.channelformats or (spec.format,) * spec.nchannels
+    if any(f.basetype not in (oiio.FLOAT, oiio.HALF) for f in formats):
+        raise InputError("holds integer channels, which have no unit", path, "keep only half and float channels")
+    if source.seek_subimage(1, 0):
+        raise InputError("holds several parts", path, "split it into one file a part")
+    oiio_error(source)
+    source.seek_subimage(0, 0)
+
+
+def oiio_error(handle):
+    """The pending message of an OpenImageIO object (or of the library, for None), its first line; fetching clears it."""
+    import OpenImageIO as oiio
+
+    try:
+        own = handle.geterror() if handle is not None else ""
+        return (own or oiio.geterror()).strip().partition("\n")[0]
+    except UnicodeDecodeError:  # the message quotes a name that is not text
+        return "a name in its header is not text"

@@ -1,0 +1,137 @@
+"""Training pictures for dictionaries and for the statistics of natural images."""
+
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.base.errors import InputError
+from plenocli.base.progress import note
+from plenocli.files.read.scenes import EMBEDDED, embedded_photograph
+
+DEFAULT = ("skimage:camera", "skimage:coffee", "skimage:chelsea", "skimage:rocket", "skimage:coins", "skimage:moon", "skimage:brick",
+           "skimage:grass", "skimage:gravel", "skimage:motorcycle_left")
+"""Photographs that ship with scikit-image, but for the astronaut, which is the test picture."""
+
+SCALES = (1, 2, 4)
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".ppm", ".pgm", ".webp")
+"""What is taken for a picture in a folder."""
+
+IN_MEMORY = 1 << 30
+"""Bytes of pictures that are held in memory; more go to a temporary file that is mapped, so that thousands of pictures stream."""
+
+
+class Shelf:
+    """Keeps float32 pictures: in memory up to `limit` bytes, the rest in a nameless temporary file."""
+
+    def __init__(self, limit=None):
+        self.limit, self.held, self.file = IN_MEMORY if limit is None else limit, 0, None
+
+    def keep(self, picture):
+        """The picture as float32, wherever it now lies."""
+        picture = np.asarray(picture, np.float32)
+        self.held += picture.nbytes
+        if self.held <= self.limit:
+            return picture
+        if self.file is None:
+            import tempfile
+            import weakref
+
+            self.file = tempfile.TemporaryFile()
+            weakref.finalize(self, self.file.close)  # the mapped pictures keep what they need
+        begin = self.file.seek(0, 2)
+        self.file.write(np.ascontiguousarray(picture).data)
+        self.file.flush()
+        return np.memmap(self.file, np.float32, "r", begin, picture.shape)
+
+
+def read_training(names, shape, *, not_scene=None, limit=None):
+    """Linear luminance pictures [(name, (row, column) float32)] of at least `shape`, from files, folders or skimage:NAME; () means DEFAULT.
+
+    A folder stands for the pictures in it and below; what cannot be read there is left out with a note. One picture is decoded
+    at a time; beyond `limit` bytes (IN_MEMORY) they lie in a temporary file.
+
+    not_scene: name of a test scene; a default picture of that name is left out with a note, one asked for is an error
+    (statistics from the test picture would flatter every result). InputError where nothing is left.
+    """
+    from plenocli.forward.scene.sample import luminance
+
+    wanted, shelf = _expand(names or DEFAULT), Shelf(limit)
+    stem = Path(str(not_scene).removeprefix(EMBEDDED)).stem if not_scene else None
+    pictures = []
+    for name, asked in wanted:
+        asked = asked and bool(names)
+        if stem and Path(str(name).removeprefix(EMBEDDED)).stem == stem:
+            if asked:
+                raise InputError("is the captured scene itself; results trained on it would flatter", name, "train on other pictures")
+            note(f"training leaves out {name}, which is the captured scene")
+            continue
+        try:
+            picture = np.asarray(luminance(_values(name)), float)
+        except InputError as error:
+            if asked:
+                raise
+            note(f"training leaves out a picture: {error}")
+            continue
+        if min(picture.shape[0] - shape[0], picture.shape[1] - shape[1]) < 0:
+            note(f"training leaves out {name}: {picture.shape[0]} x {picture.shape[1]} pixels are less than a block of {shape[0]} x {shape[1]}")
+            continue
+        if not (picture.min() >= 0 and np.ptp(picture) > 0):
+            if not asked:
+                note(f"training leaves out {name}: no structure, or values below 0")
+                continue
+            raise InputError("has no structure to learn from, or values below 0", name, "train on photographs")
+        top = float(picture.max(initial=0))
+        pictures.append((str(name), shelf.keep(picture / top if top > 1 else picture)))
+    if not pictures:
+        raise InputError("no training picture is left", fix=f"give pictures of at least {shape[0]} x {shape[1]} pixels")
+    return pictures
+
+
+def split_by_scene(pictures):
+    """(training, held out): every fifth picture, from the third on, judges; one picture alone has to do both."""
+    if len(pictures) == 1:
+        note("one training picture only: the validation patches come from it too, so the figures flatter")
+        return pictures, pictures
+    held = set(range(2, len(pictures), 5)) or {len(pictures) - 1}
+    return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
+
+
+def at_scales(pictures, shape, *, limit=None):
+    """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of `shape` fit: scenes come in all sizes."""
+    from plenocli.forward.scene.sample import block_mean
+
+    out, shelf = [], Shelf(limit)
+    for name, picture in pictures:
+        for k in SCALES:
+            rows, columns = (n // k * k for n in picture.shape)
+            if k == 1 or min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
+                out.append((name, shelf.keep(block_mean(np.asarray(picture[:rows, :columns], float), (k, k))) if k > 1 else picture))
+    return out
+
+
+def _expand(names):
+    """[(name, asked for by itself)], folders replaced by their pictures in order of their paths."""
+    out = []
+    for name in names:
+        if str(name).startswith(EMBEDDED) or not Path(name).is_dir():
+            out.append((name, True))
+            continue
+        found = sorted(p for p in Path(name).rglob("*") if p.suffix.lower() in SUFFIXES)
+        if not found:
+            raise InputError("holds no pictures", name, f"give a folder with {', '.join(SUFFIXES)}")
+        out += [(str(p), False) for p in found]
+    return out
+
+
+def _values(name):
+    if str(name).startswith(EMBEDDED):
+        return embedded_photograph(str(name).removeprefix(EMBEDDED))
+    from plenocli.files.images.pictures import read_picture
+
+    return read_picture(name).values
+
+
+def files_of(names):
+    """The paths among the names, folders as their pictures, for the provenance of an artefact."""
+    return [str(n) for n, _ in _expand(names) if not str(n).startswith(EMBEDDED)] or None

@@ -1,0 +1,150 @@
+"""Exposures of one scene made into one image: dark removed, exposure divided out, saturation masked, noise measured."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+
+SATURATION = 0.985  # of the way from black to the white level: averaging electronics saturate softly
+SAME_EXPOSURE = 0.01
+
+
+@dataclass(frozen=True)
+class Dark:
+    """What the sensor reports without light. mean (rows, columns) DN at `exposure` s (None: unknown); black (2, 2) DN;
+    sigma: temporal noise of one frame, DN (None: no dark frame was given). variance: of the mean itself, DN^2."""
+
+    mean: np.ndarray
+    black: np.ndarray
+    exposure: float | None
+    sigma: float | None
+    variance: float = 0.0
+
+    @cached_property
+    def flat(self):
+        """Whether the dark image is the black level everywhere."""
+        return bool((self.mean == tiled(self.black, self.mean.shape, self.mean.dtype)).all())
+
+    def grows(self, exposure):
+        """Whether the dark image at another exposure is another one."""
+        return not (self.exposure is None or exposure is None or abs(exposure / self.exposure - 1) < SAME_EXPOSURE)
+
+    def at(self, exposure):
+        """Expected dark image at another exposure: the part above the black level grows with time."""
+        if not self.grows(exposure):
+            return self.mean
+        level = tiled(self.black, self.mean.shape)
+        return level + (self.mean - level) * np.float32(exposure / self.exposure)
+
+
+def tiled(level, shape, dtype=np.float32):
+    """A (2, 2) level by position, repeated over (rows, columns)."""
+    rows, columns = shape
+    return np.tile(np.asarray(level, dtype), ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
+
+
+def make_dark(frames, exposures, black, shape):
+    """Dark from dark frames (possibly none): the mean of those at the longest exposure, noise from differences.
+
+    frames: list of (rows, columns) DN; exposures: s or None each; black (2, 2) DN. Without frames the black level
+    stands for the dark image. The noise of a single frame is a robust spread over pixels, at least the rounding's.
+    """
+    if not frames:
+        return Dark(tiled(black, shape), np.asarray(black, float), None, None)
+    longest = max((e for e in exposures if e is not None), default=None)
+    chosen = [np.asarray(f, np.float32) for f, e in zip(frames, exposures) if longest is None or (e and abs(e / longest - 1) < SAME_EXPOSURE)]
+    mean = sum(chosen) / np.float32(len(chosen))
+    if len(chosen) > 1:
+        spread = float(np.sqrt(np.mean([np.var(a - b) / 2 for a, b in zip(chosen[::2], chosen[1::2])])))
+    else:
+        low, high = np.percentile((mean - tiled(black, shape))[::3, ::3], [15.87, 84.13])
+        spread = float(high - low) / 2
+    spread = max(spread, 1 / np.sqrt(12))
+    return Dark(mean, np.asarray(black, float), longest, spread, spread**2 / len(chosen))
+
+
+def saturated(values, black, white):
+    """Mask of pixels at or near the white level (DN); nothing is saturated where the white level is unknown (inf)."""
+    if white is None or not np.isfinite(white):
+        return np.zeros(values.shape, bool)
+    top = tiled(np.asarray(black) + SATURATION * (white - np.asarray(black)), values.shape)
+    return values >= top
+
+
+def merge(frames, exposures, dark, white, reference):
+    """Mean signal, DN at exposure `reference` (s), of several frames: (signal float32 NaN where never good, weight).
+
+    sum of (frame - dark) over sum of exposures, saturated pixels left out: the least-noise average of shot-limited
+    frames. exposures: s each, or all None (taken as equal). weight (rows, columns): good exposure time in units of
+    `reference`: the variance of the signal is (gain signal + read variance) / weight for frames near that exposure.
+    """
+    total, time = 0.0, 0.0
+    for frame, exposure in zip(frames, exposures):
+        good = ~saturated(frame, dark.black, white)
+        share = 1.0 if exposure is None or reference is None else exposure / reference
+        total = total + np.where(good, np.asarray(frame, np.float32) - dark.at(exposure), 0)
+        time = time + good.astype(np.float32) * np.float32(share)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(time > 0, total / time, np.nan).astype(np.float32), time
+
+
+def photon_transfer(first, second, limit=np.inf, bins=24):
+    """Gain (DN per electron) and dark variance (DN^2) from two frames of one still scene.
+
+    Half the variance of the difference against the mean, by bins of the mean below `limit`; a straight line through
+    the bins (EMVA 1288, photon transfer method). Returns None where the picture has no range of levels.
+    """
+    first, second = np.asarray(first, float).ravel(), np.asarray(second, float).ravel()
+    mean, half = (first + second) / 2, (first - second) ** 2 / 2
+    good = np.isfinite(mean) & (mean < limit)
+    if good.sum() < 1000:
+        return None
+    mean, half = mean[good], half[good]
+    edges = np.unique(np.quantile(mean, np.linspace(0, 1, bins + 1)))
+    if len(edges) < 5:
+        return None
+    which = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(which, minlength=len(edges) - 1)
+    full = count > 50
+    if full.sum() < 4:
+        return None
+    x = np.bincount(which, mean, len(count))[full] / count[full]
+    y = np.bincount(which, half, len(count))[full] / count[full]
+    weight = np.sqrt(count[full]) / np.maximum(y, 1e-12)  # the variance of a variance goes with its square
+    slope, offset = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * weight[:, None], y * weight, rcond=None)[0]
+    return (float(slope), float(max(offset, 0.0))) if slope > 0 else None
+
+
+def bad_pixels(white, dark, top, step):
+    """Mask of pixels that do not follow the light: dead in the white image, or hot in the dark one.
+
+    white: signal (rows, columns), NaN where saturated; dark: Dark; top: white level, DN; step: 1 mono, 2 mosaic.
+    """
+    bad = dead_pixels(np.nan_to_num(white), step)
+    if dark.sigma is not None:
+        level = tiled(dark.black, dark.mean.shape)
+        excess = dark.mean - level - np.median((dark.mean - level)[::3, ::3])
+        scale = top if top is not None and np.isfinite(top) else np.nanmax(white)
+        bad |= excess > max(12 * dark.sigma, 0.02 * scale)
+    return bad
+
+
+def dead_pixels(image, step=1):
+    """Mask of pixels far outside the range of their four neighbours `step` px away: dead, or hot."""
+    neighbours = shifted_neighbours(image, step)
+    high, low = np.maximum.reduce(neighbours), np.minimum.reduce(neighbours)
+    sample = (image - high)[::7, ::7]
+    noise = 1.48 * np.median(np.abs(sample - np.median(sample)))
+    return (image > 3 * np.abs(high) + 6 * noise) | (image < low / 3 - 3 * noise)
+
+
+def shifted_neighbours(image, step):
+    padded = np.pad(image, step, mode="reflect")
+    rows, columns = image.shape
+    return [
+        padded[:rows, step : step + columns],
+        padded[2 * step :, step : step + columns],
+        padded[step : step + rows, :columns],
+        padded[step : step + rows, 2 * step :],
+    ]

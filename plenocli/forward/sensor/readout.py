@@ -1,0 +1,130 @@
+"""A capture as light, cut out superpixel by superpixel: dark taken off, exposure divided out, saturation masked.
+
+A whole mosaic in single precision would pass through memory several times; windows of some lenslets stay in the cache.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plenocli.forward.sensor.frames import SATURATION, Dark
+from plenocli.forward.sensor.superpixel import inside
+
+
+@dataclass(frozen=True)
+class Readout:
+    """values (rows, columns) as the sensor reports them; dark: plenocli.forward.sensor.frames.Dark; seconds: exposure (None: unknown); black
+    (2, 2) and white: levels beyond which pixels are saturated (white inf: none); scale: to the light of the calibration's
+    exposure; offset: taken off after that; ready: Levels that were cut before. `readout - number` is the capture with a larger
+    offset.
+    """
+
+    values: np.ndarray
+    dark: Dark
+    seconds: float | None
+    black: np.ndarray
+    white: float
+    scale: float = 1.0
+    offset: float = 0.0
+    ready: "Levels | None" = None
+
+    @property
+    def shape(self):
+        """(rows, columns)."""
+        return self.values.shape
+
+    def __sub__(self, offset):
+        return replace(self, offset=self.offset + float(offset))
+
+    def cut(self, origin, window):
+        """Light (lenslet, h*w) float32 of windows (h, w) whose first pixels are at `origin` (lenslet, 2); NaN where a pixel is
+        saturated, and everywhere in windows that are not wholly on the sensor."""
+        return self.cutter(origin, window)(slice(None))
+
+    def cutter(self, origin, window):
+        """Function of an index or slice into `origin` that cuts those windows."""
+        whole = inside(origin, window, self.shape)
+        if whole.all():
+            return _Cutter(self, origin, window)
+        inner = _Cutter(self, np.where(whole[:, None], origin, 0), window)
+
+        def cut(part):
+            light = inner(part)
+            light[~whole[part]] = np.nan
+            return light
+
+        return cut
+
+
+class _Cutter:
+    """Windows that are all on the sensor, and what is the same for any of them."""
+
+    def __init__(self, readout, origin, window):
+        self.readout, self.origin, self.count = readout, origin, window[0] * window[1]
+        dark = readout.dark
+        self.raw = np.lib.stride_tricks.sliding_window_view(readout.values, window)
+        self.mean = None if dark.flat else Levels(dark, origin, window)
+        if readout.ready is not None and readout.ready.origin is origin:
+            self.mean = readout.ready
+        self.level = np.float32(dark.black.flat[0]) if np.ptp(dark.black) == 0 else _tiles(dark.black, window)
+        self.growth = None if dark.flat or not dark.grows(readout.seconds) else np.float32(readout.seconds / dark.exposure)
+        black = np.asarray(readout.black, float)
+        top = black + SATURATION * (readout.white - black)
+        self.least = top.min()
+        self.top = np.float32(self.least) if np.ptp(black) == 0 or not np.isfinite(self.least) else _tiles(top, window)
+
+    def __call__(self, part):
+        origin, readout = self.origin[part], self.readout
+        at = origin[:, 0], origin[:, 1]
+        raw = self.raw[at].reshape(-1, self.count)
+        if self.mean is None:
+            mean = self._of(self.level, origin)
+        else:
+            mean = self.mean(part)
+            if self.growth is not None:  # as Dark.at
+                level = self._of(self.level, origin)
+                mean = level + (mean - level) * self.growth
+        light = np.subtract(raw, mean, dtype=np.float32, casting="same_kind")
+        if readout.scale != 1.0:
+            light *= np.float32(readout.scale)
+        if readout.offset:
+            light -= np.float32(readout.offset)
+        if raw.max() >= self.least:
+            light[raw >= self._of(self.top, origin)] = np.nan
+        return light
+
+    def _of(self, level, origin):
+        """A level under windows: one number, or (lenslet, pixel)."""
+        return level if level.ndim == 0 else level[origin[:, 0] % 2, origin[:, 1] % 2]
+
+
+class Levels:
+    """The dark image under windows; `keep` holds them all, for many captures."""
+
+    def __init__(self, dark, origin, window):
+        self.origin, self.count, self.kept = origin, window[0] * window[1], None
+        self.view = np.lib.stride_tricks.sliding_window_view(dark.mean, window)
+
+    def keep(self):
+        """Cut them all now; returns itself."""
+        kept = np.empty((len(self.origin), self.count), np.float32)
+        for first in range(0, len(kept), 64):
+            kept[first:first + 64] = self(slice(first, first + 64))
+        self.kept = kept
+        return self
+
+    def __call__(self, part):
+        if self.kept is not None:
+            return self.kept[part]
+        origin = self.origin[part]
+        return self.view[origin[:, 0], origin[:, 1]].reshape(-1, self.count)
+
+
+def _tiles(level, window):
+    """A (2, 2) level by position under a window that starts at an even or odd row and column, (2, 2, h*w) float32."""
+    out = np.empty((2, 2, *window), np.float32)
+    for row in (0, 1):
+        for column in (0, 1):
+            tile = np.roll(np.asarray(level, np.float32), (-row, -column), (0, 1))
+            out[row, column] = np.tile(tile, (window[0] // 2 + 1, window[1] // 2 + 1))[: window[0], : window[1]]
+    return out.reshape(2, 2, -1)

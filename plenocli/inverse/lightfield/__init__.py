@@ -1,0 +1,4 @@
+"""Views, refocused planes and depth from one capture.
+
+Geometry comes from forward.camera.
+"""

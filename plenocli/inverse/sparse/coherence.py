@@ -1,0 +1,28 @@
+"""Coherence of the columns that a sparse code chooses from."""
+
+import numpy as np
+
+INVISIBLE = 1e-6
+
+
+def column_coherence(effective, block=512):
+    """(largest, mean, visible): |cosine| over pairs of different columns of D `effective` (pixel, atom), None without a pair.
+
+    visible (atom,) bool: columns of at least INVISIBLE of the largest norm, which alone count.
+    """
+    norm = np.linalg.norm(effective, axis=0)
+    visible = norm > INVISIBLE * norm.max(initial=0)
+    unit = effective[:, visible] / norm[visible]
+    count = unit.shape[1]
+    if count < 2:
+        return None, None, visible
+    largest, total = 0.0, 0.0
+    for start in range(0, count, block):
+        left = unit[:, start : start + block]
+        for other in range(start, count, block):
+            gram = np.abs(left.T @ unit[:, other : other + block])
+            if other == start:
+                gram = np.triu(gram, 1)
+            largest = max(largest, float(gram.max(initial=0)))
+            total += float(gram.sum(dtype=np.float64))
+    return min(largest, 1.0), total / (count * (count - 1) / 2), visible

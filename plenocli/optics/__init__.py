@@ -1,1 +1,0 @@
-"""Wave optics: from the camera's description to the system matrix A."""

@@ -1,1 +1,0 @@
-"""Detector: noise, colour filter array, lenslet grid, superpixels. Arrays in, arrays out; no files."""

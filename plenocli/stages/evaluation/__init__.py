@@ -1,0 +1,4 @@
+"""The commands that look at results.
+
+score, report, show, inspect, colorchecker.
+"""

@@ -1,0 +1,4 @@
+"""The commands that model a camera.
+
+simulate-pif, simulate-response, capture-sim, lens.
+"""

@@ -1,0 +1,4 @@
+"""The commands that turn captures into results.
+
+calibrate, demux, learn-dict, reconstruct, refocus.
+"""

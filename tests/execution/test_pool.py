@@ -1,0 +1,186 @@
+"""Pools: the same results from this process, threads and processes; workers that die; children that go with their parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import pytest
+
+from plenocli.base.errors import InputError, UsageError
+from plenocli.base.progress import heard, note
+from plenocli.execution.pool import Lost, open_pool, run_all
+
+HERE = "tests_scheduler_tasks"  # a module that processes find by its name
+TASKS = '''
+import os, signal, time
+from pathlib import Path
+from plenocli.base.errors import InputError
+from plenocli.base.progress import note
+
+def square(n):
+    note(f"squaring {n}")
+    return n * n
+
+def refuse(n):
+    raise InputError("is odd", f"number {n}", "take another")
+
+def fault(n):
+    return 1 / 0
+
+def threads(n):
+    import numpy as np
+    from threadpoolctl import threadpool_info
+    return max(info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas")
+
+def die_once(path):
+    if not Path(path).exists():
+        Path(path).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "alive"
+
+def die(path):
+    if path == "deadly":
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path
+
+def sleep(path):
+    Path(path, str(os.getpid())).touch()
+    time.sleep(600)
+'''
+
+
+@pytest.fixture(scope="module")
+def tasks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tasks")
+    (folder / f"{HERE}.py").write_text(TASKS)
+    sys.path.insert(0, str(folder))
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder), before]))
+    import importlib
+
+    yield importlib.import_module(HERE)
+    sys.path.remove(str(folder))
+    os.environ.pop("PYTHONPATH") if before is None else os.environ.update(PYTHONPATH=before)
+
+
+def results(pool, function, numbers):
+    return dict(run_all(pool, ((n, function, n) for n in numbers)))
+
+
+def test_results_and_what_was_said_come_back_from_everywhere(tasks):
+    for options in (dict(), dict(workers=3, threads=True), dict(workers=2)):
+        with heard() as said, open_pool(**options) as pool:
+            assert results(pool, tasks.square, range(9)) == {n: n * n for n in range(9)}
+            refused = results(pool, tasks.refuse, [5])[5]
+        assert isinstance(refused, InputError) and str(refused) == "number 5: is odd; take another"
+        if "threads" not in options:
+            assert sorted(said) == [f"squaring {n}" for n in range(9)]
+
+
+def test_a_fault_of_ours_is_not_a_result(tasks):
+    for workers in (1, 2):
+        with pytest.raises(ZeroDivisionError), open_pool(workers) as pool:
+            results(pool, tasks.fault, [1, 2])
+
+
+def test_linear_algebra_has_one_thread_everywhere(tasks, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    for workers in (1, 2):
+        with open_pool(workers) as pool:
+            assert results(pool, tasks.threads, [0]) == {0: 1}
+    assert os.environ["OMP_NUM_THREADS"] == "2"
+
+
+def test_a_process_that_dies_takes_no_result_along(tasks, tmp_path):
+    with open_pool(2) as pool:
+        jobs = [(n, tasks.square, n) for n in range(4)]
+        found = dict(run_all(pool, [*jobs, ("x", tasks.die_once, str(tmp_path / "x")), *((n + 4, f, n + 4) for n, f, _ in jobs)]))
+    assert found == {n: n * n for n in range(8)} | {"x": "alive"}
+
+
+def test_tasks_may_be_handed_in_while_processes_die(tasks, tmp_path):
+    """The pool learns of the death between two tasks, not while it waits for one."""
+    with open_pool(2) as pool:
+        pool.submit("first", tasks.die_once, str(tmp_path / "x"))
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "x").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(1.0)
+        pool.submit("second", tasks.square, 3)
+        assert dict([pool.next(), pool.next()]) == {"first": "alive", "second": 9}
+
+
+def test_a_task_that_kills_every_process_is_lost_alone(tasks):
+    with open_pool(2) as pool:
+        found = dict(run_all(pool, [(name, tasks.die, name) for name in ("a", "b", "deadly", "c", "d")]))
+    assert isinstance(found.pop("deadly"), Lost) and found == {name: name for name in "abcd"}
+
+
+def test_processes_go_with_their_parent(tasks, tmp_path):
+    code = f"import {HERE}; from plenocli.execution.pool import open_pool, run_all\nif __name__ == '__main__':\n    with open_pool(2) as pool: list(run_all(pool, [(n, {HERE}.sleep, {str(tmp_path)!r}) for n in (1, 2)]))"
+    script = tmp_path / "main.py"
+    script.write_text(code)
+    parent = subprocess.Popen([sys.executable, script], start_new_session=True)
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and len([p for p in os.listdir(tmp_path) if p.isdigit()]) < 2:
+        time.sleep(0.05)
+    children = [int(p) for p in os.listdir(tmp_path) if p.isdigit()]
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    while time.monotonic() < deadline and any(map(_lives, children)):
+        time.sleep(0.05)
+    assert len(children) == 2 and not any(map(_lives, children))
+
+
+def _lives(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_few_results_wait(tasks):
+    """Tasks are handed in as results are taken, not all at once."""
+    taken = []
+
+    def jobs():
+        for n in range(50):
+            assert n - len(taken) <= 6
+            yield n, tasks.square, n
+
+    with open_pool(2) as pool:
+        for token, _ in run_all(pool, jobs()):
+            taken.append(token)
+    assert sorted(taken) == list(range(50))
+
+
+def test_what_is_said_is_heard_by_this_thread_only(capsys):
+    with heard() as said:
+        note("one")
+    note("two")
+    assert said == ["one"] and capsys.readouterr().err == "plenocli: two\n"
+
+
+@pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
+def test_a_cluster_that_is_not_there_is_a_usage_error(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(UsageError, match="scheduler"), open_pool(1, address):
+        pass
+
+
+def test_partial_functions_travel(tasks):
+    with open_pool(2) as pool:
+        assert dict(run_all(pool, [(0, partial(pow, 3), 4)])) == {0: 81}
+
+
+def test_a_worker_without_what_the_task_needs_is_told_to_install_it():
+    from plenocli.execution.pool import _trouble
+
+    error = _trouble(ModuleNotFoundError("No module named 'plenocli'"))
+    assert isinstance(error, UsageError) and "cannot load the task (No module named 'plenocli')" in str(error) and "install" in error.fix

@@ -1,0 +1,126 @@
+"""Refocusing and depth against captures of flat scenes traced ray by ray, at known distances."""
+
+import numpy as np
+import pytest
+
+from plenocli.inverse.lightfield import refocus as lightfield
+
+FOCAL, IMAGE, GAP, PITCH_PX, COUNT = 0.05, 0.055, 0.5e-3, 11, 25
+PITCH = 55e-6  # of the lenslets, m
+PIXEL = PITCH * (1 + GAP / IMAGE) / PITCH_PX
+
+
+def scene(x, y):
+    """Radiance on the plane of the lenslets' images, x and y in lenslet pitches: stripes and a blob."""
+    return 0.5 + 0.3 * np.sin(2 * np.pi * (0.11 * x + 0.07 * y)) * np.cos(2 * np.pi * 0.09 * y) + 0.2 * np.exp(-((x - 2) ** 2 + (y + 3) ** 2) / 8)
+
+
+def capture(distance, split=None):
+    """Mosaic of a flat scene at `distance` (m) by rays: pixel -> lenslet centre -> main lens -> object plane; split: another distance
+    for the right half of the object, or None. Written in lengths, not in slopes."""
+    side = COUNT * PITCH_PX
+    place = (np.arange(side) - (side - 1) / 2) * PIXEL
+    lenslet = (np.arange(side) // PITCH_PX - (COUNT - 1) / 2) * PITCH
+
+    def on_object(z):
+        """Where the rays of a line of pixels meet the plane at z, m, as its image would stand on the array."""
+        lens = lenslet - (place - lenslet) * IMAGE / GAP  # on the main lens
+        # thin lens: direction on the object's side for the ray that goes from `lens` to the lenslet
+        image_side = (lenslet - lens) / IMAGE
+        object_side = image_side + lens / FOCAL
+        return -(lens - object_side * z) * IMAGE / z / PITCH
+
+    def picture(z):
+        at = on_object(z)
+        y, x = np.meshgrid(at, at, indexing="ij")
+        return scene(x, y), x
+
+    far, x = picture(distance)
+    if split is None:
+        return far
+    near, x = picture(split)
+    return np.where(x > 0, near, far)
+
+
+def samples(mosaic, noise=0.0):
+    centres = np.stack(np.meshgrid(*[(np.arange(COUNT) + 0.5) * PITCH_PX - 0.5] * 2, indexing="ij"), axis=-1)
+    rows, columns = np.indices(mosaic.shape)
+    inside = ((rows % PITCH_PX - 5) ** 2 + (columns % PITCH_PX - 5) ** 2 <= 25).astype(float)
+    noisy = mosaic + noise * np.random.default_rng(0).normal(size=mosaic.shape)
+    return lightfield.collect(noisy * inside, inside, centres, np.ones((COUNT, COUNT), bool), PITCH_PX)
+
+
+def slope(distance):
+    return lightfield.slope_of(distance, FOCAL, IMAGE, GAP)
+
+
+@pytest.mark.parametrize("distance", [0.45, 0.52, 0.55, 0.58, 0.75, np.inf])
+def test_slopes_and_distances_are_each_others_inverse(distance):
+    assert lightfield.distance_of(slope(distance), FOCAL, IMAGE, GAP) == pytest.approx(distance, rel=1e-9)
+    assert (slope(distance) > 0) == (distance < 0.55 - 1e-9)
+
+
+@pytest.mark.parametrize("distance", [0.46, 0.52, 0.55, 0.58, 0.65])
+def test_a_plane_is_sharpest_and_right_at_its_own_slope(distance):
+    made = samples(capture(distance))
+    own = slope(distance)
+    step, edge = lightfield.STEP, 5 * lightfield.STEP
+    at = ((np.arange(COUNT * step) / step * PITCH_PX) - (COUNT * PITCH_PX - 1) / 2) / PITCH_PX
+    true = scene(*np.meshgrid(at, at, indexing="ij")[::-1])
+    inner = (slice(edge, -edge), slice(edge, -edge))
+    errors = {}
+    for offset in (-1.6, -0.5, 0.0, 0.5, 1.6):
+        picture, spread = lightfield.refocus(made, own + offset, (COUNT, COUNT))
+        errors[offset] = float(np.sqrt(np.mean((picture - true)[inner] ** 2))), float(np.mean(spread[inner]))
+    assert min(errors, key=lambda o: errors[o][0]) == 0 and min(errors, key=lambda o: errors[o][1]) == 0
+    assert errors[0.0][0] < 0.02 and errors[1.6][0] > 1.4 * errors[0.0][0] and errors[1.6][1] > 1.5 * errors[0.0][1]
+
+
+@pytest.mark.parametrize("far, near", [(0.556, 0.541), (0.6, 0.5), (0.75, 0.6)])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(noise, far, near):
+    """The limit: a lenslet of parallax across the pupil is a slope of one."""
+    made = samples(capture(far, near), noise)
+    found, confidence = lightfield.depth(made, np.linspace(-3, 3, 25), (COUNT, COUNT))
+    inner = confidence[4:-4, 4:-4] > 0.5
+    left, right = found[4:-4, 4:10], found[4:-4, 15:-4]
+    sure_left, sure_right = inner[:, :6], inner[:, 11:]
+    assert sure_left.mean() > 0.4 and sure_right.mean() > 0.4
+    assert abs(np.median(left[sure_left]) - slope(far)) < 0.1 and abs(np.median(right[sure_right]) - slope(near)) < 0.1
+    distances = lightfield.distance_of(right[sure_right], FOCAL, IMAGE, GAP)
+    limit = abs(lightfield.distance_of(slope(near) + 0.5, FOCAL, IMAGE, GAP) - lightfield.distance_of(slope(near) - 0.5, FOCAL, IMAGE, GAP))
+    assert abs(np.median(distances) - near) < 0.2 * limit
+
+
+def test_a_scene_without_texture_has_no_depth_and_no_confidence():
+    made = samples(np.full((COUNT * PITCH_PX,) * 2, 0.4))
+    found, confidence = lightfield.depth(made, np.linspace(-2, 2, 9), (COUNT, COUNT))
+    assert confidence.max() < 1e-6 and np.isfinite(found[3:-3, 3:-3]).all()
+    picture, spread = lightfield.refocus(made, 1.3, (COUNT, COUNT))
+    assert np.nanmax(np.abs(picture - 0.4)) < 1e-9 and np.nanmax(spread) < 1e-12
+
+
+def test_views_see_the_parallax_of_their_part_of_the_pupil():
+    near = samples(capture(0.541))
+    seen = lightfield.views(near, 3, (COUNT, COUNT))
+    inner = slice(6, -6)
+    left, right = seen[1, 0][inner, inner], seen[1, 2][inner, inner]
+    from scipy.ndimage import shift
+
+    def mismatch(move):
+        return np.sum((shift(seen[1, 2], (0, move), order=1)[inner, inner] - left) ** 2)
+
+    moves = np.linspace(-3, 3, 61)
+    best = moves[np.argmin([mismatch(m) for m in moves])]
+    reach = near.reach() * np.sqrt(0.5)
+    assert np.isfinite(left).all() and np.isfinite(right).all()
+    assert best == pytest.approx(slope(0.541) * (4 / 3 * reach) / PITCH_PX, abs=0.25)
+
+
+def test_holes_dead_pixels_and_lenslets_off_the_sensor_are_left_out():
+    mosaic = capture(0.55)
+    mosaic[20:25, 30:33] = np.nan
+    made = samples(np.nan_to_num(mosaic, nan=np.nan))
+    assert np.isfinite(made.value).all()
+    picture, _ = lightfield.refocus(made, 0.0, (COUNT + 3, COUNT))
+    assert np.isnan(picture[-4:]).all() and np.isfinite(picture[8:-20, 8:-8]).all()

@@ -1,0 +1,88 @@
+"""Block matching against a plain loop, another library's denoiser, and what must not change."""
+
+import numpy as np
+import pytest
+from scipy.fft import dctn, idctn
+from scipy.linalg import hadamard
+
+from plenocli.evaluation.metrics.quality import psnr
+from plenocli.forward.scene.sample import luminance, sample_picture
+from plenocli.inverse.picture import block_matching as denoise
+from plenocli.files.read.scenes import embedded_photograph
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    truth = np.asarray(sample_picture(luminance(embedded_photograph("coffee")), 96, 96), float)
+    return truth, truth + 0.05 * np.random.default_rng(0).standard_normal(truth.shape)
+
+
+def by_loops(picture, sigma, pilot):
+    """The definition, patch by patch, with scipy's transforms."""
+    p, k = denoise.PATCH, denoise.STACK
+    guide = picture if pilot is None else pilot
+    corners = [sorted({*range(0, n - p + 1, denoise.STEP), n - p}) for n in picture.shape]
+    total, weights = np.zeros(picture.shape), np.zeros(picture.shape)
+    window = np.outer(np.kaiser(p, 2.0), np.kaiser(p, 2.0))
+    for r in corners[0]:
+        for c in corners[1]:
+            near = [(a, b) for a in range(max(0, r - denoise.WINDOW), min(picture.shape[0] - p, r + denoise.WINDOW) + 1)
+                    for b in range(max(0, c - denoise.WINDOW), min(picture.shape[1] - p, c + denoise.WINDOW) + 1)]
+            far = {(a, b): -1.0 if (a, b) == (r, c) else np.sum((guide[a : a + p, b : b + p] - guide[r : r + p, c : c + p]) ** 2) for a, b in near}
+            near = sorted(near, key=far.get)[:k]
+            transform = lambda x: np.tensordot(hadamard(k) / np.sqrt(k), np.stack([dctn(x[a : a + p, b : b + p], norm="ortho") for a, b in near]), 1)  # noqa: E731
+            z = transform(picture)
+            if pilot is None:
+                keep = np.abs(z) > denoise.THRESHOLD * sigma
+                keep[0, 0, 0] = True
+                z, weight = z * keep, 1 / keep.sum()
+            else:
+                wiener = transform(pilot) ** 2
+                wiener /= wiener + sigma**2
+                wiener[0, 0, 0] = 1
+                z, weight = z * wiener, 1 / max(np.sum(wiener**2), 1)
+            for (a, b), patch in zip(near, np.tensordot(hadamard(k) / np.sqrt(k), z, 1)):
+                total[a : a + p, b : b + p] += weight * window * idctn(patch, norm="ortho")
+                weights[a : a + p, b : b + p] += weight * window
+    return total / weights
+
+
+@pytest.mark.parametrize("with_pilot", [False, True])
+def test_it_is_the_plain_loop(noisy, with_pilot):
+    truth, picture = noisy
+    picture, pilot = picture[:22, :25], truth[:22, :25] if with_pilot else None
+    np.testing.assert_allclose(denoise.block_matching(picture, 0.05, pilot), by_loops(picture, 0.05, pilot), atol=2e-5)
+
+
+def test_it_beats_total_variation_and_a_pilot_helps(noisy):
+    from skimage.restoration import denoise_tv_chambolle
+
+    truth, picture = noisy
+    plain = denoise.block_matching(picture, 0.05)
+    tv = max(psnr(denoise_tv_chambolle(picture, weight=w), truth) for w in (0.03, 0.05, 0.08, 0.12))
+    assert psnr(plain, truth) > tv + 0.2 and psnr(plain, truth) > psnr(picture, truth) + 5
+    assert psnr(denoise.block_matching(picture, 0.05, plain), truth) > psnr(plain, truth) + 0.1
+
+
+def test_strips_change_nothing(noisy, monkeypatch):
+    whole = denoise.block_matching(noisy[1], 0.05)
+    monkeypatch.setattr(denoise, "TOGETHER", 60)
+    np.testing.assert_allclose(denoise.block_matching(noisy[1], 0.05), whole, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (8, 8), (9, 30), (33, 10)])
+def test_any_shape_and_level(shape):
+    level = denoise.block_matching(np.full(shape, 0.3), 0.1)
+    np.testing.assert_allclose(level, 0.3, rtol=1e-6)
+    picture = np.random.default_rng(0).random(shape)
+    np.testing.assert_allclose(denoise.block_matching(picture, 0.0), picture, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 2.0**90])
+def test_the_unit_of_the_picture_does_not_matter(unit):
+    rng = np.random.default_rng(6)
+    picture = rng.random((20, 24))
+    pilot = picture + 0.01 * rng.normal(size=picture.shape)
+    for first, second in ((None, None), (pilot, unit * pilot)):
+        assert denoise.block_matching(unit * picture, unit * 0.1, second) == pytest.approx(unit * denoise.block_matching(picture, 0.1, first), rel=1e-4)
+    assert not denoise.block_matching(np.zeros((9, 9)), 0.1).any()

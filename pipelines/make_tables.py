@@ -1,7 +1,8 @@
-"""Freeze the colorimetric tables that plenocli uses: `python pipelines/make_tables.py [TABLES.npz]`.
+"""Freeze the colorimetric tables that plenocli uses: `python
+pipelines/make_tables.py [TABLES.npz]`.
 
-The numbers come from colour-science, whose import takes two seconds; the small file written here is read in a
-millisecond. Rerun after an upgrade of colour-science; a test compares file and library.
+The numbers come from colour-science, whose import takes two seconds; the small file written here is
+read in a millisecond. Rerun after an upgrade of colour-science; a test compares file and library.
 """
 
 import sys
@@ -25,7 +26,9 @@ def _colour():
 
 
 def collect():
-    """dict of arrays: wavelengths in nm (float64), tables as colour-science holds them (float64)."""
+    """dict of arrays: wavelengths in nm (float64), tables as colour-science
+    holds them (float64).
+    """
     colour = _colour()
     from colour.quality.cfi2017 import load_TCS_CIE2017
 
@@ -53,7 +56,10 @@ def collect():
     return tables
 
 
-def main(path=Path(__file__).resolve().parents[1] / "plenocli" / "forward" / "scene" / "tables.npz"):
+TABLES = Path(__file__).resolve().parents[1] / "plenocli" / "forward" / "scene" / "tables.npz"
+
+
+def main(path=TABLES):
     np.savez_compressed(path, **collect())
 
 

@@ -1,4 +1,5 @@
-"""The documentation's pages that come from the program itself: one for each command from its help, one of the file format from its tables.
+"""The documentation's pages that come from the program itself: one for each command from its help,
+one of the file format from its tables.
 
 `make docs` writes them; a test compares them with the program.
 """
@@ -17,8 +18,12 @@ def pages():
     from plenocli.files.artefacts.schema import markdown
 
     made = {f"commands/{name}.md": _page(name) for name in COMMANDS}
-    links = "\n".join(f"- [{name}]({name}.md): {_command(name).get_short_help_str(200)}" for name in COMMANDS)
-    made["commands/README.md"] = f"# Commands\n\nIn the order of the pipeline; each has `--help`.\n\n{links}\n"
+    links = "\n".join(
+        f"- [{name}]({name}.md): {_command(name).get_short_help_str(200)}" for name in COMMANDS
+    )
+    made["commands/README.md"] = (
+        f"# Commands\n\nIn the order of the pipeline; each has `--help`.\n\n{links}\n"
+    )
     made["files.md"] = markdown(SCHEMAS)
     return made
 
@@ -30,7 +35,12 @@ def _command(name):
 def _page(name):
     parts = [f"# plenocli {name}"]
     for words, command in _leaves(_command(name), (name,)):
-        context = click.Context(command, info_name=" ".join(("plenocli", *words)), max_content_width=110, terminal_width=110)
+        context = click.Context(
+            command,
+            info_name=" ".join(("plenocli", *words)),
+            max_content_width=110,
+            terminal_width=110,
+        )
         if len(words) > 1:
             parts.append(f"## plenocli {' '.join(words)}")
         parts.append(f"```text\n{command.get_help(context)}\n```")

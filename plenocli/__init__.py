@@ -1,3 +1,5 @@
-"""plenocli: an end-to-end model of plenoptic (light-field) cameras as a chain of file-based commands."""
+"""plenocli: an end-to-end model of plenoptic (light-field) cameras as a chain of
+file-based commands.
+"""
 
 __version__ = "0.1.0"

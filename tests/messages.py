@@ -7,12 +7,15 @@ from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"
-MAKERS = re.compile(r"(\w+\.)?(UsageError|ConfigError|InputError|OutputError|NumericsError|BadParameter|fail|require_memory)")
+MAKERS = re.compile(
+    r"(\w+\.)?(UsageError|ConfigError|InputError|OutputError|NumericsError|BadParameter|"
+    r"fail|require_memory)"
+)
 
 
 @cache
 def all_places():
-    """"file:first line" -> last line of every statement of the package that makes a message."""
+    """ "file:first line" -> last line of every statement of the package that makes a message."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -23,12 +26,22 @@ def all_places():
 
 def shown_places(reached):
     """Which of all_places are among "file:line" words; other words do not count."""
-    lines = {(file, int(line)) for file, _, line in (word.rpartition(":") for word in reached if ":" in word)}
-    return {place for place, last in all_places().items() for file, _, first in [place.rpartition(":")] if any((file, n) in lines for n in range(int(first), last + 1))}
+    lines = {
+        (file, int(line))
+        for file, _, line in (word.rpartition(":") for word in reached if ":" in word)
+    }
+    return {
+        place
+        for place, last in all_places().items()
+        for file, _, first in [place.rpartition(":")]
+        if any((file, n) in lines for n in range(int(first), last + 1))
+    }
 
 
 def listen(tell):
-    """From now on every message that is made says tell("file:line") for each frame of the package on its way."""
+    """From now on every message that is made says tell("file:line") for each frame of the
+    package on its way.
+    """
     import click
 
     from plenocli.base.errors import PlenoError

@@ -1,4 +1,6 @@
-"""The house: rooms bottom to top without circles, kernels touch no files, the help imports nothing heavy."""
+"""The house: rooms bottom to top without circles, kernels touch no files, the help
+imports nothing heavy.
+"""
 
 import ast
 import re
@@ -10,10 +12,32 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "plenocli"
-ROOMS = ("base", "forward", "inverse", "evaluation", "files", "report", "execution", "stages", "api", "cli")
+ROOMS = (
+    "base",
+    "forward",
+    "inverse",
+    "evaluation",
+    "files",
+    "report",
+    "execution",
+    "stages",
+    "api",
+    "cli",
+)
 """Bottom to top: a room imports from itself and from those before it."""
 KERNELS = ("forward", "inverse", "evaluation")
-FILE_LIBRARIES = {"h5py", "click", "OpenImageIO", "OpenEXR", "rawpy", "exifread", "tqdm", "tifffile", "imageio", "PIL"}
+FILE_LIBRARIES = {
+    "h5py",
+    "click",
+    "OpenImageIO",
+    "OpenEXR",
+    "rawpy",
+    "exifread",
+    "tqdm",
+    "tifffile",
+    "imageio",
+    "PIL",
+}
 MOST_MODULES, MOST_LEVELS = 12, 2
 PENDING = {
     ("plenocli.evaluation.depth_score", "plenocli.files.artefacts.container"),
@@ -44,7 +68,15 @@ def imported(path):
 def modules(*rooms):
     """Files of these rooms (all of the package without any)."""
     places = [PACKAGE / room for room in rooms] or [PACKAGE]
-    return [path for place in places for path in ([place.with_suffix(".py")] if place.with_suffix(".py").is_file() else sorted(place.rglob("*.py")))]
+    return [
+        path
+        for place in places
+        for path in (
+            [place.with_suffix(".py")]
+            if place.with_suffix(".py").is_file()
+            else sorted(place.rglob("*.py"))
+        )
+    ]
 
 
 def name_of(path):
@@ -53,9 +85,16 @@ def name_of(path):
 
 
 def arrows():
-    """Module -> the modules of the package that it imports anywhere in its code; a package counts by its __init__."""
+    """Module -> the modules of the package that it imports anywhere in its code; a package
+    counts by its __init__.
+    """
     known = {name_of(path): path for path in modules()}
-    return {name: {n for n in imported(path) if n in known and n != name and known[n].name != "__init__.py"} for name, path in known.items()}
+    return {
+        name: {
+            n for n in imported(path) if n in known and n != name and known[n].name != "__init__.py"
+        }
+        for name, path in known.items()
+    }
 
 
 def circles(graph):
@@ -77,7 +116,11 @@ def room(name):
 
 
 def test_every_room_is_known_and_says_what_belongs_in_it():
-    found = {path.name if path.is_dir() else path.stem for path in PACKAGE.iterdir() if path.name[0] != "_" and (path.is_dir() or path.suffix == ".py")}
+    found = {
+        path.name if path.is_dir() else path.stem
+        for path in PACKAGE.iterdir()
+        if path.name[0] != "_" and (path.is_dir() or path.suffix == ".py")
+    }
     assert found <= set(ROOMS)
     for folder in {path.parent for path in modules()} - {PACKAGE}:
         text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
@@ -92,20 +135,31 @@ def test_rooms_are_small_and_shallow():
 
 
 def test_no_arrow_points_up():
-    up = {(a, b) for a, targets in arrows().items() for b in targets
-          if room(a) in ROOMS and room(b) in ROOMS and ROOMS.index(room(b)) > ROOMS.index(room(a))}
+    up = {
+        (a, b)
+        for a, targets in arrows().items()
+        for b in targets
+        if room(a) in ROOMS and room(b) in ROOMS and ROOMS.index(room(b)) > ROOMS.index(room(a))
+    }
     assert up == PENDING
 
 
 def test_no_circles():
-    assert circles(arrows()) == {frozenset({"plenocli.forward.propagation.system_matrix", "plenocli.forward.propagation.bands"})}
+    assert circles(arrows()) == {
+        frozenset(
+            {"plenocli.forward.propagation.system_matrix", "plenocli.forward.propagation.bands"}
+        )
+    }
 
 
 def test_the_guards_see_what_they_must_refuse(tmp_path):
     bad = tmp_path / "kernel.py"
     bad.write_text("def f():\n    import h5py\n    from plenocli.files.atomic import publish\n")
     assert {"h5py", "plenocli.files.atomic", "plenocli.files.atomic.publish"} <= imported(bad)
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"d"}}) == {frozenset("bc"), frozenset("d")}
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"d"}}) == {
+        frozenset("bc"),
+        frozenset("d"),
+    }
 
 
 @pytest.mark.parametrize("path", modules(*KERNELS), ids=lambda p: str(p.relative_to(PACKAGE)))
@@ -117,20 +171,58 @@ def test_kernels_touch_no_files(path):
 def test_commands_only_parse(path):
     allowed = {"plenocli.forward.scene.white_reference", "plenocli.forward.camera.model"}
     names = {n for n in imported(path) if any(n == a or n.startswith(a + ".") for a in allowed)}
-    assert not {room(name) for name in imported(path) - names if name.startswith("plenocli.")} & {*KERNELS, "report"}
+    assert not {room(name) for name in imported(path) - names if name.startswith("plenocli.")} & {
+        *KERNELS,
+        "report",
+    }
 
 
-HEAVY = ("numpy", "scipy", "h5py", "colour", "matplotlib", "pydantic", "skimage", "rawpy", "OpenImageIO", "numba", "tqdm", "distributed", "optuna")
+HEAVY = (
+    "numpy",
+    "scipy",
+    "h5py",
+    "colour",
+    "matplotlib",
+    "pydantic",
+    "skimage",
+    "rawpy",
+    "OpenImageIO",
+    "numba",
+    "tqdm",
+    "distributed",
+    "optuna",
+)
 
 
-@pytest.mark.parametrize("command", ["", "simulate-pif", "simulate-response", "capture-sim", "calibrate", "demux", "learn-dict", "reconstruct", "score", "report", "sweep", "optimise", "inspect", "lens", "schema"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "",
+        "simulate-pif",
+        "simulate-response",
+        "capture-sim",
+        "calibrate",
+        "demux",
+        "learn-dict",
+        "reconstruct",
+        "score",
+        "report",
+        "sweep",
+        "optimise",
+        "inspect",
+        "lens",
+        "schema",
+    ],
+)
 def test_help_imports_nothing_heavy(command):
     code = (
         "import sys; from plenocli.cli.main import run\n"
         f"assert run({[command, '--help'] if command else ['--help']!r}) == 0\n"
         f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stdout.splitlines()[-1] == "HEAVY []"
     assert "Usage: plenocli" in done.stdout
 

@@ -1,6 +1,8 @@
-"""Every command line of the README and of docs, run as it stands and in the order of its page, by bash in a folder of a new user.
+"""Every command line of the README and of docs, run as it stands and in the order of its page, by
+bash in a folder of a new user.
 
-What is run: fenced blocks marked `sh`. The files that the pages name as the reader's own, and the cameras of sample_configs, are small ones here.
+What is run: fenced blocks marked `sh`. The files that the pages name as the reader's own, and the
+cameras of sample_configs, are small ones here.
 """
 
 import contextlib
@@ -21,11 +23,25 @@ from plenocli.cli.main import run
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
-BLOCKS = {page: re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.S | re.M) for page in PAGES}
+BLOCKS = {
+    page: re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.S | re.M)
+    for page in PAGES
+}
 NEEDS = {"lens import": "optiland", "dask ": "distributed", "optimise": "optuna"}
 """Words of a block -> the module of an extra without which it cannot run."""
-SMALL = {"count = [20, 30]": "count = [12, 18]", "[20, 20]": "[12, 12]", '"80 um"': '"48 um"', '"640 um"': '"384 um"', "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]"}
-SWEEP = {"[5, 6, 8, 10]": "[6, 8]", "[[9, 9], [11, 11], [13, 13], [15, 15], [17, 17]]": "[[9, 9]]", "steps = 5": "steps = 2", '["40 dB", "60 dB"]': '["60 dB"]'}
+SMALL = {
+    "count = [20, 30]": "count = [12, 18]",
+    "[20, 20]": "[12, 12]",
+    '"80 um"': '"48 um"',
+    '"640 um"': '"384 um"',
+    "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
+}
+SWEEP = {
+    "[5, 6, 8, 10]": "[6, 8]",
+    "[[9, 9], [11, 11], [13, 13], [15, 15], [17, 17]]": "[[9, 9]]",
+    "steps = 5": "steps = 2",
+    '["40 dB", "60 dB"]': '["60 dB"]',
+}
 
 
 def rewritten(text, changes):
@@ -37,7 +53,9 @@ def rewritten(text, changes):
 
 @pytest.fixture(scope="session")
 def kit(tmp_path_factory):
-    """A folder with what the pages suppose: descriptions, photographs, RAW files of a small camera with four filters, a run to report."""
+    """A folder with what the pages suppose: descriptions, photographs, RAW files of a small
+    camera with four filters, a run to report.
+    """
     from PIL import Image
     from skimage import data
 
@@ -46,9 +64,18 @@ def kit(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("kit")
     shutil.copytree(ROOT / "sample_configs", folder / "sample_configs")
-    tiny, spectral = ((ROOT / "sample_configs" / f"{name}.toml").read_text() for name in ("tiny", "demo_spectral"))
+    tiny, spectral = (
+        (ROOT / "sample_configs" / f"{name}.toml").read_text() for name in ("tiny", "demo_spectral")
+    )
     spectral = rewritten(spectral, SMALL)
-    for name, text in {"seed_spatial": tiny, "seed_spatial_250um": tiny, "seed_spectral": spectral, "dslr": spectral.replace("bits = 12", 'bits = 12\ncfa = "RGGB"\ncamera = "Nikon 5100 (NPL)"').replace("quantum_efficiency = 0.55\n", "")}.items():
+    for name, text in {
+        "seed_spatial": tiny,
+        "seed_spatial_250um": tiny,
+        "seed_spectral": spectral,
+        "dslr": spectral.replace(
+            "bits = 12", 'bits = 12\ncfa = "RGGB"\ncamera = "Nikon 5100 (NPL)"'
+        ).replace("quantum_efficiency = 0.55\n", ""),
+    }.items():
         (folder / "sample_configs" / f"{name}.toml").write_text(text)
     sweep = folder / "sample_configs" / "sweeps" / "lenslets.toml"
     sweep.write_text(rewritten(sweep.read_text(), SWEEP))
@@ -60,14 +87,40 @@ def kit(tmp_path_factory):
         Image.fromarray(getattr(data, name)()).save(folder / "photos" / f"{name}.jpg", quality=95)
 
     (folder / "captures").mkdir()
-    shots = {"white": ["--target", "white"], "dark": ["--target", "dark"], "captures/chart": ["--target", "colorchecker"], "captures/a": ["--scene", str(folder / "photo.png")],
-             **{f"b{nm}": ["--target", f"mono:{nm}nm"] for nm in (450, 540, 570, 650)}}
+    shots = {
+        "white": ["--target", "white"],
+        "dark": ["--target", "dark"],
+        "captures/chart": ["--target", "colorchecker"],
+        "captures/a": ["--scene", str(folder / "photo.png")],
+        **{f"b{nm}": ["--target", f"mono:{nm}nm"] for nm in (450, 540, 570, 650)},
+    }
     for seed, (name, what) in enumerate(shots.items()):
         made = folder / f"{name}.dng"
-        assert run(["capture-sim", str(folder / "camera.toml"), *what, "--model", "fresnel", "--accuracy", "1e-2", "--superpixels", "1x1", "--seed", str(seed), "-o", str(made)]) == 0
+        assert (
+            run(
+                [
+                    "capture-sim",
+                    str(folder / "camera.toml"),
+                    *what,
+                    "--model",
+                    "fresnel",
+                    "--accuracy",
+                    "1e-2",
+                    "--superpixels",
+                    "1x1",
+                    "--seed",
+                    str(seed),
+                    "-o",
+                    str(made),
+                ]
+            )
+            == 0
+        )
         made.rename(made.with_suffix(".nef"))
     shutil.copy(folder / "captures" / "a.nef", folder / "capture.nef")
-    Image.fromarray(read_mosaic(folder / "capture.nef").values.astype(np.uint16)).save(folder / "lightfield.png")
+    Image.fromarray(read_mosaic(folder / "capture.nef").values.astype(np.uint16)).save(
+        folder / "lightfield.png"
+    )
 
     chart = folder / "chart"
     chart.mkdir()
@@ -75,12 +128,46 @@ def kit(tmp_path_factory):
     (folder / "triplet.zmx").write_text(ZMX)
     made = folder / "explore"  # what the other pages made, for the one that goes on from there
     (made / "captures").mkdir(parents=True)
-    bands = [word for nm in (450, 540, 570, 650) for word in ("--band", f"{nm}nm={folder}/b{nm}.nef")]
-    assert run(["calibrate", "--white", str(folder / "white.nef"), "--dark", str(folder / "dark.nef"), *bands, "-o", str(made / "calibration.h5")]) == 0
+    bands = [
+        word for nm in (450, 540, 570, 650) for word in ("--band", f"{nm}nm={folder}/b{nm}.nef")
+    ]
+    assert (
+        run(
+            [
+                "calibrate",
+                "--white",
+                str(folder / "white.nef"),
+                "--dark",
+                str(folder / "dark.nef"),
+                *bands,
+                "-o",
+                str(made / "calibration.h5"),
+            ]
+        )
+        == 0
+    )
     pif, camera = str(made / "pif.h5"), str(folder / "sample_configs" / "tiny.toml")
     assert run(["simulate-pif", camera, "--model", "ray", "--superpixels", "1x1", "-o", pif]) == 0
     for seed, name in enumerate(("capture", "captures/one", "captures/two")):
-        assert run(["capture-sim", camera, "--pif", pif, "--scene", "skimage:coins", "--snr", "50dB", "--seed", str(seed), "-o", str(made / f"{name}.h5")]) == 0
+        assert (
+            run(
+                [
+                    "capture-sim",
+                    camera,
+                    "--pif",
+                    pif,
+                    "--scene",
+                    "skimage:coins",
+                    "--snr",
+                    "50dB",
+                    "--seed",
+                    str(seed),
+                    "-o",
+                    str(made / f"{name}.h5"),
+                ]
+            )
+            == 0
+        )
     (folder / "runs" / "spatial").mkdir(parents=True)
     shutil.copy(pif, folder / "runs" / "spatial" / "pif.h5")
     (folder / "Makefile").write_text(f"raw:\n\t$(MAKE) -f {ROOT}/pipelines/raw.mk RUN=runs/raw\n")
@@ -119,11 +206,26 @@ def free_port():
 
 
 def bash(script, folder, timeout):
-    """(exit code, what was printed) of a script; what it left running in the background is ended."""
+    """(exit code, what was printed) of a script; what it left running in the
+    background is ended.
+    """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")} | {"PATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")} | {
+        "PATH": path,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
     with open(folder / "log", "w+") as log:
-        child = subprocess.Popen(["bash", "-euo", "pipefail", "-x", "-c", script], cwd=folder, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True)
+        child = subprocess.Popen(
+            ["bash", "-euo", "pipefail", "-x", "-c", script],
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         try:
             child.wait(timeout=timeout)
         finally:
@@ -143,22 +245,40 @@ def test_the_page_runs_as_it_stands(kit, tmp_path, page):
         shutil.copytree(kit / "explore", folder, dirs_exist_ok=True)
     blocks, left = [], []
     for block in BLOCKS[page]:
-        missing = [module for words, module in NEEDS.items() if words in block and find_spec(module) is None]
+        missing = [
+            module
+            for words, module in NEEDS.items()
+            if words in block and find_spec(module) is None
+        ]
         (left if missing else blocks).append((block, missing))
     script = "".join(block for block, _ in blocks).replace("8786", free_port())
     code, log = bash(script, folder, 900)
     assert code == 0, log[-3000:]
     if left:
-        pytest.skip("without " + ", ".join(sorted({m for _, missing in left for m in missing})) + f" these were not run: {[block for block, _ in left]}")
+        pytest.skip(
+            "without "
+            + ", ".join(sorted({m for _, missing in left for m in missing}))
+            + f" these were not run: {[block for block, _ in left]}"
+        )
 
 
 def test_command_lines_stand_in_blocks_that_are_run():
-    """All but the two that make the environment itself (README) and the script for a SLURM cluster."""
+    """All but the two that make the environment itself (README) and the script
+    for a SLURM cluster.
+    """
     for page in PAGES:
         text = (ROOT / page).read_text(encoding="utf-8")
-        other = [block for mark, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M) if mark != "sh"]
+        other = [
+            block
+            for mark, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M)
+            if mark != "sh"
+        ]
         assert not re.findall(r"^    (?:plenocli|make) [a-z].*", text, re.M), page
-        assert {line.split("#")[0].strip() for block in other for line in re.findall(r"^(?:plenocli|make) .*", block, re.M)} <= {"make demo", "make test"}, page
+        assert {
+            line.split("#")[0].strip()
+            for block in other
+            for line in re.findall(r"^(?:plenocli|make) .*", block, re.M)
+        } <= {"make demo", "make test"}, page
 
 
 def test_the_plan_that_the_page_shows_is_the_plan(monkeypatch, capsys):
@@ -166,8 +286,15 @@ def test_the_plan_that_the_page_shows_is_the_plan(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     assert run(["simulate-pif", "sample_configs/seed_spatial.toml", "--explain"]) == 0
     printed = capsys.readouterr().out
-    shown, = re.findall(r"^```\n(asked: .*?)^```", (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8"), re.S | re.M)
-    found, page = ([re.sub(r"[\d.]+ s |\s+", " ", line).split() for line in text.splitlines()] for text in (printed, shown))
+    (shown,) = re.findall(
+        r"^```\n(asked: .*?)^```",
+        (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8"),
+        re.S | re.M,
+    )
+    found, page = (
+        [re.sub(r"[\d.]+ s |\s+", " ", line).split() for line in text.splitlines()]
+        for text in (printed, shown)
+    )
     assert len(page) == 8 and found[:8] == page
 
 
@@ -178,8 +305,16 @@ def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
 
     (tmp_path / "sweeps").mkdir()
     shutil.copy(ROOT / "sample_configs" / "tiny.toml", tmp_path)
-    example, = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / "explore.md").read_text(encoding="utf-8"), re.S | re.M)
+    (example,) = re.findall(
+        r"^```toml\n(.*?)^```",
+        (ROOT / "docs" / "explore.md").read_text(encoding="utf-8"),
+        re.S | re.M,
+    )
     (tmp_path / "sweeps" / "mine.toml").write_text(example)
     space = open_space(tmp_path / "sweeps" / "mine.toml", read_options, 0)
-    rows = [space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, 0))]
-    assert len(rows) == 4 * 5 * 3 * 2 and all(row.task is not None and row.result is None for row in rows)
+    rows = [
+        space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, 0))
+    ]
+    assert len(rows) == 4 * 5 * 3 * 2 and all(
+        row.task is not None and row.result is None for row in rows
+    )

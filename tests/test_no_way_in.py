@@ -6,15 +6,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.shards import read_pif
-from plenocli.base.errors import InputError
 from plenocli.stages.evaluation.report import run_report
 
 PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"
-FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal", "yaml", "joblib", "jsonpickle", "xmlrpc"}
-FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "builtins.eval", "np.fromstring"}
+FORBIDDEN_MODULES = {
+    "pickle",
+    "cPickle",
+    "dill",
+    "cloudpickle",
+    "shelve",
+    "marshal",
+    "yaml",
+    "joblib",
+    "jsonpickle",
+    "xmlrpc",
+}
+FORBIDDEN_CALLS = {
+    "eval",
+    "exec",
+    "compile",
+    "__import__",
+    "os.system",
+    "os.popen",
+    "builtins.eval",
+    "np.fromstring",
+}
 FORBIDDEN_KEYWORDS = {"shell", "allow_pickle"}
 
 
@@ -22,17 +42,39 @@ def offences(text):
     """What in Python source `text` could run what a file says: (line, what)."""
     found = []
     for node in ast.walk(ast.parse(text)):
-        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names = (
+            [a.name for a in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
         found += [(node.lineno, n) for n in names if n.split(".")[0] in FORBIDDEN_MODULES]
         if isinstance(node, ast.Call):
             if ast.unparse(node.func) in FORBIDDEN_CALLS:
                 found.append((node.lineno, ast.unparse(node.func)))
-            found += [(node.lineno, k.arg) for k in node.keywords if k.arg in FORBIDDEN_KEYWORDS and not (isinstance(k.value, ast.Constant) and k.value.value is False)]
+            found += [
+                (node.lineno, k.arg)
+                for k in node.keywords
+                if k.arg in FORBIDDEN_KEYWORDS
+                and not (isinstance(k.value, ast.Constant) and k.value.value is False)
+            ]
     return found
 
 
-@pytest.mark.parametrize("text, count", [("import pickle", 1), ("from yaml import load", 1), ("eval(x)", 1), ("np.load(f, allow_pickle=True)", 1), ("np.load(f, allow_pickle=False)", 0),
-                                         ("subprocess.run(c, shell=True)", 1), ("import json\njson.loads(x)", 0), ("model.evaluate(x)", 0)])
+@pytest.mark.parametrize(
+    "text, count",
+    [
+        ("import pickle", 1),
+        ("from yaml import load", 1),
+        ("eval(x)", 1),
+        ("np.load(f, allow_pickle=True)", 1),
+        ("np.load(f, allow_pickle=False)", 0),
+        ("subprocess.run(c, shell=True)", 1),
+        ("import json\njson.loads(x)", 0),
+        ("model.evaluate(x)", 0),
+    ],
+)
 def test_the_check_finds_what_it_looks_for(text, count):
     assert len(offences(text)) == count
 
@@ -40,16 +82,34 @@ def test_the_check_finds_what_it_looks_for(text, count):
 def test_no_module_runs_what_a_file_says(count):
     files = sorted(PACKAGE.rglob("*.py"))
     assert len(files) > 100
-    assert {str(f.relative_to(PACKAGE)): offences(f.read_text()) for f in files if offences(f.read_text())} == {}
+    assert {
+        str(f.relative_to(PACKAGE)): offences(f.read_text())
+        for f in files
+        if offences(f.read_text())
+    } == {}
     count("modules that run, unpickle or evaluate what a file says", modules=len(files), found=0)
 
 
 def test_libraw_runs_in_the_limited_child_only():
-    importing = {path.name: {a.name.split(".")[0] for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import) for a in node.names} for path in PACKAGE.rglob("*.py")}
+    importing = {
+        path.name: {
+            a.name.split(".")[0]
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import)
+            for a in node.names
+        }
+        for path in PACKAGE.rglob("*.py")
+    }
     assert [name for name, modules in importing.items() if "rawpy" in modules] == ["raw_child.py"]
     child = (PACKAGE / "files" / "images" / "raw_child.py").read_text()
-    assert all(limit in child for limit in ("RLIMIT_AS", "RLIMIT_CPU", "RLIMIT_FSIZE")) and child.index("setrlimit") < child.index("rawpy.imread")
-    assert not [path.name for path in PACKAGE.rglob("*.py") if "import raw_child" in path.read_text() or "raw_child import" in path.read_text()]
+    assert all(
+        limit in child for limit in ("RLIMIT_AS", "RLIMIT_CPU", "RLIMIT_FSIZE")
+    ) and child.index("setrlimit") < child.index("rawpy.imread")
+    assert not [
+        path.name
+        for path in PACKAGE.rglob("*.py")
+        if "import raw_child" in path.read_text() or "raw_child import" in path.read_text()
+    ]
 
 
 @pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "a/b.h5", "", "x\0.h5", 3])
@@ -57,9 +117,23 @@ def test_names_inside_a_file_never_become_paths(tmp_path, name):
     (tmp_path / "secret.h5").write_bytes(b"x")
     folder = tmp_path / "here"
     folder.mkdir()
-    data = {"pif/wavelength": np.array([5e-7]), "pif/lenslet_offset": np.zeros((1, 2), int), "pif/pixel_shape": np.array([2, 2]), "pif/object_shape": np.array([1, 1]),
-            "pif/column_energy": np.ones((1, 1)), "pif/shard": np.zeros(1, np.int32)}
-    write_artefact(folder / "i.h5", Artefact("pif-index", data, {"pif": {"shards": [{"name": name, "sha256": "0" * 64}]}}, Provenance("t")))
+    data = {
+        "pif/wavelength": np.array([5e-7]),
+        "pif/lenslet_offset": np.zeros((1, 2), int),
+        "pif/pixel_shape": np.array([2, 2]),
+        "pif/object_shape": np.array([1, 1]),
+        "pif/column_energy": np.ones((1, 1)),
+        "pif/shard": np.zeros(1, np.int32),
+    }
+    write_artefact(
+        folder / "i.h5",
+        Artefact(
+            "pif-index",
+            data,
+            {"pif": {"shards": [{"name": name, "sha256": "0" * 64}]}},
+            Provenance("t"),
+        ),
+    )
     with pytest.raises(InputError, match="i.h5: does not name the files"):
         read_pif(folder / "i.h5")
 
@@ -67,9 +141,19 @@ def test_names_inside_a_file_never_become_paths(tmp_path, name):
 def test_the_report_escapes_what_files_say(tmp_path):
     evil = '<script>alert(1)</script>"><img src=x onerror=y>'
     (tmp_path / "run").mkdir()
-    write_artefact(tmp_path / "run" / "a.h5", Artefact("image", {"image/value": np.random.default_rng(0).random((8, 8))}, {"image": {"method": evil}},
-                                                       Provenance(evil, {evil: {"name": evil, "sha256": "0" * 64}}, 1, evil, {evil: evil})))
-    (tmp_path / "run" / "score.json").write_text('{"results": [{"name": "x", "label": "%s", "metrics": {"psnr_db": 3.0}}], "command": "%s"}' % ((evil.replace('"', '\\"'),) * 2))
+    write_artefact(
+        tmp_path / "run" / "a.h5",
+        Artefact(
+            "image",
+            {"image/value": np.random.default_rng(0).random((8, 8))},
+            {"image": {"method": evil}},
+            Provenance(evil, {evil: {"name": evil, "sha256": "0" * 64}}, 1, evil, {evil: evil}),
+        ),
+    )
+    (tmp_path / "run" / "score.json").write_text(
+        '{"results": [{"name": "x", "label": "%s", "metrics": {"psnr_db": 3.0}}], "command": "%s"}'
+        % ((evil.replace('"', '\\"'),) * 2)
+    )
     run_report(tmp_path / "run", tmp_path / "r.html", title=evil)
     page = (tmp_path / "r.html").read_text()
     assert "&lt;script&gt;" in page and "<script" not in page and "<img src=x" not in page

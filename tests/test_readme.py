@@ -1,4 +1,6 @@
-"""Every plenocli command line in the README, in docs (test_docs runs them) and in the help is one that the program understands."""
+"""Every plenocli command line in the README, in docs (test_docs runs them) and in the help is
+one that the program understands.
+"""
 
 import re
 import shlex
@@ -9,9 +11,28 @@ import pytest
 from plenocli.cli.main import COMMANDS, cli
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCKS = [block for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")] for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.S | re.M)]
-LINES = sorted({line for block in BLOCKS for line in block.splitlines() if line.startswith("plenocli ")})
-EXAMPLES = sorted({line for page in (ROOT / "docs" / "commands").glob("*.md") for line in re.findall(r"^ +(plenocli [a-z].*)", page.read_text(), re.M)})
+
+
+def joined(text):
+    """Text whose lines that end in a backslash go on in the next one."""
+    return re.sub(r"\\\n\s*", "", text)
+
+
+BLOCKS = [
+    block
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.S | re.M)
+]
+LINES = sorted(
+    {line for block in BLOCKS for line in block.splitlines() if line.startswith("plenocli ")}
+)
+EXAMPLES = sorted(
+    {
+        line
+        for page in (ROOT / "docs" / "commands").glob("*.md")
+        for line in re.findall(r"^ +(plenocli [a-z].*)", joined(page.read_text()), re.M)
+    }
+)
 
 
 def test_the_readme_shows_every_command():
@@ -26,7 +47,8 @@ def test_command_lines_parse(line):
     if hasattr(command, "commands"):  # a group: its subcommand is what parses
         name, *arguments = arguments
         command = command.commands[name]
-    assert command.make_context(name, arguments).params  # a click.UsageError for an unknown option or a missing one
+    # a click.UsageError for an unknown option or a missing one
+    assert command.make_context(name, arguments).params
 
 
 def test_files_named_in_the_readme_exist():
@@ -45,9 +67,27 @@ def test_python_in_the_documentation_runs(tmp_path, monkeypatch):
 
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scientist.md").read_text(), re.S)
     monkeypatch.chdir(tmp_path)
-    assert run(["simulate-pif", str(ROOT / "sample_configs" / "tiny.toml"), "--model", "ray", "--superpixels", "3x3", "-o", "pif.h5"]) == 0
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(ROOT / "sample_configs" / "tiny.toml"),
+                "--model",
+                "ray",
+                "--superpixels",
+                "3x3",
+                "-o",
+                "pif.h5",
+            ]
+        )
+        == 0
+    )
     for block in blocks:
         names = {}
         exec(block, names)
-        assert names["psf"].shape == (13, 13) and names["own"].shape == (169, 64) and 0.1 < names["psf"].sum() <= 1.001
+        assert (
+            names["psf"].shape == (13, 13)
+            and names["own"].shape == (169, 64)
+            and 0.1 < names["psf"].sum() <= 1.001
+        )
     assert blocks

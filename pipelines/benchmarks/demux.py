@@ -1,10 +1,12 @@
-"""How long demux takes for a 24-megapixel Bayer DNG, beside LibRaw's decoding of the same file, and what a batch costs.
+"""How long demux takes for a 24-megapixel Bayer DNG, beside LibRaw's decoding of the same file, and
+what a batch costs.
 
-RUN gets the captures of a DSLR with a lenslet array (sample_configs/dslr.toml: 52-pixel superpixels, four bands, 6000 x 4000
-pixels) and their calibrations, made once. Then, in a child process for each kind of calibration, LibRaw's decoding, the
-product's reading, demultiplexing and writing are timed apart, rounds interleaved; and a batch of files with one worker and
-with two. CPU seconds (user + system) of single-threaded BLAS; wall seconds stand beside them and mean something only on an idle
-machine. Run from the project's root: python pipelines/benchmarks/demux.py --help.
+RUN gets the captures of a DSLR with a lenslet array (sample_configs/dslr.toml: 52-pixel
+superpixels, four bands, 6000 x 4000 pixels) and their calibrations, made once. Then, in a child
+process for each kind of calibration, LibRaw's decoding, the product's reading, demultiplexing and
+writing are timed apart, rounds interleaved; and a batch of files with one worker and with two. CPU
+seconds (user + system) of single-threaded BLAS; wall seconds stand beside them and mean something
+only on an idle machine. Run from the project's root: python pipelines/benchmarks/demux.py --help.
 """
 
 import argparse
@@ -35,10 +37,16 @@ KINDS = {"shared": "one F for all lenslets", "each": "an F for every lenslet"}
 
 def main():
     """Parse, make what is missing, measure, print and keep RUN/demux.json."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="folder for captures, calibrations and results (about 1.5 GB)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "run", type=Path, help="folder for captures, calibrations and results (about 1.5 GB)"
+    )
     parser.add_argument("--rounds", type=int, default=6, help="interleaved rounds (default 6)")
-    parser.add_argument("--files", type=int, default=20, help="captures of the batch (default 20; 0: no batch)")
+    parser.add_argument(
+        "--files", type=int, default=20, help="captures of the batch (default 20; 0: no batch)"
+    )
     parser.add_argument("--child", choices=KINDS, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
@@ -48,7 +56,15 @@ def main():
     make(options.run)
     found = {}
     for kind in KINDS:
-        command = [sys.executable, __file__, str(options.run), "--child", kind, "--rounds", str(options.rounds)]
+        command = [
+            sys.executable,
+            __file__,
+            str(options.run),
+            "--child",
+            kind,
+            "--rounds",
+            str(options.rounds),
+        ]
         found[kind] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
         show(kind, found[kind])
     if options.files:
@@ -56,7 +72,8 @@ def main():
     (options.run / "demux.json").write_text(json.dumps(found, indent=1))
 
 
-# --- captures -----------------------------------------------------------------------------------------------------------
+# --- captures -------------------------------------------------------------------------------------
+
 
 def make(run):
     """The captures and both calibrations, if they are not there."""
@@ -65,40 +82,86 @@ def make(run):
     for kind in KINDS:
         target = run / f"{kind}.h5"
         if not target.exists():
-            words = [f"--band={b}={run / f'band-{b}.dng'}" for b in BANDS] + [f"--response={'shared' if kind == 'shared' else 'own'}"]
-            plenocli("calibrate", f"--white={run / 'white.dng'}", f"--dark={run / 'dark.dng'}", *words, "-o", str(target), "--overwrite")
+            words = [f"--band={b}={run / f'band-{b}.dng'}" for b in BANDS] + [
+                f"--response={'shared' if kind == 'shared' else 'own'}"
+            ]
+            plenocli(
+                "calibrate",
+                f"--white={run / 'white.dng'}",
+                f"--dark={run / 'dark.dng'}",
+                *words,
+                "-o",
+                str(target),
+                "--overwrite",
+            )
 
 
 def captures(run):
-    """White, dark, narrow-band and scene captures: predicted superpixels on a sensor of SIZE, with the sensor's noise."""
-    from plenocli.files.images.dng import write_dng
+    """White, dark, narrow-band and scene captures: predicted superpixels on a sensor of SIZE,
+    with the sensor's noise.
+    """
     from plenocli.files.config.camera_file import load_camera
+    from plenocli.files.images.dng import write_dng
     from plenocli.forward.scene.tables import surfaces
     from plenocli.forward.sensor.noise import SensorModel
 
-    camera = load_camera(ROOT / "sample_configs" / "dslr.toml").replace(**{"lenslet_array.count": (2, 2)})
-    light, moved = (np.stack(part) for part in zip(*(superpixel(camera, f"mono:{band}") for band in BANDS)))
+    camera = load_camera(ROOT / "sample_configs" / "dslr.toml").replace(
+        **{"lenslet_array.count": (2, 2)}
+    )
+    light, moved = (
+        np.stack(part) for part in zip(*(superpixel(camera, f"mono:{band}") for band in BANDS))
+    )
     shape = light.shape[1:]
     count = [n // p for n, p in zip(SIZE, shape)]
-    light, moved = (part * 0.8 * camera.sensor.full_well / light.sum(axis=0).max() for part in (light, moved))
+    light, moved = (
+        part * 0.8 * camera.sensor.full_well / light.sum(axis=0).max() for part in (light, moved)
+    )
     model, rng = SensorModel.from_camera(camera), np.random.default_rng(0)
     reflectance = surfaces(np.array([float(b[:-2]) * 1e-9 for b in BANDS]))
-    patches = reflectance[rng.integers(len(reflectance), size=(count[0] // 8 + 1, count[1] // 8 + 1))]
-    scene = patches.repeat(8, axis=0).repeat(8, axis=1)[:count[0], :count[1]]
-    shots = {"white": np.ones(4), "dark": np.zeros(4), **{f"band-{b}": np.eye(4)[k] for k, b in enumerate(BANDS)}, "shot": scene, "moved": scene}
+    patches = reflectance[
+        rng.integers(len(reflectance), size=(count[0] // 8 + 1, count[1] // 8 + 1))
+    ]
+    scene = patches.repeat(8, axis=0).repeat(8, axis=1)[: count[0], : count[1]]
+    shots = {
+        "white": np.ones(4),
+        "dark": np.zeros(4),
+        **{f"band-{b}": np.eye(4)[k] for k, b in enumerate(BANDS)},
+        "shot": scene,
+        "moved": scene,
+    }
     for name, radiance in shots.items():
         if (run / f"{name}.dng").exists():
             continue
         electrons = np.zeros(SIZE)
         top, left = ((n - c * p) // 4 * 2 for n, c, p in zip(SIZE, count, shape))
-        picture = np.einsum("rcb,byx->rycx", np.broadcast_to(radiance, (*count, 4)), moved if name == "moved" else light, optimize=True)
-        electrons[top:top + count[0] * shape[0], left:left + count[1] * shape[1]] = picture.reshape(count[0] * shape[0], -1)
-        levels = dict(cfa=camera.sensor.cfa, black=camera.sensor.black_level, white=model.white_level, exposure_s=EXPOSURE)
-        write_dng(run / f"{name}.dng", model.expose(electrons, rng), **levels, xmp_json={"gain_e_per_dn": 1 / camera.sensor.gain}, overwrite=True)
+        picture = np.einsum(
+            "rcb,byx->rycx",
+            np.broadcast_to(radiance, (*count, 4)),
+            moved if name == "moved" else light,
+            optimize=True,
+        )
+        electrons[top : top + count[0] * shape[0], left : left + count[1] * shape[1]] = (
+            picture.reshape(count[0] * shape[0], -1)
+        )
+        levels = dict(
+            cfa=camera.sensor.cfa,
+            black=camera.sensor.black_level,
+            white=model.white_level,
+            exposure_s=EXPOSURE,
+        )
+        write_dng(
+            run / f"{name}.dng",
+            model.expose(electrons, rng),
+            **levels,
+            xmp_json={"gain_e_per_dn": 1 / camera.sensor.gain},
+            overwrite=True,
+        )
 
 
 def superpixel(camera, target):
-    """Light (rows, columns) of one superpixel on the mosaic for a uniform object, as capture-sim carries it, and moved by SHIFT."""
+    """Light (rows, columns) of one superpixel on the mosaic for a uniform object, as capture-sim
+    carries it, and moved by SHIFT.
+    """
     from scipy.ndimage import shift
 
     from plenocli.forward.sensor.cfa import cfa_map
@@ -110,10 +173,14 @@ def superpixel(camera, target):
     where = cfa_map(shape, camera.sensor.cfa)
     planes = [plane.reshape(shape) for plane in whites]
     moved = [np.maximum(shift(plane, SHIFT, order=5), 0) for plane in planes]
-    return tuple(sum(np.where(where == letter, plane, 0.0) for letter, plane in zip(letters, part)) for part in (planes, moved))
+    return tuple(
+        sum(np.where(where == letter, plane, 0.0) for letter, plane in zip(letters, part))
+        for part in (planes, moved)
+    )
 
 
-# --- measurements -------------------------------------------------------------------------------------------------------
+# --- measurements ---------------------------------------------------------------------------------
+
 
 class Clock:
     """CPU and wall seconds by name, this process and its children."""
@@ -131,7 +198,10 @@ class Clock:
 
     def medians(self):
         """Name -> [CPU, wall], medians, s."""
-        return {name: [float(np.median(self.cpu[name])), float(np.median(self.wall[name]))] for name in self.cpu}
+        return {
+            name: [float(np.median(self.cpu[name])), float(np.median(self.wall[name]))]
+            for name in self.cpu
+        }
 
 
 def _cpu():
@@ -140,12 +210,14 @@ def _cpu():
 
 
 def measure(run, kind, rounds):
-    """Seconds of every part, and peak memory, of demultiplexing one capture with one kind of calibration."""
+    """Seconds of every part, and peak memory, of demultiplexing one capture with one
+    kind of calibration.
+    """
     import rawpy
 
     from plenocli.files.artefacts.provenance import describe_inputs
-    from plenocli.stages.inverse.demux import Demultiplexer, Settings
     from plenocli.files.read.mosaics import read_exposure
+    from plenocli.stages.inverse.demux import Demultiplexer, Settings
 
     clock, shot = Clock(), run / "shot.dng"
 
@@ -155,21 +227,35 @@ def measure(run, kind, rounds):
 
     worker = clock.time("prepare", lambda: Demultiplexer(run / f"{kind}.h5", Settings(), True, ""))
     exposure = read_exposure(shot, cfa=worker.calibration.cfa)
-    clock.time("first", lambda: worker.estimate(exposure, shot))  # and what it leaves for the others
+    # and what it leaves for the others
+    clock.time("first", lambda: worker.estimate(exposure, shot))
     plain = replace(worker, "register", "off")
     for _ in range(rounds):
         clock.time("decode", decode)
         exposure = clock.time("read", lambda: read_exposure(shot, cfa=worker.calibration.cfa))
         found = clock.time("demux", lambda: worker.estimate(exposure, shot))
         clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
-        clock.time("write", lambda: worker.write((found, describe_inputs({"capture": shot})), shot, run / "shot.exr"))
+        clock.time(
+            "write",
+            lambda: worker.write(
+                (found, describe_inputs({"capture": shot})), shot, run / "shot.exr"
+            ),
+        )
     elsewhere = read_exposure(run / "moved.dng", cfa=worker.calibration.cfa)
     for _ in range(2):
         away = clock.time("demux, moved", lambda: worker.estimate(elsewhere, run / "moved.dng"))
     parts = clock.medians()
     ratio = sorted(d / max(e, 1e-9) for d, e in zip(clock.cpu["demux"], clock.cpu["decode"]))
-    return {"seconds": parts, "ratio": float(np.median(ratio)), "ratios": ratio, "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "method": found.method, "corrected": away.record["corrected"], "shift": away.record["shift_px"], "load": os.getloadavg()[0]}
+    return {
+        "seconds": parts,
+        "ratio": float(np.median(ratio)),
+        "ratios": ratio,
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "method": found.method,
+        "corrected": away.record["corrected"],
+        "shift": away.record["shift_px"],
+        "load": os.getloadavg()[0],
+    }
 
 
 def replace(worker, name, value):
@@ -184,8 +270,14 @@ def show(kind, found):
     print(f"{KINDS[kind]} (method {found['method']}, load {found['load']:.1f}):")
     for name, (cpu, wall) in found["seconds"].items():
         print(f"  {name:22s} {cpu:7.3f} s CPU {wall:7.3f} s wall")
-    print(f"  the moved capture: corrected {', '.join(found['corrected'])}, by {found['shift'][0]:.4f} and {found['shift'][1]:.4f} px for {SHIFT}")
-    print(f"  demux / decode {found['ratio']:.2f} (rounds {', '.join(f'{r:.2f}' for r in found['ratios'])}); peak {found['peak_mib']:.0f} MiB")
+    print(
+        f"  the moved capture: corrected {', '.join(found['corrected'])}, by "
+        f"{found['shift'][0]:.4f} and {found['shift'][1]:.4f} px for {SHIFT}"
+    )
+    print(
+        f"  demux / decode {found['ratio']:.2f} (rounds "
+        f"{', '.join(f'{r:.2f}' for r in found['ratios'])}); peak {found['peak_mib']:.0f} MiB"
+    )
 
 
 def batch(run, kind, files):
@@ -201,16 +293,32 @@ def batch(run, kind, files):
         out = run / f"out{workers}"
         shutil.rmtree(out, ignore_errors=True)
         before, start = _cpu(), time.perf_counter()
-        plenocli("demux", *(str(shots / f"shot{n:02d}.dng") for n in range(files)), f"--calibration={run / f'{kind}.h5'}", f"--workers={workers}", "-o", str(out))
+        plenocli(
+            "demux",
+            *(str(shots / f"shot{n:02d}.dng") for n in range(files)),
+            f"--calibration={run / f'{kind}.h5'}",
+            f"--workers={workers}",
+            "-o",
+            str(out),
+        )
         found[workers] = [_cpu() - before, time.perf_counter() - start]
     (one, one_wall), (two, two_wall) = found[1], found[2]
-    print(f"{files} files, {KINDS[kind]}: 1 worker {one:.1f} s CPU {one_wall:.1f} s wall, 2 workers {two:.1f} s CPU {two_wall:.1f} s wall: wall ratio {one_wall / two_wall:.2f}, load {os.getloadavg()[0]:.1f}", flush=True)
+    print(
+        (
+            f"{files} files, {KINDS[kind]}: 1 worker {one:.1f} s CPU {one_wall:.1f} s wall, 2 "
+            f"workers {two:.1f} s CPU {two_wall:.1f} s wall: wall ratio {one_wall / two_wall:.2f}, "
+            f"load {os.getloadavg()[0]:.1f}"
+        ),
+        flush=True,
+    )
     return {"1": found[1], "2": found[2]}
 
 
 def plenocli(*words):
     """Run the command line in a process of its own."""
-    subprocess.run([sys.executable, "-m", "plenocli", *words], check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "plenocli", *words], check=True, cwd=ROOT, stdout=subprocess.DEVNULL
+    )
 
 
 if __name__ == "__main__":

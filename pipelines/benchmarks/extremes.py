@@ -1,4 +1,5 @@
-"""Errors of the solvers against the condition of the matrix, in units of rounding errors: writes RUN/extremes.md.
+"""Errors of the solvers against the condition of the matrix, in units of rounding errors:
+writes RUN/extremes.md.
 
 Run from the project's root: python pipelines/benchmarks/extremes.py --run runs/extremes
 """
@@ -20,8 +21,16 @@ def main():
     folder = parser.parse_args().run
     from tests.reference.extremes import table
 
-    text = ("What an answer violates of its own equations, over eps |A| (|A| |x| + |y|): below 30 is as good as arithmetic allows. Worst of two kinds of\n"
-            "spectra, single and double precision data, and sizes from 1x1 to 60x17. The gap of l1 is relative, at lambda over the largest useful one.\n\n" + table() + "\n")
+    text = (
+        (
+            "What an answer violates of its own equations, over eps |A| (|A| |x| + |y|): below 30 "
+            "is as good as arithmetic allows. Worst of two kinds of\n"
+            "spectra, single and double precision data, and sizes from 1x1 to 60x17. The gap of l1 "
+            "is relative, at lambda over the largest useful one.\n\n"
+        )
+        + table()
+        + "\n"
+    )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "extremes.md").write_text(text)
     print(text)

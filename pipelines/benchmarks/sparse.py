@@ -1,14 +1,19 @@
-"""Sparse coding beside other solvers: processor time a signal, and the duality gap that each reached, recomputed for all alike.
+"""Sparse coding beside other solvers: processor time a signal, and the duality gap that each
+reached, recomputed for all alike.
 
-The problem is  min |y - D c|^2 + lambda |c|_1  for signals of held-out photographs: D = A Phi with the matrix of one isolated lenslet of
-a configuration and a dictionary learnt for it, noise at 60 dB, lambda the best on validation patches. A and y are compressed by A's
-singular vectors, which changes nothing but a constant, and the constant atom, which is free of the penalty, is projected out: every
-solver gets the same D and Y and starts from them, so Gram matrices count. All run in one process on one thread, in turns; a time is
-the median over the turns of the process time. Slow solvers get the first few signals only. The gap comes from the residual in
-double precision: (P - dual) / P with the scaled residual as the dual point. Solvers that are not installed are left out:
-`pip install -e '.[bench]'`. A second table has the gaps that ours and the quickest of the others reach where it is hard.
+The problem is min |y - D c|^2 + lambda |c|_1 for signals of held-out photographs: D = A Phi with
+the matrix of one isolated lenslet of a configuration and a dictionary learnt for it, noise at 60
+dB, lambda the best on validation patches. A and y are compressed by A's singular vectors, which
+changes nothing but a constant, and the constant atom, which is free of the penalty, is projected
+out: every solver gets the same D and Y and starts from them, so Gram matrices count. All run in one
+process on one thread, in turns; a time is the median over the turns of the process time. Slow
+solvers get the first few signals only. The gap comes from the residual in double precision: (P -
+dual) / P with the scaled residual as the dual point. Solvers that are not installed are left out:
+`pip install -e '.[bench]'`. A second table has the gaps that ours and the quickest of the others
+reach where it is hard.
 
-Writes RUN/sparse.json and RUN/sparse.md. Run from the project's root: python pipelines/benchmarks/sparse.py --help.
+Writes RUN/sparse.json and RUN/sparse.md. Run from the project's root: python
+pipelines/benchmarks/sparse.py --help.
 """
 
 import argparse
@@ -37,26 +42,39 @@ PACKAGES = {"SPAMS": "spams-bin", "scikit-learn": "scikit-learn", "interior poin
 
 
 def problem(config, iterations, count, seed):
-    """dict: D (row, atom), Y (row, signal) and the same without noise, lambda, and the validation table that chose it."""
-    from plenocli.forward.accuracy.dial import plan_pif
+    """dict: D (row, atom), Y (row, signal) and the same without noise, lambda, and the
+    validation table that chose it.
+    """
     from plenocli.files.config.camera_file import load_camera
+    from plenocli.files.read.training import at_scales, read_training, split_by_scene
+    from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.propagation.system_matrix import build_pif
-    from plenocli.inverse.sparse.dictionary import Learner, Settings
     from plenocli.inverse.picture.least_squares import decompose
     from plenocli.inverse.prior.natural_images import draw_patches
-    from plenocli.files.read.training import at_scales, read_training, split_by_scene
+    from plenocli.inverse.sparse.dictionary import Learner, Settings
 
     camera = load_camera(config)
     shape = camera.object.samples_per_lenslet
-    matrix = build_pif(camera, plan_pif(camera, model="fresnel", superpixels=(1, 1), coherent_ring=0, accuracy=1e-5)).A[0, 0]
-    training, held = ([p for _, p in at_scales(part, shape)] for part in split_by_scene(read_training((), shape)))
+    matrix = build_pif(
+        camera,
+        plan_pif(camera, model="fresnel", superpixels=(1, 1), coherent_ring=0, accuracy=1e-5),
+    ).A[0, 0]
+    training, held = (
+        [p for _, p in at_scales(part, shape)] for part in split_by_scene(read_training((), shape))
+    )
     points = int(np.prod(shape))
     settings = Settings(points, 4 * points, 1e-6, 1e-3, SNR_DB, seed=seed)
     learner = Learner(decompose(matrix), shape, training, held, settings, workers=1)
     state = learner.start()
     for k in range(iterations):
         state = learner.step(state)
-        print(f"learning: iteration {k + 1} of {iterations}, validation {state.history['validation_psnr'][-1]:.2f} dB", flush=True)
+        print(
+            (
+                f"learning: iteration {k + 1} of {iterations}, validation "
+                f"{state.history['validation_psnr'][-1]:.2f} dB"
+            ),
+            flush=True,
+        )
     table = learner.validate_path(state.atoms, LAMBDAS)
     lam = max(table, key=lambda row: row[1])[0]
     rng = np.random.default_rng([seed, 99])
@@ -64,12 +82,21 @@ def problem(config, iterations, count, seed):
     signals, _ = learner.measure(patches, rng)
     effective = learner.seen @ state.atoms
     constant = effective[:, :1] / np.linalg.norm(effective[:, 0])
-    effective, signals, clean = (x - constant @ (constant.T @ x) for x in (effective[:, 1:], signals, learner.seen @ patches))
-    return {"D": effective, "Y": signals, "clean": clean, "lambda": lam, "validation": [(float(a), float(b), float(c)) for a, b, c in table]}
+    effective, signals, clean = (
+        x - constant @ (constant.T @ x) for x in (effective[:, 1:], signals, learner.seen @ patches)
+    )
+    return {
+        "D": effective,
+        "Y": signals,
+        "clean": clean,
+        "lambda": lam,
+        "validation": [(float(a), float(b), float(c)) for a, b, c in table],
+    }
 
 
-# the solvers: (D, Y, lambda) -> coefficients (atom, signal); libraries get the problem divided by lambda, since some of their
-# tolerances are absolute: as it stands scikit-learn's LARS ends after eleven atoms
+# the solvers: (D, Y, lambda) -> coefficients (atom, signal); libraries get the problem divided by
+# lambda, since some of their tolerances are absolute: as it stands scikit-learn's LARS ends
+# after eleven atoms
 
 
 def ours(d, y, lam):
@@ -93,30 +120,58 @@ def interior(d, y, lam):
 def spams_cholesky(d, y, lam):
     import spams
 
-    return lam * spams.lasso(np.asfortranarray(y / lam), D=np.asfortranarray(d), lambda1=0.5, mode=2, cholesky=True, numThreads=1).toarray()
+    return (
+        lam
+        * spams.lasso(
+            np.asfortranarray(y / lam),
+            D=np.asfortranarray(d),
+            lambda1=0.5,
+            mode=2,
+            cholesky=True,
+            numThreads=1,
+        ).toarray()
+    )
 
 
 def spams_lars(d, y, lam):
     import spams
 
-    return lam * spams.lasso(np.asfortranarray(y / lam), D=np.asfortranarray(d), lambda1=0.5, mode=2, numThreads=1).toarray()
+    return (
+        lam
+        * spams.lasso(
+            np.asfortranarray(y / lam), D=np.asfortranarray(d), lambda1=0.5, mode=2, numThreads=1
+        ).toarray()
+    )
 
 
 def sklearn_lars(d, y, lam):
     from sklearn.decomposition import sparse_encode
 
-    return lam * sparse_encode(y.T / lam, d.T, algorithm="lasso_lars", alpha=0.5, max_iter=4000, n_jobs=1).T
+    return (
+        lam
+        * sparse_encode(
+            y.T / lam, d.T, algorithm="lasso_lars", alpha=0.5, max_iter=4000, n_jobs=1
+        ).T
+    )
 
 
 def sklearn_cd(d, y, lam):
     from sklearn.decomposition import sparse_encode
 
-    return lam * sparse_encode(y.T / lam, d.T, algorithm="lasso_cd", alpha=0.5, max_iter=1000, n_jobs=1).T
+    return (
+        lam
+        * sparse_encode(y.T / lam, d.T, algorithm="lasso_cd", alpha=0.5, max_iter=1000, n_jobs=1).T
+    )
 
 
 SOLVERS = {
-    "ours": (ours, None), "SPAMS lasso, Cholesky": (spams_cholesky, None), "SPAMS lasso, LARS": (spams_lars, None),
-    "scikit-learn lasso_lars (4000)": (sklearn_lars, 4), "scikit-learn lasso_cd (1000)": (sklearn_cd, 8), "FISTA (300)": (fista, 64), "interior point": (interior, 1),
+    "ours": (ours, None),
+    "SPAMS lasso, Cholesky": (spams_cholesky, None),
+    "SPAMS lasso, LARS": (spams_lars, None),
+    "scikit-learn lasso_lars (4000)": (sklearn_lars, 4),
+    "scikit-learn lasso_cd (1000)": (sklearn_cd, 8),
+    "FISTA (300)": (fista, 64),
+    "interior point": (interior, 1),
 }
 """Name: (function, how many of the signals it gets; None: all)."""
 
@@ -149,16 +204,37 @@ def measure(task, rounds, chosen):
     rows = []
     for name, c in codes.items():
         _, gap, _ = duality_gap(d, y[:, : c.shape[1]], np.ascontiguousarray(c.T), threshold)
-        rows.append({"solver": name, "signals": c.shape[1], "ms": 1e3 * float(np.median(times[name])), "ms_all": [1e3 * t for t in times[name]],
-                     "gap_median": float(np.median(gap)), "gap_95": float(np.percentile(gap, 95)), "gap_max": float(gap.max()), "nonzeros": float(np.count_nonzero(c, axis=0).mean())})
+        rows.append(
+            {
+                "solver": name,
+                "signals": c.shape[1],
+                "ms": 1e3 * float(np.median(times[name])),
+                "ms_all": [1e3 * t for t in times[name]],
+                "gap_median": float(np.median(gap)),
+                "gap_95": float(np.percentile(gap, 95)),
+                "gap_max": float(gap.max()),
+                "nonzeros": float(np.count_nonzero(c, axis=0).mean()),
+            }
+        )
     return rows, missing
 
 
 def hard_cases(task):
     """Yields (name, D, Y, lambda) of what solvers stumble over."""
-    d, y, clean, lam = task["D"], task["Y"][:, :HARD_SIGNALS], task["clean"][:, :HARD_SIGNALS], task["lambda"]
+    d, y, clean, lam = (
+        task["D"],
+        task["Y"][:, :HARD_SIGNALS],
+        task["clean"][:, :HARD_SIGNALS],
+        task["lambda"],
+    )
     most = 2 * np.abs(d.T @ y).max()
-    for name, value in (("lambda", lam), ("lambda / 100", lam / 100), ("lambda / 10,000", lam / 1e4), ("0.99 of the largest lambda", 0.99 * most), ("10 times the largest", 10 * most)):
+    for name, value in (
+        ("lambda", lam),
+        ("lambda / 100", lam / 100),
+        ("lambda / 10,000", lam / 1e4),
+        ("0.99 of the largest lambda", 0.99 * most),
+        ("10 times the largest", 10 * most),
+    ):
         yield name, d, y, value
     yield "without noise", d, clean, lam
     loud = clean + 1000 * (y - clean)
@@ -172,7 +248,9 @@ def hard_cases(task):
 
 
 def measure_hard(task, chosen):
-    """[(name, {solver: (median, largest gap) or None where it failed})] of `hard_cases`; a gap that is no number counts as 1."""
+    """[(name, {solver: (median, largest gap) or None where it failed})] of `hard_cases`; a gap
+    that is no number counts as 1.
+    """
     from plenocli.inverse.sparse.l1.certificate import duality_gap
 
     out = []
@@ -182,7 +260,9 @@ def measure_hard(task, chosen):
             try:
                 c = np.ascontiguousarray(np.nan_to_num(SOLVERS[solver][0](d, y, lam), nan=np.inf).T)
                 with np.errstate(all="ignore"):
-                    gap = np.nan_to_num(duality_gap(d, y, c, np.full(d.shape[1], lam / 2))[1], nan=1.0)
+                    gap = np.nan_to_num(
+                        duality_gap(d, y, c, np.full(d.shape[1], lam / 2))[1], nan=1.0
+                    )
                 gaps[solver] = float(np.median(gap)), float(gap.max())
             except Exception:
                 gaps[solver] = None
@@ -192,18 +272,41 @@ def measure_hard(task, chosen):
 
 def markdown_hard(hard, chosen):
     """The table of `measure_hard`."""
-    lines = [f"{HARD_SIGNALS} signals, gap median / max", "", "| case | " + " | ".join(chosen) + " |", "|---" * (len(chosen) + 1) + "|"]
+    lines = [
+        f"{HARD_SIGNALS} signals, gap median / max",
+        "",
+        "| case | " + " | ".join(chosen) + " |",
+        "|---" * (len(chosen) + 1) + "|",
+    ]
     for name, gaps in hard:
-        lines.append(f"| {name} | " + " | ".join("failed" if gaps[solver] is None else "{:.0e} / {:.0e}".format(*gaps[solver]) for solver in chosen) + " |")
+        lines.append(
+            f"| {name} | "
+            + " | ".join(
+                "failed" if gaps[solver] is None else "{:.0e} / {:.0e}".format(*gaps[solver])
+                for solver in chosen
+            )
+            + " |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def markdown(task, rows, missing):
     """The table, with times relative to the first row."""
-    lines = [f"D {task['D'].shape[0]} x {task['D'].shape[1]}, {task['Y'].shape[1]} signals, {SNR_DB:g} dB, lambda {task['lambda']:.2e}; versions: {', '.join(versions())}", "",
-             "| solver | signals | CPU ms a signal | times ours | gap median | 95 % | max | non-zeros |", "|---|---|---|---|---|---|---|---|"]
+    lines = [
+        (
+            f"D {task['D'].shape[0]} x {task['D'].shape[1]}, {task['Y'].shape[1]} signals, "
+            f"{SNR_DB:g} dB, lambda {task['lambda']:.2e}; versions: {', '.join(versions())}"
+        ),
+        "",
+        "| solver | signals | CPU ms a signal | times ours | gap median | 95 % | max | non-zeros |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
-        lines.append(f"| {row['solver']} | {row['signals']} | {row['ms']:.2f} | {row['ms'] / rows[0]['ms']:.1f} | {row['gap_median']:.0e} | {row['gap_95']:.0e} | {row['gap_max']:.0e} | {row['nonzeros']:.0f} |")
+        lines.append(
+            f"| {row['solver']} | {row['signals']} | {row['ms']:.2f} | "
+            f"{row['ms'] / rows[0]['ms']:.1f} | {row['gap_median']:.0e} | {row['gap_95']:.0e} | "
+            f"{row['gap_max']:.0e} | {row['nonzeros']:.0f} |"
+        )
     lines += [""] + [f"Not installed: {name}." for name in missing]
     return "\n".join(lines) + "\n"
 
@@ -221,19 +324,42 @@ def versions():
 
 def main():
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, default=Path("runs/bench-sparse"), help="folder of the results; the problem is kept there too")
-    parser.add_argument("--config", type=Path, default=ROOT / "sample_configs" / "seed_spatial.toml", help="camera (default: the paper's)")
-    parser.add_argument("--iterations", type=int, default=3, help="iterations of the dictionary (default 3)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--run",
+        type=Path,
+        default=Path("runs/bench-sparse"),
+        help="folder of the results; the problem is kept there too",
+    )
+    parser.add_argument(
+        "--config",
+        type=Path,
+        default=ROOT / "sample_configs" / "seed_spatial.toml",
+        help="camera (default: the paper's)",
+    )
+    parser.add_argument(
+        "--iterations", type=int, default=3, help="iterations of the dictionary (default 3)"
+    )
     parser.add_argument("--signals", type=int, default=1024, help="signals (default 1024)")
     parser.add_argument("--rounds", type=int, default=3, help="turns of every solver (default 3)")
-    parser.add_argument("--lambda-factor", type=float, default=1.0, help="times the best lambda (default 1)")
-    parser.add_argument("--solver", action="append", choices=list(SOLVERS), help="only this solver beside ours (repeatable)")
+    parser.add_argument(
+        "--lambda-factor", type=float, default=1.0, help="times the best lambda (default 1)"
+    )
+    parser.add_argument(
+        "--solver",
+        action="append",
+        choices=list(SOLVERS),
+        help="only this solver beside ours (repeatable)",
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     options.run.mkdir(parents=True, exist_ok=True)
-    kept = options.run / f"problem2-{options.config.stem}-{options.iterations}-{options.signals}-{options.seed}.npz"
+    kept = options.run / (
+        f"problem2-{options.config.stem}-{options.iterations}-{options.signals}-{options.seed}.npz"
+    )
     if not kept.exists():
         np.savez(kept, **problem(options.config, options.iterations, options.signals, options.seed))
     with np.load(kept) as stored:
@@ -242,9 +368,26 @@ def main():
     rows, missing = measure(task, options.rounds, ["ours", *(options.solver or list(SOLVERS)[1:])])
     text = markdown(task, rows, missing)
     print(text, flush=True)
-    quick = [name for name in ("ours", "SPAMS lasso, Cholesky") if name in {row["solver"] for row in rows}]
+    quick = [
+        name
+        for name in ("ours", "SPAMS lasso, Cholesky")
+        if name in {row["solver"] for row in rows}
+    ]
     hard = measure_hard(task, quick) if options.lambda_factor == 1 else []
-    (options.run / "sparse.json").write_text(json.dumps({"lambda": task["lambda"], "validation": task["validation"].tolist(), "rows": rows, "hard": hard, "missing": missing, "versions": versions()}, indent=1) + "\n")
+    (options.run / "sparse.json").write_text(
+        json.dumps(
+            {
+                "lambda": task["lambda"],
+                "validation": task["validation"].tolist(),
+                "rows": rows,
+                "hard": hard,
+                "missing": missing,
+                "versions": versions(),
+            },
+            indent=1,
+        )
+        + "\n"
+    )
     text += "\n" + markdown_hard(hard, quick) if hard else ""
     (options.run / "sparse.md").write_text(text)
     print(markdown_hard(hard, quick) if hard else "")

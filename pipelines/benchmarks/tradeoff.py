@@ -1,11 +1,14 @@
-"""The measured trade of accuracy against time: what the dial promises, what it delivers, and whether its choice was the cheapest.
+"""The measured trade of accuracy against time: what the dial promises, what it delivers, and
+whether its choice was the cheapest.
 
-Ten cameras, eight accuracies, within the paraxial model and against the exact one, each for isolated lenslets and with the
-coherent neighbours that the dial finds right. For each case the dial plans; what is not refused is computed, cheap cases first,
-in a process of its own; three columns (centre, middle, corner) are compared with brute force (tradeoff_truth.py); rungs that
-the dial passed over are timed too where they might have served. Cases that are estimated above the budget are listed with the
-estimate. What was measured is kept in RUN/cases and RUN/reference: a rerun computes only what a new plan or new code changes.
-Writes RUN/tradeoff.json, .md and .png. Run from the project's root: python pipelines/benchmarks/tradeoff.py --help.
+Ten cameras, eight accuracies, within the paraxial model and against the exact one, each for
+isolated lenslets and with the coherent neighbours that the dial finds right. For each case the dial
+plans; what is not refused is computed, cheap cases first, in a process of its own; three columns
+(centre, middle, corner) are compared with brute force (tradeoff_truth.py); rungs that the dial
+passed over are timed too where they might have served. Cases that are estimated above the budget
+are listed with the estimate. What was measured is kept in RUN/cases and RUN/reference: a rerun
+computes only what a new plan or new code changes. Writes RUN/tradeoff.json, .md and .png. Run from
+the project's root: python pipelines/benchmarks/tradeoff.py --help.
 """
 
 import argparse
@@ -25,22 +28,38 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import numpy as np  # noqa: E402
-import scipy.sparse  # noqa: E402, F401  as all else that is imported, it is there before time is taken
+
+# as all else that is imported, it is there before time is taken
+import scipy.sparse  # noqa: E402, F401
 from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for  # noqa: E402
 
+from plenocli.base.errors import NumericsError  # noqa: E402
+from plenocli.files.artefacts import pif_pieces  # noqa: E402
 from plenocli.files.config.camera_file import to_toml  # noqa: E402
 from plenocli.forward.accuracy import dial  # noqa: E402
-from plenocli.forward.accuracy.dial import plan_pif
-from plenocli.base.errors import NumericsError  # noqa: E402
+from plenocli.forward.accuracy.dial import plan_pif  # noqa: E402
 from plenocli.forward.propagation.system_matrix import build_pif  # noqa: E402
-from plenocli.files.artefacts import pif_pieces  # noqa: E402
 from plenocli.stages.forward.simulate_pif import Settings  # noqa: E402
 
 ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
 NEAR = 3.0
-"""A rung that was passed over is timed if its estimated error is at most so many times what was asked."""
-LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_products", "expected_rank", "_own_terms", "_require_sketch", "exact_band", "size_band", "_chord_counts"}
+"""A rung that was passed over is timed if its estimated error is at most so many
+times what was asked.
+"""
+LAWS = {
+    "cost",
+    "valid_for",
+    "error_bound",
+    "fresnel_model_error",
+    "expected_products",
+    "expected_rank",
+    "_own_terms",
+    "_require_sketch",
+    "exact_band",
+    "size_band",
+    "_chord_counts",
+}
 """Functions that plan and do not compute: what was measured outlives their changes."""
 
 
@@ -48,8 +67,9 @@ LAWS = {"cost", "valid_for", "error_bound", "fresnel_model_error", "expected_pro
 
 
 def plan_case(model, scope, name, accuracy):
-    """One case as a dict: what the dial says, with the candidates under "_" keys, or "refused", for its error or for the memory that the
-    command allows by default."""
+    """One case as a dict: what the dial says, with the candidates under "_" keys, or "refused", for
+    its error or for the memory that the command allows by default.
+    """
     case = {"camera": name, "accuracy": accuracy, "model": model, "scope": scope}
     try:
         start = time.process_time()
@@ -59,14 +79,27 @@ def plan_case(model, scope, name, accuracy):
     except NumericsError as error:
         return case | {"refused": str(error)}
     chosen = plan.chosen
-    others = [c for c in plan.candidates if c is not chosen and c.error <= NEAR * accuracy and c.bands]
-    return case | {"rung": plan.rung, "superpixels": list(plan.superpixels), "coherent_ring": plan.coherent_ring, "estimated_error": plan.estimated,
-                   "split": plan.split, "estimated_bytes": plan.memory, "dtype": plan.dtype, "_chosen": chosen, "_others": others}
+    others = [
+        c for c in plan.candidates if c is not chosen and c.error <= NEAR * accuracy and c.bands
+    ]
+    return case | {
+        "rung": plan.rung,
+        "superpixels": list(plan.superpixels),
+        "coherent_ring": plan.coherent_ring,
+        "estimated_error": plan.estimated,
+        "split": plan.split,
+        "estimated_bytes": plan.memory,
+        "dtype": plan.dtype,
+        "_chosen": chosen,
+        "_others": others,
+    }
 
 
 def request_of(model, scope):
     """Keyword arguments of plan_pif."""
-    return {"model": model} | ({"superpixels": (1, 1), "coherent_ring": 0} if scope == "isolated" else {})
+    return {"model": model} | (
+        {"superpixels": (1, 1), "coherent_ring": 0} if scope == "isolated" else {}
+    )
 
 
 def forced(name):
@@ -76,9 +109,15 @@ def forced(name):
 
 @cache
 def code(rung):
-    """Digest of the code that computes a rung: its modules without comments, docstrings and planning laws."""
+    """Digest of the code that computes a rung: its modules without comments, docstrings
+    and planning laws.
+    """
     files = ["pif", "geometry", "psf", "pupil", "quadrature", "relay", "factors"]
-    files += {"rays": ["rays"], "fresnel, low rank": ["square"], "fresnel, triple product": ["shaped"]}.get(rung, ["exact", "pairs", "prolate", "residual", "debye", "product"])
+    files += {
+        "rays": ["rays"],
+        "fresnel, low rank": ["square"],
+        "fresnel, triple product": ["shaped"],
+    }.get(rung, ["exact", "pairs", "prolate", "residual", "debye", "product"])
     parts = []
     for file in files:
         path = ROOT / "plenocli" / "optics" / f"{file}.py"
@@ -86,16 +125,34 @@ def code(rung):
         tree.body = [node for node in tree.body if getattr(node, "name", None) not in LAWS]
         for node in ast.walk(tree):
             body = getattr(node, "body", None)
-            if isinstance(body, list) and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+            if (
+                isinstance(body, list)
+                and body
+                and isinstance(body[0], ast.Expr)
+                and isinstance(body[0].value, ast.Constant)
+            ):
                 node.body = body[1:]
         parts.append(ast.dump(tree))
     return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
 
 
 def record_path(run, case, candidate, truth):
-    """Where the measurement of a candidate is kept: by what is computed and what it is compared with."""
-    what = [to_toml(camera_of(case["camera"])), case["superpixels"], case["dtype"], candidate.name, candidate.ring, f"{candidate.sampling:.3g}", candidate.double,
-            repr(candidate.bands), candidate.band_nodes, truth.key, code(candidate.name)]
+    """Where the measurement of a candidate is kept: by what is computed and what
+    it is compared with.
+    """
+    what = [
+        to_toml(camera_of(case["camera"])),
+        case["superpixels"],
+        case["dtype"],
+        candidate.name,
+        candidate.ring,
+        f"{candidate.sampling:.3g}",
+        candidate.double,
+        repr(candidate.bands),
+        candidate.band_nodes,
+        truth.key,
+        code(candidate.name),
+    ]
     return run / "cases" / f"{hashlib.sha256(json.dumps(what).encode()).hexdigest()[:20]}.json"
 
 
@@ -117,12 +174,22 @@ def compute(name, accuracy, model, scope, rung):
         return {"refused": str(error)}, None
     seconds = time.process_time() - start
     notes = {k: v for k, v in pif.notes.items() if isinstance(v, (int, float))}
-    found = {"seconds": seconds, "bytes": _resident() - before, "rates": rates, "load": os.getloadavg()[0], "notes": notes}
-    return found, np.ascontiguousarray(pif.A[0][:, :, places(camera)].transpose(2, 0, 1)).astype(float)
+    found = {
+        "seconds": seconds,
+        "bytes": _resident() - before,
+        "rates": rates,
+        "load": os.getloadavg()[0],
+        "notes": notes,
+    }
+    return found, np.ascontiguousarray(pif.A[0][:, :, places(camera)].transpose(2, 0, 1)).astype(
+        float
+    )
 
 
 def _resident(reset=False):
-    """The highest resident memory (bytes) of this process, so far or since it was reset; where Linux does not let reset it, so far."""
+    """The highest resident memory (bytes) of this process, so far or since it was reset; where
+    Linux does not let reset it, so far.
+    """
     status = Path("/proc/self/status")
     if reset and status.exists():
         try:
@@ -130,7 +197,14 @@ def _resident(reset=False):
         except OSError:
             pass
     if status.exists():
-        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) * 1024
+        return (
+            next(
+                int(line.split()[1])
+                for line in status.read_text().splitlines()
+                if line.startswith("VmHWM")
+            )
+            * 1024
+        )
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
@@ -143,13 +217,29 @@ def measured(run, case, candidate, truth):
     # a fork has the imports but nothing that a matrix leaves behind
     with ProcessPoolExecutor(1, get_context("fork")) as pool:
         try:
-            found, columns = pool.submit(compute, case["camera"], case["accuracy"], case["model"], case["scope"], candidate.name).result()
+            found, columns = pool.submit(
+                compute,
+                case["camera"],
+                case["accuracy"],
+                case["model"],
+                case["scope"],
+                candidate.name,
+            ).result()
         except (BrokenProcessPool, MemoryError) as error:
             return {"failed": str(error)}
     if columns is not None:
         columns = truth.pick(columns, reach_of(case))
-        found["errors"] = [float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in zip(columns, truth.columns())]
-        found |= {"change": truth.change(), "window": truth.window, "camera": case["camera"], "rung": candidate.name, "accuracy": case["accuracy"]}
+        found["errors"] = [
+            float(np.linalg.norm(a - b) / np.linalg.norm(b))
+            for a, b in zip(columns, truth.columns())
+        ]
+        found |= {
+            "change": truth.change(),
+            "window": truth.window,
+            "camera": case["camera"],
+            "rung": candidate.name,
+            "accuracy": case["accuracy"],
+        }
     path.write_text(json.dumps(found, indent=1) + "\n")
     return found
 
@@ -157,29 +247,58 @@ def measured(run, case, candidate, truth):
 def reach_of(case):
     """(row, column) of the superpixels of a case, in the matrix's order."""
     rows, columns = case["superpixels"]
-    return [(r, c) for r in range(-(rows // 2), rows // 2 + 1) for c in range(-(columns // 2), columns // 2 + 1)]
+    return [
+        (r, c)
+        for r in range(-(rows // 2), rows // 2 + 1)
+        for c in range(-(columns // 2), columns // 2 + 1)
+    ]
 
 
 # the sweep
 
 
 def truth_of(run, case, kept_only=False):
-    """The Truth of a case; asking for it may take a paraxial sum, unless it is to be of what is kept only: then it may be None."""
-    model, neighbours = "fresnel" if case["model"] == "fresnel" else "exact", case["scope"] == "neighbours"
-    return truth_for(camera_of(case["camera"]), model, neighbours, reach_of(case), case["accuracy"], run / "reference", kept_only)
+    """The Truth of a case; asking for it may take a paraxial sum, unless it is to be of what is
+    kept only: then it may be None.
+    """
+    model, neighbours = (
+        "fresnel" if case["model"] == "fresnel" else "exact",
+        case["scope"] == "neighbours",
+    )
+    return truth_for(
+        camera_of(case["camera"]),
+        model,
+        neighbours,
+        reach_of(case),
+        case["accuracy"],
+        run / "reference",
+        kept_only,
+    )
 
 
 def expected(run, cases, budget):
-    """(seconds of the matrices, seconds of the brute-force columns) that are still to be computed, about."""
+    """(seconds of the matrices, seconds of the brute-force columns) that are still to
+    be computed, about.
+    """
     matrices, truths = 0.0, {}
     for case in cases:
         if case["model"] == "auto" and case["scope"] == "neighbours":
             # which lenslets the exact sum needs is found by paraxial sums
-            truth = Truth(camera_of(case["camera"]), "exact", 1 if case["accuracy"] > 2e-3 else 2 if case["accuracy"] > 2e-4 else 3, reach_of(case), run / "reference")
+            truth = Truth(
+                camera_of(case["camera"]),
+                "exact",
+                1 if case["accuracy"] > 2e-3 else 2 if case["accuracy"] > 2e-4 else 3,
+                reach_of(case),
+                run / "reference",
+            )
             todo = [case["_chosen"], *case["_others"]]
         else:
             truth = truth_of(run, case)
-            todo = [c for c in (case["_chosen"], *case["_others"]) if not record_path(run, case, c, truth).exists()]
+            todo = [
+                c
+                for c in (case["_chosen"], *case["_others"])
+                if not record_path(run, case, c, truth).exists()
+            ]
         matrices += sum(0.5 + dial.seconds_here(c) for c in todo if dial.seconds_here(c) <= budget)
         if todo and truth.affordable():
             truths[truth.key] = truth.seconds()
@@ -197,16 +316,41 @@ def run_case(run, case, budget, race, kept_only=False):
     found = measured(run, case, chosen, truth)
     if "errors" not in found:
         return case | found
-    case |= {"seconds": found["seconds"], "bytes": found["bytes"], "load": found["load"], "errors": found["errors"], "achieved": max(found["errors"]),
-             "reference_change": found["change"], "estimated_seconds": chosen.seconds(lambda double: found["rates"][double]), "others": []}
+    case |= {
+        "seconds": found["seconds"],
+        "bytes": found["bytes"],
+        "load": found["load"],
+        "errors": found["errors"],
+        "achieved": max(found["errors"]),
+        "reference_change": found["change"],
+        "estimated_seconds": chosen.seconds(lambda double: found["rates"][double]),
+        "others": [],
+    }
     for other in others if race else ():
-        # what serves is timed unless it is hopeless; what is thought too coarse, only if it would have been faster
-        limit = min(budget, 4 * max(chosen.seconds(), 0.01) if other.error <= case["accuracy"] else chosen.seconds())
-        if other.seconds() <= limit and (not kept_only or record_path(run, case, other, truth).exists()):
+        # what serves is timed unless it is hopeless; what is thought too coarse, only if it
+        # would have been faster
+        limit = min(
+            budget,
+            4 * max(chosen.seconds(), 0.01)
+            if other.error <= case["accuracy"]
+            else chosen.seconds(),
+        )
+        if other.seconds() <= limit and (
+            not kept_only or record_path(run, case, other, truth).exists()
+        ):
             again = measured(run, case, other, truth)
             if "errors" in again:
-                case["others"].append({"rung": other.name, "estimated_error": other.error, "achieved": max(again["errors"]), "seconds": again["seconds"],
-                                       "estimated_seconds": other.seconds(lambda double, again=again: again["rates"][double])})
+                case["others"].append(
+                    {
+                        "rung": other.name,
+                        "estimated_error": other.error,
+                        "achieved": max(again["errors"]),
+                        "seconds": again["seconds"],
+                        "estimated_seconds": other.seconds(
+                            lambda double, again=again: again["rates"][double]
+                        ),
+                    }
+                )
     adequate = [o["seconds"] for o in case["others"] if o["achieved"] <= case["accuracy"]]
     case["regret"] = case["seconds"] / min([case["seconds"], *adequate])
     return case
@@ -216,23 +360,46 @@ def verdict(case):
     """held, missed, or open: beyond the accuracy by no more than the reference's own."""
     if case["achieved"] <= case["accuracy"]:
         return "held"
-    return "missed" if case["achieved"] > case["accuracy"] + 1.5 * case["reference_change"] else "open"
+    return (
+        "missed" if case["achieved"] > case["accuracy"] + 1.5 * case["reference_change"] else "open"
+    )
 
 
 def line(case):
     """One case in one line of text."""
     head = f"{case['model']:8s} {case['scope']:10s} {case['camera']:18s} {case['accuracy']:7.0e} "
     if "achieved" not in case:
-        return head + next(f"{word}: {str(case[word])[:110]}" for word in ("refused", "not_run", "failed") if word in case)
-    return head + (f"est {case['estimated_error']:.1e} got {case['achieved']:.1e} {verdict(case)} "
-                   f"time est {case['estimated_seconds']:.3g} got {case['seconds']:.3g} s, {case['rung']}, {case['superpixels'][0]}x{case['superpixels'][1]} "
-                   f"ring {case['coherent_ring']} mem est {case['estimated_bytes'] / 2**20:.0f} got {case['bytes'] / 2**20:.0f} MiB"
-                   + "".join(f"; {o['rung']} {o['estimated_seconds']:.3g} got {o['seconds']:.3g} s, {o['achieved']:.1e}" for o in case["others"])
-                   + (f" (reference {case['reference_change']:.0e})" if case["reference_change"] > 0.1 * case["achieved"] else ""))
+        return head + next(
+            f"{word}: {str(case[word])[:110]}"
+            for word in ("refused", "not_run", "failed")
+            if word in case
+        )
+    return head + (
+        (
+            f"est {case['estimated_error']:.1e} got {case['achieved']:.1e} {verdict(case)} time "
+            f"est {case['estimated_seconds']:.3g} got {case['seconds']:.3g} s, {case['rung']}, "
+            f"{case['superpixels'][0]}x{case['superpixels'][1]} ring {case['coherent_ring']} mem "
+            f"est {case['estimated_bytes'] / 2**20:.0f} got {case['bytes'] / 2**20:.0f} MiB"
+        )
+        + "".join(
+            (
+                f"; {o['rung']} {o['estimated_seconds']:.3g} got {o['seconds']:.3g} s, "
+                f"{o['achieved']:.1e}"
+            )
+            for o in case["others"]
+        )
+        + (
+            f" (reference {case['reference_change']:.0e})"
+            if case["reference_change"] > 0.1 * case["achieved"]
+            else ""
+        )
+    )
 
 
 def summary(cases):
-    """Counts over the cases: how many hold, how honest the estimates are, how often the choice was near the fastest."""
+    """Counts over the cases: how many hold, how honest the estimates are, how often the choice
+    was near the fastest.
+    """
     done = [c for c in cases if "achieved" in c]
 
     def share(test, among=done):
@@ -240,11 +407,18 @@ def summary(cases):
 
     solid = [c for c in done if c["reference_change"] < 0.3 * c["achieved"]]
     return {
-        "cases": len(cases), "computed": len(done), **{word: sum(verdict(c) == word for c in done) for word in ("held", "open", "missed")},
-        "refused": sum("refused" in c for c in cases), "not run": sum("not_run" in c for c in cases), "failed": sum("failed" in c for c in cases),
-        "error within [0.1, 10]": share(lambda c: 0.1 <= c["estimated_error"] / max(c["achieved"], 1e-300) <= 10, solid),
+        "cases": len(cases),
+        "computed": len(done),
+        **{word: sum(verdict(c) == word for c in done) for word in ("held", "open", "missed")},
+        "refused": sum("refused" in c for c in cases),
+        "not run": sum("not_run" in c for c in cases),
+        "failed": sum("failed" in c for c in cases),
+        "error within [0.1, 10]": share(
+            lambda c: 0.1 <= c["estimated_error"] / max(c["achieved"], 1e-300) <= 10, solid
+        ),
         "time within [0.5, 2]": share(lambda c: 0.5 <= c["estimated_seconds"] / c["seconds"] <= 2),
-        "choice within 1.5": share(lambda c: c["regret"] <= 1.5), "worst choice": round(max((c["regret"] for c in done), default=1), 2),
+        "choice within 1.5": share(lambda c: c["regret"] <= 1.5),
+        "worst choice": round(max((c["regret"] for c in done), default=1), 2),
     }
 
 
@@ -256,26 +430,54 @@ def markdown(cases):
         if not some:
             continue
         asked = sorted({c["accuracy"] for c in some}, reverse=True)
-        lines += [f"**{'Paraxial model' if model == 'fresnel' else 'Against the exact model'}, {'isolated lenslets' if scope == 'isolated' else 'with coherent neighbours'}**", "",
-                  "| camera | " + " | ".join(f"{a:.0e}" for a in asked) + " |", "|---" * (len(asked) + 1) + "|"]
+        lines += [
+            (
+                f"**{'Paraxial model' if model == 'fresnel' else 'Against the exact model'}, "
+                f"{'isolated lenslets' if scope == 'isolated' else 'with coherent neighbours'}**"
+            ),
+            "",
+            "| camera | " + " | ".join(f"{a:.0e}" for a in asked) + " |",
+            "|---" * (len(asked) + 1) + "|",
+        ]
         for name in dict.fromkeys(c["camera"] for c in some):
             row = {c["accuracy"]: c for c in some if c["camera"] == name}
-            lines.append(f"| {name} | " + " | ".join(_cell(row[a]) if a in row else "" for a in asked) + " |")
+            lines.append(
+                f"| {name} | " + " | ".join(_cell(row[a]) if a in row else "" for a in asked) + " |"
+            )
         lines.append("")
-    totals = {f"{m}, {s}": summary([c for c in cases if (c["model"], c["scope"]) == (m, s)]) for m, s in SUITES}
+    totals = {
+        f"{m}, {s}": summary([c for c in cases if (c["model"], c["scope"]) == (m, s)])
+        for m, s in SUITES
+    }
     totals = {k: v for k, v in totals.items() if v["cases"]} | {"all": summary(cases)}
     words = list(totals["all"])
     lines += ["| suite | " + " | ".join(words) + " |", "|---" * (len(words) + 1) + "|"]
-    lines += [f"| {suite} | " + " | ".join("" if values[w] is None else str(values[w]) for w in words) + " |" for suite, values in totals.items()]
+    lines += [
+        f"| {suite} | "
+        + " | ".join("" if values[w] is None else str(values[w]) for w in words)
+        + " |"
+        for suite, values in totals.items()
+    ]
     return "\n".join(lines) + "\n"
 
 
 def _cell(case):
     if "achieved" not in case:
-        return "refused" if "refused" in case else f"({case['not_run'].replace('estimated ', '')})" if "not_run" in case else "FAILED"
-    letter = {"rays": "R", "fresnel, low rank": "F", "fresnel, triple product": "T"}.get(case["rung"], "E")
+        return (
+            "refused"
+            if "refused" in case
+            else f"({case['not_run'].replace('estimated ', '')})"
+            if "not_run" in case
+            else "FAILED"
+        )
+    letter = {"rays": "R", "fresnel, low rank": "F", "fresnel, triple product": "T"}.get(
+        case["rung"], "E"
+    )
     mark = {"held": "", "open": " ?", "missed": " **missed**"}[verdict(case)]
-    return f"{case['achieved']:.0e}{mark}, {case['seconds']:{'.0f' if case['seconds'] >= 10 else '.2g'}} s {letter}"
+    return (
+        f"{case['achieved']:.0e}{mark}, "
+        f"{case['seconds']:{'.0f' if case['seconds'] >= 10 else '.2g'}} s {letter}"
+    )
 
 
 def plot(cases, path):
@@ -289,14 +491,32 @@ def plot(cases, path):
     for index, name in enumerate(dict.fromkeys(c["camera"] for c in cases)):
         label = name
         for model, scope in SUITES:
-            done = [c for c in cases if (c["camera"], c["model"], c["scope"]) == (name, model, scope) and "achieved" in c]
+            done = [
+                c
+                for c in cases
+                if (c["camera"], c["model"], c["scope"]) == (name, model, scope) and "achieved" in c
+            ]
             style = ("o" if scope == "neighbours" else "x") + ("-" if model == "auto" else ":")
             asked = [c["accuracy"] for c in done]
-            left.loglog(asked, [c["achieved"] for c in done], style, color=f"C{index}", label=label, ms=4, lw=0.8)
-            right.loglog(asked, [c["seconds"] for c in done], style, color=f"C{index}", ms=4, lw=0.8)
+            left.loglog(
+                asked,
+                [c["achieved"] for c in done],
+                style,
+                color=f"C{index}",
+                label=label,
+                ms=4,
+                lw=0.8,
+            )
+            right.loglog(
+                asked, [c["seconds"] for c in done], style, color=f"C{index}", ms=4, lw=0.8
+            )
             label = None
     left.plot([1e-8, 1e-1], [1e-8, 1e-1], "k-", lw=0.8)
-    left.set(xlabel="accuracy asked for", ylabel="relative error achieved, worst column", title="circles: with neighbours; solid: against the exact model")
+    left.set(
+        xlabel="accuracy asked for",
+        ylabel="relative error achieved, worst column",
+        title="circles: with neighbours; solid: against the exact model",
+    )
     right.set(xlabel="accuracy asked for", ylabel="CPU time of one core (s)")
     left.legend(fontsize=7)
     figure.savefig(path, dpi=130, metadata={"Software": None})
@@ -305,38 +525,84 @@ def plot(cases, path):
 
 def write(run, cases):
     """The results so far."""
-    kept = [{k: v for k, v in c.items() if not k.startswith("_")} for c in cases if any(w in c for w in ("achieved", "refused", "not_run", "failed"))]
-    (run / "tradeoff.json").write_text(json.dumps({"summary": summary(kept), "cases": kept}, indent=1) + "\n")
+    kept = [
+        {k: v for k, v in c.items() if not k.startswith("_")}
+        for c in cases
+        if any(w in c for w in ("achieved", "refused", "not_run", "failed"))
+    ]
+    (run / "tradeoff.json").write_text(
+        json.dumps({"summary": summary(kept), "cases": kept}, indent=1) + "\n"
+    )
     (run / "tradeoff.md").write_text(markdown(kept))
     plot(kept, run / "tradeoff.png")
 
 
 def main():
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", default="runs/tradeoff", help="folder of the results and of what is kept")
-    parser.add_argument("--camera", action="append", choices=list(CAMERAS), help="only this camera (repeatable)")
-    parser.add_argument("--accuracy", action="append", type=float, help="only this accuracy (repeatable)")
-    parser.add_argument("--model", action="append", choices=["fresnel", "auto"], help="fresnel: within that model; auto: against the exact one (default: both)")
-    parser.add_argument("--scope", action="append", choices=["isolated", "neighbours"], help="one lenslet alone, or neighbours as the dial finds right (default: both)")
-    parser.add_argument("--budget", type=float, default=30.0, help="matrices estimated to take more seconds than this are not run")
-    parser.add_argument("--no-race", action="store_true", help="do not time the other rungs that might serve")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--run", default="runs/tradeoff", help="folder of the results and of what is kept"
+    )
+    parser.add_argument(
+        "--camera", action="append", choices=list(CAMERAS), help="only this camera (repeatable)"
+    )
+    parser.add_argument(
+        "--accuracy", action="append", type=float, help="only this accuracy (repeatable)"
+    )
+    parser.add_argument(
+        "--model",
+        action="append",
+        choices=["fresnel", "auto"],
+        help="fresnel: within that model; auto: against the exact one (default: both)",
+    )
+    parser.add_argument(
+        "--scope",
+        action="append",
+        choices=["isolated", "neighbours"],
+        help="one lenslet alone, or neighbours as the dial finds right (default: both)",
+    )
+    parser.add_argument(
+        "--budget",
+        type=float,
+        default=30.0,
+        help="matrices estimated to take more seconds than this are not run",
+    )
+    parser.add_argument(
+        "--no-race", action="store_true", help="do not time the other rungs that might serve"
+    )
     parser.add_argument("--plan", action="store_true", help="only say what would be run")
     parser.add_argument("--table", action="store_true", help="only tabulate what is kept")
     options = parser.parse_args()
     run = ROOT / options.run
     run.mkdir(parents=True, exist_ok=True)
-    cases = [plan_case(model, scope, name, accuracy) for model, scope in SUITES if model in (options.model or [model]) and scope in (options.scope or [scope])
-             for name in options.camera or CAMERAS for accuracy in options.accuracy or ACCURACIES]
+    cases = [
+        plan_case(model, scope, name, accuracy)
+        for model, scope in SUITES
+        if model in (options.model or [model]) and scope in (options.scope or [scope])
+        for name in options.camera or CAMERAS
+        for accuracy in options.accuracy or ACCURACIES
+    ]
     for case in cases:
         if "refused" not in case and dial.seconds_here(case["_chosen"]) > options.budget:
             case["not_run"] = f"estimated {dial.seconds_here(case['_chosen']):.0f} s"
-    todo = sorted((c for c in cases if "refused" not in c and "not_run" not in c), key=lambda c: dial.seconds_here(c["_chosen"]))
+    todo = sorted(
+        (c for c in cases if "refused" not in c and "not_run" not in c),
+        key=lambda c: dial.seconds_here(c["_chosen"]),
+    )
     matrices, sums = expected(run, todo, options.budget)
-    print(f"{len(cases)} cases: {sum('refused' in c for c in cases)} refused, {sum('not_run' in c for c in cases)} above the budget, {len(todo)} to do; "
-          f"about {matrices:.0f} s for matrices and {sums:.0f} s for brute-force columns that are not at hand, of one core", flush=True)
+    print(
+        (
+            f"{len(cases)} cases: {sum('refused' in c for c in cases)} refused, "
+            f"{sum('not_run' in c for c in cases)} above the budget, {len(todo)} to do; about "
+            f"{matrices:.0f} s for matrices and {sums:.0f} s for brute-force columns that are not "
+            "at hand, of one core"
+        ),
+        flush=True,
+    )
     if options.plan:
-        return None
+        return
     for number, case in enumerate(todo):
         case |= run_case(run, case, options.budget, not options.no_race, options.table)
         print(line(case), flush=True)

@@ -12,7 +12,13 @@ def default_mem_limit():
 
 
 def require_room(path, needed, mem_limit=None):
-    """Raise InputError, before anything is read, if the data that a header declares (`needed` bytes) exceed the limit."""
+    """Raise InputError, before anything is read, if the data that a header declares (`needed`
+    bytes) exceed the limit.
+    """
     limit = default_mem_limit() if mem_limit is None else mem_limit
     if needed > limit:
-        raise InputError(f"declares {size_text(needed)} of data, above the memory limit of {size_text(limit)}", path, f"raise --mem-limit to {size_text(1.05 * needed)} if the file is yours")
+        raise InputError(
+            f"declares {size_text(needed)} of data, above the memory limit of {size_text(limit)}",
+            path,
+            f"raise --mem-limit to {size_text(1.05 * needed)} if the file is yours",
+        )

@@ -1,7 +1,8 @@
-"""Linear maps between named spaces: a dense matrix, and a matrix that repeats from lenslet to lenslet.
+"""Linear maps between named spaces: a dense matrix, and a matrix that repeats from
+lenslet to lenslet.
 
-Every map has `domain` and `range` (Space), `dtype`, `forward(x)` and `adjoint(y)`; both directions keep leading axes out:
-x has exactly `domain.shape` and y exactly `range.shape`.
+Every map has `domain` and `range` (Space), `dtype`, `forward(x)` and `adjoint(y)`; both directions
+keep leading axes out: x has exactly `domain.shape` and y exactly `range.shape`.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,9 @@ class Space:
 
 
 class LinearMap(Protocol):
-    """What every map offers. <forward(x), y> = <x, adjoint(y)> for all x in domain, y in range (see adjoint_gap)."""
+    """What every map offers. <forward(x), y> = <x, adjoint(y)> for all x in domain, y in range
+    (see adjoint_gap).
+    """
 
     domain: Space
     range: Space
@@ -41,7 +44,9 @@ class Dense:
     def __init__(self, matrix):
         self.matrix = np.asarray(matrix)
         if self.matrix.ndim != 2:
-            raise ValueError(f"a dense map needs a matrix, not an array of shape {self.matrix.shape}")
+            raise ValueError(
+                f"a dense map needs a matrix, not an array of shape {self.matrix.shape}"
+            )
         self.dtype = self.matrix.dtype
         self.range = Space(("pixel",), self.matrix.shape[:1])
         self.domain = Space(("point",), self.matrix.shape[1:])
@@ -56,27 +61,39 @@ class Dense:
 
 
 class BlockToeplitz:
-    """The whole array when every lenslet answers alike: y[l] = sum_o A_o x[l - offset_o], x = 0 outside the array.
+    """The whole array when every lenslet answers alike: y[l] = sum_o A_o x[l - offset_o], x = 0
+    outside the array.
 
-    blocks: A_o, (lenslet offset, pixel, point): light from an object block that lands in the superpixel `offset` rows and
-    columns away from the block's own.  offsets: (lenslet offset, 2) integers, row then column (rows downwards).
-    count: (rows, columns) of lenslets.  The full matrix (for 11 x 11 lenslets 2.5e9 entries) is never formed.
-    Source: Berkner et al. 2013, section 3-2 (one on-axis response serves all lenslets).
+    blocks: A_o, (lenslet offset, pixel, point): light from an object block that lands in the
+        superpixel `offset` rows and columns away from the block's own.
+    offsets: (lenslet offset, 2) integers, row then column (rows downwards).
+    count: (rows, columns) of lenslets. The full matrix (for 11 x 11 lenslets 2.5e9 entries) is
+        never formed. Source: Berkner et al. 2013, section 3-2 (one on-axis response
+        serves all lenslets).
     """
 
     def __init__(self, blocks, offsets, count):
         self.blocks, self.offsets = np.asarray(blocks), np.asarray(offsets, dtype=int)
         if self.blocks.ndim != 3 or self.offsets.shape != (len(self.blocks), 2):
-            raise ValueError(f"blocks {self.blocks.shape} need offsets ({len(self.blocks)}, 2), not {self.offsets.shape}")
+            raise ValueError(
+                f"blocks {self.blocks.shape} need offsets ({len(self.blocks)}, 2), not "
+                f"{self.offsets.shape}"
+            )
         if len({tuple(o) for o in self.offsets.tolist()}) != len(self.offsets):
             raise ValueError("an offset appears twice")
         self.dtype = self.blocks.dtype
         rows, columns = (int(n) for n in count)
-        self.domain = Space(("lenslet_row", "lenslet_column", "point"), (rows, columns, self.blocks.shape[2]))
-        self.range = Space(("lenslet_row", "lenslet_column", "pixel"), (rows, columns, self.blocks.shape[1]))
+        self.domain = Space(
+            ("lenslet_row", "lenslet_column", "point"), (rows, columns, self.blocks.shape[2])
+        )
+        self.range = Space(
+            ("lenslet_row", "lenslet_column", "pixel"), (rows, columns, self.blocks.shape[1])
+        )
 
     def forward(self, x):
-        """(lenslet_row, lenslet_column, point) -> (lenslet_row, lenslet_column, pixel): sum_o A_o x[l - o]."""
+        """(lenslet_row, lenslet_column, point) -> (lenslet_row, lenslet_column, pixel):
+        sum_o A_o x[l - o].
+        """
         x = _checked(x, self.domain)
         y = np.zeros(self.range.shape, np.result_type(self.dtype, x.dtype))
         for block, offset in zip(self.blocks, self.offsets):
@@ -85,7 +102,9 @@ class BlockToeplitz:
         return y
 
     def adjoint(self, y):
-        """(lenslet_row, lenslet_column, pixel) -> (lenslet_row, lenslet_column, point): sum_o A_o^T y[l + o]."""
+        """(lenslet_row, lenslet_column, pixel) -> (lenslet_row, lenslet_column, point):
+        sum_o A_o^T y[l + o].
+        """
         y = _checked(y, self.range)
         x = np.zeros(self.domain.shape, np.result_type(self.dtype, y.dtype))
         for block, offset in zip(self.blocks, self.offsets):
@@ -99,12 +118,13 @@ class BlockToeplitz:
         return BlockToeplitz(self.blocks[keep], self.offsets[keep], self.domain.shape[:2])
 
 
-
 def adjoint_gap(op, seed=0):
-    """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y: about 1-10 for a correct pair at any shape and scale.
+    """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y: about 1-10 for a correct pair
+    at any shape and scale.
 
-    Divided by |Ax| |y| / sqrt(size of y), not by the inner product itself, which may be near zero by chance.
-    An adjoint that is wrong by 0.1 % gives hundreds (float32) or more, so 100 separates right from wrong.
+    Divided by |Ax| |y| / sqrt(size of y), not by the inner product itself, which may be near zero
+    by chance. An adjoint that is wrong by 0.1 % gives hundreds (float32) or more, so 100
+    separates right from wrong.
     """
     rng = np.random.default_rng(seed)
     x, y = (rng.standard_normal(s.shape).astype(op.dtype) for s in (op.domain, op.range))

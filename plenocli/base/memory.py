@@ -1,4 +1,6 @@
-"""How much memory a process may take: the limit of the command line, that of the shell or a queue, and what to say where it is too little."""
+"""How much memory a process may take: the limit of the command line, that of the shell or a
+queue, and what to say where it is too little.
+"""
 
 import contextlib
 import errno
@@ -10,11 +12,15 @@ import resource
 from plenocli.base.errors import NumericsError
 
 BASE, CORE = 384 << 20, 80 << 20
-"""What a process takes beside its data, bytes, and for each core: the interpreter, the libraries and the room that they set aside."""
+"""What a process takes beside its data, bytes, and for each core: the interpreter, the libraries
+and the room that they set aside.
+"""
 _CODE = 128 << 20
 """Of it: the libraries' own code, which no limit of data counts."""
 ROOM = 256 << 20
-"""Bytes without which no command starts: HDF5, OpenBLAS and LLVM end the process where they get none."""
+"""Bytes without which no command starts: HDF5, OpenBLAS and LLVM end the process
+where they get none.
+"""
 _SIGNS = ("memory allocation failed", "start new thread", "failed to map segment", "bad_alloc")
 
 
@@ -24,14 +30,19 @@ def base_memory():
 
 
 def hold(mem_limit):
-    """From now on this process gets MemoryError instead of more than `mem_limit` bytes of data and the base; only on Linux."""
+    """From now on this process gets MemoryError instead of more than `mem_limit` bytes of data
+    and the base; only on Linux.
+    """
     table = "/proc/self/status"
     if os.path.exists(table):
         with open(table) as lines:
             used = next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData"))
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         most = used + mem_limit + base_memory() - _CODE
-        resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+        resource.setrlimit(
+            resource.RLIMIT_DATA,
+            (most if hard == resource.RLIM_INFINITY else min(most, hard), hard),
+        )
 
 
 @contextlib.contextmanager
@@ -60,20 +71,35 @@ def require_start():
 
 
 def require_memory(needed, mem_limit, what, where=None, fewer="take less of it"):
-    """NumericsError, before a long computation, if `what` needs more bytes than the limit; it says how much would do."""
+    """NumericsError, before a long computation, if `what` needs more bytes than the limit; it
+    says how much would do.
+    """
     if mem_limit is not None and needed > mem_limit:
-        raise NumericsError(f"{what} needs about {size_text(needed)}, more than the limit of {size_text(mem_limit)}", where, f"{fewer}, or raise --mem-limit to {size_text(1.05 * needed)}")
+        raise NumericsError(
+            (
+                f"{what} needs about {size_text(needed)}, more than the limit of "
+                f"{size_text(mem_limit)}"
+            ),
+            where,
+            f"{fewer}, or raise --mem-limit to {size_text(1.05 * needed)}",
+        )
 
 
 def is_lack_of_memory(error):
-    """Whether an error means that there is no memory: of ours, of a library, of a thread or process that cannot start, or one that came
-    of such an error, as where a library takes it for another and goes on."""
+    """Whether an error means that there is no memory: of ours, of a library, of a thread or process
+    that cannot start, or one that came of such an error, as where a library takes it for
+    another and goes on.
+    """
     return _lack_behind(error) is not None
 
 
 def _lack_behind(error):
     while error is not None:
-        if isinstance(error, MemoryError) or getattr(error, "errno", None) in (errno.ENOMEM, errno.EAGAIN) or any(sign in str(error).lower() for sign in _SIGNS):
+        if (
+            isinstance(error, MemoryError)
+            or getattr(error, "errno", None) in (errno.ENOMEM, errno.EAGAIN)
+            or any(sign in str(error).lower() for sign in _SIGNS)
+        ):
             return error
         error = error.__cause__ or error.__context__
     return None
@@ -82,13 +108,19 @@ def _lack_behind(error):
 def lack_of_memory(error):
     """What to say of it."""
     said = str(_lack_behind(error) or "")
-    return (f"not enough memory{said and f' ({said})'}; use fewer points, lenslets or wavelengths, another --mem-limit, or raise the limit that the shell or the queue sets "
-            "(ulimit -v)")
+    return (
+        f"not enough memory{said and f' ({said})'}; use fewer points, lenslets or wavelengths, "
+        "another --mem-limit, or raise the limit that the shell or the queue sets (ulimit -v)"
+    )
 
 
 def size_text(count):
     """Bytes as options take them, rounded up to three digits: 34.8MiB."""
-    unit, power = next((u, p) for u, p in (("GiB", 30), ("MiB", 20), ("KiB", 10), ("B", 0)) if count >= 2**p or not p)
+    unit, power = next(
+        (u, p)
+        for u, p in (("GiB", 30), ("MiB", 20), ("KiB", 10), ("B", 0))
+        if count >= 2**p or not p
+    )
     value = count / 2**power
     step = 10.0 ** (math.floor(math.log10(max(value, 1))) - 2)
     return f"{math.ceil(value / step) * step:.6g}{unit}"

@@ -10,8 +10,9 @@ _EAR = contextvars.ContextVar("ear", default=None)
 
 
 def bar(iterable, total=None, label=""):
-    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent elsewhere, for a single step, and while
-    `heard` listens."""
+    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent
+    elsewhere, for a single step, and while `heard` listens.
+    """
     if quiet or total == 1 or _EAR.get() is not None:
         return _Silent(iterable)
     from tqdm import tqdm
@@ -21,7 +22,9 @@ def bar(iterable, total=None, label=""):
 
 
 class _Silent:
-    """A bar that nobody sees, without the lock between processes that tqdm makes and a worker that is ended would leave behind."""
+    """A bar that nobody sees, without the lock between processes that tqdm makes and a worker
+    that is ended would leave behind.
+    """
 
     def __init__(self, iterable):
         self.n, self._iterable = 0, iterable

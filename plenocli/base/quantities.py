@@ -1,18 +1,28 @@
-"""Fields of descriptions: numbers with a unit as text, read into SI, and the frozen section that holds them."""
+"""Fields of descriptions: numbers with a unit as text, read into SI, and the frozen
+section that holds them.
+"""
 
 import re
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
-from plenocli.base.units import UnitError, format_duration, format_length, parse_duration, parse_length
+from plenocli.base.units import (
+    UnitError,
+    format_duration,
+    format_length,
+    parse_duration,
+    parse_length,
+)
 
 
 def quantity(parse, example, low, high, show):
     """An annotated float that is written as text with a unit and lies within [low, high] in SI."""
 
     def read(value: Any, info) -> float:
-        """SI value of text with a unit, or of a number where the context says that it is SI already."""
+        """SI value of text with a unit, or of a number where the context says
+        that it is SI already.
+        """
         if info.context and info.context.get("si"):
             number = value
         elif isinstance(value, str):
@@ -23,7 +33,10 @@ def quantity(parse, example, low, high, show):
             raise ValueError(f"{value!r} is outside {show(low)} ... {show(high)}")
         return number
 
-    pattern = {"type": "string", "description": f"number and unit, such as {example!r}, from {show(low)} to {show(high)}"}
+    pattern = {
+        "type": "string",
+        "description": f"number and unit, such as {example!r}, from {show(low)} to {show(high)}",
+    }
     return Annotated[float, BeforeValidator(read), WithJsonSchema(pattern)]
 
 

@@ -5,7 +5,9 @@ import math
 
 
 def plain(value):
-    """A copy without what JSON lacks: arrays become lists, paths text, and numbers that are not finite None (an infinite PSNR: no error at all)."""
+    """A copy without what JSON lacks: arrays become lists, paths text, and numbers that are not
+    finite None (an infinite PSNR: no error at all).
+    """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -18,7 +20,7 @@ def plain(value):
 
 
 def by(shape):
-    """"4 x 6" of (4, 6)."""
+    """ "4 x 6" of (4, 6)."""
     return " x ".join(str(int(n)) for n in shape)
 
 

@@ -2,8 +2,9 @@
 
 
 def one_thread():
-    """A context in which products and decompositions of matrices stay on the thread that asks for them: idle threads that wait for
-    the next product cost many times its processor time."""
+    """A context in which products and decompositions of matrices stay on the thread that asks for
+    them: idle threads that wait for the next product cost many times its processor time.
+    """
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(1, "blas")

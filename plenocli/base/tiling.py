@@ -1,27 +1,43 @@
-"""A plane of pixels or object points as blocks, one a lenslet, and back; lenslets tile the plane from its first corner."""
+"""A plane of pixels or object points as blocks, one a lenslet, and back; lenslets tile the plane
+from its first corner.
+"""
 
 import numpy as np
 
 
 def to_blocks(plane, shape):
-    """(row, column) -> (lenslet_row, lenslet_column, sample), samples numbered row by row in blocks of `shape` = (rows, columns).
+    """(row, column) -> (lenslet_row, lenslet_column, sample), samples numbered row by row in blocks
+    of `shape` = (rows, columns).
 
-    Both sides of the plane are whole numbers of blocks. Of several planes, (band, row, column), the samples of one band
-    follow those of the other.
+    Both sides of the plane are whole numbers of blocks. Of several planes, (band, row, column), the
+    samples of one band follow those of the other.
     """
     if plane.ndim == 3:
         return np.concatenate([to_blocks(one, shape) for one in plane], axis=2)
     rows, columns = plane.shape[0] // shape[0], plane.shape[1] // shape[1]
-    return plane.reshape(rows, shape[0], columns, shape[1]).swapaxes(1, 2).reshape(rows, columns, shape[0] * shape[1])
+    return (
+        plane.reshape(rows, shape[0], columns, shape[1])
+        .swapaxes(1, 2)
+        .reshape(rows, columns, shape[0] * shape[1])
+    )
 
 
 def to_plane(blocks, shape):
     """(lenslet_row, lenslet_column, sample) -> (row, column), the inverse of `to_blocks`.
 
-    Of one axis of samples or of two that stand for it, (..., rows, columns). More samples than a block holds are several
-    bands, and give (band, row, column).
+    Of one axis of samples or of two that stand for it, (..., rows, columns). More samples than a
+    block holds are several bands, and give (band, row, column).
     """
     rows, columns = blocks.shape[:2]
     if blocks.ndim == 3 and blocks.shape[2] > shape[0] * shape[1]:
-        return np.stack([to_plane(band, shape) for band in np.split(blocks, blocks.shape[2] // (shape[0] * shape[1]), axis=2)])
-    return blocks.reshape(rows, columns, *shape).swapaxes(1, 2).reshape(rows * shape[0], columns * shape[1])
+        return np.stack(
+            [
+                to_plane(band, shape)
+                for band in np.split(blocks, blocks.shape[2] // (shape[0] * shape[1]), axis=2)
+            ]
+        )
+    return (
+        blocks.reshape(rows, columns, *shape)
+        .swapaxes(1, 2)
+        .reshape(rows * shape[0], columns * shape[1])
+    )

@@ -1,4 +1,6 @@
-"""TOML text against a pydantic class: every violation in words, with its path and the nearest known key."""
+"""TOML text against a pydantic class: every violation in words, with its path and the
+nearest known key.
+"""
 
 import difflib
 import re
@@ -18,7 +20,9 @@ _MOST_LINES = 40
 
 
 def parse_toml(text, where, model):
-    """What the pydantic class `model` makes of TOML text; ConfigError lists every violation with its path."""
+    """What the pydantic class `model` makes of TOML text; ConfigError lists every
+    violation with its path.
+    """
     if _DEEP_KEY.search(text):  # the standard parser takes time as the square of the depth
         raise ConfigError("is nested too deep", where, "mend the line")
     try:
@@ -48,7 +52,9 @@ def _short(text):
 
 
 def _sentence(error, model):
-    """One violation in words: path, what is wrong, and the nearest known key where a key is unknown."""
+    """One violation in words: path, what is wrong, and the nearest known key
+    where a key is unknown.
+    """
     path = [str(p) for p in error["loc"]]
     if error["type"] == "extra_forbidden":
         known = known_keys(path[:-1], model)
@@ -66,7 +72,11 @@ def known_keys(path, model):
     for name in path:
         if name.isdigit() or name not in model.model_fields:
             continue
-        kinds = [a for a in _leaves(model.model_fields[name].annotation) if isinstance(a, type) and issubclass(a, BaseModel)]
+        kinds = [
+            a
+            for a in _leaves(model.model_fields[name].annotation)
+            if isinstance(a, type) and issubclass(a, BaseModel)
+        ]
         model = kinds[0] if kinds else model
     return list(model.model_fields)
 

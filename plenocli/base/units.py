@@ -3,9 +3,29 @@
 import math
 import re
 
-LENGTHS = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+LENGTHS = {
+    "pm": 1e-12,
+    "nm": 1e-9,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "μm": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "km": 1e3,
+}
 DURATIONS = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0}
-BYTES = {"B": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+BYTES = {
+    "B": 1,
+    "KiB": 2**10,
+    "MiB": 2**20,
+    "GiB": 2**30,
+    "TiB": 2**40,
+    "kB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "TB": 10**12,
+}
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]\S*)?\s*")
 
@@ -20,12 +40,21 @@ def _parse(text, units, what, example):
         raise UnitError(f"{text!r} is no {what}; write a number and a unit, such as {example!r}")
     number, unit = match.groups()
     if unit is None:
-        raise UnitError(f"{text!r} has no unit; a {what} needs one of {', '.join(units)}, such as {example!r}")
+        raise UnitError(
+            f"{text!r} has no unit; a {what} needs one of {', '.join(units)}, such as {example!r}"
+        )
     if unit not in units:
-        raise UnitError(f"{text!r} is no {what}; the unit must be one of {', '.join(units)}, such as {example!r}")
+        raise UnitError(
+            f"{text!r} is no {what}; the unit must be one of {', '.join(units)}, "
+            f"such as {example!r}"
+        )
     # dividing by the exact power of ten keeps "550 nm" the double nearest to 550e-9
     scale = units[unit]
-    value = float(f"{number}e{round(math.log10(scale))}") if scale < 1 and "e" not in number.lower() else float(number) * scale
+    value = (
+        float(f"{number}e{round(math.log10(scale))}")
+        if scale < 1 and "e" not in number.lower()
+        else float(number) * scale
+    )
     if not math.isfinite(value):
         raise UnitError(f"{text!r} is too large for a {what} such as {example!r}")
     return value
@@ -42,7 +71,9 @@ def parse_wavelength(text):
     if value <= 0:
         raise UnitError(f"{text!r} must be above 0")
     if not 100e-9 <= value <= 100e-6:
-        raise UnitError(f"{text!r} is no wavelength of this model, which goes from 100 nm to 100 um")
+        raise UnitError(
+            f"{text!r} is no wavelength of this model, which goes from 100 nm to 100 um"
+        )
     return value
 
 
@@ -73,7 +104,9 @@ def parse_number(text):
 
 
 def format_length(metres):
-    """The shortest text that parse_length reads back to the same double, in a handy unit: 5.5e-7 -> "550 nm"."""
+    """The shortest text that parse_length reads back to the same double, in a handy unit:
+    5.5e-7 -> "550 nm".
+    """
     return _format(metres, LENGTHS, ("nm", "um", "mm"), "m", parse_length)
 
 

@@ -26,4 +26,6 @@ COMMANDS = {
 
 def load_command(name):
     """The click command `name`, imported when it is asked for."""
-    return importlib.import_module(f"plenocli.cli.{COMMANDS[name]}.{name.replace('-', '_')}").command
+    return importlib.import_module(
+        f"plenocli.cli.{COMMANDS[name]}.{name.replace('-', '_')}"
+    ).command

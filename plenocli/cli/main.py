@@ -1,4 +1,6 @@
-"""Entry point: the list of commands in the order of the pipeline, and the only place where errors become exit codes."""
+"""Entry point: the list of commands in the order of the pipeline, and the only place where
+errors become exit codes.
+"""
 
 import difflib
 import errno
@@ -11,8 +13,8 @@ import click
 
 from plenocli import __version__
 from plenocli.base.errors import PlenoError
-from plenocli.cli.commands import COMMANDS, load_command
 from plenocli.base.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
+from plenocli.cli.commands import COMMANDS, load_command
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -40,19 +42,28 @@ class Pipeline(click.Group):
     cls=Pipeline,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    epilog="Exit codes: 0 done; 2 usage or configuration; 3 an input file is unreadable, damaged or of the wrong kind; "
-    "4 the output could not be written; 5 numerically impossible or accuracy unreachable; 70 a bug of plenocli.",
+    epilog=(
+        "Exit codes: 0 done; 2 usage or configuration; 3 an input file is unreadable, damaged or "
+        "of the wrong kind; 4 the output could not be written; 5 numerically impossible or "
+        "accuracy unreachable; 70 a bug of plenocli."
+    ),
 )
 @click.version_option(__version__, prog_name="plenocli")
-@click.option("-q", "--quiet", is_flag=True, help="No progress and no notes; errors and results only.")
-@click.option("-v", "--verbose", is_flag=True, help="Also say what a command cost: time and memory.")
+@click.option(
+    "-q", "--quiet", is_flag=True, help="No progress and no notes; errors and results only."
+)
+@click.option(
+    "-v", "--verbose", is_flag=True, help="Also say what a command cost: time and memory."
+)
 @click.pass_context
 def cli(ctx, quiet, verbose):
-    """Model a plenoptic camera end to end: from its description and a scene to captures, spectra and images.
+    """Model a plenoptic camera end to end: from its description and a scene to captures,
+    spectra and images.
 
     \b
     camera.toml --simulate-pif--> pif.h5 --capture-sim--> capture.h5|exr|dng
-      RAW or simulated captures --calibrate--> calibration.h5 --demux--> spectra.exr --score--> score.json
+      RAW or simulated captures --calibrate--> calibration.h5 --demux--> spectra.exr
+          --score--> score.json
       photographs --learn-dict--> dictionary.h5 --reconstruct--> image.exr --score--> report.html
 
     Every command has --help with examples. Lengths carry their unit: 550nm, "250 um", 50mm.
@@ -72,12 +83,23 @@ def _cost(start):
     import resource
 
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    seconds, peak = sum(u.ru_utime + u.ru_stime for u in used), max(u.ru_maxrss for u in used) / 2**20
-    click.echo(f"plenocli: {time.monotonic() - start:.2f} s, {seconds:.2f} s of processor time, at most {peak:.2f} GiB of memory", err=True)
+    seconds, peak = (
+        sum(u.ru_utime + u.ru_stime for u in used),
+        max(u.ru_maxrss for u in used) / 2**20,
+    )
+    click.echo(
+        (
+            f"plenocli: {time.monotonic() - start:.2f} s, {seconds:.2f} s of processor time, at "
+            f"most {peak:.2f} GiB of memory"
+        ),
+        err=True,
+    )
 
 
 def main(argv=None):
-    """Run the command line and exit; every expected failure is one message on stderr and its exit code."""
+    """Run the command line and exit; every expected failure is one message on stderr
+    and its exit code.
+    """
     sys.exit(run(argv))
 
 
@@ -115,7 +137,13 @@ def run(argv=None):
             return _fail(lack_of_memory(error), 5)
         if isinstance(error, OSError) and (error.filename or error.errno in _NO_SPACE):
             where = error.filename or "standard output"
-            return _fail(f"{where}: {error.strerror}; check the name, the permissions and the space on the disk", 4 if error.errno in _NO_SPACE else 3)
+            return _fail(
+                (
+                    f"{where}: {error.strerror}; check the name, the permissions and "
+                    "the space on the disk"
+                ),
+                4 if error.errno in _NO_SPACE else 3,
+            )
         return _fail(
             f"internal error, a bug of plenocli: {type(error).__name__}: {error}\n"
             "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",

@@ -1,4 +1,6 @@
-"""Every shared option once, with its unit and default in its help, and the parameter types that read units."""
+"""Every shared option once, with its unit and default in its help, and the parameter
+types that read units.
+"""
 
 import json
 import math
@@ -6,18 +8,45 @@ from pathlib import Path
 
 import click
 
-from plenocli.base.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length, parse_number, parse_wavelength
 from plenocli.base.text import plain
+from plenocli.base.units import (
+    UnitError,
+    format_duration,
+    format_length,
+    parse_bytes,
+    parse_decibel,
+    parse_duration,
+    parse_length,
+    parse_number,
+    parse_wavelength,
+)
 
 
 class _Quantity(click.ParamType):
     """A number with its unit, read by one of the parsers of plenocli.base.units."""
 
-    def __init__(self, name, parse, minimum=None, exclusive=False, show=lambda value: format(value, ".12g"), limits=(-math.inf, math.inf)):
-        self.name, self._parse, self._minimum, self._exclusive, self.show, self._limits = name, parse, minimum, exclusive, show, limits
+    def __init__(
+        self,
+        name,
+        parse,
+        minimum=None,
+        exclusive=False,
+        show=lambda value: format(value, ".12g"),
+        limits=(-math.inf, math.inf),
+    ):
+        self.name, self._parse, self._minimum, self._exclusive, self.show, self._limits = (
+            name,
+            parse,
+            minimum,
+            exclusive,
+            show,
+            limits,
+        )
 
     def convert(self, value, param, ctx):
-        """Text in the units that the command line takes; a default that is a number stays as it is."""
+        """Text in the units that the command line takes; a default that is a
+        number stays as it is.
+        """
         if not isinstance(value, str):
             return value
         try:
@@ -26,19 +55,48 @@ class _Quantity(click.ParamType):
             self.fail(str(error), param, ctx)
         low = self._minimum
         if low is not None and (number < low or (self._exclusive and number == low)):
-            self.fail(f"{value!r} must be {'above' if self._exclusive else 'at least'} {low:g}", param, ctx)
+            self.fail(
+                f"{value!r} must be {'above' if self._exclusive else 'at least'} {low:g}",
+                param,
+                ctx,
+            )
         if number and not self._limits[0] <= number <= self._limits[1]:
-            self.fail(f"{value!r} is outside {self.show(self._limits[0])} ... {self.show(self._limits[1])}", param, ctx)
+            self.fail(
+                (
+                    f"{value!r} is outside {self.show(self._limits[0])} ... "
+                    f"{self.show(self._limits[1])}"
+                ),
+                param,
+                ctx,
+            )
         return number
 
 
 # what lies outside the limits is a slip, and would overflow somewhere deep inside
-LENGTH = _Quantity("length", parse_length, 0.0, exclusive=True, show=lambda value: format_length(value).replace(" ", ""), limits=(1e-12, 100e-6))
-DISTANCE = _Quantity("length", parse_length, 0.0, exclusive=True, show=LENGTH.show, limits=(1e-6, 1e6))
+LENGTH = _Quantity(
+    "length",
+    parse_length,
+    0.0,
+    exclusive=True,
+    show=lambda value: format_length(value).replace(" ", ""),
+    limits=(1e-12, 100e-6),
+)
+DISTANCE = _Quantity(
+    "length", parse_length, 0.0, exclusive=True, show=LENGTH.show, limits=(1e-6, 1e6)
+)
 WAVELENGTH = _Quantity("length", parse_wavelength, show=LENGTH.show)
-DECIBEL = _Quantity("decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0))
+DECIBEL = _Quantity(
+    "decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0)
+)
 BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)
-DURATION = _Quantity("duration", parse_duration, 0.0, exclusive=True, show=lambda value: format_duration(value).replace(" ", ""), limits=(1e-9, 1e6))
+DURATION = _Quantity(
+    "duration",
+    parse_duration,
+    0.0,
+    exclusive=True,
+    show=lambda value: format_duration(value).replace(" ", ""),
+    limits=(1e-9, 1e6),
+)
 POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30, 1e12))
 NON_NEGATIVE = _Quantity("number", parse_number, 0.0, limits=(1e-30, 1e12))
 
@@ -61,7 +119,9 @@ class Whole(click.IntRange):
         try:
             int(value)
         except ValueError:
-            self.fail(f"{value!r} is no whole number; write for example {max(1, self.min)}", param, ctx)
+            self.fail(
+                f"{value!r} is no whole number; write for example {max(1, self.min)}", param, ctx
+            )
         return super().convert(value, param, ctx)
 
 
@@ -80,7 +140,11 @@ class Grid(click.ParamType):
         parts = value.lower().split("x")
         if len(parts) == 2 and all(p.isdigit() and 0 < int(p) < 100000 for p in parts):
             return int(parts[0]), int(parts[1])
-        self.fail(f"{value!r} is not a grid; write for example {'|'.join((*self._words, '3x3'))}", param, ctx)
+        self.fail(
+            f"{value!r} is not a grid; write for example {'|'.join((*self._words, '3x3'))}",
+            param,
+            ctx,
+        )
 
 
 class Place(click.ParamType):
@@ -111,7 +175,14 @@ class Pair(click.ParamType):
             return value
         key, equals, rest = value.partition("=")
         if not equals or not rest:
-            self.fail(f"{value!r} is not {self.name}; write for example 450nm={'band450.dng' if self._convert is Path else '0.8'}", param, ctx)
+            self.fail(
+                (
+                    f"{value!r} is not {self.name}; write for example "
+                    f"450nm={'band450.dng' if self._convert is Path else '0.8'}"
+                ),
+                param,
+                ctx,
+            )
         try:
             return parse_wavelength(key), self._convert(rest)
         except (UnitError, ValueError) as error:
@@ -124,16 +195,20 @@ class Ring(click.ParamType):
     name = "auto|0|1|2..."
 
     def convert(self, value, param, ctx):
-        """"auto", or the number."""
+        """ "auto", or the number."""
         if value == "auto" or isinstance(value, int):
             return value
         if not value.isdigit() or int(value) > 20:
-            self.fail(f"{value!r} is not auto or a whole number from 0 to 20, such as 1", param, ctx)
+            self.fail(
+                f"{value!r} is not auto or a whole number from 0 to 20, such as 1", param, ctx
+            )
         return int(value)
 
 
 class _File(click.Path):
-    """A path with a name: an empty one, often a shell variable that is not set, would mean the current folder."""
+    """A path with a name: an empty one, often a shell variable that is not set, would mean
+    the current folder.
+    """
 
     def convert(self, value, param, ctx):
         if value == "":
@@ -145,18 +220,59 @@ FILE = _File(path_type=Path)
 
 
 def input_path(name, **settings):
-    """A positional input file; its existence is checked by the reader, so that the exit code is 3 and the message says what is wrong."""
+    """A positional input file; its existence is checked by the reader, so that the exit code is
+    3 and the message says what is wrong.
+    """
     return click.argument(name, type=FILE, **settings)
 
 
-output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="File to write; a folder when there are several inputs.")
-table_output = click.option("-o", "--output", required=True, type=FILE, metavar="OUT", help="Table to write, .h5; the same goes beside it as .csv.")
-front_plot = click.option("--plot", type=FILE, help="Also draw the front, such as front.png; needs matplotlib.")
-overwrite = click.option("--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default).")
-as_json = click.option("--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout.")
-seed = click.option("--seed", type=Whole(0, 2**63 - 1), default=0, show_default=True, help="Seed of every random number; the same seed gives the same bytes.")
-workers = click.option("--workers", type=Whole(1, 1024), default=1, show_default=True, help="Processes or threads to use; the results do not depend on it.")
-scheduler = click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler instead, such as tcp://10.0.0.1:8786, or the file it wrote; the results are the same.")
+output = click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=FILE,
+    metavar="OUT",
+    help="File to write; a folder when there are several inputs.",
+)
+table_output = click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=FILE,
+    metavar="OUT",
+    help="Table to write, .h5; the same goes beside it as .csv.",
+)
+front_plot = click.option(
+    "--plot", type=FILE, help="Also draw the front, such as front.png; needs matplotlib."
+)
+overwrite = click.option(
+    "--overwrite", is_flag=True, help="Replace OUT if it exists (refused by default)."
+)
+as_json = click.option(
+    "--json", "as_json", is_flag=True, help="Print the summary as one line of JSON on stdout."
+)
+seed = click.option(
+    "--seed",
+    type=Whole(0, 2**63 - 1),
+    default=0,
+    show_default=True,
+    help="Seed of every random number; the same seed gives the same bytes.",
+)
+workers = click.option(
+    "--workers",
+    type=Whole(1, 1024),
+    default=1,
+    show_default=True,
+    help="Processes or threads to use; the results do not depend on it.",
+)
+scheduler = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help=(
+        "Use the workers of this Dask scheduler instead, such as tcp://10.0.0.1:8786, or the file "
+        "it wrote; the results are the same."
+    ),
+)
 
 
 def _held(ctx, param, value):
@@ -166,25 +282,55 @@ def _held(ctx, param, value):
     return value
 
 
-mem_limit = click.option("--mem-limit", type=BYTES, default="8GiB", show_default=True, callback=_held,
-                         help="Memory for data, such as 4GiB; a plan that needs more is refused, and nobody gets more. Interpreter and libraries come on top: 384 MiB, and 80 MiB a core.")
+mem_limit = click.option(
+    "--mem-limit",
+    type=BYTES,
+    default="8GiB",
+    show_default=True,
+    callback=_held,
+    help=(
+        "Memory for data, such as 4GiB; a plan that needs more is refused, and nobody gets more. "
+        "Interpreter and libraries come on top: 384 MiB, and 80 MiB a core."
+    ),
+)
 
 
-coherent_ring = click.option("--coherent-ring", type=Ring(), default="auto", show_default=True, help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.")
+coherent_ring = click.option(
+    "--coherent-ring",
+    type=Ring(),
+    default="auto",
+    show_default=True,
+    help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.",
+)
 
 
 def superpixels(meaning):
     """--superpixels with its meaning for one command."""
-    return click.option("--superpixels", type=Grid("auto"), default="auto", show_default=True, help=f"{meaning}: auto, 1x1, 3x3.")
+    return click.option(
+        "--superpixels",
+        type=Grid("auto"),
+        default="auto",
+        show_default=True,
+        help=f"{meaning}: auto, 1x1, 3x3.",
+    )
 
 
 def file_type(first, second):
     """--format, the suffix of each result where OUT is a folder; the first is the default."""
-    return click.option("--format", "suffix", type=click.Choice([first, second]), default=first, show_default=True, help="File type when OUT is a folder.")
+    return click.option(
+        "--format",
+        "suffix",
+        type=click.Choice([first, second]),
+        default=first,
+        show_default=True,
+        help="File type when OUT is a folder.",
+    )
 
 
 def command_line(ctx):
-    """The command as typed, without folders and without options left at their default: it goes into the artefact."""
+    """The command as typed, without folders and without options left at their default: it goes
+    into the artefact.
+    """
     words = [f"plenocli {ctx.info_name}"]
     for parameter in ctx.command.params:
         value = ctx.params.get(parameter.name)
@@ -197,8 +343,22 @@ def command_line(ctx):
     return " ".join(words)
 
 
-_UNRECORDED = {"overwrite", "as_json", "workers", "mem_limit", "output", "scene_out", "explain", "report", "measures", "scheduler", "plot"}
-"""How a file was made, not what it holds: the same inputs give the same bytes whatever these say."""
+_UNRECORDED = {
+    "overwrite",
+    "as_json",
+    "workers",
+    "mem_limit",
+    "output",
+    "scene_out",
+    "explain",
+    "report",
+    "measures",
+    "scheduler",
+    "plot",
+}
+"""How a file was made, not what it holds: the same inputs give the same bytes
+whatever these say.
+"""
 
 
 def _word(value, kind):

@@ -1,4 +1,6 @@
-"""Spectral results in score: errors, patches, classification, SNR, and each method against single pixel."""
+"""Spectral results in score: errors, patches, classification, SNR, and each method
+against single pixel.
+"""
 
 import numpy as np
 
@@ -20,7 +22,11 @@ def score_spectra(path, result, truth, context):
     labels = None if context.patches is None else read_labels(context.patches, result.grid)
     scores = score_cube(values, truth, result.wavelengths, context.light)
     if not scores["lenslets"]:
-        raise InputError("has no lenslet with values in all bands", path, "check the calibration it was made with")
+        raise InputError(
+            "has no lenslet with values in all bands",
+            path,
+            "check the calibration it was made with",
+        )
     if result.kind == "image":
         scores |= score_picture(values, truth)
     listed = []
@@ -31,17 +37,25 @@ def score_spectra(path, result, truth, context):
         scores |= _classification(values, labels, true)
         names = colorchecker()[0]
         for label, found in patch_statistics(values, labels).items():
-            listed.append({
-                "label": label, "name": names[label - 1], "lenslets": found["count"], "mean": found["mean"].tolist(),
-                "std": found["std"].tolist(), "truth": true[label]["mean"].tolist() if label in true else None,
-                "one_of_six": label in six,
-            })
+            listed.append(
+                {
+                    "label": label,
+                    "name": names[label - 1],
+                    "lenslets": found["count"],
+                    "mean": found["mean"].tolist(),
+                    "std": found["std"].tolist(),
+                    "truth": true[label]["mean"].tolist() if label in true else None,
+                    "one_of_six": label in six,
+                }
+            )
     scores |= _snr(result, labels, _whites(path, result, context))
     return scores, listed
 
 
 def _reflectance(path, result, context):
-    """The result's values as reflectance: as they are, or radiance divided by that of the white target."""
+    """The result's values as reflectance: as they are, or radiance divided by that
+    of the white target.
+    """
     from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 
     if result.quantity != "radiance":
@@ -49,24 +63,47 @@ def _reflectance(path, result, context):
     whites = _whites(path, result, context)
     if whites is None:
         if str(context.truth) == CHART:
-            raise UsageError("holds radiance, the truth is reflectance", path, "demux with --reference, or name the spectra of a white target with --white")
+            raise UsageError(
+                "holds radiance, the truth is reflectance",
+                path,
+                "demux with --reference, or name the spectra of a white target with --white",
+            )
         return result.values
     white = whites[0].mean(axis=0)
     if white.shape != result.values.shape:
-        raise UsageError(f"has {by(result.values.shape)} values (band x row x column), the white target {by(white.shape)}", path, "demultiplex both with one calibration")
-    return np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0) * REFERENCE_REFLECTANCE
+        raise UsageError(
+            (
+                f"has {by(result.values.shape)} values (band x row x column), the white "
+                f"target {by(white.shape)}"
+            ),
+            path,
+            "demultiplex both with one calibration",
+        )
+    return (
+        np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0)
+        * REFERENCE_REFLECTANCE
+    )
 
 
 def _snr(result, labels, whites):
-    """Capture and predicted SNR on the white target, or on the chart's white patch where there is none."""
+    """Capture and predicted SNR on the white target, or on the chart's white patch
+    where there is none.
+    """
     from plenocli.evaluation.metrics.snr import snr_capture, snr_predicted
 
     if whites is not None:
         frames, sigma = whites
-        target = f"white target, {len(frames)} frames over time" if len(frames) > 1 else "white target, one frame over its lenslets"
+        target = (
+            f"white target, {len(frames)} frames over time"
+            if len(frames) > 1
+            else "white target, one frame over its lenslets"
+        )
     elif labels is not None and (labels == WHITE_LABEL).any():
         here = labels == WHITE_LABEL
-        frames, sigma = result.values[None][:, :, here], None if result.sigma is None else np.asarray(result.sigma)[:, here]
+        frames, sigma = (
+            result.values[None][:, :, here],
+            None if result.sigma is None else np.asarray(result.sigma)[:, here],
+        )
         target = "white patch of the chart, over its lenslets"
     else:
         return {}
@@ -82,20 +119,30 @@ def _snr(result, labels, whites):
 
 
 def _whites(path, result, context):
-    """(frames (frame, band, row, column), sigma or None) of the white target made by the method of the result, else of all there are;
-    None without any."""
+    """(frames (frame, band, row, column), sigma or None) of the white target made by the method of
+    the result, else of all there are; None without any.
+    """
     groups = context.whites
     if not groups:
         return None
     if result.method in groups:
         return groups[result.method]
     if len(groups) > 1:
-        raise UsageError(f"was made by {result.method or 'an unknown method'}, the white targets by {', '.join(sorted(groups))}", path, "demultiplex a white target by the same method")
+        raise UsageError(
+            (
+                f"was made by {result.method or 'an unknown method'}, the white targets by "
+                f"{', '.join(sorted(groups))}"
+            ),
+            path,
+            "demultiplex a white target by the same method",
+        )
     return next(iter(groups.values()))
 
 
 def _classification(values, labels, true):
-    """How often spectra tell their patch; the number that needs scikit-learn only where it is installed."""
+    """How often spectra tell their patch; the number that needs scikit-learn only
+    where it is installed.
+    """
     from plenocli.evaluation.metrics.classify import cross_validated, nearest_known, samples
 
     spectra, patches = samples(values, labels)
@@ -111,13 +158,28 @@ def _classification(values, labels, true):
 
 
 def against_single_pixel(scored):
-    """Add to every entry of spectra what it gains over the one of single pixel extraction, where there is exactly one."""
-    base = [entry["metrics"] for entry in scored if entry.get("method") == SINGLE and "error" not in entry]
+    """Add to every entry of spectra what it gains over the one of single pixel extraction, where
+    there is exactly one.
+    """
+    base = [
+        entry["metrics"]
+        for entry in scored
+        if entry.get("method") == SINGLE and "error" not in entry
+    ]
     for entry in scored:
-        if len(base) != 1 or entry.get("method") == SINGLE or entry.get("kind") != "spectra" or "error" in entry:
+        if (
+            len(base) != 1
+            or entry.get("method") == SINGLE
+            or entry.get("kind") != "spectra"
+            or "error" in entry
+        ):
             continue
         own = entry["metrics"]
-        for name, ratio in (("rmse", "rmse"), ("six_patch_rmse", "six_patch_rmse"), ("delta_e_2000", "delta_e")):
+        for name, ratio in (
+            ("rmse", "rmse"),
+            ("six_patch_rmse", "six_patch_rmse"),
+            ("delta_e_2000", "delta_e"),
+        ):
             if own.get(name) is not None and base[0].get(name):
                 own[f"{ratio}_over_single_pixel"] = own[name] / base[0][name]
         pair = own.get("snr_capture_mean_db"), base[0].get("snr_capture_mean_db")

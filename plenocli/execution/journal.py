@@ -1,7 +1,8 @@
-"""Results of many small tasks, kept as they come: one line each in a file that is only ever added to.
+"""Results of many small tasks, kept as they come: one line each in a file that is
+only ever added to.
 
-A line is a short checksum and a JSON record. A run that is killed leaves at most its last line torn; torn and damaged lines
-are left out when the file is read, so that their tasks are done again.
+A line is a short checksum and a JSON record. A run that is killed leaves at most its last line
+torn; torn and damaged lines are left out when the file is read, so that their tasks are done again.
 """
 
 import fcntl
@@ -15,19 +16,28 @@ from plenocli.base.text import plain
 
 
 class Journal:
-    """Records by key in the file at `path`, which one run at a time holds. OutputError where that cannot be."""
+    """Records by key in the file at `path`, which one run at a time holds.
+
+    OutputError where that cannot be.
+    """
 
     def __init__(self, path):
         self.path, self.records = Path(path), {}
         try:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
-            raise OutputError(f"cannot be written ({error.strerror})", path, "check the folder and its permissions") from None
+            raise OutputError(
+                f"cannot be written ({error.strerror})",
+                path,
+                "check the folder and its permissions",
+            ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._file.close()
-            raise OutputError("another run is working here", path, "wait for it, stop it, or choose another OUT") from None
+            raise OutputError(
+                "another run is working here", path, "wait for it, stop it, or choose another OUT"
+            ) from None
         self._file.seek(0)
         content = self._file.read()
         for line in content.split(b"\n"):
@@ -39,17 +49,23 @@ class Journal:
 
     def add(self, key, record):
         """Keep a record (JSON-able) for good before this returns."""
-        text = json.dumps([key, plain(record)], sort_keys=True, ensure_ascii=True, allow_nan=False).encode()
+        text = json.dumps(
+            [key, plain(record)], sort_keys=True, ensure_ascii=True, allow_nan=False
+        ).encode()
         self._write(_checksum(text) + b" " + text + b"\n")
         self.records[key] = json.loads(text)[1]
 
     def _write(self, data):
         try:
             while data:
-                data = data[os.write(self._file.fileno(), data):]
+                data = data[os.write(self._file.fileno(), data) :]
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise OutputError(f"cannot be written ({error.strerror})", self.path, "free some space, then run again: what is finished is kept") from None
+            raise OutputError(
+                f"cannot be written ({error.strerror})",
+                self.path,
+                "free some space, then run again: what is finished is kept",
+            ) from None
 
     def close(self):
         """Let go of the file."""

@@ -1,9 +1,11 @@
-"""Where independent tasks run: in this process, in threads, in processes, or on a Dask cluster that is there already.
+"""Where independent tasks run: in this process, in threads, in processes, or on a Dask cluster
+that is there already.
 
-A task is a function of one argument, found by its name in a module of plenocli (threads and this process take any), that
-depends on nothing else: the same results come back wherever it runs, to this process, which is the only one that writes.
-Whoever asks hands in tasks while there is room and takes results as they come, in any order. Linear algebra runs in one thread
-everywhere, because the last digits of its results depend on how many there are.
+A task is a function of one argument, found by its name in a module of plenocli (threads and this
+process take any), that depends on nothing else: the same results come back wherever it runs, to
+this process, which is the only one that writes. Whoever asks hands in tasks while there is room and
+takes results as they come, in any order. Linear algebra runs in one thread everywhere, because the
+last digits of its results depend on how many there are.
 """
 
 import contextlib
@@ -11,7 +13,13 @@ import os
 import signal
 import threading
 from collections import deque
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from pathlib import Path
 
 from plenocli import __version__
@@ -24,32 +32,54 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Lost(OutputError):
-    """A task whose worker died with it, again and again: it has no result, and may have one another time."""
+    """A task whose worker died with it, again and again: it has no result, and may
+    have one another time.
+    """
 
 
 @contextlib.contextmanager
 def open_pool(workers=1, scheduler=None, *, threads=False):
-    """A pool for tasks while the block lasts: `submit(token, function, task)`, `next()` -> (token, result or PlenoError), `room`.
+    """A pool for tasks while the block lasts: `submit(token, function, task)`, `next()` -> (token,
+    result or PlenoError), `room`.
 
-    workers: processes (threads, where asked for) beside this one; 1 runs every task here. scheduler: address of a Dask
-    scheduler, or the file that it wrote; then its workers serve, however many they are. UsageError where there is none.
+    workers: processes (threads, where asked for) beside this one; 1 runs every task here.
+    scheduler: address of a Dask scheduler, or the file that it wrote; then its workers serve,
+        however many they are.
+    UsageError where there is none.
     """
     if scheduler is not None:
-        with _one_thread(), _cluster(scheduler) as client, contextlib.closing(_on_cluster(client)) as pool:
+        with (
+            _one_thread(),
+            _cluster(scheduler) as client,
+            contextlib.closing(_on_cluster(client)) as pool,
+        ):
             yield pool
     elif workers == 1:
         with _one_thread():
             yield Here()
     elif threads:
-        with _one_thread(), contextlib.closing(_Executing(lambda: ThreadPoolExecutor(workers), lambda: workers + 1, attempt)) as pool:
+        with (
+            _one_thread(),
+            contextlib.closing(
+                _Executing(lambda: ThreadPoolExecutor(workers), lambda: workers + 1, attempt)
+            ) as pool,
+        ):
             yield pool
     else:
-        with _one_thread(), _environment(), contextlib.closing(_Executing(lambda: _processes(workers), lambda: 2 * workers)) as pool:
+        with (
+            _one_thread(),
+            _environment(),
+            contextlib.closing(
+                _Executing(lambda: _processes(workers), lambda: 2 * workers)
+            ) as pool,
+        ):
             yield pool
 
 
 def run_all(pool, jobs):
-    """(token, result or PlenoError) of every (token, function, task) of `jobs`, as they end; few results wait."""
+    """(token, result or PlenoError) of every (token, function, task) of `jobs`, as they
+    end; few results wait.
+    """
     jobs, left = iter(jobs), 0
     more = True
     while more or left:
@@ -67,7 +97,8 @@ def run_all(pool, jobs):
 
 @contextlib.contextmanager
 def _one_thread():
-    import scipy.linalg.blas  # noqa: F401  a library of its own, which the limit below reaches only once it is loaded
+    # a library of its own, which the limit below reaches only once it is loaded
+    import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1, "blas"):
@@ -75,7 +106,9 @@ def _one_thread():
 
 
 def absolute(name):
-    """A file name that means the same to a process elsewhere; None, and what is no file here, as they are."""
+    """A file name that means the same to a process elsewhere; None, and what is no file
+    here, as they are.
+    """
     return name if name is None or not os.path.exists(name) else type(name)(os.path.abspath(name))
 
 
@@ -90,7 +123,10 @@ def attempt(function, *task):
 def _remotely(version, function, task):
     """(result or PlenoError, what it said) of a task in a process that runs nothing but tasks."""
     if version != __version__:
-        return UsageError(f"a worker runs plenocli {__version__}, this is {version}", fix="install one version everywhere"), []
+        return UsageError(
+            f"a worker runs plenocli {__version__}, this is {version}",
+            fix="install one version everywhere",
+        ), []
     import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
 
@@ -108,7 +144,10 @@ def _tell(answer):
 
 
 class Here:
-    """Tasks in this process, each when its result is asked for. far: whether tasks run where relative file names mean nothing."""
+    """Tasks in this process, each when its result is asked for.
+
+    far: whether tasks run where relative file names mean nothing.
+    """
 
     far = False
 
@@ -131,11 +170,20 @@ class Here:
 
 
 class _Executing:
-    """Tasks through an executor of concurrent.futures. Where a process dies, the tasks under way run again one at a time, so that
-    the one that kills its worker is found: only that one is lost."""
+    """Tasks through an executor of concurrent.futures.
+
+    Where a process dies, the tasks under way run again one at a time, so that the one that kills
+    its worker is found: only that one is lost.
+    """
 
     def __init__(self, start, limit, call=None, explain=None, far=False):
-        self._start, self._limit, self._call, self._explain, self.far = start, limit, call, explain, far
+        self._start, self._limit, self._call, self._explain, self.far = (
+            start,
+            limit,
+            call,
+            explain,
+            far,
+        )
         self._executor, self._running, self._suspects, self._deaths = start(), {}, deque(), 0
 
     @property
@@ -145,7 +193,9 @@ class _Executing:
 
     def submit(self, token, function, task):
         """Hand in a task."""
-        call = (self._call, function, task) if self._call else (_remotely, __version__, function, task)
+        call = (
+            (self._call, function, task) if self._call else (_remotely, __version__, function, task)
+        )
         try:
             self._running[self._executor.submit(*call)] = (token, function, task)
         except BrokenExecutor:  # a process died since we looked
@@ -172,14 +222,18 @@ class _Executing:
                 return job[0], answer if self._call else _tell(answer)
 
     def _explained(self, error):
-        """The PlenoError that an error of the executor stands for; a fault of ours goes on as it is."""
+        """The PlenoError that an error of the executor stands for; a fault of
+        ours goes on as it is.
+        """
         found = self._explain and self._explain(error)
         if not found:
             raise error
         return found
 
     def _restart(self, job):
-        """New workers in place of those that died; (token, Lost) where `job` was alone with them, and not for the first time."""
+        """New workers in place of those that died; (token, Lost) where `job` was alone with
+        them, and not for the first time.
+        """
         alone = not self._running
         self._suspects.appendleft(job)
         self._renew()
@@ -187,11 +241,18 @@ class _Executing:
         if self._deaths < ATTEMPTS:
             return None
         self._deaths = 0
-        return self._suspects.popleft()[0], Lost(f"its process died {ATTEMPTS} times (was it killed, or out of memory?)", fix="take fewer --workers, or run again")
+        return self._suspects.popleft()[0], Lost(
+            f"its process died {ATTEMPTS} times (was it killed, or out of memory?)",
+            fix="take fewer --workers, or run again",
+        )
 
     def _renew(self):
         """New workers; what the old ones had not finished is under suspicion."""
-        broken = [future for future in self._running if not future.done() or future.exception() is not None]
+        broken = [
+            future
+            for future in self._running
+            if not future.done() or future.exception() is not None
+        ]
         self._suspects.extend(self._running.pop(future) for future in broken)
         _stop(self._executor, True)
         self._executor = self._start()
@@ -214,17 +275,21 @@ def _stop(executor, busy):
         executor.shutdown(wait=False)
 
 
-# --- processes ----------------------------------------------------------------------------------------------------------
+# --- processes ------------------------------------------------------------------------------------
 
 
 def _processes(workers):
     import multiprocessing
 
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_become_worker)
+    return ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_become_worker
+    )
 
 
 def _become_worker():
-    """In a new process: the person's Ctrl-C is for the parent, and when that is gone, killed even, this one goes too."""
+    """In a new process: the person's Ctrl-C is for the parent, and when that is gone, killed
+    even, this one goes too.
+    """
     from multiprocessing import connection, parent_process
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -238,7 +303,9 @@ def _become_worker():
 
 @contextlib.contextmanager
 def _environment():
-    """One thread of linear algebra for processes started meanwhile: it is read when their libraries are loaded."""
+    """One thread of linear algebra for processes started meanwhile: it is read when their
+    libraries are loaded.
+    """
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -248,7 +315,7 @@ def _environment():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-# --- a Dask cluster -----------------------------------------------------------------------------------------------------
+# --- a Dask cluster -------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -256,14 +323,28 @@ def _cluster(scheduler):
     try:
         from distributed import Client
     except ImportError as error:
-        raise UsageError("--scheduler needs Dask, which is not installed", fix="pip install 'plenocli[cluster]'") from error
+        raise UsageError(
+            "--scheduler needs Dask, which is not installed", fix="pip install 'plenocli[cluster]'"
+        ) from error
     file = not str(scheduler).startswith(("tcp://", "tls://", "ucx://"))
     if file and not Path(scheduler).is_file():
-        raise UsageError(f"{str(scheduler)!r} is no address of a Dask scheduler and no file that one wrote", "--scheduler", "write for example tcp://10.0.0.1:8786")
+        raise UsageError(
+            f"{str(scheduler)!r} is no address of a Dask scheduler and no file that one wrote",
+            "--scheduler",
+            "write for example tcp://10.0.0.1:8786",
+        )
     try:
-        client = Client(**({"scheduler_file": str(scheduler)} if file else {"address": scheduler}), timeout="10s", set_as_default=False)
+        client = Client(
+            **({"scheduler_file": str(scheduler)} if file else {"address": scheduler}),
+            timeout="10s",
+            set_as_default=False,
+        )
     except (OSError, ValueError, TimeoutError) as error:
-        raise UsageError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__})", "--scheduler", "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`") from None
+        raise UsageError(
+            f"no Dask scheduler answers at {scheduler} ({type(error).__name__})",
+            "--scheduler",
+            "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+        ) from None
     with client:
         if not client.nthreads():
             note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
@@ -272,16 +353,31 @@ def _cluster(scheduler):
 
 
 def _on_cluster(client):
-    return _Executing(lambda: client.get_executor(pure=False), lambda: max(2, 2 * sum(client.nthreads().values())), explain=_trouble, far=True)
+    return _Executing(
+        lambda: client.get_executor(pure=False),
+        lambda: max(2, 2 * sum(client.nthreads().values())),
+        explain=_trouble,
+        far=True,
+    )
 
 
 def _trouble(error):
     """The PlenoError that stands for what a cluster reports; None for a fault of ours."""
     name, text = type(error).__name__, str(error)
     if name == "KilledWorker":
-        return Lost("the Dask workers that ran it died, one after the other", fix="see their logs (out of memory?), or run again")
+        return Lost(
+            "the Dask workers that ran it died, one after the other",
+            fix="see their logs (out of memory?), or run again",
+        )
     if isinstance(error, ImportError) or "deserializ" in text.lower():
-        return UsageError(f"a Dask worker cannot load the task ({text.splitlines()[0]})", "--scheduler", "install the same plenocli and its extras where the workers run")
+        return UsageError(
+            f"a Dask worker cannot load the task ({text.splitlines()[0]})",
+            "--scheduler",
+            "install the same plenocli and its extras where the workers run",
+        )
     if name in ("CancelledError", "FutureCancelledError", "CommClosedError"):
-        return Lost(f"the connection to the Dask scheduler broke ({name})", fix="what is finished is kept: run again")
+        return Lost(
+            f"the connection to the Dask scheduler broke ({name})",
+            fix="what is finished is kept: run again",
+        )
     return None

@@ -1,4 +1,6 @@
-"""Results appear whole or not at all: temporary file beside the target, fsync, rename, fsync of the folder."""
+"""Results appear whole or not at all: temporary file beside the target, fsync, rename,
+fsync of the folder.
+"""
 
 import contextlib
 import errno
@@ -12,9 +14,9 @@ from plenocli.base.errors import OutputError, UsageError
 def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
     """Refuse an output path that cannot work, before any long computation.
 
-    Raises UsageError if the file exists and `overwrite` is not set, or its suffix is none of `suffixes` (where given);
-    OutputError if `path` is a folder or not an ordinary file, its name is impossible, its folder is missing or read-only, or
-    it is one of `inputs`.
+    Raises UsageError if the file exists and `overwrite` is not set, or its suffix is none of
+    `suffixes` (where given); OutputError if `path` is a folder or not an ordinary file, its name is
+    impossible, its folder is missing or read-only, or it is one of `inputs`.
     """
     path = Path(path)
     folder = path.parent
@@ -23,17 +25,28 @@ def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
     except (FileNotFoundError, NotADirectoryError):
         pass
     except OSError as error:
-        raise OutputError(f"is no possible file name ({error.strerror})", path, "choose another name") from None
+        raise OutputError(
+            f"is no possible file name ({error.strerror})", path, "choose another name"
+        ) from None
     if path.is_dir():
         raise OutputError("is a folder", path, "name a file for the result")
     if suffixes and path.suffix not in suffixes:
-        raise UsageError(f"the result is written as {' or '.join(suffixes)}, not {path.suffix or 'without a suffix'}", path, "change the suffix of OUT")
+        raise UsageError(
+            (
+                f"the result is written as {' or '.join(suffixes)}, not "
+                f"{path.suffix or 'without a suffix'}"
+            ),
+            path,
+            "change the suffix of OUT",
+        )
     if not folder.is_dir():
         raise OutputError(f"the folder {folder} does not exist", path, "make it first")
     if path.exists():
         for other in inputs:
             if other is not None and os.path.exists(other) and os.path.samefile(path, other):
-                raise OutputError("is also an input of this command", path, "give the result another name")
+                raise OutputError(
+                    "is also an input of this command", path, "give the result another name"
+                )
         if not path.is_file():
             raise OutputError("is not an ordinary file", path, "name a file for the result")
         if not overwrite:
@@ -43,16 +56,19 @@ def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
 
 
 def partial_path(path):
-    """The temporary name used while `path` is written; always the same, so that the next run sweeps what a killed one left."""
+    """The temporary name used while `path` is written; always the same, so that the next run
+    sweeps what a killed one left.
+    """
     path = Path(path)
     return path.with_name(f".{path.name}.partial")
 
 
 def publish(path, data, *, overwrite=False):
-    """Put `data` (bytes, or a list of bytes-like pieces) at `path` so that a reader sees all of it or the file as it was.
+    """Put `data` (bytes, or a list of bytes-like pieces) at `path` so that a reader sees all of it
+    or the file as it was.
 
-    Raises UsageError if the file exists and `overwrite` is not set, OutputError if it cannot be written; the target is
-    then untouched and nothing is left beside it.
+    Raises UsageError if the file exists and `overwrite` is not set, OutputError if it cannot be
+    written; the target is then untouched and nothing is left beside it.
     """
     pieces = [data] if isinstance(data, (bytes, bytearray, memoryview)) else data
     with replacement(path, overwrite=overwrite) as (_, descriptor):
@@ -62,9 +78,11 @@ def publish(path, data, *, overwrite=False):
 
 @contextlib.contextmanager
 def replacement(path, *, overwrite=False):
-    """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when the block ends well.
+    """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when
+    the block ends well.
 
-    For libraries that write by name; they must write into the file that is there. Errors as `publish`.
+    For libraries that write by name; they must write into the file that is there.
+    Errors as `publish`.
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)
@@ -72,17 +90,26 @@ def replacement(path, *, overwrite=False):
     try:
         descriptor = _open_partial(partial)
     except OSError as error:
-        raise OutputError(f"cannot be written ({error.strerror})", path, "check the folder and its permissions") from error
+        raise OutputError(
+            f"cannot be written ({error.strerror})", path, "check the folder and its permissions"
+        ) from error
     try:
         yield partial, descriptor
         os.fsync(descriptor)
         if not overwrite and path.exists():
-            raise UsageError("appeared while the result was computed", path, "pass --overwrite or choose another name")
+            raise UsageError(
+                "appeared while the result was computed",
+                path,
+                "pass --overwrite or choose another name",
+            )
         os.replace(partial, path)
         _sync_folder(path.parent)
     except OSError as error:
-        raise OutputError(f"cannot be written ({error.strerror})", path,
-                          "free some space or choose another folder; what was there before is untouched") from error
+        raise OutputError(
+            f"cannot be written ({error.strerror})",
+            path,
+            "free some space or choose another folder; what was there before is untouched",
+        ) from error
     finally:
         if _is_same_file(descriptor, partial):
             partial.unlink(missing_ok=True)
@@ -90,15 +117,21 @@ def replacement(path, *, overwrite=False):
 
 
 def _open_partial(partial):
-    """Open and lock the temporary file, empty. The lock keeps two runs with one target from mixing their bytes."""
+    """Open and lock the temporary file, empty.
+
+    The lock keeps two runs with one target from mixing their bytes.
+    """
     while True:
         descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise OutputError("another run is writing this file", partial, "wait for it, or stop it") from error
-            if _is_same_file(descriptor, partial):  # else the other run renamed it between our open and our lock
+                raise OutputError(
+                    "another run is writing this file", partial, "wait for it, or stop it"
+                ) from error
+            # else the other run renamed it between our open and our lock
+            if _is_same_file(descriptor, partial):
                 _empty(descriptor, partial)
                 return descriptor
         except BaseException:
@@ -126,11 +159,13 @@ def _is_same_file(descriptor, path):
 
 def _write_all(descriptor, view):
     while view:
-        view = view[os.write(descriptor, view[: 1 << 24]):]
+        view = view[os.write(descriptor, view[: 1 << 24]) :]
 
 
 def write_at(descriptor, offset, data):
-    """Write all of `data` (bytes-like or a C-ordered array) at `offset` of an open file; short writes are continued."""
+    """Write all of `data` (bytes-like or a C-ordered array) at `offset` of an open file; short
+    writes are continued.
+    """
     view = memoryview(data)
     view = view.cast("B") if view.nbytes else view[:0]
     while view:
@@ -139,17 +174,28 @@ def write_at(descriptor, offset, data):
 
 
 def reserve(descriptor, size):
-    """Make an open file `size` bytes long, with room for them on the disk where the file system can promise it."""
+    """Make an open file `size` bytes long, with room for them on the disk where the file
+    system can promise it.
+    """
     os.ftruncate(descriptor, size)
     try:
         os.posix_fallocate(descriptor, 0, size)
     except OSError as error:
-        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS, errno.EBADF, errno.ENODEV):
+        if error.errno not in (
+            errno.EOPNOTSUPP,
+            errno.EINVAL,
+            errno.ENOSYS,
+            errno.EBADF,
+            errno.ENODEV,
+        ):
             raise
 
 
 def _sync_folder(folder):
-    """Make the rename survive a power cut. Some network file systems refuse this; the file is then whole all the same."""
+    """Make the rename survive a power cut.
+
+    Some network file systems refuse this; the file is then whole all the same.
+    """
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,6 @@
-"""One look for all pictures: figures made without pyplot, drawn by Agg, handed back as PNG bytes."""
+"""One look for all pictures: figures made without pyplot, drawn by Agg, handed
+back as PNG bytes.
+"""
 
 import io
 from contextlib import contextmanager
@@ -17,14 +19,41 @@ GRID_LINE = "#56B4E9"
 DPI = 130
 
 _STYLE = {
-    "font.family": "DejaVu Sans", "font.size": 8.5, "axes.titlesize": 9, "axes.labelsize": 8.5, "axes.titleweight": "normal",
-    "axes.titlepad": 5, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5, "legend.fontsize": 8, "legend.frameon": False,
-    "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888", "axes.linewidth": 0.7,
-    "axes.labelcolor": "#333333", "text.color": "#222222", "xtick.color": "#666666", "ytick.color": "#666666",
-    "xtick.labelcolor": "#444444", "ytick.labelcolor": "#444444", "xtick.major.width": 0.6, "ytick.major.width": 0.6,
-    "xtick.major.size": 3, "ytick.major.size": 3, "axes.grid": False, "grid.color": "#e3e3e3", "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4, "axes.axisbelow": True, "figure.facecolor": "white", "savefig.facecolor": "white",
-    "figure.constrained_layout.w_pad": 0.07, "figure.constrained_layout.wspace": 0.03, "image.cmap": LEVEL_MAP, "mathtext.default": "regular",
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.titleweight": "normal",
+    "axes.titlepad": 5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "axes.linewidth": 0.7,
+    "axes.labelcolor": "#333333",
+    "text.color": "#222222",
+    "xtick.color": "#666666",
+    "ytick.color": "#666666",
+    "xtick.labelcolor": "#444444",
+    "ytick.labelcolor": "#444444",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 3,
+    "ytick.major.size": 3,
+    "axes.grid": False,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "axes.axisbelow": True,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "figure.constrained_layout.w_pad": 0.07,
+    "figure.constrained_layout.wspace": 0.03,
+    "image.cmap": LEVEL_MAP,
+    "mathtext.default": "regular",
 }
 
 
@@ -39,14 +68,17 @@ class Drawing:
 def drawing(width, height, layout="constrained"):
     """A Drawing of width x height inches in the house style; rendered when the block ends.
 
-    layout: matplotlib's layout engine; None for figures of many panels, which it would take seconds to arrange.
+    layout: matplotlib's layout engine; None for figures of many panels, which it would take
+        seconds to arrange.
     """
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise UsageError("pictures need matplotlib, which is not installed", fix="pip install 'plenocli[plot]'") from error
+        raise UsageError(
+            "pictures need matplotlib, which is not installed", fix="pip install 'plenocli[plot]'"
+        ) from error
     with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE}):
         made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout=layout))
         FigureCanvasAgg(made.figure)
@@ -57,7 +89,9 @@ def drawing(width, height, layout="constrained"):
 
 
 def show_picture(axes, values, title="", **options):
-    """A picture without ticks; a 2-D one as linear light, white at 1, encoded for the screen as sRGB is."""
+    """A picture without ticks; a 2-D one as linear light, white at 1, encoded for the
+    screen as sRGB is.
+    """
     from plenocli.forward.scene.colour import encode_srgb
 
     values = np.asarray(values, dtype=np.float64)
@@ -94,7 +128,9 @@ def bare(axes, title=""):
 
 
 def thumbnail(values, limit=1100):
-    """`values` (row, column) averaged over whole blocks so that neither side exceeds `limit`, and the block size used."""
+    """`values` (row, column) averaged over whole blocks so that neither side exceeds `limit`,
+    and the block size used.
+    """
     from plenocli.forward.scene.sample import block_mean
 
     step = max(1, -(-max(values.shape) // limit))

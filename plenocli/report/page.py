@@ -34,7 +34,13 @@ class Page:
     def cards(self, cards):
         """Headline numbers: a sequence of (value, what it is)."""
         if cards:
-            boxes = "".join(f'<div class="card"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>' for value, what in cards)
+            boxes = "".join(
+                (
+                    f'<div class="card"><b>{html.escape(value)}</b><span>'
+                    f"{html.escape(what)}</span></div>"
+                )
+                for value, what in cards
+            )
             self._blocks.append(f'<div class="cards">{boxes}</div>')
 
     def figure(self, png, caption=""):
@@ -43,40 +49,77 @@ class Page:
             data = base64.b64encode(png).decode("ascii")
             width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
             self._blocks.append(
-                f'<figure><img src="data:image/png;base64,{data}" width="{width * 100 // 130}" height="{height * 100 // 130}" alt="{html.escape(caption or "picture")}">'
+                f'<figure><img src="data:image/png;base64,{data}" width="{width * 100 // 130}" '
+                f'height="{height * 100 // 130}" alt="{html.escape(caption or "picture")}">'
                 f"<figcaption>{html.escape(caption)}</figcaption></figure>"
             )
 
     def table(self, header, rows, caption="", best=None, text=False):
-        """A table of text cells. best: row number -> set of columns set in bold. text: cells are words, aligned left."""
+        """A table of text cells.
+
+        best: row number -> set of columns set in bold.
+        text: cells are words, aligned left.
+        """
         best = best or {}
         head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
         body = "".join(
-            "<tr>" + "".join(f"<td{' class=best' if column in best.get(number, ()) else ''}>{html.escape(cell)}</td>" for column, cell in enumerate(row)) + "</tr>"
+            "<tr>"
+            + "".join(
+                (
+                    f"<td{' class=best' if column in best.get(number, ()) else ''}>"
+                    f"{html.escape(cell)}</td>"
+                )
+                for column, cell in enumerate(row)
+            )
+            + "</tr>"
             for number, row in enumerate(rows)
         )
         legend = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         kind = ' class="text"' if text else ""
-        self._blocks.append(f'<div class="scroll"><table{kind}>{legend}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+        self._blocks.append(
+            f'<div class="scroll"><table{kind}>{legend}<thead><tr>{head}</tr></thead><tbody>{body}'
+            "</tbody></table></div>"
+        )
 
     def definitions(self, entries, summary="What the numbers mean"):
         """Terms and what they mean, folded away: dict term -> text."""
         if entries:
-            inner = "".join(f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>" for term, text in entries.items())
-            self._blocks.append(f"<details><summary>{html.escape(summary)}</summary><dl>{inner}</dl></details>")
+            inner = "".join(
+                f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>"
+                for term, text in entries.items()
+            )
+            self._blocks.append(
+                f"<details><summary>{html.escape(summary)}</summary><dl>{inner}</dl></details>"
+            )
 
     def code(self, text, summary):
         """Text in a fixed-width block, folded away."""
-        self._blocks.append(f"<details><summary>{html.escape(summary)}</summary><pre>{html.escape(text)}</pre></details>")
+        self._blocks.append(
+            f"<details><summary>{html.escape(summary)}</summary><pre>"
+            f"{html.escape(text)}</pre></details>"
+        )
 
     def render(self):
         """The page as text. The same blocks give the same bytes."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-        links = "".join(f'<a href="#s{i}">{html.escape(title)}</a>' for i, title in enumerate(self._sections, start=1))
+        links = "".join(
+            f'<a href="#s{i}">{html.escape(title)}</a>'
+            for i, title in enumerate(self._sections, start=1)
+        )
         nav = f"<nav>{links}</nav>" if len(self._sections) > 1 else ""
         lead = f'<p class="lead">{html.escape(self._lead)}</p>' if self._lead else ""
         return (
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-            f"<title>{html.escape(self._title)}</title>\n<style>\n{style}</style></head>\n<body><main>\n"
-            f"<h1>{html.escape(self._title)}</h1>\n{lead}{nav}\n" + "\n".join(self._blocks) + "\n</main></body></html>\n"
+            (
+                "<!doctype html>\n"
+                '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+                'content="width=device-width, initial-scale=1">'
+                f"<title>{html.escape(self._title)}</title>\n"
+                "<style>\n"
+                f"{style}</style></head>\n"
+                "<body><main>\n"
+                f"<h1>{html.escape(self._title)}</h1>\n"
+                f"{lead}{nav}\n"
+            )
+            + "\n".join(self._blocks)
+            + "\n</main></body></html>\n"
         )

@@ -1,20 +1,46 @@
-"""Pictures of the spatial chain: capture, system matrix, reconstructions, dictionary. Every function returns PNG bytes."""
+"""Pictures of the spatial chain: capture, system matrix, reconstructions, dictionary.
+
+Every function returns PNG bytes.
+"""
 
 import numpy as np
 
-from plenocli.report.drawing import COLOURS, GRID_LINE, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, bare, colour_bar, drawing, nanometres, show_map, show_picture, thumbnail
+from plenocli.report.drawing import (
+    COLOURS,
+    GRID_LINE,
+    LEVEL_MAP,
+    LIGHT_MAP,
+    SIGN_MAP,
+    bare,
+    colour_bar,
+    drawing,
+    nanometres,
+    show_map,
+    show_picture,
+    thumbnail,
+)
 
 ZOOMED = 3  # superpixels per side in the close-up
-HISTORY = {"validation_psnr": "PSNR on held-out patches [dB]", "change": "change of the atoms (norm)", "coherence_max": "coherence of A phi, largest", "coherence_mean": "coherence of A phi, mean",
-           "dead_share": "share of atoms replaced", "nonzeros": "coefficients of a patch", "step_residual": "residual of the step (relative)", "worst_gap": "duality gap, worst (relative)"}
+HISTORY = {
+    "validation_psnr": "PSNR on held-out patches [dB]",
+    "change": "change of the atoms (norm)",
+    "coherence_max": "coherence of A phi, largest",
+    "coherence_mean": "coherence of A phi, mean",
+    "dead_share": "share of atoms replaced",
+    "nonzeros": "coefficients of a patch",
+    "step_residual": "residual of the step (relative)",
+    "worst_gap": "duality gap, worst (relative)",
+}
 """What learning records, in words."""
 
 
 def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
-    """A capture: the whole mosaic (row, column) with its lenslet grid, and the middle superpixels close up.
+    """A capture: the whole mosaic (row, column) with its lenslet grid, and the middle
+    superpixels close up.
 
-    centres: superpixel centres (R, C, 2) in px or None; pitch: (row, column) px or None, used where centres are missing,
-    for superpixels that tile from the corner. Levels are shown above `black` on one scale for both parts.
+    centres: superpixel centres (R, C, 2) in px or None;
+    pitch: (row, column) px or None, used where centres are missing, for superpixels that tile from
+        the corner. Levels are shown above `black` on one scale for both parts.
     """
     mosaic = np.asarray(mosaic, dtype=np.float64) - black
     top = float(np.percentile(mosaic, 99.9)) or 1.0
@@ -25,12 +51,34 @@ def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
     with drawing(10.2, 4.75) as made:
         whole, close = made.figure.subplots(1, 2)
         shown, step = thumbnail(mosaic)
-        whole.imshow(shown, cmap=LIGHT_MAP, vmin=0, vmax=top, extent=(-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5))
-        whole.set(xlabel="column [px]", ylabel="row [px]", title=f"{rows} x {cols} pixels" + ("" if step == 1 else f", shown {step} times smaller"))
+        whole.imshow(
+            shown,
+            cmap=LIGHT_MAP,
+            vmin=0,
+            vmax=top,
+            extent=(-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5),
+        )
+        whole.set(
+            xlabel="column [px]",
+            ylabel="row [px]",
+            title=f"{rows} x {cols} pixels"
+            + ("" if step == 1 else f", shown {step} times smaller"),
+        )
         box = _middle(mosaic.shape, centres)
-        image = close.imshow(mosaic[box[0] : box[1], box[2] : box[3]], cmap=LIGHT_MAP, vmin=0, vmax=top, interpolation="nearest",
-                             extent=(box[2] - 0.5, box[3] - 0.5, box[1] - 0.5, box[0] - 0.5))
-        close.set(xlabel="column [px]", title="close-up" if centres is None else f"{ZOOMED} x {ZOOMED} superpixels in the middle")
+        image = close.imshow(
+            mosaic[box[0] : box[1], box[2] : box[3]],
+            cmap=LIGHT_MAP,
+            vmin=0,
+            vmax=top,
+            interpolation="nearest",
+            extent=(box[2] - 0.5, box[3] - 0.5, box[1] - 0.5, box[0] - 0.5),
+        )
+        close.set(
+            xlabel="column [px]",
+            title="close-up"
+            if centres is None
+            else f"{ZOOMED} x {ZOOMED} superpixels in the middle",
+        )
         if centres is not None:
             _lattice(close, centres, 0.9)
             if centres.shape[0] * centres.shape[1] <= 2500:
@@ -47,21 +95,29 @@ def _tiling(shape, pitch):
 
 
 def _middle(shape, centres):
-    """Row and column range of the middle ZOOMED x ZOOMED superpixels, or of the middle of the frame."""
+    """Row and column range of the middle ZOOMED x ZOOMED superpixels, or of the
+    middle of the frame.
+    """
     if centres is None or min(centres.shape[:2]) < 1:
         half = [min(n, 160) // 2 for n in shape]
         middle = [n // 2 for n in shape]
     else:
         centre = centres[centres.shape[0] // 2, centres.shape[1] // 2]
         half = [max(int(ZOOMED / 2 * p), 2) for p in _spacing(centres, shape)]
-        middle = [int(np.nan_to_num(c, nan=n / 2) + 0.5) for c, n in zip(centre, shape, strict=True)]
-    low = [min(max(m - h, 0), max(n - 2 * h, 0)) for m, h, n in zip(middle, half, shape, strict=True)]
+        middle = [
+            int(np.nan_to_num(c, nan=n / 2) + 0.5) for c, n in zip(centre, shape, strict=True)
+        ]
+    low = [
+        min(max(m - h, 0), max(n - 2 * h, 0)) for m, h, n in zip(middle, half, shape, strict=True)
+    ]
     high = [min(b + 2 * h, n) for b, h, n in zip(low, half, shape, strict=True)]
     return low[0], high[0], low[1], high[1]
 
 
 def _spacing(centres, shape):
-    """Median (row, column) spacing of lenslets in px; the frame's size along an axis with one lenslet."""
+    """Median (row, column) spacing of lenslets in px; the frame's size along an
+    axis with one lenslet.
+    """
     found = []
     for axis in (0, 1):
         steps = np.abs(np.diff(centres[..., axis], axis=axis))
@@ -71,7 +127,9 @@ def _spacing(centres, shape):
 
 
 def _lattice(axes, centres, width):
-    """Boundaries between neighbouring superpixels along rows and columns; follows rotated and bent grids."""
+    """Boundaries between neighbouring superpixels along rows and columns; follows
+    rotated and bent grids.
+    """
     limits = axes.get_xlim(), axes.get_ylim()
     for points in (centres, np.swapaxes(centres, 0, 1)):
         if len(points) < 2:
@@ -79,7 +137,9 @@ def _lattice(axes, centres, width):
         between = (points[1:] + points[:-1]) / 2
         for line in between:
             if len(line) > 1:
-                line = np.vstack([1.5 * line[0] - 0.5 * line[1], line, 1.5 * line[-1] - 0.5 * line[-2]])
+                line = np.vstack(
+                    [1.5 * line[0] - 0.5 * line[1], line, 1.5 * line[-1] - 0.5 * line[-2]]
+                )
             axes.plot(line[:, 1], line[:, 0], color=GRID_LINE, linewidth=width, alpha=0.9)
     axes.set(xlim=limits[0], ylim=limits[1])
 
@@ -87,30 +147,46 @@ def _lattice(axes, centres, width):
 def _outline(box):
     from matplotlib.patches import Rectangle
 
-    return Rectangle((box[2] - 0.5, box[0] - 0.5), box[3] - box[2], box[1] - box[0], fill=False, edgecolor="white", linewidth=1.0)
+    return Rectangle(
+        (box[2] - 0.5, box[0] - 0.5),
+        box[3] - box[2],
+        box[1] - box[0],
+        fill=False,
+        edgecolor="white",
+        linewidth=1.0,
+    )
 
 
 def pif_columns(matrix, pixel_shape, object_shape, offsets, per_side=3, points=None):
-    """What the sensor sees of single object points: columns of A laid out on the superpixels, per_side x per_side points
-    or the given `points`, (row, column) each.
+    """What the sensor sees of single object points: columns of A laid out on the superpixels,
+    per_side x per_side points or the given `points`, (row, column) each.
 
-    matrix (lenslet, pixel, point), offsets (lenslet, 2) superpixel (row, column) from the point's own. The panels stand as
-    the points' images do on the lenslet. Square-root scale, because the outer fringes are weak.
+    matrix (lenslet, pixel, point), offsets (lenslet, 2) superpixel (row, column) from the point's
+    own. The panels stand as the points' images do on the lenslet. Square-root scale, because the
+    outer fringes are weak.
     """
     if points is None:
-        rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(per_side, n))).astype(int)) for n in object_shape)
+        rows, columns = (
+            np.unique(np.round(np.linspace(0, n - 1, min(per_side, n))).astype(int))
+            for n in object_shape
+        )
         points, across = [(i, j) for i in rows for j in columns], len(columns)
     else:
         across = min(3, len(points))
     lines = -(-len(points) // across)
     with drawing(2.4 * max(across, 2) + 0.6, 2.35 * lines + 0.15) as made:
         panels = made.figure.subplots(lines, across, squeeze=False)
-        for axes in panels.flat[len(points):]:
+        for axes in panels.flat[len(points) :]:
             axes.set_axis_off()
-        pictures = [_on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets) for i, j in points]
+        pictures = [
+            _on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets)
+            for i, j in points
+        ]
         top = max(picture.max() for picture in pictures) or 1.0
         for axes, (i, j), picture in zip(panels.flat, points, pictures, strict=False):
-            image = axes.imshow(picture, cmap=LIGHT_MAP, norm=_root_norm(top), interpolation="nearest")
+            image = axes.imshow(
+                picture, cmap=LIGHT_MAP, norm=_root_norm(top), interpolation="nearest"
+            )
             bare(axes, f"point ({i}, {j}), {picture.sum():.0%} of its light")
             for line in range(1, picture.shape[0] // pixel_shape[0]):
                 axes.axhline(line * pixel_shape[0] - 0.5, color=GRID_LINE, linewidth=0.6)
@@ -134,57 +210,99 @@ def _on_superpixels(column, pixel_shape, offsets):
     height, width = pixel_shape
     picture = np.zeros((offsets[:, 0].max() * height + height, offsets[:, 1].max() * width + width))
     for (row, col), values in zip(offsets, column, strict=True):
-        picture[row * height : (row + 1) * height, col * width : (col + 1) * width] = values.reshape(pixel_shape)
+        picture[row * height : (row + 1) * height, col * width : (col + 1) * width] = (
+            values.reshape(pixel_shape)
+        )
     return picture
 
 
 def matrix_picture(matrix):
-    """A of one superpixel, (pixel, point): what each pixel has of each object point, square-root scale."""
+    """A of one superpixel, (pixel, point): what each pixel has of each object point,
+    square-root scale.
+    """
     shown, step = thumbnail(np.asarray(matrix, dtype=np.float64), 700)
     with drawing(7.2, 4.6) as made:
         axes = made.figure.subplots()
-        image = axes.imshow(shown, cmap=LIGHT_MAP, norm=_root_norm(float(shown.max()) or 1.0), interpolation="nearest", aspect="auto",
-                            extent=(-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5))
-        axes.set(xlabel="object point, row by row", ylabel="pixel of the superpixel, row by row", title=f"A, {matrix.shape[0]} x {matrix.shape[1]}")
+        image = axes.imshow(
+            shown,
+            cmap=LIGHT_MAP,
+            norm=_root_norm(float(shown.max()) or 1.0),
+            interpolation="nearest",
+            aspect="auto",
+            extent=(-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5),
+        )
+        axes.set(
+            xlabel="object point, row by row",
+            ylabel="pixel of the superpixel, row by row",
+            title=f"A, {matrix.shape[0]} x {matrix.shape[1]}",
+        )
         colour_bar(axes, image, "share of a point's light in a pixel")
     return made.png
 
 
 def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ranks=None):
-    """Singular values of A relative to the largest, one line a band, and the share of light kept by object point.
+    """Singular values of A relative to the largest, one line a band, and the share of light
+    kept by object point.
 
-    singular_values (band, value) or (value,) or None; column_energy (band, point); ranks (band,) or None. Of many bands six are drawn.
+    singular_values (band, value) or (value,) or None; column_energy (band, point); ranks (band,) or
+    None. Of many bands six are drawn.
     """
     values = None if singular_values is None else np.atleast_2d(singular_values)
     with drawing(9.4, 3.6) as made:
         left, right = made.figure.subplots(1, 2, width_ratios=(1.55, 1))
-        ranks = [None] * len(wavelengths) if ranks is None else np.broadcast_to(np.ravel(ranks), len(wavelengths))
-        chosen = np.unique(np.round(np.linspace(0, len(wavelengths) - 1, min(len(wavelengths), 6))).astype(int))
+        ranks = (
+            [None] * len(wavelengths)
+            if ranks is None
+            else np.broadcast_to(np.ravel(ranks), len(wavelengths))
+        )
+        chosen = np.unique(
+            np.round(np.linspace(0, len(wavelengths) - 1, min(len(wavelengths), 6))).astype(int)
+        )
         for number, band in enumerate(chosen if values is not None else ()):
             one = values[min(band, len(values) - 1)]
             kept = one[one > 0]
             rank = "" if ranks[band] is None else f", rank {int(ranks[band])} of {len(one)}"
             if len(kept):
-                left.semilogy(np.arange(1, len(kept) + 1), kept / kept[0], color=COLOURS[number], label=nanometres(wavelengths[band]) + rank)
+                left.semilogy(
+                    np.arange(1, len(kept) + 1),
+                    kept / kept[0],
+                    color=COLOURS[number],
+                    label=nanometres(wavelengths[band]) + rank,
+                )
         left.set(xlabel="number", ylabel="singular value, relative to the largest")
         left.grid(True)
         if values is not None:
             left.legend(loc="lower left")
         energy = np.asarray(column_energy)[0].reshape(object_shape) * 100
-        show_map(right, energy, f"light on the superpixels kept, {nanometres(wavelengths[0])}", "share of a point's light [%]", cmap=LEVEL_MAP, vmin=0, vmax=100)
+        show_map(
+            right,
+            energy,
+            f"light on the superpixels kept, {nanometres(wavelengths[0])}",
+            "share of a point's light [%]",
+            cmap=LEVEL_MAP,
+            vmin=0,
+            vmax=100,
+        )
         right.set(xlabel="object point, column", ylabel="object point, row")
     return made.png
 
 
 def reconstructions(entries, truth, columns=4):
-    """Reconstructions beside the truth, each above its error; light encoded for the screen, white = 1.
+    """Reconstructions beside the truth, each above its error; light encoded for the
+    screen, white = 1.
 
-    entries: sequence of (label, values (row, column), caption). One error scale for all, that of the typical result.
+    entries: sequence of (label, values (row, column), caption). One error scale for all, that of
+        the typical result.
     """
     truth = np.asarray(truth, dtype=np.float64)
     errors = [np.asarray(values) - truth for _, values, _ in entries]
-    # Methods differ by decades: the scale is that of the typical method and never beyond half of white; poor ones saturate.
-    top = min(max(float(np.median([np.percentile(np.abs(e), 98) for e in errors])), 1e-6), 0.5) if errors else 1.0
+    # Methods differ by decades: the scale is that of the typical method and never beyond half of
+    # white; poor ones saturate.
+    top = (
+        min(max(float(np.median([np.percentile(np.abs(e), 98) for e in errors])), 1e-6), 0.5)
+        if errors
+        else 1.0
+    )
     columns = min(columns, len(entries) + 1)
     lines = -(-(len(entries) + 1) // columns)
     panel = 10.2 / columns
@@ -196,7 +314,9 @@ def reconstructions(entries, truth, columns=4):
         panels[0, 0].set_axis_on()
         show_picture(panels[0, 0], truth, "truth")
         image = None
-        for number, ((label, values, caption), error) in enumerate(zip(entries, errors, strict=True), start=1):
+        for number, ((label, values, caption), error) in enumerate(
+            zip(entries, errors, strict=True), start=1
+        ):
             line, column = divmod(number, columns)
             above, below = panels[2 * line, column], panels[2 * line + 1, column]
             above.set_axis_on()
@@ -205,20 +325,30 @@ def reconstructions(entries, truth, columns=4):
             image = below.imshow(error, cmap=SIGN_MAP, vmin=-top, vmax=top)
             bare(below)
         if image is not None:
-            bar = made.figure.colorbar(image, cax=panels[1, 0].inset_axes([0.04, 0.8, 0.92, 0.05]), orientation="horizontal", ticks=[-top, 0, top], format="%.2g")
+            bar = made.figure.colorbar(
+                image,
+                cax=panels[1, 0].inset_axes([0.04, 0.8, 0.92, 0.05]),
+                orientation="horizontal",
+                ticks=[-top, 0, top],
+                format="%.2g",
+            )
             bar.set_label("error: result - truth\n(white = 1)")
             bar.outline.set_linewidth(0.4)
     return made.png
 
 
 def close_ups(entries, truth, block, lenslets=3, columns=4):
-    """The middle `lenslets` x `lenslets` lenslet fields of truth and results, enlarged, with the lenslets' borders."""
+    """The middle `lenslets` x `lenslets` lenslet fields of truth and results, enlarged, with the
+    lenslets' borders.
+    """
     boxes = []
     for size, side in zip(truth.shape, block, strict=True):
         count = size // side
         first = max((count - lenslets) // 2, 0) * side
         boxes.append(slice(first, min(first + lenslets * side, size)))
-    parts = [("truth", truth[tuple(boxes)])] + [(label, np.asarray(values)[tuple(boxes)]) for label, values, _ in entries]
+    parts = [("truth", truth[tuple(boxes)])] + [
+        (label, np.asarray(values)[tuple(boxes)]) for label, values, _ in entries
+    ]
     columns = min(columns, len(parts))
     lines = -(-len(parts) // columns)
     panel = 10.2 / columns
@@ -245,16 +375,26 @@ def picture(values, title=""):
     return made.png
 
 
-
 def seen_map(share):
     """What of a lenslet's object the sensor tells apart, 0 to 1, by object point (row, column)."""
     with drawing(4.6, 3.8) as made:
         axes = made.figure.subplots()
-        show_map(axes, share, "seen of the object under a lenslet", "share that is told apart, by object point", cmap=LEVEL_MAP, vmin=0, vmax=1)
+        show_map(
+            axes,
+            share,
+            "seen of the object under a lenslet",
+            "share that is told apart, by object point",
+            cmap=LEVEL_MAP,
+            vmin=0,
+            vmax=1,
+        )
     return made.png
 
+
 def method_bars(documents):
-    """PSNR of every method, one colour an experiment: documents is a sequence of (name, entries of a score document)."""
+    """PSNR of every method, one colour an experiment: documents is a sequence of (name, entries
+    of a score document).
+    """
     methods = list(dict.fromkeys(entry["label"] for _, entries in documents for entry in entries))
     with drawing(8.2, 0.95 + (0.24 * len(documents) + 0.16) * len(methods)) as made:
         axes = made.figure.subplots()
@@ -269,14 +409,46 @@ def method_bars(documents):
                     continue
                 low, high = min(value, low or value), max(value, high or value)
                 place = position + (number - (len(documents) - 1) / 2) * thick
-                axes.barh(place, value, 0.88 * thick, color=colour, label=name if method == next(m for m in methods if found.get(m, {}).get("psnr_db") is not None) else None)
-                axes.annotate(f"{value:.1f}", (max(value, 0), place), (3, 0), textcoords="offset points", va="center", fontsize=7.5)
-            baseline = next((m["block_mean_psnr_db"] for m in found.values() if m.get("block_mean_psnr_db") is not None), None)
+                axes.barh(
+                    place,
+                    value,
+                    0.88 * thick,
+                    color=colour,
+                    label=name
+                    if method
+                    == next(m for m in methods if found.get(m, {}).get("psnr_db") is not None)
+                    else None,
+                )
+                axes.annotate(
+                    f"{value:.1f}",
+                    (max(value, 0), place),
+                    (3, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=7.5,
+                )
+            baseline = next(
+                (
+                    m["block_mean_psnr_db"]
+                    for m in found.values()
+                    if m.get("block_mean_psnr_db") is not None
+                ),
+                None,
+            )
             if baseline is not None and number == 0:
-                axes.axvline(baseline, color="#777777", linewidth=0.9, linestyle=(0, (4, 3)), label="block mean of the truth")
+                axes.axvline(
+                    baseline,
+                    color="#777777",
+                    linewidth=0.9,
+                    linestyle=(0, (4, 3)),
+                    label="block mean of the truth",
+                )
         axes.set_yticks(range(len(methods)), methods)
         axes.invert_yaxis()
-        axes.set(xlabel="PSNR [dB], peak 1.0, whole picture", xlim=(max(min(0, low or 0), -8), max(high or 1, 1) * 1.08))
+        axes.set(
+            xlabel="PSNR [dB], peak 1.0, whole picture",
+            xlim=(max(min(0, low or 0), -8), max(high or 1, 1) * 1.08),
+        )
         axes.grid(True, axis="x")
         axes.tick_params(axis="y", length=0)
         made.figure.legend(loc="outside lower center", ncols=3)
@@ -284,7 +456,8 @@ def method_bars(documents):
 
 
 def dictionary_atoms(atoms, object_shape, matrix=None, pixel_shape=None, per_side=10):
-    """Atoms in object space and, where A (pixel, point) is given, what the sensor sees of each; each on its own scale.
+    """Atoms in object space and, where A (pixel, point) is given, what the sensor sees of each;
+    each on its own scale.
 
     atoms (point, atom); the first per_side^2 by order of use are those in the file's order.
     """
@@ -294,14 +467,24 @@ def dictionary_atoms(atoms, object_shape, matrix=None, pixel_shape=None, per_sid
     if matrix is not None:
         parts.append(("the same atoms on the sensor, A phi", matrix @ chosen, pixel_shape))
     with drawing(5.1 * len(parts), 5.0 * -(-count // per_side) / per_side + 0.35) as made:
-        for axes, (title, columns, shape) in zip(np.ravel(made.figure.subplots(1, len(parts))), parts, strict=True):
-            axes.imshow(_mosaic_of(columns, shape, per_side), cmap="gray", vmin=-1, vmax=1, interpolation="nearest")
+        for axes, (title, columns, shape) in zip(
+            np.ravel(made.figure.subplots(1, len(parts))), parts, strict=True
+        ):
+            axes.imshow(
+                _mosaic_of(columns, shape, per_side),
+                cmap="gray",
+                vmin=-1,
+                vmax=1,
+                interpolation="nearest",
+            )
             bare(axes, f"{title} ({count} of {atoms.shape[1]}, each on its own scale)")
     return made.png
 
 
 def _mosaic_of(columns, shape, per_side):
-    """Columns (sample, n) as small pictures side by side, each scaled to its largest magnitude, on a white gap."""
+    """Columns (sample, n) as small pictures side by side, each scaled to its largest
+    magnitude, on a white gap.
+    """
     gap = max(1, min(shape) // 12)
     height, width = shape[0] + gap, shape[1] + gap
     lines = -(-columns.shape[1] // per_side)
@@ -309,13 +492,22 @@ def _mosaic_of(columns, shape, per_side):
     for number, column in enumerate(columns.T):
         row, col = divmod(number, per_side)
         scale = np.abs(column).max() or 1.0
-        canvas[gap + row * height :, gap + col * width :][: shape[0], : shape[1]] = column.reshape(shape) / scale
+        canvas[gap + row * height :, gap + col * width :][: shape[0], : shape[1]] = (
+            column.reshape(shape) / scale
+        )
     return canvas
 
 
 def learning_history(history):
-    """How learning went: one small panel for each recorded value; history: name -> (iteration,) array."""
-    named = {name: np.asarray(v, dtype=float) for name, v in history.items() if np.ndim(v) == 1 and len(v) and np.isfinite(np.asarray(v, float)).any()}
+    """How learning went: one small panel for each recorded value;
+
+    history: name -> (iteration,) array.
+    """
+    named = {
+        name: np.asarray(v, dtype=float)
+        for name, v in history.items()
+        if np.ndim(v) == 1 and len(v) and np.isfinite(np.asarray(v, float)).any()
+    }
     if not named:
         return b""
     columns = min(4, len(named))
@@ -326,7 +518,12 @@ def learning_history(history):
             axes.set_axis_off()
         for axes, (name, values) in zip(panels.flat, named.items(), strict=False):
             axes.set_axis_on()
-            axes.plot(np.arange(1, len(values) + 1), values, color=COLOURS[0], marker="." if len(values) < 40 else "")
+            axes.plot(
+                np.arange(1, len(values) + 1),
+                values,
+                color=COLOURS[0],
+                marker="." if len(values) < 40 else "",
+            )
             axes.set(title=HISTORY.get(name, name.replace("_", " ")), xlabel="iteration")
             axes.xaxis.get_major_locator().set_params(integer=True)
             axes.grid(True)

@@ -1,14 +1,32 @@
-"""Pictures of the spectral chain: lenslet grid, response, demultiplexed bands, spectra of patches, error bars. PNG bytes."""
+"""Pictures of the spectral chain: lenslet grid, response, demultiplexed bands, spectra of
+patches, error bars. PNG bytes.
+"""
 
 import numpy as np
 
-from plenocli.report.drawing import COLOURS, LEVEL_MAP, LIGHT_MAP, SIGN_MAP, TRUTH, bare, colour_bar, drawing, nanometres, show_picture, swatch, thumbnail
+from plenocli.report.drawing import (
+    COLOURS,
+    LEVEL_MAP,
+    LIGHT_MAP,
+    SIGN_MAP,
+    TRUTH,
+    bare,
+    colour_bar,
+    drawing,
+    nanometres,
+    show_picture,
+    swatch,
+    thumbnail,
+)
 
 
 def calibration_picture(flat, centres, valid, residual=None, predicted=False):
-    """The white image (row, column; peak 1 in each superpixel) with the lenslet centres found, and a close-up.
+    """The white image (row, column; peak 1 in each superpixel) with the lenslet centres
+    found, and a close-up.
 
-    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None. flat None: the centres alone. predicted: nobody looked for them.
+    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None.
+    flat None: the centres alone.
+    predicted: nobody looked for them.
     """
     centres, valid = np.asarray(centres), np.asarray(valid, dtype=bool)
     found = centres[valid & np.isfinite(centres).all(axis=-1)]
@@ -17,29 +35,70 @@ def calibration_picture(flat, centres, valid, residual=None, predicted=False):
         if flat is not None:
             shown, step = thumbnail(np.nan_to_num(np.asarray(flat, dtype=np.float64)))
             extent = (-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5)
-            for axes, picture, where in ((whole, shown, extent), (close, np.nan_to_num(flat), None)):
-                axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest", **({"extent": where} if where else {}))
+            for axes, picture, where in (
+                (whole, shown, extent),
+                (close, np.nan_to_num(flat), None),
+            ):
+                axes.imshow(
+                    picture,
+                    cmap="gray",
+                    vmin=0,
+                    vmax=1,
+                    interpolation="nearest",
+                    **({"extent": where} if where else {}),
+                )
             limits = extent
         else:
-            limits = (found[:, 1].min() - 5, found[:, 1].max() + 5, found[:, 0].max() + 5, found[:, 0].min() - 5)
-        colours = np.full(len(found), 0.0) if residual is None or predicted else np.asarray(residual)[valid & np.isfinite(centres).all(axis=-1)]
+            limits = (
+                found[:, 1].min() - 5,
+                found[:, 1].max() + 5,
+                found[:, 0].max() + 5,
+                found[:, 0].min() - 5,
+            )
+        colours = (
+            np.full(len(found), 0.0)
+            if residual is None or predicted
+            else np.asarray(residual)[valid & np.isfinite(centres).all(axis=-1)]
+        )
         size = max(0.8, min(14.0, 5000 / max(len(found), 1)))
-        dots = whole.scatter(found[:, 1], found[:, 0], c=np.nan_to_num(colours), s=size, cmap=LEVEL_MAP, linewidths=0)
-        whole.set(xlim=limits[:2], ylim=limits[2:], aspect="equal", xlabel="column [px]", ylabel="row [px]",
-                  title=f"{len(found)} lenslets" + (" as described" if predicted else " found" + (" on the white image" if flat is not None else "")))
+        dots = whole.scatter(
+            found[:, 1], found[:, 0], c=np.nan_to_num(colours), s=size, cmap=LEVEL_MAP, linewidths=0
+        )
+        whole.set(
+            xlim=limits[:2],
+            ylim=limits[2:],
+            aspect="equal",
+            xlabel="column [px]",
+            ylabel="row [px]",
+            title=f"{len(found)} lenslets"
+            + (
+                " as described"
+                if predicted
+                else " found" + (" on the white image" if flat is not None else "")
+            ),
+        )
         if residual is not None and not predicted:
             colour_bar(whole, dots, "distance from the lattice [px]")
         middle = found[np.argmin(((found - found.mean(axis=0)) ** 2).sum(axis=1))]
         nearest = np.sort(np.hypot(*(found - middle).T))
         half = 2.2 * (nearest[1] if len(nearest) > 1 else 20)
-        close.plot(found[:, 1], found[:, 0], "+", color=COLOURS[1], markersize=9, markeredgewidth=1.4)
-        close.set(xlim=(middle[1] - half, middle[1] + half), ylim=(middle[0] + half, middle[0] - half), aspect="equal", xlabel="column [px]",
-                  title="centres in the middle of the sensor")
+        close.plot(
+            found[:, 1], found[:, 0], "+", color=COLOURS[1], markersize=9, markeredgewidth=1.4
+        )
+        close.set(
+            xlim=(middle[1] - half, middle[1] + half),
+            ylim=(middle[0] + half, middle[0] - half),
+            aspect="equal",
+            xlabel="column [px]",
+            title="centres in the middle of the sensor",
+        )
     return made.png
 
 
 def response_picture(response, window, wavelengths):
-    """F of one lenslet (pixel, band): which pixels of the superpixel answer to which band, each band on its own scale."""
+    """F of one lenslet (pixel, band): which pixels of the superpixel answer to which band, each
+    band on its own scale.
+    """
     count = len(wavelengths)
     with drawing(min(2.5 * count, 10.2), 2.7) as made:
         panels = made.figure.subplots(1, count, squeeze=False)[0]
@@ -52,21 +111,31 @@ def response_picture(response, window, wavelengths):
 
 
 def response_errors(error, peak, window, wavelengths):
-    """Differences of two responses (pixel, band) over the brightest pixel of each band (band,): which pixels of the superpixel differ, on one scale."""
+    """Differences of two responses (pixel, band) over the brightest pixel of each band (band,):
+    which pixels of the superpixel differ, on one scale.
+    """
     count = len(wavelengths)
     shares = 100 * np.asarray(error) / np.asarray(peak)
     limit = float(np.nanmax(np.abs(shares))) or 1.0
     with drawing(min(2.5 * count, 10.2), 2.7) as made:
         panels = made.figure.subplots(1, count, squeeze=False)[0]
         for band, axes in enumerate(panels):
-            image = axes.imshow(np.nan_to_num(shares[:, band]).reshape(window), cmap=SIGN_MAP, vmin=-limit, vmax=limit, interpolation="nearest")
+            image = axes.imshow(
+                np.nan_to_num(shares[:, band]).reshape(window),
+                cmap=SIGN_MAP,
+                vmin=-limit,
+                vmax=limit,
+                interpolation="nearest",
+            )
             bare(axes, nanometres(wavelengths[band]))
         made.figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, label="% of the peak")
     return made.png
 
 
 def filters_picture(camera):
-    """The filter array in the pupil of the main lens, and what filters and sensor let through, by wavelength; b"" without filters."""
+    """The filter array in the pupil of the main lens, and what filters and sensor let through,
+    by wavelength; b"" without filters.
+    """
     from matplotlib.patches import Circle, Rectangle
 
     from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
@@ -80,24 +149,60 @@ def filters_picture(camera):
     with drawing(8.6, 2.9) as made:
         pupil, through = made.figure.subplots(1, 2, width_ratios=(1, 2.2))
         square = camera.main_lens.aperture_shape in ("square", "image")
-        pupil.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, color="#444444") if square else Circle((0, 0), half, color="#444444"))
-        for number, (((y0, y1, x0, x1), _), one) in enumerate(zip(filter_cells(camera, filters[0].center), filters, strict=True)):
+        pupil.add_patch(
+            Rectangle((-half, -half), 2 * half, 2 * half, color="#444444")
+            if square
+            else Circle((0, 0), half, color="#444444")
+        )
+        for number, (((y0, y1, x0, x1), _), one) in enumerate(
+            zip(filter_cells(camera, filters[0].center), filters, strict=True)
+        ):
             colour = COLOURS[number % len(COLOURS)]
-            pupil.add_patch(Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour))
-            pupil.text((x0 + x1) * 500, (y0 + y1) * 500, f"{one.center * 1e9:.4g}", ha="center", va="center", color="white")
-            through.plot(wavelengths * 1e9, [filter_transmittance(one, w) for w in wavelengths], color=colour)
-        pupil.set(xlim=(-1.05 * half, 1.05 * half), ylim=(1.05 * half, -1.05 * half), aspect="equal", xlabel="pupil [mm]", title="filters [nm]")
+            pupil.add_patch(
+                Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour)
+            )
+            pupil.text(
+                (x0 + x1) * 500,
+                (y0 + y1) * 500,
+                f"{one.center * 1e9:.4g}",
+                ha="center",
+                va="center",
+                color="white",
+            )
+            through.plot(
+                wavelengths * 1e9, [filter_transmittance(one, w) for w in wavelengths], color=colour
+            )
+        pupil.set(
+            xlim=(-1.05 * half, 1.05 * half),
+            ylim=(1.05 * half, -1.05 * half),
+            aspect="equal",
+            xlabel="pupil [mm]",
+            title="filters [nm]",
+        )
         for letter, curve in zip(letters, curves, strict=True):
             through.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
             top = np.argmax(curve) if np.ptp(curve) else len(curve) * 14 // 15
-            through.annotate("sensor" if len(letters) == 1 else letter, (wavelengths[top] * 1e9, curve[top]), ha="center", va="bottom", fontsize=7.5)
-        through.set(xlim=(400, 700), ylim=(0, 1.05), xlabel="wavelength [nm]", title="transmittance, and quantum efficiency of the sensor")
+            through.annotate(
+                "sensor" if len(letters) == 1 else letter,
+                (wavelengths[top] * 1e9, curve[top]),
+                ha="center",
+                va="bottom",
+                fontsize=7.5,
+            )
+        through.set(
+            xlim=(400, 700),
+            ylim=(0, 1.05),
+            xlabel="wavelength [nm]",
+            title="transmittance, and quantum efficiency of the sensor",
+        )
         through.grid(True)
     return made.png
 
 
 def band_pictures(cube, wavelengths, quantity="value", light="D65"):
-    """Demultiplexed bands (band, row, column) on one scale, and the colour they make together (white = 1)."""
+    """Demultiplexed bands (band, row, column) on one scale, and the colour they make
+    together (white = 1).
+    """
     from plenocli.forward.scene.colour import preview_rgb
 
     cube = np.asarray(cube, dtype=np.float64)
@@ -113,36 +218,63 @@ def band_pictures(cube, wavelengths, quantity="value", light="D65"):
         for axes in panels.flat:
             axes.set_axis_off()
         panels[0, 0].set_axis_on()
-        show_picture(panels[0, 0], np.moveaxis(preview_rgb(wavelengths, np.nan_to_num(cube) / scale, light), 0, -1), f"colour from {len(wavelengths)} bands", interpolation="nearest")
+        show_picture(
+            panels[0, 0],
+            np.moveaxis(preview_rgb(wavelengths, np.nan_to_num(cube) / scale, light), 0, -1),
+            f"colour from {len(wavelengths)} bands",
+            interpolation="nearest",
+        )
         used = [panels.flat[0]]
         for axes, band in zip(panels.flat[1:], chosen, strict=False):
             axes.set_axis_on()
             image = axes.imshow(cube[band], cmap="gray", vmin=0, vmax=top, interpolation="nearest")
             bare(axes, nanometres(wavelengths[band]))
             used.append(axes)
-        bar = made.figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, shrink=0.85)
+        bar = made.figure.colorbar(
+            image, ax=list(panels.flat), fraction=0.02, pad=0.01, shrink=0.85
+        )
         bar.set_label(quantity)
         bar.outline.set_linewidth(0.4)
     return made.png
 
 
 def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
-    """Spectra of single lenslets with one standard deviation: cube and sigma (band, row, column), sigma None where unknown.
+    """Spectra of single lenslets with one standard deviation: cube and sigma (band, row, column),
+    sigma None where unknown.
 
-    lenslets: (row, column) each; by default those whose brightness is at five even ranks, which shows dark and bright ones.
+    lenslets: (row, column) each; by default those whose brightness is at five even ranks, which
+        shows dark and bright ones.
     """
     cube = np.asarray(cube, dtype=np.float64)
     if lenslets is None:
         level = cube.mean(axis=0)
         known = np.argwhere(np.isfinite(level))
         order = known[np.argsort(level[tuple(known.T)], kind="stable")]
-        lenslets = [tuple(int(n) for n in order[k]) for k in np.unique(np.round(np.linspace(0.02, 0.98, 5) * (len(order) - 1)).astype(int))] if len(order) else []
+        lenslets = (
+            [
+                tuple(int(n) for n in order[k])
+                for k in np.unique(
+                    np.round(np.linspace(0.02, 0.98, 5) * (len(order) - 1)).astype(int)
+                )
+            ]
+            if len(order)
+            else []
+        )
     with drawing(6.4, 3.4) as made:
         axes = made.figure.subplots()
         for number, (row, col) in enumerate(lenslets):
             spread = None if sigma is None else np.asarray(sigma)[:, row, col]
-            axes.errorbar(np.asarray(wavelengths) * 1e9, cube[:, row, col], spread, marker="o", markersize=3.5, capsize=2.5, linewidth=1.1,
-                          color=COLOURS[number % len(COLOURS)], label=f"lenslet ({row}, {col})")
+            axes.errorbar(
+                np.asarray(wavelengths) * 1e9,
+                cube[:, row, col],
+                spread,
+                marker="o",
+                markersize=3.5,
+                capsize=2.5,
+                linewidth=1.1,
+                color=COLOURS[number % len(COLOURS)],
+                label=f"lenslet ({row}, {col})",
+            )
         axes.set(xlabel="wavelength [nm]", ylabel=quantity)
         axes.grid(True)
         if lenslets:
@@ -151,16 +283,19 @@ def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
 
 
 def patch_spectra(entries, wavelengths_nm, only_six=False):
-    """Spectra of the chart's patches: truth as a line, each result as points with +- one standard deviation.
+    """Spectra of the chart's patches: truth as a line, each result as points with +- one
+    standard deviation.
 
-    entries: sequence of (label, patches) as score lists them: dicts with label, name, mean, std, truth. A colour strip
-    beneath each title shows the patch.
+    entries: sequence of (label, patches) as score lists them: dicts with label, name, mean, std,
+        truth. A colour strip beneath each title shows the patch.
     """
     from plenocli.forward.scene.colour import preview_rgb
     from plenocli.forward.scene.tables import colorchecker
 
     wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
-    wanted = {p["label"]: p for _, patches in entries for p in patches if p["one_of_six"] or not only_six}
+    wanted = {
+        p["label"]: p for _, patches in entries for p in patches if p["one_of_six"] or not only_six
+    }
     order = sorted(wanted)
     columns = 6 if len(order) > 6 else 3
     lines = -(-len(order) // columns)
@@ -168,22 +303,58 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
     colours = preview_rgb(table_wavelengths, table.T[:, :, None])[..., 0].T
     height = (1.5 if columns == 6 else 2.1) * lines + 0.8
     with drawing(10.2, height, layout=None) as made:
-        panels = made.figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw={
-            "left": 0.055, "right": 0.99, "bottom": 0.48 / height, "top": 1 - 0.55 / height, "wspace": 0.12 if columns == 6 else 0.07, "hspace": 0.28})
-        for axes in panels.flat[len(order):]:
+        panels = made.figure.subplots(
+            lines,
+            columns,
+            squeeze=False,
+            sharex=True,
+            sharey=True,
+            gridspec_kw={
+                "left": 0.055,
+                "right": 0.99,
+                "bottom": 0.48 / height,
+                "top": 1 - 0.55 / height,
+                "wspace": 0.12 if columns == 6 else 0.07,
+                "hspace": 0.28,
+            },
+        )
+        for axes in panels.flat[len(order) :]:
             axes.set_axis_off()
         spread = 0.012 * np.ptp(wavelengths_nm) if len(entries) > 1 else 0.0
         for place, (axes, label) in enumerate(zip(panels.flat, order, strict=False)):
             axes.axhspan(1.06, 1.14, color=swatch(colours[label - 1]), linewidth=0)
-            axes.plot(table_wavelengths * 1e9, table[label - 1], color="#bbbbbb", linewidth=1, label="chart, full spectrum" if not place else None)
+            axes.plot(
+                table_wavelengths * 1e9,
+                table[label - 1],
+                color="#bbbbbb",
+                linewidth=1,
+                label="chart, full spectrum" if not place else None,
+            )
             if wanted[label]["truth"] is not None:
-                axes.plot(wavelengths_nm, wanted[label]["truth"], "_", color=TRUTH, markersize=9, markeredgewidth=1.4, label="truth" if not place else None)
+                axes.plot(
+                    wavelengths_nm,
+                    wanted[label]["truth"],
+                    "_",
+                    color=TRUTH,
+                    markersize=9,
+                    markeredgewidth=1.4,
+                    label="truth" if not place else None,
+                )
             for number, (name, patches) in enumerate(entries):
                 for patch in patches:
                     if patch["label"] == label:
                         shift = (number - (len(entries) - 1) / 2) * spread
-                        axes.errorbar(wavelengths_nm + shift, patch["mean"], patch["std"], fmt="o", markersize=3.2, capsize=1.8, linewidth=0.9,
-                                      color=COLOURS[number % len(COLOURS)], label=name if not place else None)
+                        axes.errorbar(
+                            wavelengths_nm + shift,
+                            patch["mean"],
+                            patch["std"],
+                            fmt="o",
+                            markersize=3.2,
+                            capsize=1.8,
+                            linewidth=0.9,
+                            color=COLOURS[number % len(COLOURS)],
+                            label=name if not place else None,
+                        )
             axes.set_title(wanted[label]["name"], fontsize=8)
             axes.set_ylim(-0.05, 1.14)
             if 400 <= wavelengths_nm.min() and wavelengths_nm.max() <= 700:
@@ -196,9 +367,16 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
 
 
 def patch_errors(entries, wavelengths_nm):
-    """Error (mean - truth) of the six patches by band with +- one standard deviation of a lenslet; entries as in patch_spectra."""
+    """Error (mean - truth) of the six patches by band with +- one standard deviation of a
+    lenslet; entries as in patch_spectra.
+    """
     wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
-    found = {p["label"]: p["name"] for _, patches in entries for p in patches if p["one_of_six"] and p["truth"] is not None}
+    found = {
+        p["label"]: p["name"]
+        for _, patches in entries
+        for p in patches
+        if p["one_of_six"] and p["truth"] is not None
+    }
     if not found:
         return b""
     spread = 0.02 * max(np.ptp(wavelengths_nm), 1.0)
@@ -207,11 +385,22 @@ def patch_errors(entries, wavelengths_nm):
         for place, (axes, label) in enumerate(zip(panels, sorted(found), strict=True)):
             axes.axhline(0, color=TRUTH, linewidth=0.9)
             for number, (name, patches) in enumerate(entries):
-                patch = next((p for p in patches if p["label"] == label and p["truth"] is not None), None)
+                patch = next(
+                    (p for p in patches if p["label"] == label and p["truth"] is not None), None
+                )
                 if patch is not None:
                     shift = (number - (len(entries) - 1) / 2) * spread
-                    axes.errorbar(wavelengths_nm + shift, np.subtract(patch["mean"], patch["truth"]), patch["std"], fmt="o", markersize=3.2, capsize=1.8,
-                                  linewidth=0.9, color=COLOURS[number % len(COLOURS)], label=name if not place else None)
+                    axes.errorbar(
+                        wavelengths_nm + shift,
+                        np.subtract(patch["mean"], patch["truth"]),
+                        patch["std"],
+                        fmt="o",
+                        markersize=3.2,
+                        capsize=1.8,
+                        linewidth=0.9,
+                        color=COLOURS[number % len(COLOURS)],
+                        label=name if not place else None,
+                    )
             axes.set(title=found[label], xlabel="wavelength [nm]")
             axes.grid(True, axis="y")
         panels[0].set_ylabel("error in reflectance")
@@ -220,22 +409,36 @@ def patch_errors(entries, wavelengths_nm):
 
 
 def accuracy_bars(entries):
-    """Error and SNR per band for each result, as the paper's Fig. 7: entries of a score document with bands.
+    """Error and SNR per band for each result, as the paper's Fig. 7: entries of a score
+    document with bands.
 
-    Left: RMSE averaged over the six patches (over all lenslets where no patches are known). Right: capture SNR, with the
-    predicted SNR as a tick.
+    Left: RMSE averaged over the six patches (over all lenslets where no patches are known). Right:
+    capture SNR, with the predicted SNR as a tick.
     """
     entries = [e for e in entries if e.get("wavelengths_nm") and "rmse_per_band" in e["metrics"]]
-    error_name = "six_patch_rmse_per_band" if all("six_patch_rmse_per_band" in e["metrics"] for e in entries) else "rmse_per_band"
+    error_name = (
+        "six_patch_rmse_per_band"
+        if all("six_patch_rmse_per_band" in e["metrics"] for e in entries)
+        else "rmse_per_band"
+    )
     with_snr = any(e["metrics"].get("snr_capture_db") for e in entries)
     with drawing(9.6 if with_snr else 5.4, 3.1) as made:
         panels = np.ravel(made.figure.subplots(1, 2 if with_snr else 1))
         _bars(panels[0], entries, error_name)
-        panels[0].set(ylabel="RMSE in reflectance", title="error, mean of the six patches" if error_name.startswith("six") else "error over all lenslets")
+        panels[0].set(
+            ylabel="RMSE in reflectance",
+            title="error, mean of the six patches"
+            if error_name.startswith("six")
+            else "error over all lenslets",
+        )
         if with_snr:
             _bars(panels[1], entries, "snr_capture_db", "snr_predicted_db")
             panels[1].set(ylabel="SNR [dB]", title="capture SNR on white (tick: predicted)")
-        made.figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(entries), 4))
+        made.figure.legend(
+            *panels[0].get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=min(len(entries), 4),
+        )
     return made.png
 
 
@@ -244,11 +447,26 @@ def _bars(axes, entries, name, tick=None):
     width = 0.8 / len(entries)
     for number, entry in enumerate(entries):
         place = np.arange(len(bands)) + (number - (len(entries) - 1) / 2) * width
-        values = [np.nan if v is None else v for v in entry["metrics"].get(name) or [None] * len(bands)]
-        axes.bar(place, values, 0.9 * width, color=COLOURS[number % len(COLOURS)], label=entry.get("label", entry["name"]))
+        values = [
+            np.nan if v is None else v for v in entry["metrics"].get(name) or [None] * len(bands)
+        ]
+        axes.bar(
+            place,
+            values,
+            0.9 * width,
+            color=COLOURS[number % len(COLOURS)],
+            label=entry.get("label", entry["name"]),
+        )
         predicted = entry["metrics"].get(tick) if tick else None
         if predicted:
-            axes.plot(place, [np.nan if v is None else v for v in predicted], "_", color=TRUTH, markersize=60 * width, markeredgewidth=1.3)
+            axes.plot(
+                place,
+                [np.nan if v is None else v for v in predicted],
+                "_",
+                color=TRUTH,
+                markersize=60 * width,
+                markeredgewidth=1.3,
+            )
     axes.set_xticks(range(len(bands)), [f"{w:g} nm" for w in bands])
     axes.tick_params(axis="x", length=0)
     axes.grid(True, axis="y")

@@ -63,7 +63,8 @@ LABELS = {
 def metric_rows(document):
     """(header, rows) of text for a score document: metric names first, then one column a result.
 
-    Metrics with one value a band take one row a band, named by its wavelength where all results share their bands.
+    Metrics with one value a band take one row a band, named by its wavelength where all results
+    share their bands.
     """
     results = document["results"]
     header = ["", *(entry.get("label", entry["name"]) for entry in results)]
@@ -76,16 +77,33 @@ def metric_rows(document):
         unit = f" [{unit}]" if unit else ""
         bands = max((len(v) for v in values if isinstance(v, list)), default=0)
         if not bands:
-            rows.append([label + unit, *(_cell(name, name in e["metrics"], v) for e, v in zip(results, values, strict=True))])
+            rows.append(
+                [
+                    label + unit,
+                    *(
+                        _cell(name, name in e["metrics"], v)
+                        for e, v in zip(results, values, strict=True)
+                    ),
+                ]
+            )
         for band in range(bands):
             of_band = [v[band] if isinstance(v, list) and band < len(v) else None for v in values]
             given = [isinstance(v, list) and band < len(v) for v in values]
-            rows.append([f"{label}, {_band_name(results, band)}{unit}", *(_cell(name, g, v) for g, v in zip(given, of_band, strict=True))])
+            rows.append(
+                [
+                    f"{label}, {_band_name(results, band)}{unit}",
+                    *(_cell(name, g, v) for g, v in zip(given, of_band, strict=True)),
+                ]
+            )
     return header, rows
 
 
 def _band_name(results, band):
-    names = {f"{entry['wavelengths_nm'][band]:g} nm" for entry in results if band < len(entry.get("wavelengths_nm", ()))}
+    names = {
+        f"{entry['wavelengths_nm'][band]:g} nm"
+        for entry in results
+        if band < len(entry.get("wavelengths_nm", ()))
+    }
     return names.pop() if len(names) == 1 else f"band {band + 1}"
 
 

@@ -12,20 +12,31 @@ def next_step(folder):
     cameras = sorted(p.name for p in Path(folder).glob("*.toml") if _is_camera(p))
     first = {kind: names[0] for kind, names in found.items()}
     if "image" in first and "capture" in first:
-        return f"plenocli score {' '.join(found['image'][:3])} --truth {first['capture']} -o score.json --report report.html"
+        return (
+            f"plenocli score {' '.join(found['image'][:3])} --truth {first['capture']} -o "
+            "score.json --report report.html"
+        )
     if "spectra" in first:
         return f"plenocli show {first['spectra']} -o spectra.png"
     if "capture" in first and "pif" in first:
         return f"plenocli reconstruct {first['capture']} --pif {first['pif']} -o image.h5"
     if "capture" in first and "calibration" in first:
-        return f"plenocli demux {first['capture']} --calibration {first['calibration']} -o spectra.exr"
+        return (
+            f"plenocli demux {first['capture']} --calibration {first['calibration']} -o spectra.exr"
+        )
     if "pif" in first and cameras:
-        return f"plenocli capture-sim {cameras[0]} --pif {first['pif']} --scene skimage:astronaut --snr 60dB -o capture.h5"
+        return (
+            f"plenocli capture-sim {cameras[0]} --pif {first['pif']} --scene skimage:astronaut "
+            "--snr 60dB -o capture.h5"
+        )
     if "calibration" in first:
         return f"plenocli demux YOUR.nef --calibration {first['calibration']} -o spectra.exr"
     if cameras:
         return f"plenocli simulate-pif {cameras[0]} -o pif.h5"
-    return "describe a camera (plenocli schema camera; examples are in sample_configs), then plenocli simulate-pif camera.toml -o pif.h5; or measure yours: plenocli calibrate --help"
+    return (
+        "describe a camera (plenocli schema camera; examples are in sample_configs), then plenocli "
+        "simulate-pif camera.toml -o pif.h5; or measure yours: plenocli calibrate --help"
+    )
 
 
 def _kinds(folder):
@@ -45,6 +56,8 @@ def _kinds(folder):
 
 def _is_camera(path):
     try:
-        return path.stat().st_size < 1 << 20 and "[lenslet_array]" in path.read_text(encoding="utf-8")
+        return path.stat().st_size < 1 << 20 and "[lenslet_array]" in path.read_text(
+            encoding="utf-8"
+        )
     except (OSError, UnicodeDecodeError):
         return False

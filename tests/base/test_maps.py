@@ -1,4 +1,6 @@
-"""Linear maps: forward and adjoint belong together, and the block map equals the matrix that it never forms."""
+"""Linear maps: forward and adjoint belong together, and the block map equals the matrix
+that it never forms.
+"""
 
 import numpy as np
 import pytest
@@ -35,7 +37,13 @@ def test_block_map_is_the_full_matrix(count):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("make", [lambda t: Dense(np.random.default_rng(0).random((30, 20)).astype(t)), lambda t: block_map(dtype=t)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda t: Dense(np.random.default_rng(0).random((30, 20)).astype(t)),
+        lambda t: block_map(dtype=t),
+    ],
+)
 def test_adjoint_gap_is_small_for_a_pair(make, dtype):
     assert adjoint_gap(make(dtype)) < 100
     assert adjoint_gap(make(dtype), seed=5) < 100
@@ -58,7 +66,12 @@ def test_adjoint_gap_is_repeatable_and_scale_free():
 def test_parts_of_the_block_map():
     op = block_map()
     x = np.random.default_rng(3).standard_normal(op.domain.shape)
-    np.testing.assert_allclose(op.neighbours_only().forward(x) + x @ op.blocks[np.flatnonzero((op.offsets == 0).all(axis=1))[0]].T, op.forward(x), rtol=1e-12)
+    np.testing.assert_allclose(
+        op.neighbours_only().forward(x)
+        + x @ op.blocks[np.flatnonzero((op.offsets == 0).all(axis=1))[0]].T,
+        op.forward(x),
+        rtol=1e-12,
+    )
 
 
 def test_shapes_are_checked():

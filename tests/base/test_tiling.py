@@ -11,7 +11,10 @@ def test_blocks_are_what_stands_in_the_plane_and_go_back():
     assert blocks.shape == (3, 4, 10)
     for row in range(3):
         for column in range(4):
-            assert blocks[row, column].tolist() == plane[2 * row : 2 * row + 2, 5 * column : 5 * column + 5].ravel().tolist()
+            assert (
+                blocks[row, column].tolist()
+                == plane[2 * row : 2 * row + 2, 5 * column : 5 * column + 5].ravel().tolist()
+            )
     assert (to_plane(blocks, (2, 5)) == plane).all()
     assert (to_plane(blocks.reshape(3, 4, 2, 5), (2, 5)) == plane).all()
 

@@ -4,15 +4,53 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plenocli.base.units import UnitError, format_duration, format_length, parse_bytes, parse_decibel, parse_duration, parse_length
+from plenocli.base.units import (
+    UnitError,
+    format_duration,
+    format_length,
+    parse_bytes,
+    parse_decibel,
+    parse_duration,
+    parse_length,
+)
 
 
-@pytest.mark.parametrize("text, metres", [("550nm", 550e-9), ("550 nm", 550e-9), ("250 um", 250e-6), ("250 µm", 250e-6), ("50mm", 0.05), ("1e-3 m", 1e-3), (" 2.5 mm ", 2.5e-3), ("1.1 m", 1.1), ("0.55um", 550e-9)])
+@pytest.mark.parametrize(
+    "text, metres",
+    [
+        ("550nm", 550e-9),
+        ("550 nm", 550e-9),
+        ("250 um", 250e-6),
+        ("250 µm", 250e-6),
+        ("50mm", 0.05),
+        ("1e-3 m", 1e-3),
+        (" 2.5 mm ", 2.5e-3),
+        ("1.1 m", 1.1),
+        ("0.55um", 550e-9),
+    ],
+)
 def test_lengths_are_the_nearest_doubles(text, metres):
     assert parse_length(text) == metres
 
 
-@pytest.mark.parametrize("text", ["250", "", "um", "5 kg", "5 um um", "1,5 mm", "nan um", "inf m", "--5 um", None, 5, "1e999 m", "5e um"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "250",
+        "",
+        "um",
+        "5 kg",
+        "5 um um",
+        "1,5 mm",
+        "nan um",
+        "inf m",
+        "--5 um",
+        None,
+        5,
+        "1e999 m",
+        "5e um",
+    ],
+)
 def test_what_is_no_length_is_refused_with_an_example(text):
     with pytest.raises(UnitError, match="(such as '250 um')|too large"):
         parse_length(text)
@@ -33,4 +71,10 @@ def test_formatting_is_undone_by_parsing(value):
 
 
 def test_formatting_is_what_a_person_would_write():
-    assert [format_length(x) for x in (550e-9, 104e-6, 0.05, 1.1, 0)] == ["550 nm", "104 um", "50 mm", "1.1 m", "0 nm"]
+    assert [format_length(x) for x in (550e-9, 104e-6, 0.05, 1.1, 0)] == [
+        "550 nm",
+        "104 um",
+        "50 mm",
+        "1.1 m",
+        "0 nm",
+    ]

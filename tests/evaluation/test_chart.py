@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from plenocli.evaluation.metrics.chart import against_white, compare_chart, lobe_reflectance, nominal_reflectance
+from plenocli.evaluation.metrics.chart import (
+    against_white,
+    compare_chart,
+    lobe_reflectance,
+    nominal_reflectance,
+)
 
 NM = np.arange(350, 800.5, 1.0) * 1e-9
 
@@ -11,7 +16,8 @@ def test_a_lobe_leaves_the_floor_and_other_peaks_of_a_filter_out():
     dirty = peak + 0.02 + 0.9 * np.exp(-(((NM - 400e-9) / 10e-9) ** 2))
     slope = np.stack([NM * 1e6, 1 - NM * 1e6])
     found = lobe_reflectance(NM, [dirty], [550e-9], slope)
-    np.testing.assert_allclose(found[:, 0], [0.543, 0.457], atol=5e-5)  # the floor is even about the peak
+    # the floor is even about the peak
+    np.testing.assert_allclose(found[:, 0], [0.543, 0.457], atol=5e-5)
     step = (NM > 570e-9).astype(float)[None]
     assert lobe_reflectance(NM, [dirty], [550e-9], step)[0, 0] == 0
 
@@ -29,7 +35,11 @@ def test_errors_by_band_are_those_of_the_patches():
     found[3, 0], found[5, 1] = 0.7, 0.4
     scores = compare_chart(found, truth, (3, 7), np.array([True, True, False]))
     assert scores["rmse_24_per_band"] == pytest.approx([0.2 / np.sqrt(24), 0.1 / np.sqrt(24), 0])
-    assert scores["rmse_six_per_band"] == pytest.approx([0.2 / np.sqrt(2), 0, 0]) and scores["rmse_six"] == pytest.approx(0.1 / np.sqrt(2))
+    assert scores["rmse_six_per_band"] == pytest.approx([0.2 / np.sqrt(2), 0, 0]) and scores[
+        "rmse_six"
+    ] == pytest.approx(0.1 / np.sqrt(2))
     angles = np.degrees([np.arctan(7 / 5) - np.pi / 4, np.pi / 4 - np.arctan(4 / 5)])
-    assert scores["spectral_angle_deg"] == pytest.approx(angles.sum() / 24) and scores["spectral_angle_worst_deg"] == pytest.approx(angles.max())
+    assert scores["spectral_angle_deg"] == pytest.approx(angles.sum() / 24) and scores[
+        "spectral_angle_worst_deg"
+    ] == pytest.approx(angles.max())
     np.testing.assert_allclose(against_white(3 * found, truth, 0), found)

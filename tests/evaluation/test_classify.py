@@ -9,7 +9,9 @@ from plenocli.evaluation.metrics.classify import cross_validated, nearest_known,
 
 
 def two_classes(distance, count=3000, seed=0):
-    """Spectra of two patches that differ by `distance` standard deviations along one direction of equal, correlated noise."""
+    """Spectra of two patches that differ by `distance` standard deviations along one direction
+    of equal, correlated noise.
+    """
     rng = np.random.default_rng(seed)
     mixing = np.array([[0.01, 0, 0], [0.02, 0.05, 0], [0, 0.03, 0.2]])
     labels = np.repeat([3, 9], count)
@@ -22,7 +24,8 @@ def test_two_gaussian_patches_are_told_apart_as_often_as_can_be(distance):
     pytest.importorskip("sklearn")
     best = 0.5 * (1 + erf(distance / 2 / sqrt(2)))
     spectra, labels = two_classes(distance)
-    assert cross_validated(spectra, labels) == pytest.approx(best, abs=0.02)  # 6 000 draws tell 0.006
+    # 6 000 draws tell 0.006
+    assert cross_validated(spectra, labels) == pytest.approx(best, abs=0.02)
     known = {3: np.full(3, 0.4), 9: spectra[labels == 9].mean(axis=0)}
     assert nearest_known(spectra, labels, known) < best  # blind to how noise is correlated
 
@@ -30,7 +33,8 @@ def test_two_gaussian_patches_are_told_apart_as_often_as_can_be(distance):
 def test_training_lenslets_do_not_judge_themselves():
     pytest.importorskip("sklearn")
     rng = np.random.default_rng(1)
-    assert cross_validated(rng.normal(size=(240, 12)), np.arange(240) % 24) < 0.15  # chance is 1 in 24
+    # chance is 1 in 24
+    assert cross_validated(rng.normal(size=(240, 12)), np.arange(240) % 24) < 0.15
 
 
 def test_lonely_patches_are_left_out():

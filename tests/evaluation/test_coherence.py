@@ -30,15 +30,21 @@ def test_two_orthobases_reach_their_known_coherence():
 
 def test_the_simplex_meets_the_welch_bound():
     n = 5
-    simplex = np.linalg.svd(np.eye(n + 1) - 1 / (n + 1))[0][:, :n].T  # n + 1 vectors in n dimensions
+    # n + 1 vectors in n dimensions
+    simplex = np.linalg.svd(np.eye(n + 1) - 1 / (n + 1))[0][:, :n].T
     found = coherence(np.eye(n), simplex)
-    assert found["coherence_effective"] == pytest.approx(welch_bound(n + 1, n)) == pytest.approx(1 / n)
+    assert (
+        found["coherence_effective"] == pytest.approx(welch_bound(n + 1, n)) == pytest.approx(1 / n)
+    )
 
 
 def test_scales_change_only_the_raw_measure():
     rng = np.random.default_rng(0)
     system, atoms = rng.standard_normal((20, 12)), rng.standard_normal((12, 30))
-    plain, scaled = coherence(system, atoms), coherence(100 * system, atoms * rng.uniform(0.5, 2, 30))
+    plain, scaled = (
+        coherence(system, atoms),
+        coherence(100 * system, atoms * rng.uniform(0.5, 2, 30)),
+    )
     for key in ("coherence_candes_romberg", "coherence_effective", "coherence_effective_mean"):
         assert scaled[key] == pytest.approx(plain[key])
     assert scaled["coherence_raw"] > 10 * plain["coherence_raw"]

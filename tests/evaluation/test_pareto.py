@@ -8,13 +8,17 @@ from plenocli.evaluation.metrics.pareto import front
 
 def brute_force(values, signs):
     """By the definition: nobody is at least as good everywhere and better somewhere."""
+
     def beats(a, b):
         better = [s * x > s * y for x, y, s in zip(a, b, signs)]
         worse = [s * x < s * y for x, y, s in zip(a, b, signs)]
         return any(better) and not any(worse)
 
     whole = [not any(v != v for v in row) for row in values]
-    return [w and not any(beats(other, row) for other, o in zip(values, whole) if o) for row, w in zip(values, whole)]
+    return [
+        w and not any(beats(other, row) for other, o in zip(values, whole) if o)
+        for row, w in zip(values, whole)
+    ]
 
 
 @pytest.mark.parametrize("seed", range(12))

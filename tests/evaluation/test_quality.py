@@ -37,9 +37,18 @@ def test_ssim_has_the_settings_it_claims():
     rng = np.random.default_rng(1)
     truth = rng.random((40, 50))
     estimate = truth + 0.1 * rng.standard_normal(truth.shape)
-    expected = structural_similarity(truth, estimate, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False)
+    expected = structural_similarity(
+        truth,
+        estimate,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
     assert quality.ssim(estimate, truth) == pytest.approx(expected)
-    assert quality.ssim(np.stack([estimate, truth]), np.stack([truth, truth])) == pytest.approx((expected + 1) / 2)
+    assert quality.ssim(np.stack([estimate, truth]), np.stack([truth, truth])) == pytest.approx(
+        (expected + 1) / 2
+    )
     assert quality.ssim(truth[:10], truth[:10]) is None
 
 

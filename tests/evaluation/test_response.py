@@ -20,15 +20,22 @@ def test_gains_divide_out_and_errors_are_relative():
     np.testing.assert_allclose(found["response_gain_per_band"], gains, rtol=2e-4)
     np.testing.assert_allclose(found["response_error_per_band"], 0.01, rtol=1e-3)
     np.testing.assert_allclose(found["response_error_lenslet_per_band"], 0.01, rtol=1e-3)
-    np.testing.assert_allclose(found["response_pixel_per_band"], np.abs(error).max(axis=0) / mean.max(axis=0), rtol=0.02)
+    np.testing.assert_allclose(
+        found["response_pixel_per_band"], np.abs(error).max(axis=0) / mean.max(axis=0), rtol=0.02
+    )
     assert set(found) == set(DEFINITIONS)
 
 
 def test_noise_counts_for_single_lenslets_and_not_for_their_mean():
     many = np.repeat(TRUTH, 40, axis=0)
     found = score_response(many, many + RNG.normal(0, 0.2, many.shape))
-    single, mean = np.array(found["response_error_lenslet_per_band"]), np.array(found["response_error_per_band"])
-    np.testing.assert_allclose(single, 0.2 * np.sqrt(40) / np.linalg.norm(many, axis=1).mean(axis=0), rtol=0.1)
+    single, mean = (
+        np.array(found["response_error_lenslet_per_band"]),
+        np.array(found["response_error_per_band"]),
+    )
+    np.testing.assert_allclose(
+        single, 0.2 * np.sqrt(40) / np.linalg.norm(many, axis=1).mean(axis=0), rtol=0.1
+    )
     np.testing.assert_allclose(mean, single / np.sqrt(len(many)), rtol=0.3)
 
 
@@ -43,7 +50,15 @@ def test_dead_pixels_are_left_out():
     broken[:, 7] = np.nan
     broken[2, 9, 1] = np.nan
     error, gain, mean = response_error(broken, TRUTH)
-    assert np.isnan(error[7]).all() and np.isfinite(np.delete(error, 7, axis=0)).all() and np.isnan(mean[7]).all()
+    assert (
+        np.isnan(error[7]).all()
+        and np.isfinite(np.delete(error, 7, axis=0)).all()
+        and np.isnan(mean[7]).all()
+    )
     np.testing.assert_allclose(gain, 1)
     found = score_response(broken, TRUTH)
-    assert max(found["response_error_per_band"]) < 1e-12 and max(found["response_error_lenslet_per_band"]) < 1e-12 and found["response_leak"] < 1e-9
+    assert (
+        max(found["response_error_per_band"]) < 1e-12
+        and max(found["response_error_lenslet_per_band"]) < 1e-12
+        and found["response_leak"] < 1e-9
+    )

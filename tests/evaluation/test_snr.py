@@ -9,7 +9,9 @@ def test_capture_snr_over_frames_sees_time_and_not_space():
     shading = np.linspace(0.5, 1.5, 400)
     frames = shading + 0.01 * rng.standard_normal((16, 2, 400)) * np.array([1, 3])[:, None]
     np.testing.assert_allclose(snr.snr_capture(frames), [40, 40 - 20 * np.log10(3)], atol=0.3)
-    np.testing.assert_allclose(snr.snr_capture(frames[:1]), 20 * np.log10(1 / shading.std()), atol=0.1)
+    np.testing.assert_allclose(
+        snr.snr_capture(frames[:1]), 20 * np.log10(1 / shading.std()), atol=0.1
+    )
 
 
 def test_two_frames_are_their_difference_over_root_two():
@@ -29,7 +31,9 @@ def test_sensor_snr_takes_the_power_and_not_the_variance():
     signal = 1 + 0.1 * np.random.default_rng(2).standard_normal(200000)
     assert snr.snr_sensor(signal, 1e-3) == pytest.approx(60 + 10 * np.log10(1.01), abs=0.01)
     noisy = signal + 0.5 * np.random.default_rng(3).standard_normal(signal.size)
-    assert snr.snr_sensor(noisy, 0.5, noisy=True) == pytest.approx(snr.snr_sensor(signal, 0.5), abs=0.03)
+    assert snr.snr_sensor(noisy, 0.5, noisy=True) == pytest.approx(
+        snr.snr_sensor(signal, 0.5), abs=0.03
+    )
     assert snr.snr_sensor(signal, 10.0, noisy=True) == -np.inf
 
 

@@ -9,7 +9,9 @@ WAVELENGTHS = np.array([450, 540, 570, 650]) * 1e-9
 
 def test_rmse_per_band_is_by_band():
     truth = np.zeros((5, 7, 3))
-    np.testing.assert_allclose(spectral.rmse_per_band(truth + [0.1, 0.0, -0.3], truth), [0.1, 0.0, 0.3])
+    np.testing.assert_allclose(
+        spectral.rmse_per_band(truth + [0.1, 0.0, -0.3], truth), [0.1, 0.0, 0.3]
+    )
 
 
 @pytest.mark.parametrize("angle", [0, 1e-9, 1e-3, 1.0, np.pi / 2])
@@ -29,7 +31,9 @@ def test_angle_is_blind_to_brightness_and_defined_for_zero():
 def test_colour_difference_of_equal_spectra_is_zero_and_of_black_and_white_is_100():
     spectra = colorchecker(WAVELENGTHS)[2]
     assert spectral.colour_difference(WAVELENGTHS, spectra, spectra).max() < 1e-9
-    assert spectral.colour_difference(WAVELENGTHS, np.ones(4), np.zeros(4)) == pytest.approx(100, abs=1e-6)
+    assert spectral.colour_difference(WAVELENGTHS, np.ones(4), np.zeros(4)) == pytest.approx(
+        100, abs=1e-6
+    )
 
 
 def test_cube_scores_leave_invalid_lenslets_out():

@@ -1,4 +1,6 @@
-"""Batches of captures: killed without warning and run again, bad files among good ones, threads, one writer."""
+"""Batches of captures: killed without warning and run again, bad files among good ones,
+threads, one writer.
+"""
 
 import os
 import signal
@@ -10,11 +12,11 @@ import time
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.execution.batch import outcomes, plan_batch, summarise
-from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.execution.pool import open_pool
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
 
 PITCH, COUNT, FILES = 12, 9, 14
@@ -24,11 +26,20 @@ def capture(path, radiance, seed):
     """Lenslets with two bands, one a half, and noise."""
     y, x = np.indices((PITCH, PITCH)) - (PITCH - 1) / 2
     edge = np.clip((5.2 - np.abs(y)) / 1.5, 0, 1) * np.clip((5.2 - np.abs(x)) / 1.5, 0, 1)
-    response = 1000 * edge[..., None] * np.where((x > 0)[..., None] == (np.arange(2) == 1), 0.97, 0.03)
-    image = np.einsum("rcb,yxb->rycx", np.broadcast_to(radiance, (COUNT, COUNT, 2)), response).reshape(COUNT * PITCH, -1)
-    values = np.rint(100 + image + np.random.default_rng(seed).normal(0, 2.0, image.shape)).astype(np.uint16)
+    response = (
+        1000 * edge[..., None] * np.where((x > 0)[..., None] == (np.arange(2) == 1), 0.97, 0.03)
+    )
+    image = np.einsum(
+        "rcb,yxb->rycx", np.broadcast_to(radiance, (COUNT, COUNT, 2)), response
+    ).reshape(COUNT * PITCH, -1)
+    values = np.rint(100 + image + np.random.default_rng(seed).normal(0, 2.0, image.shape)).astype(
+        np.uint16
+    )
     attrs = dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1, gain_e_per_dn=4.0)
-    write_artefact(path, Artefact("capture", {"capture/mosaic": values, "capture/cfa": "mono"}, {"capture": attrs}))
+    write_artefact(
+        path,
+        Artefact("capture", {"capture/mosaic": values, "capture/cfa": "mono"}, {"capture": attrs}),
+    )
     return path
 
 
@@ -36,10 +47,15 @@ def capture(path, radiance, seed):
 def folder(tmp_path_factory):
     """Captures, a calibration, and the results of a run that nobody interrupted, in `whole`."""
     folder = tmp_path_factory.mktemp("batch")
-    bands = [(w, capture(folder / f"b{k}.h5", np.eye(2)[k], k)) for k, w in enumerate((480e-9, 620e-9))]
+    bands = [
+        (w, capture(folder / f"b{k}.h5", np.eye(2)[k], k)) for k, w in enumerate((480e-9, 620e-9))
+    ]
     run_calibrate(folder / "c.h5", whites=[capture(folder / "white.h5", 1.0, 5)], bands=bands)
     rng = np.random.default_rng(1)
-    shots = [capture(folder / f"shot{i:02d}.h5", rng.uniform(0.1, 0.9, (COUNT, COUNT, 2)), 10 + i) for i in range(FILES)]
+    shots = [
+        capture(folder / f"shot{i:02d}.h5", rng.uniform(0.1, 0.9, (COUNT, COUNT, 2)), 10 + i)
+        for i in range(FILES)
+    ]
     run_demux(shots, folder / "whole", calibration=folder / "c.h5", suffix=".exr")
     return folder
 
@@ -50,13 +66,27 @@ def shots(folder):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path, seed):
-    """Killed at a random moment after a random number of results, then run again: the same bytes, finished files untouched."""
+    """Killed at a random moment after a random number of results, then run again: the same
+    bytes, finished files untouched.
+    """
     rng, out = np.random.default_rng(seed), tmp_path / "out"
-    code = (f"from pathlib import Path; from plenocli.stages.inverse.demux import Settings, run_demux; f = Path({str(folder)!r}); "
-            f"run_demux(sorted(f.glob('shot*.h5')), Path({str(out)!r}), calibration=f / 'c.h5', suffix='.exr', workers={1 + seed % 2})")
-    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True)
+    code = (
+        "from pathlib import Path; from plenocli.stages.inverse.demux import Settings, run_demux; "
+        f"f = Path({str(folder)!r}); run_demux(sorted(f.glob('shot*.h5')), Path({str(out)!r}), "
+        f"calibration=f / 'c.h5', suffix='.exr', workers={1 + seed % 2})"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
     wanted, deadline = int(rng.integers(1, FILES - 3)), time.monotonic() + 300
-    while child.poll() is None and time.monotonic() < deadline and len(list(out.glob("*.exr"))) < wanted:
+    while (
+        child.poll() is None
+        and time.monotonic() < deadline
+        and len(list(out.glob("*.exr"))) < wanted
+    ):
         time.sleep(0.001)
     time.sleep(rng.uniform(0, 0.05))
     os.killpg(child.pid, signal.SIGKILL)
@@ -68,7 +98,10 @@ def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path
     report = run_demux(shots(folder), out, calibration=folder / "c.h5", suffix=".exr", workers=2)
     assert (report["done"], report["skipped"]) == (FILES - len(before), len(before))
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in before.items())
-    assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in (folder / "whole").iterdir())  # nothing half-written is left
+    # nothing half-written is left
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        p.name for p in (folder / "whole").iterdir()
+    )
     for path in out.iterdir():
         assert path.read_bytes() == (folder / "whole" / path.name).read_bytes()
 
@@ -76,14 +109,24 @@ def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path
 @pytest.mark.parametrize("suffix", [".exr", ".h5"])
 def test_finished_results_of_another_recipe_stay_and_are_named(folder, tmp_path, suffix, capsys):
     def rerun(**settings):
-        report = run_demux(shots(folder)[:3], tmp_path / "out", calibration=folder / "c.h5", suffix=suffix, settings=Settings(**settings))
+        report = run_demux(
+            shots(folder)[:3],
+            tmp_path / "out",
+            calibration=folder / "c.h5",
+            suffix=suffix,
+            settings=Settings(**settings),
+        )
         return report["done"], report["skipped"], capsys.readouterr().err
 
     assert rerun()[:2] == (3, 0)
     assert rerun() == (0, 3, "")
     for other in (dict(method="pinv"), dict(register="off"), dict(reference=folder / "white.h5")):
         done, skipped, said = rerun(**other)
-        assert (done, skipped) == (0, 3) and "3 of 3 finished results" in said and "--overwrite" in said
+        assert (
+            (done, skipped) == (0, 3)
+            and "3 of 3 finished results" in said
+            and "--overwrite" in said
+        )
     (tmp_path / "out" / f"shot01{suffix}").write_bytes(b"torn")
     assert "1 of 3 finished results" in rerun()[2]
 
@@ -94,16 +137,24 @@ def test_a_bad_file_stops_no_other(folder, tmp_path, workers, capsys):
     bad.write_bytes(shots(folder)[0].read_bytes()[:-40])
     files = [*shots(folder)[:3], bad, tmp_path / "missing.h5", *shots(folder)[3:6]]
     with pytest.raises(InputError, match="2 of 8 captures failed: bad.h5, missing.h5"):
-        run_demux(files, tmp_path / "out", calibration=folder / "c.h5", suffix=".h5", workers=workers)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [p.name for p in shots(folder)[:6]]
+        run_demux(
+            files, tmp_path / "out", calibration=folder / "c.h5", suffix=".h5", workers=workers
+        )
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        p.name for p in shots(folder)[:6]
+    ]
     err = capsys.readouterr().err
     assert str(bad) in err and "missing.h5" in err
 
 
 def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
-    """Work of several captures at the same time, in other threads; writing in this one, and reports in the order of captures."""
+    """Work of several captures at the same time, in other threads; writing in this one, and
+    reports in the order of captures.
+    """
     captures = [tmp_path / f"{i:02d}.x" for i in range(12)]
-    batch = plan_batch(captures, tmp_path / "out", ".h5", "numbers are", overwrite=False, inputs=captures)
+    batch = plan_batch(
+        captures, tmp_path / "out", ".h5", "numbers are", overwrite=False, inputs=captures
+    )
     both, held, most = threading.Barrier(2), [], [0]
 
     def work(capture):
@@ -114,7 +165,10 @@ def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
         return threading.get_ident()
 
     def write(thread, capture, target):
-        assert thread != threading.get_ident() and threading.current_thread() is threading.main_thread()
+        assert (
+            thread != threading.get_ident()
+            and threading.current_thread() is threading.main_thread()
+        )
         most[0] = max(most[0], len(held))
         held.remove(capture)
         return int(capture.stem)
@@ -130,6 +184,8 @@ def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
 
 def test_a_fault_of_ours_ends_the_batch_with_its_traceback(tmp_path):
     captures = [tmp_path / f"{i}.x" for i in range(4)]
-    batch = plan_batch(captures, tmp_path / "out", ".h5", "numbers are", overwrite=False, inputs=captures)
+    batch = plan_batch(
+        captures, tmp_path / "out", ".h5", "numbers are", overwrite=False, inputs=captures
+    )
     with pytest.raises(ZeroDivisionError), open_pool(2, threads=True) as pool:
         list(outcomes(batch, pool, lambda capture: 1 / 0, lambda *_: None))

@@ -1,4 +1,6 @@
-"""Pools: the same results from this process, threads and processes; workers that die; children that go with their parent."""
+"""Pools: the same results from this process, threads and processes; workers that die; children
+that go with their parent.
+"""
 
 import os
 import signal
@@ -14,7 +16,7 @@ from plenocli.base.progress import heard, note
 from plenocli.execution.pool import Lost, open_pool, run_all
 
 HERE = "tests_scheduler_tasks"  # a module that processes find by its name
-TASKS = '''
+TASKS = """
 import os, signal, time
 from pathlib import Path
 from plenocli.base.errors import InputError
@@ -50,7 +52,7 @@ def die(path):
 def sleep(path):
     Path(path, str(os.getpid())).touch()
     time.sleep(600)
-'''
+"""
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +101,16 @@ def test_linear_algebra_has_one_thread_everywhere(tasks, monkeypatch):
 def test_a_process_that_dies_takes_no_result_along(tasks, tmp_path):
     with open_pool(2) as pool:
         jobs = [(n, tasks.square, n) for n in range(4)]
-        found = dict(run_all(pool, [*jobs, ("x", tasks.die_once, str(tmp_path / "x")), *((n + 4, f, n + 4) for n, f, _ in jobs)]))
+        found = dict(
+            run_all(
+                pool,
+                [
+                    *jobs,
+                    ("x", tasks.die_once, str(tmp_path / "x")),
+                    *((n + 4, f, n + 4) for n, f, _ in jobs),
+                ],
+            )
+        )
     assert found == {n: n * n for n in range(8)} | {"x": "alive"}
 
 
@@ -117,12 +128,19 @@ def test_tasks_may_be_handed_in_while_processes_die(tasks, tmp_path):
 
 def test_a_task_that_kills_every_process_is_lost_alone(tasks):
     with open_pool(2) as pool:
-        found = dict(run_all(pool, [(name, tasks.die, name) for name in ("a", "b", "deadly", "c", "d")]))
+        found = dict(
+            run_all(pool, [(name, tasks.die, name) for name in ("a", "b", "deadly", "c", "d")])
+        )
     assert isinstance(found.pop("deadly"), Lost) and found == {name: name for name in "abcd"}
 
 
 def test_processes_go_with_their_parent(tasks, tmp_path):
-    code = f"import {HERE}; from plenocli.execution.pool import open_pool, run_all\nif __name__ == '__main__':\n    with open_pool(2) as pool: list(run_all(pool, [(n, {HERE}.sleep, {str(tmp_path)!r}) for n in (1, 2)]))"
+    code = (
+        f"import {HERE}; from plenocli.execution.pool import open_pool, run_all\n"
+        "if __name__ == '__main__':\n"
+        f"    with open_pool(2) as pool: list(run_all(pool, [(n, {HERE}.sleep, "
+        f"{str(tmp_path)!r}) for n in (1, 2)]))"
+    )
     script = tmp_path / "main.py"
     script.write_text(code)
     parent = subprocess.Popen([sys.executable, script], start_new_session=True)
@@ -183,4 +201,8 @@ def test_a_worker_without_what_the_task_needs_is_told_to_install_it():
     from plenocli.execution.pool import _trouble
 
     error = _trouble(ModuleNotFoundError("No module named 'plenocli'"))
-    assert isinstance(error, UsageError) and "cannot load the task (No module named 'plenocli')" in str(error) and "install" in error.fix
+    assert (
+        isinstance(error, UsageError)
+        and "cannot load the task (No module named 'plenocli')" in str(error)
+        and "install" in error.fix
+    )

@@ -1,6 +1,7 @@
 """One small file of every kind, made by the commands themselves, and the size of the campaigns.
 
-By default each test does a seeded share of its campaign; `pytest --campaign` (make faults) does all of it.
+By default each test does a seeded share of its campaign; `pytest --campaign` (make
+faults) does all of it.
 """
 
 import fcntl
@@ -40,9 +41,11 @@ def runner():
 
 @pytest.fixture(scope="session")
 def stages(tmp_path_factory, runner):
-    """(folder, stages): a folder with one file of each kind, and for each command the arguments that make its result again.
+    """(folder, stages): a folder with one file of each kind, and for each command the arguments
+    that make its result again.
 
-    stages: name -> (arguments without -o, name of the result). The processes of a parallel run share one folder: look, never touch.
+    stages: name -> (arguments without -o, name of the result). The processes of a parallel run
+    share one folder: look, never touch.
     """
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
@@ -70,7 +73,9 @@ def make_all(folder, runner):
 
 
 def write_shards(folder, name, groups):
-    """The 3x3 matrix in a file for each group of its lenslets, and their index: cameras for which the stage does so are too large for these tests."""
+    """The 3x3 matrix in a file for each group of its lenslets, and their index: cameras for
+    which the stage does so are too large for these tests.
+    """
     from plenocli.files.artefacts.shards import read_pif, writing_pif
 
     whole = read_pif(folder / "pif-3x3.h5")
@@ -85,7 +90,12 @@ def write_shards(folder, name, groups):
 
 def _spectral_camera():
     """The demo's camera with few lenslets and two colours."""
-    text = (SAMPLES / "demo_spectral.toml").read_text().replace("count = [20, 30]", "count = [6, 7]").replace("samples_per_lenslet = [3, 3]", "samples_per_lenslet = [2, 2]")
+    text = (
+        (SAMPLES / "demo_spectral.toml")
+        .read_text()
+        .replace("count = [20, 30]", "count = [6, 7]")
+        .replace("samples_per_lenslet = [3, 3]", "samples_per_lenslet = [2, 2]")
+    )
     assert "[6, 7]" in text and "[2, 2]" in text
     return text
 
@@ -104,21 +114,113 @@ def _write_pictures(folder):
 def _steps():
     quick = ["--model", "ray", "--superpixels", "1x1"]
     bands = [f"{nm}nm" for nm in (450, 540, 570, 650)]
-    take = {f"band-{b}": (["capture-sim", "colour.toml", *quick, "--target", f"mono:{b}", "--seed", "3"], f"{b}.dng") for b in bands}
-    take |= {t: (["capture-sim", "colour.toml", *quick, "--target", t, "--seed", "4"], f"{t}.dng") for t in ("white", "dark", "colorchecker")}
+    take = {
+        f"band-{b}": (
+            ["capture-sim", "colour.toml", *quick, "--target", f"mono:{b}", "--seed", "3"],
+            f"{b}.dng",
+        )
+        for b in bands
+    }
+    take |= {
+        t: (["capture-sim", "colour.toml", *quick, "--target", t, "--seed", "4"], f"{t}.dng")
+        for t in ("white", "dark", "colorchecker")
+    }
     return {
-        "simulate-pif": (["simulate-pif", "camera.toml", "--superpixels", "1x1", "--coherent-ring", "0"], "pif.h5"),
-        "simulate-pif 3x3": (["simulate-pif", "camera.toml", "--superpixels", "3x3", "--coherent-ring", "1"], "pif-3x3.h5"),
-        "capture-sim": (["capture-sim", "camera.toml", "--pif", "pif.h5", "--scene", "photo.png", "--snr", "50dB"], "capture.h5"),
-        "capture-sim exr": (["capture-sim", "camera.toml", "--pif", "pif.h5", "--scene", "photo.png", "--snr", "50dB"], "capture.exr"),
+        "simulate-pif": (
+            ["simulate-pif", "camera.toml", "--superpixels", "1x1", "--coherent-ring", "0"],
+            "pif.h5",
+        ),
+        "simulate-pif 3x3": (
+            ["simulate-pif", "camera.toml", "--superpixels", "3x3", "--coherent-ring", "1"],
+            "pif-3x3.h5",
+        ),
+        "capture-sim": (
+            [
+                "capture-sim",
+                "camera.toml",
+                "--pif",
+                "pif.h5",
+                "--scene",
+                "photo.png",
+                "--snr",
+                "50dB",
+            ],
+            "capture.h5",
+        ),
+        "capture-sim exr": (
+            [
+                "capture-sim",
+                "camera.toml",
+                "--pif",
+                "pif.h5",
+                "--scene",
+                "photo.png",
+                "--snr",
+                "50dB",
+            ],
+            "capture.exr",
+        ),
         **take,
-        "simulate-response": (["simulate-response", "colour.toml", "--model", "ray"], "predicted.h5"),
-        "calibrate": (["calibrate", "--white", "white.dng", "--dark", "dark.dng", *(w for b in bands for w in ("--band", f"{b}={b}.dng"))], "calibration.h5"),
-        "demux": (["demux", "colorchecker.dng", "--calibration", "calibration.h5", "--reference", "white.dng"], "spectra.h5"),
-        "demux exr": (["demux", "colorchecker.dng", "--calibration", "calibration.h5", "--reference", "white.dng"], "spectra.exr"),
-        "learn-dict": (["learn-dict", "photo.png", "--pif", "pif.h5", "--atoms", "80", "--batch", "64", "--iterations", "2"], "dictionary.h5"),
-        "reconstruct": (["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"], "image.h5"),
-        "reconstruct exr": (["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"], "image.exr"),
+        "simulate-response": (
+            ["simulate-response", "colour.toml", "--model", "ray"],
+            "predicted.h5",
+        ),
+        "calibrate": (
+            [
+                "calibrate",
+                "--white",
+                "white.dng",
+                "--dark",
+                "dark.dng",
+                *(w for b in bands for w in ("--band", f"{b}={b}.dng")),
+            ],
+            "calibration.h5",
+        ),
+        "demux": (
+            [
+                "demux",
+                "colorchecker.dng",
+                "--calibration",
+                "calibration.h5",
+                "--reference",
+                "white.dng",
+            ],
+            "spectra.h5",
+        ),
+        "demux exr": (
+            [
+                "demux",
+                "colorchecker.dng",
+                "--calibration",
+                "calibration.h5",
+                "--reference",
+                "white.dng",
+            ],
+            "spectra.exr",
+        ),
+        "learn-dict": (
+            [
+                "learn-dict",
+                "photo.png",
+                "--pif",
+                "pif.h5",
+                "--atoms",
+                "80",
+                "--batch",
+                "64",
+                "--iterations",
+                "2",
+            ],
+            "dictionary.h5",
+        ),
+        "reconstruct": (
+            ["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"],
+            "image.h5",
+        ),
+        "reconstruct exr": (
+            ["reconstruct", "capture.h5", "--pif", "pif.h5", "--method", "tikhonov"],
+            "image.exr",
+        ),
         "refocus": (["refocus", "capture.h5", "--planes", "3"], "planes.h5"),
         "score": (["score", "image.h5", "--truth", "capture.h5"], "score.json"),
         "show": (["show", "image.h5"], "image.png"),

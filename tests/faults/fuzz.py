@@ -1,8 +1,9 @@
-"""Coverage-guided fuzzing of the readers: nothing but plenocli's own errors may come out, within 10 s and 2 GiB.
+"""Coverage-guided fuzzing of the readers: nothing but plenocli's own errors may come out,
+within 10 s and 2 GiB.
 
-Run from the project's root (extra [fuzz], `make fuzz`): python tests/faults/fuzz.py --seconds 600 --run runs/fuzz
-Each reader gets an equal share of the time in a process of its own, which starts from the small files of the fault tests; what
-breaks one stays in RUN. Exit 1 where anything did.
+Run from the project's root (extra [fuzz], `make fuzz`): python tests/faults/fuzz.py --seconds 600
+--run runs/fuzz Each reader gets an equal share of the time in a process of its own, which starts
+from the small files of the fault tests; what breaks one stays in RUN. Exit 1 where anything did.
 """
 
 import argparse
@@ -16,7 +17,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
-LIMITS = ["-timeout=10", "-rss_limit_mb=2048", "-max_len=60000", "-len_control=0", "-print_final_stats=1", "-verbosity=0"]
+LIMITS = [
+    "-timeout=10",
+    "-rss_limit_mb=2048",
+    "-max_len=60000",
+    "-len_control=0",
+    "-print_final_stats=1",
+    "-verbosity=0",
+]
 
 
 def artefact(path, data):
@@ -28,9 +36,10 @@ def artefact(path, data):
 
 
 def sealed(path, data):
-    """Files of someone who knows how to make a digest: links, filters, sizes and tables are all there is against them."""
-    from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC
+    """Files of someone who knows how to make a digest: links, filters, sizes and tables are all
+    there is against them.
+    """
+    from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, read_artefact
 
     image = data[HEADER_BYTES:]
     head = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
@@ -61,11 +70,11 @@ def notes(path, data):
 
 def description(path, data):
     """TOML of cameras, scenes, sweeps and lenses."""
+    from plenocli.base.errors import PlenoError
     from plenocli.files.config.camera_file import load_camera
     from plenocli.files.config.lens_file import load_lens
     from plenocli.files.config.scene_file import load_scene
     from plenocli.files.config.sweep_file import load_sweep, points
-    from plenocli.base.errors import PlenoError
 
     path.write_bytes(data)
     for load in (load_camera, load_scene, load_lens):
@@ -84,8 +93,26 @@ def score(path, data):
     _score_document(path)
 
 
-READERS = {"artefact": (artefact, ("*.h5",)), "sealed": (sealed, ("capture.h5", "score*.h5", "spectra.h5", "shards.h5", "image.h5", "predicted.h5", "sweep.h5")), "exr": (exr, ("*.exr",)),
-           "photograph": (photograph, ("photo.*",)), "notes": (notes, ("*.dng",)), "description": (description, ("*.toml",)), "score": (score, ("*.json",))}
+READERS = {
+    "artefact": (artefact, ("*.h5",)),
+    "sealed": (
+        sealed,
+        (
+            "capture.h5",
+            "score*.h5",
+            "spectra.h5",
+            "shards.h5",
+            "image.h5",
+            "predicted.h5",
+            "sweep.h5",
+        ),
+    ),
+    "exr": (exr, ("*.exr",)),
+    "photograph": (photograph, ("photo.*",)),
+    "notes": (notes, ("*.dng",)),
+    "description": (description, ("*.toml",)),
+    "score": (score, ("*.json",)),
+}
 
 
 def work(name, arguments):
@@ -94,22 +121,27 @@ def work(name, arguments):
 
     with atheris.instrument_imports(include=["plenocli", "json", "tomllib"]):
         import plenocli.files.artefacts.container
-        import plenocli.files.images.dng
-        import plenocli.files.images.exr
-        import plenocli.files.images.pictures
         import plenocli.files.config.lens_file
         import plenocli.files.config.scene_file
         import plenocli.files.config.sweep_file
+        import plenocli.files.images.dng
+        import plenocli.files.images.exr
+        import plenocli.files.images.pictures
         import plenocli.files.read.run_folder  # noqa: F401
     from plenocli.base.errors import PlenoError
 
-    read, path = READERS[name][0], Path(tempfile.mkdtemp(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)) / "input"
+    read, path = (
+        READERS[name][0],
+        Path(tempfile.mkdtemp(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)) / "input",
+    )
 
     def once(data):
         try:
             read(path, data)
         except PlenoError as error:
-            assert str(path) in str(error) or path.name in str(error) or "\n" in str(error), f"the file is not named: {error}"
+            assert str(path) in str(error) or path.name in str(error) or "\n" in str(error), (
+                f"the file is not named: {error}"
+            )
 
     atheris.Setup([sys.argv[0], *arguments], once)
     atheris.Fuzz()
@@ -137,13 +169,35 @@ def main():
             kept.mkdir(exist_ok=True)
             for path in (p for pattern in READERS[name][1] for p in samples.glob(pattern)):
                 (corpus / path.name).write_bytes(path.read_bytes())
-            command = [sys.executable, __file__, "--work", name, str(corpus), f"-max_total_time={options.seconds // len(names)}", f"-artifact_prefix={kept}/", *LIMITS]
-            done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=os.environ | {"OMP_NUM_THREADS": "1"})
+            command = [
+                sys.executable,
+                __file__,
+                "--work",
+                name,
+                str(corpus),
+                f"-max_total_time={options.seconds // len(names)}",
+                f"-artifact_prefix={kept}/",
+                *LIMITS,
+            ]
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
+            )
             (kept / "log.txt").write_text(done.stdout + done.stderr)
             tried = re.search(r"number_of_executed_units:\s+(\d+)", done.stderr)
             broken = sorted(p.name for p in kept.iterdir() if p.name != "log.txt")
             found += len(broken) + (done.returncode != 0 and not broken)
-            print(f"{name}: {tried[1] if tried else 'unknown'} files tried, {len(list(corpus.iterdir()))} that reach something new, {', '.join(broken) or 'nothing'} found, exit {done.returncode}", flush=True)
+            print(
+                (
+                    f"{name}: {tried[1] if tried else 'unknown'} files tried, "
+                    f"{len(list(corpus.iterdir()))} that reach something new, "
+                    f"{', '.join(broken) or 'nothing'} found, exit {done.returncode}"
+                ),
+                flush=True,
+            )
     sys.exit(found > 0)
 
 

@@ -1,10 +1,14 @@
-"""Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line. See harness.py.
+"""Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line.
 
-A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, or "False" for what it returns, "lasting": whether all later
-calls fail too, "of": another module that holds the function}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a file may have}; {"call": "memory", "nth":
-bytes of memory beyond what is in use}; {"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a part;
-{"call": "without", "module": name}, a module that is not installed. With {"places": True} the notes also say where messages
-are made, as file:line words.
+See harness.py.
+
+A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, or
+"False" for what it returns, "lasting": whether all later calls fail too, "of": another module that
+holds the function}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a
+file may have}; {"call": "memory", "nth": bytes of memory beyond what is in use}; {"call": "array"},
+the nth numpy array gets no memory; {"call": "short"}, writes that take only a part; {"call":
+"without", "module": name}, a module that is not installed. With {"places": True} the notes also say
+where messages are made, as file:line words.
 """
 
 import errno
@@ -39,7 +43,7 @@ def _import_everything():
     for module in pkgutil.walk_packages(plenocli.__path__, "plenocli."):
         if not module.name.endswith(("__main__", "raw_child")):
             importlib.import_module(module.name)
-    import h5py, numpy, OpenImageIO, scipy.linalg, scipy.ndimage, scipy.optimize  # noqa: E401, F401
+    import h5py  # noqa: F401
 
 
 def _serve(request):
@@ -57,8 +61,14 @@ def _serve(request):
     if not ended:
         os.killpg(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    answer = {"code": os.waitstatus_to_exitcode(status), "text": _drain(heard, said).decode("utf-8", "replace"), "seconds": time.perf_counter() - start, "cpu": usage.ru_utime + usage.ru_stime,
-              "grown": max(0, usage.ru_maxrss - before) * 1024, "hung": not ended and request["kill_after"] is None}
+    answer = {
+        "code": os.waitstatus_to_exitcode(status),
+        "text": _drain(heard, said).decode("utf-8", "replace"),
+        "seconds": time.perf_counter() - start,
+        "cpu": usage.ru_utime + usage.ru_stime,
+        "grown": max(0, usage.ru_maxrss - before) * 1024,
+        "hung": not ended and request["kill_after"] is None,
+    }
     os.close(handle)
     notes = _drain(noticed, fired).decode()
     return answer | {"fired": bool(notes), "notes": notes}
@@ -119,8 +129,11 @@ def _arm(fault, fired):
     if fault["call"] == "memory":
         with open("/proc/self/status") as table:
             used = next(int(line.split()[1]) << 10 for line in table if line.startswith("VmData"))
-        # not of the address space: that would take the stack too, without which nothing can be told to anyone
-        return resource.setrlimit(resource.RLIMIT_DATA, (used + fault["nth"], resource.RLIM_INFINITY))
+        # not of the address space: that would take the stack too, without which nothing
+        # can be told to anyone
+        return resource.setrlimit(
+            resource.RLIMIT_DATA, (used + fault["nth"], resource.RLIM_INFINITY)
+        )
     if fault["call"] == "array":
         return _arm_arrays(fault["nth"], fault.get("lasting"), fired)
     if fault["call"] == "short":
@@ -171,7 +184,9 @@ def _arm_bytes(room, number, fired):
 
 
 def _arm_arrays(nth, lasting, fired):
-    """numpy's memory comes from functions of ours; the nth piece, and perhaps all that follow, is refused."""
+    """numpy's memory comes from functions of ours; the nth piece, and perhaps all that
+    follow, is refused.
+    """
     import ctypes
 
     import numpy
@@ -189,24 +204,53 @@ def _arm_arrays(nth, lasting, fired):
             _real_write(fired, b"x ")
         return not refused
 
-    kinds = {"malloc": (address, size), "calloc": (address, size, size), "realloc": (address, address, size), "free": (address, address, size)}
-    calls = {"malloc": lambda _, count: libc.malloc(size(count)) if granted() else None, "calloc": lambda _, many, each: libc.calloc(size(many), size(each)) if granted() else None,
-             "realloc": lambda _, old, count: libc.realloc(address(old), size(count)) if granted() else None}
+    kinds = {
+        "malloc": (address, size),
+        "calloc": (address, size, size),
+        "realloc": (address, address, size),
+        "free": (address, address, size),
+    }
+    calls = {
+        "malloc": lambda _, count: libc.malloc(size(count)) if granted() else None,
+        "calloc": lambda _, many, each: libc.calloc(size(many), size(each)) if granted() else None,
+        "realloc": lambda _, old, count: (
+            libc.realloc(address(old), size(count)) if granted() else None
+        ),
+    }
 
-    types = {name: ctypes.CFUNCTYPE(None if name == "free" else address, *arguments) for name, arguments in kinds.items()}
+    types = {
+        name: ctypes.CFUNCTYPE(None if name == "free" else address, *arguments)
+        for name, arguments in kinds.items()
+    }
 
     class Handler(ctypes.Structure):
-        _fields_ = [("name", ctypes.c_char * 127), ("version", ctypes.c_uint8), ("context", address), *types.items()]
+        _fields_ = [
+            ("name", ctypes.c_char * 127),
+            ("version", ctypes.c_uint8),
+            ("context", address),
+            *types.items(),
+        ]
 
     made = {name: types[name](call) for name, call in calls.items()}
-    # nothing is given back: arrays are freed while numpy's exception stands, which a function in Python would lose
+    # nothing is given back: arrays are freed while numpy's exception stands, which a function
+    # in Python would lose
     handler = Handler(b"faulty", 1, None, **made, free=ctypes.cast(libc.getpid, types["free"]))
     python = ctypes.pythonapi
-    python.PyCapsule_New.restype, python.PyCapsule_New.argtypes = ctypes.py_object, [address, ctypes.c_char_p, address]
-    python.PyCapsule_GetPointer.restype, python.PyCapsule_GetPointer.argtypes = address, [ctypes.py_object, ctypes.c_char_p]
-    table = ctypes.cast(python.PyCapsule_GetPointer(numpy._core._multiarray_umath._ARRAY_API, None), ctypes.POINTER(address))
+    python.PyCapsule_New.restype, python.PyCapsule_New.argtypes = (
+        ctypes.py_object,
+        [address, ctypes.c_char_p, address],
+    )
+    python.PyCapsule_GetPointer.restype, python.PyCapsule_GetPointer.argtypes = (
+        address,
+        [ctypes.py_object, ctypes.c_char_p],
+    )
+    table = ctypes.cast(
+        python.PyCapsule_GetPointer(numpy._core._multiarray_umath._ARRAY_API, None),
+        ctypes.POINTER(address),
+    )
     capsule = python.PyCapsule_New(ctypes.addressof(handler), b"mem_handler", None)
-    ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(table[304])(capsule)  # PyDataMem_SetHandler
+    # PyDataMem_SetHandler
+    ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(table[304])(capsule)
     _kept.append((handler, capsule))
 
 
@@ -224,7 +268,7 @@ def _arm_short(fired):
             if _is_console(descriptor):
                 return real(descriptor, view, *rest)
             _real_write(fired, b"x ")
-            return real(descriptor, memoryview(view).cast("B")[:1 + count[0] * 997 % 7000], *rest)
+            return real(descriptor, memoryview(view).cast("B")[: 1 + count[0] * 997 % 7000], *rest)
 
         setattr(os, name, short)
 

@@ -1,4 +1,6 @@
-"""kill -9 at any time: a target is absent or whole, the same command run again gives the same bytes, and nothing is left beside it."""
+"""kill -9 at any time: a target is absent or whole, the same command run again gives the same
+bytes, and nothing is left beside it.
+"""
 
 import os
 import shutil
@@ -16,10 +18,21 @@ from tests.faults.harness import results, tree
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ("simulate-pif", "capture-sim", "white", "reconstruct", "refocus", "score", "sweep")
-LONG = ("simulate-pif 3x3", "simulate-response", "calibrate", "demux", "demux exr", "learn-dict", "reconstruct exr", "show")
+LONG = (
+    "simulate-pif 3x3",
+    "simulate-response",
+    "calibrate",
+    "demux",
+    "demux exr",
+    "learn-dict",
+    "reconstruct exr",
+    "show",
+)
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)])
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+)
 def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campaign, count, name):
     source, steps = stages
     arguments, result = steps[name]
@@ -41,7 +54,8 @@ def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campa
             assert outcome.code == -signal.SIGKILL, outcome
             killed += 1
         left = tree(target.parent)
-        assert all(left.get(file, content) == content for file, content in whole.items())  # absent or whole
+        # absent or whole
+        assert all(left.get(file, content) == content for file, content in whole.items())
         if whole.keys() <= left.keys():
             empty(target.parent)
         assert finished < 1000
@@ -57,12 +71,34 @@ def empty(folder):
 
 @pytest.mark.slow
 def test_make_after_a_kill_gives_the_tree_of_an_uninterrupted_run(tmp_path, campaign, count):
-    """The tiny pipeline, all of its processes killed at once at random times, until it gets through."""
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    """The tiny pipeline, all of its processes killed at once at random times,
+    until it gets through.
+    """
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
 
     def make(run):
-        command = ["make", "-f", "pipelines/spatial.mk", f"RUN={run}", "CONFIG=sample_configs/tiny.toml", "ITERATIONS=2", "BATCH=64", "-j2"]
-        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        command = [
+            "make",
+            "-f",
+            "pipelines/spatial.mk",
+            f"RUN={run}",
+            "CONFIG=sample_configs/tiny.toml",
+            "ITERATIONS=2",
+            "BATCH=64",
+            "-j2",
+        ]
+        return subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
 
     start = time.monotonic()
     assert make(tmp_path / "whole" / "run").wait() == 0
@@ -82,17 +118,41 @@ def test_make_after_a_kill_gives_the_tree_of_an_uninterrupted_run(tmp_path, camp
 
 
 @pytest.mark.slow
-def test_learning_interrupted_at_every_iteration_resumes_to_the_same_dictionary(runner, stages, tmp_path, campaign, count):
+def test_learning_interrupted_at_every_iteration_resumes_to_the_same_dictionary(
+    runner, stages, tmp_path, campaign, count
+):
     source, steps = stages
     most = campaign(4, 20)
     for name in ("photo.png", "pif.h5"):
         (tmp_path / name).symlink_to(source / name)
     start = [word for word in steps["learn-dict"][0] if word not in ("--iterations", "2")]
-    assert runner.run([*start, "--iterations", most, "-o", "whole.h5"], tmp_path, limit=600).code == 0
+    assert (
+        runner.run([*start, "--iterations", most, "-o", "whole.h5"], tmp_path, limit=600).code == 0
+    )
     assert runner.run([*start, "--iterations", 1, "-o", "part.h5"], tmp_path, limit=600).code == 0
     for stop in range(2, most + 1):
-        outcome = runner.run(["learn-dict", "photo.png", "--pif", "pif.h5", "--resume", "part.h5", "--iterations", stop, "-o", "part.h5", "--overwrite"], tmp_path, limit=600)
+        outcome = runner.run(
+            [
+                "learn-dict",
+                "photo.png",
+                "--pif",
+                "pif.h5",
+                "--resume",
+                "part.h5",
+                "--iterations",
+                stop,
+                "-o",
+                "part.h5",
+                "--overwrite",
+            ],
+            tmp_path,
+            limit=600,
+        )
         assert outcome.code == 0, outcome
-    whole, part = (read_artefact(tmp_path / name, "dictionary").data for name in ("whole.h5", "part.h5"))
-    assert set(whole) == set(part) and all(whole[key].tobytes() == part[key].tobytes() for key in whole)
+    whole, part = (
+        read_artefact(tmp_path / name, "dictionary").data for name in ("whole.h5", "part.h5")
+    )
+    assert set(whole) == set(part) and all(
+        whole[key].tobytes() == part[key].tobytes() for key in whole
+    )
     count("learn-dict interrupted and resumed", interruptions=most - 1, other_dictionaries=0)

@@ -1,6 +1,8 @@
-"""--mem-limit: a plan that needs more is refused with what would do, what it says it needs is what it takes, and nobody takes more.
+"""--mem-limit: a plan that needs more is refused with what would do, what it says it needs is what
+it takes, and nobody takes more.
 
-Memory is the most that a process of its own had resident, over what the same command takes on the smallest camera.
+Memory is the most that a process of its own had resident, over what the same command takes on
+the smallest camera.
 """
 
 import json
@@ -18,18 +20,41 @@ from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (ROOT / "sample_configs" / "tiny.toml").read_text()
-WATCHED = ("import sys; from plenocli.cli.main import run; code = run(sys.argv[1:])\n"
-           f"peak = {PEAK}\n"
-           "print(f'\\nend {code} {peak << 10}')")
-SIZES = {"simulate-pif": (24, 28, 32), "capture-sim": (60, 90, 120), "refocus": (30, 45, 60), "score": (30, 45, 60), "reconstruct": (32, 36, 40), "learn-dict": (24, 28, 32)}
-CASES = [pytest.param(stage, size, marks=() if (stage, size) == ("capture-sim", 60) else pytest.mark.slow) for stage, sizes in SIZES.items() for size in sizes]
+WATCHED = (
+    "import sys; from plenocli.cli.main import run; code = run(sys.argv[1:])\n"
+    f"peak = {PEAK}\n"
+    "print(f'\\nend {code} {peak << 10}')"
+)
+SIZES = {
+    "simulate-pif": (24, 28, 32),
+    "capture-sim": (60, 90, 120),
+    "refocus": (30, 45, 60),
+    "score": (30, 45, 60),
+    "reconstruct": (32, 36, 40),
+    "learn-dict": (24, 28, 32),
+}
+CASES = [
+    pytest.param(
+        stage, size, marks=() if (stage, size) == ("capture-sim", 60) else pytest.mark.slow
+    )
+    for stage, sizes in SIZES.items()
+    for size in sizes
+]
 BLOCKS = ("simulate-pif", "reconstruct", "learn-dict")
-"""Stages whose memory goes by the size of a superpixel and of its object, not by the number of lenslets."""
+"""Stages whose memory goes by the size of a superpixel and of its object, not by the
+number of lenslets.
+"""
 
 
 def watched(folder, *arguments):
     """(exit code, most bytes resident, stdout, stderr) of a command in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", WATCHED, *map(str, arguments)], cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, *map(str, arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
     said, _, end = done.stdout.rpartition("\nend ")
     code, peak = end.split()
     return int(code), int(peak), said, done.stderr
@@ -41,11 +66,17 @@ def folder(tmp_path_factory):
 
 
 def camera(folder, stage, size):
-    """Name of a camera whose size grows with `size`: of the matrix for BLOCKS, else of the array."""
+    """Name of a camera whose size grows with `size`: of the matrix for BLOCKS,
+    else of the array.
+    """
     pixels, count = (size, 9 if stage == "simulate-pif" else 5) if stage in BLOCKS else (16, size)
     name = f"{stage}-{size}.toml"
-    (folder / name).write_text(TINY.replace("[8, 8]", f"[{pixels}, {pixels}]").replace("[13, 13]", f"[{pixels}, {pixels}]").replace("[5, 5]", f"[{count}, {count}]")
-                               .replace('pixel_pitch = "2 um"', f'pixel_pitch = "{26 / pixels} um"'))
+    (folder / name).write_text(
+        TINY.replace("[8, 8]", f"[{pixels}, {pixels}]")
+        .replace("[13, 13]", f"[{pixels}, {pixels}]")
+        .replace("[5, 5]", f"[{count}, {count}]")
+        .replace('pixel_pitch = "2 um"', f'pixel_pitch = "{26 / pixels} um"')
+    )
     return name
 
 
@@ -53,18 +84,81 @@ def command(folder, stage, size):
     """Arguments of a stage on the camera of a size, its inputs made."""
     name = camera(folder, stage, size)
     if stage == "simulate-pif":
-        return ["simulate-pif", name, "--superpixels", "5x5", "--coherent-ring", "0", "--model", "ray", "-o", "out.h5", "--overwrite"]
+        return [
+            "simulate-pif",
+            name,
+            "--superpixels",
+            "5x5",
+            "--coherent-ring",
+            "0",
+            "--model",
+            "ray",
+            "-o",
+            "out.h5",
+            "--overwrite",
+        ]
     pif, capture, picture = (f"{stage}-{size}-{what}.h5" for what in ("pif", "capture", "image"))
-    take = ["capture-sim", name, "--pif", pif, "--scene", "skimage:astronaut", "--snr", "50dB", "--overwrite"]
-    steps = [["simulate-pif", name, "--superpixels", "1x1", "--coherent-ring", "0", *(["--model", "ray"] if stage in BLOCKS else []), "-o", pif], [*take, "-o", capture],
-             ["reconstruct", capture, "--pif", pif, "--method", "block-mean", "-o", picture]]
-    for step in steps[:{"capture-sim": 1, "learn-dict": 1, "refocus": 2, "reconstruct": 2, "score": 3}[stage]]:
+    take = [
+        "capture-sim",
+        name,
+        "--pif",
+        pif,
+        "--scene",
+        "skimage:astronaut",
+        "--snr",
+        "50dB",
+        "--overwrite",
+    ]
+    steps = [
+        [
+            "simulate-pif",
+            name,
+            "--superpixels",
+            "1x1",
+            "--coherent-ring",
+            "0",
+            *(["--model", "ray"] if stage in BLOCKS else []),
+            "-o",
+            pif,
+        ],
+        [*take, "-o", capture],
+        ["reconstruct", capture, "--pif", pif, "--method", "block-mean", "-o", picture],
+    ]
+    for step in steps[
+        : {"capture-sim": 1, "learn-dict": 1, "refocus": 2, "reconstruct": 2, "score": 3}[stage]
+    ]:
         if not (folder / step[-1]).exists():
             assert watched(folder, *step)[0] == 0
-    return {"capture-sim": [*take, "-o", "out.h5"], "refocus": ["refocus", capture, "--planes", "3", "-o", "out.h5", "--overwrite"],
-            "reconstruct": ["reconstruct", capture, "--pif", pif, "--method", "lmmse", "-o", "out.h5", "--overwrite"],
-            "learn-dict": ["learn-dict", "--pif", pif, "--lambda", "1e-5", "--iterations", "1", "--workers", "1", "-o", "out.h5", "--overwrite"],
-            "score": ["score", picture, "--truth", capture, "-o", "out.json", "--overwrite"]}[stage]
+    return {
+        "capture-sim": [*take, "-o", "out.h5"],
+        "refocus": ["refocus", capture, "--planes", "3", "-o", "out.h5", "--overwrite"],
+        "reconstruct": [
+            "reconstruct",
+            capture,
+            "--pif",
+            pif,
+            "--method",
+            "lmmse",
+            "-o",
+            "out.h5",
+            "--overwrite",
+        ],
+        "learn-dict": [
+            "learn-dict",
+            "--pif",
+            pif,
+            "--lambda",
+            "1e-5",
+            "--iterations",
+            "1",
+            "--workers",
+            "1",
+            "-o",
+            "out.h5",
+            "--overwrite",
+        ],
+        "score": ["score", picture, "--truth", capture, "-o", "out.json", "--overwrite"],
+    }[stage]
 
 
 @cache
@@ -82,40 +176,81 @@ def in_bytes(text):
 def test_what_is_needed_is_what_is_said_and_less_is_refused(folder, count, stage, size):
     arguments = command(folder, stage, size)
     # with the limit below, inputs can be read, so that the plan is made
-    code, peak, said, error = watched(folder, *arguments, "--mem-limit", {"simulate-pif": "1MiB", "reconstruct": "40MiB"}.get(stage, "26MiB"))
+    code, peak, said, error = watched(
+        folder,
+        *arguments,
+        "--mem-limit",
+        {"simulate-pif": "1MiB", "reconstruct": "40MiB"}.get(stage, "26MiB"),
+    )
     assert code == 5 and peak < least(folder, stage) + (100 << 20), error
-    if stage == "simulate-pif":  # under a limit that holds a part of the matrix it is written in pieces
-        code, peak, *_ = watched(folder, *arguments[:-3], "-o", "shards.h5", "--overwrite", "--mem-limit", "32MiB")
+    # under a limit that holds a part of the matrix it is written in pieces
+    if stage == "simulate-pif":
+        code, peak, *_ = watched(
+            folder, *arguments[:-3], "-o", "shards.h5", "--overwrite", "--mem-limit", "32MiB"
+        )
         assert code == 0 and peak <= (32 << 20) + base_memory()
         needed = json.loads(watched(folder, *arguments[:-3], "--explain", "--json")[2])["memory"]
     else:
         needed = in_bytes(re.search(r"needs about (\S+),", error)[1])
-        assert in_bytes(re.search(r"raise --mem-limit to (\S+)", error)[1]) == pytest.approx(1.05 * needed, rel=0.01)
+        assert in_bytes(re.search(r"raise --mem-limit to (\S+)", error)[1]) == pytest.approx(
+            1.05 * needed, rel=0.01
+        )
         assert watched(folder, *arguments, "--mem-limit", f"{int(0.9 * needed)}B")[0] == 5
     limit = int(1.05 * needed)
-    code, peak, *_ = watched(folder, *arguments, *(["--mem-limit", f"{limit}B"] if stage != "simulate-pif" else []))
+    code, peak, *_ = watched(
+        folder, *arguments, *(["--mem-limit", f"{limit}B"] if stage != "simulate-pif" else [])
+    )
     assert code == 0 and peak <= limit + base_memory()
     taken = peak - least(folder, stage)
     assert 0.8 * needed <= taken <= 1.2 * needed, (needed, taken)
-    count("--mem-limit, the estimate against what was taken", sizes=1, off_by_more_than_20_percent=0)
+    count(
+        "--mem-limit, the estimate against what was taken", sizes=1, off_by_more_than_20_percent=0
+    )
 
 
 def test_nobody_gets_more_than_the_limit_and_the_base():
-    code = ("import resource, numpy\nfrom plenocli.base.memory import base_memory, hold, limits_restored\n"
-            "with limits_restored():\n"
-            "    hold(100 << 20)\n    few = numpy.ones(90 << 17)\n"
-            "    try:\n        numpy.ones((100 << 20) + base_memory() >> 3)\n        raise SystemExit('more than the limit')\n    except MemoryError: pass\n"
-            "numpy.ones((100 << 20) + base_memory() >> 3)\n")
-    assert subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0
+    code = (
+        "import resource, numpy\n"
+        "from plenocli.base.memory import base_memory, hold, limits_restored\n"
+        "with limits_restored():\n"
+        "    hold(100 << 20)\n"
+        "    few = numpy.ones(90 << 17)\n"
+        "    try:\n"
+        "        numpy.ones((100 << 20) + base_memory() >> 3)\n"
+        "        raise SystemExit('more than the limit')\n"
+        "    except MemoryError: pass\n"
+        "numpy.ones((100 << 20) + base_memory() >> 3)\n"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}
+        ).returncode
+        == 0
+    )
 
 
-@pytest.mark.parametrize("words", [["inspect", "image.h5"], ["show", "image.h5", "-o", "a.png"], ["score", "image.h5", "--truth", "capture.h5", "-o", "a.json"], ["refocus", "capture.h5", "-o", "a.h5"],
-                                   ["reconstruct", "capture.h5", "--pif", "pif.h5", "-o", "a.h5"], ["learn-dict", "photo.png", "--pif", "pif.h5", "-o", "a.h5"],
-                                   ["capture-sim", "camera.toml", "--scene", "photo.png", "-o", "a.h5"], ["simulate-pif", "camera.toml", "-o", "a.h5"]], ids=lambda w: w[0])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["inspect", "image.h5"],
+        ["show", "image.h5", "-o", "a.png"],
+        ["score", "image.h5", "--truth", "capture.h5", "-o", "a.json"],
+        ["refocus", "capture.h5", "-o", "a.h5"],
+        ["reconstruct", "capture.h5", "--pif", "pif.h5", "-o", "a.h5"],
+        ["learn-dict", "photo.png", "--pif", "pif.h5", "-o", "a.h5"],
+        ["capture-sim", "camera.toml", "--scene", "photo.png", "-o", "a.h5"],
+        ["simulate-pif", "camera.toml", "-o", "a.h5"],
+    ],
+    ids=lambda w: w[0],
+)
 def test_every_stage_with_the_option_refuses_what_cannot_fit(runner, stages, tmp_path, words):
     source, _ = stages
     for path in source.iterdir():
         (tmp_path / path.name).symlink_to(path)
     outcome = runner.run([*words, "--mem-limit", "1KiB"], tmp_path)
-    assert outcome.code in (3, 5) and "raise --mem-limit" in outcome.text and not (tmp_path / "a.h5").exists(), outcome
+    assert (
+        outcome.code in (3, 5)
+        and "raise --mem-limit" in outcome.text
+        and not (tmp_path / "a.h5").exists()
+    ), outcome
     assert outcome.cpu < 2

@@ -1,5 +1,6 @@
-"""The same inputs give the same bytes: again, in another folder, time zone, locale and hash seed, and with two workers; threads of the
-linear algebra change the last digits at most."""
+"""The same inputs give the same bytes: again, in another folder, time zone, locale and hash seed,
+and with two workers; threads of the linear algebra change the last digits at most.
+"""
 
 import os
 import shutil
@@ -15,17 +16,40 @@ from tests.faults.harness import results
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ("simulate-pif 3x3", "capture-sim", "white", "reconstruct", "refocus", "score", "sweep")
-LONG = ("simulate-pif", "capture-sim exr", "simulate-response", "calibrate", "demux", "demux exr", "learn-dict", "reconstruct exr", "show")
-STRANGE = {"TZ": "Pacific/Kiritimati", "LC_ALL": "C", "LANG": "C", "PYTHONHASHSEED": "77", "COLUMNS": "50", "OMP_NUM_THREADS": "1"}
+LONG = (
+    "simulate-pif",
+    "capture-sim exr",
+    "simulate-response",
+    "calibrate",
+    "demux",
+    "demux exr",
+    "learn-dict",
+    "reconstruct exr",
+    "show",
+)
+STRANGE = {
+    "TZ": "Pacific/Kiritimati",
+    "LC_ALL": "C",
+    "LANG": "C",
+    "PYTHONHASHSEED": "77",
+    "COLUMNS": "50",
+    "OMP_NUM_THREADS": "1",
+}
 
 
 def copy_inputs(source, folder, result):
     """Copy all files of a folder but a stage's result; the copies."""
     made = results(source / result, result)
-    return [Path(shutil.copy(path, folder)) for path in source.iterdir() if path.is_file() and path.name not in made]
+    return [
+        Path(shutil.copy(path, folder))
+        for path in source.iterdir()
+        if path.is_file() and path.name not in made
+    ]
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)])
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+)
 def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, name):
     source, steps = stages
     arguments, result = steps[name]
@@ -35,8 +59,16 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
         folder.mkdir()
         for path in copy_inputs(source, folder, result):
             os.utime(path, (1e9, 1e9 + number))
-        environment = os.environ | STRANGE | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(77 + number)}
-        done = subprocess.run([sys.executable, "-m", "plenocli", *arguments, "-o", result], cwd=folder, env=environment, capture_output=True, text=True)
+        environment = (
+            os.environ | STRANGE | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(77 + number)}
+        )
+        done = subprocess.run(
+            [sys.executable, "-m", "plenocli", *arguments, "-o", result],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
         assert done.returncode == 0, done.stderr
         assert results(folder / result, result) == results(source / result, result), number
     count("stages run again elsewhere", runs=runs, other_bytes=0)
@@ -44,37 +76,80 @@ def test_stages_repeat_their_bytes_anywhere(stages, tmp_path, campaign, count, n
 
 @pytest.mark.slow
 def test_the_run_that_compiles_gives_the_bytes_of_all_later_ones(tmp_path, count):
-    """Compiled code comes from a cache but for the first time, where all that was compiled on the way is in memory beside it."""
+    """Compiled code comes from a cache but for the first time, where all that was compiled on
+    the way is in memory beside it.
+    """
     pytest.importorskip("numba")
-    code = ("import sys, numpy as np\nfrom plenocli.inverse.sparse.l1.solve import sparse_code\nrng = np.random.default_rng(1)\nfall = np.logspace(0, -4, 30)[:, None]\n"
-            "D, Y = rng.standard_normal((30, 80)) * fall, rng.standard_normal((30, 64)) * fall\n"
-            "sys.stdout.write(sparse_code(D, Y, 1e-4, free=[0], workers=1).c.tobytes().hex())\n")
+    code = (
+        "import sys, numpy as np\n"
+        "from plenocli.inverse.sparse.l1.solve import sparse_code\n"
+        "rng = np.random.default_rng(1)\n"
+        "fall = np.logspace(0, -4, 30)[:, None]\n"
+        "D, Y = rng.standard_normal((30, 80)) * fall, rng.standard_normal((30, 64)) * fall\n"
+        "sys.stdout.write(sparse_code(D, Y, 1e-4, free=[0], workers=1).c.tobytes().hex())\n"
+    )
     environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    first, later = (subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    first, later = (
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for _ in range(2)
+    )
     assert first == later and any(tmp_path.rglob("*.nbc"))
     count("compiled and cached code", programs=1, other_bytes=0)
 
 
 THREADS = 1e-12
-"""Largest difference between results of one and of two threads of the linear algebra, relative to the largest value of a dataset."""
+"""Largest difference between results of one and of two threads of the linear algebra, relative
+to the largest value of a dataset.
+"""
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "simulate-response" else pytest.mark.slow) for name in (*QUICK, *LONG)])
-def test_threads_of_the_linear_algebra_change_the_last_digits_at_most(stages, tmp_path, count, name):
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name == "simulate-response" else pytest.mark.slow)
+        for name in (*QUICK, *LONG)
+    ],
+)
+def test_threads_of_the_linear_algebra_change_the_last_digits_at_most(
+    stages, tmp_path, count, name
+):
     source, steps = stages
     arguments, result = steps[name]
     copy_inputs(source, tmp_path, result)
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    done = subprocess.run([sys.executable, "-m", "plenocli", *arguments, "-o", result], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "2",
+        "OPENBLAS_NUM_THREADS": "2",
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "plenocli", *arguments, "-o", result],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     one, two = source / result, tmp_path / result
     worst = 0.0 if one.read_bytes() == two.read_bytes() else largest_difference(one, two)
     assert worst <= THREADS
-    count("stages with one and two threads of linear algebra", stages=1, other_bytes=int(worst > 0), beyond_the_bound=0)
+    count(
+        "stages with one and two threads of linear algebra",
+        stages=1,
+        other_bytes=int(worst > 0),
+        beyond_the_bound=0,
+    )
 
 
 def largest_difference(one, two):
-    """Of two artefacts of one stage, relative to the largest value of each dataset; infinite where anything but numbers differs."""
+    """Of two artefacts of one stage, relative to the largest value of each dataset; infinite
+    where anything but numbers differs.
+    """
     one, two = (read_artefact(path).data for path in (one, two))
     if one.keys() != two.keys():
         return np.inf
@@ -83,17 +158,25 @@ def largest_difference(one, two):
         if values.dtype.kind != "f":
             found.append(0.0 if np.array_equal(values, two[name]) else np.inf)
         elif values.size and not np.array_equal(values, two[name], equal_nan=True):
-            found.append(float(np.nanmax(np.abs(values - two[name])) / np.nanmax(np.abs(values))) if np.array_equal(np.isnan(values), np.isnan(two[name])) else np.inf)
+            found.append(
+                float(np.nanmax(np.abs(values - two[name])) / np.nanmax(np.abs(values)))
+                if np.array_equal(np.isnan(values), np.isnan(two[name]))
+                else np.inf
+            )
     return max(found)
 
 
-@pytest.mark.parametrize("name", ["sweep", "simulate-pif 3x3", pytest.param("learn-dict", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["sweep", "simulate-pif 3x3", pytest.param("learn-dict", marks=pytest.mark.slow)]
+)
 def test_workers_of_one_result_change_nothing(runner, stages, tmp_path, count, name):
     source, steps = stages
     arguments, result = steps[name]
     copy_inputs(source, tmp_path, result)
     outcome = runner.run([*arguments, "--workers", 2, "-o", result], tmp_path, limit=240)
-    assert outcome.code == 0 and results(tmp_path / result, result) == results(source / result, result), outcome
+    assert outcome.code == 0 and results(tmp_path / result, result) == results(
+        source / result, result
+    ), outcome
     count("stages with two workers", stages=1, other_bytes=0)
 
 
@@ -108,8 +191,26 @@ def test_workers_of_a_batch_change_nothing(runner, stages, tmp_path, count, name
         shutil.copy(source / arguments[1], tmp_path / f"{copy}{suffix}")
     found = []
     for workers in (1, 2):
-        outcome = runner.run([arguments[0], *(f"{c}{suffix}" for c in "abc"), *arguments[2:], "--workers", workers, "-o", f"out{workers}"], tmp_path, limit=240)
+        outcome = runner.run(
+            [
+                arguments[0],
+                *(f"{c}{suffix}" for c in "abc"),
+                *arguments[2:],
+                "--workers",
+                workers,
+                "-o",
+                f"out{workers}",
+            ],
+            tmp_path,
+            limit=240,
+        )
         assert outcome.code == 0, outcome
-        found.append({p.name: p.read_bytes() for p in sorted((tmp_path / f"out{workers}").iterdir()) if p.is_file()})
+        found.append(
+            {
+                p.name: p.read_bytes()
+                for p in sorted((tmp_path / f"out{workers}").iterdir())
+                if p.is_file()
+            }
+        )
     assert found[0] == found[1] and len(found[0]) >= 3
     count("stages with two workers", stages=1, other_bytes=0)

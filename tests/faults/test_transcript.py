@@ -1,8 +1,9 @@
-"""What plenocli says when it refuses, word for word: transcript.txt holds commands, their exit codes and their messages.
+"""What plenocli says when it refuses, word for word: transcript.txt holds commands, their exit
+codes and their messages.
 
-A command may have a fault before it, as server.py knows them: [without MODULE], which is then not installed, or
-[MODULE.FUNCTION ERROR n], a function that fails from its n-th call on.
-`pytest tests/faults/test_transcript.py --new-transcript` writes the answers anew, for a person to read.
+A command may have a fault before it, as server.py knows them: [without MODULE], which is then not
+installed, or [MODULE.FUNCTION ERROR n], a function that fails from its n-th call on. `pytest
+tests/faults/test_transcript.py --new-transcript` writes the answers anew, for a person to read.
 """
 
 import re
@@ -16,7 +17,11 @@ from tests.faults.wrong_files import make_wrong_files
 from tests.messages import shown_places
 
 TRANSCRIPT = Path(__file__).with_name("transcript.txt")
-ENTRIES = {part.partition("\n")[0].removeprefix("$ "): part.rstrip() for part in re.split(r"(?m)^(?=\$ )", TRANSCRIPT.read_text()) if part}
+ENTRIES = {
+    part.partition("\n")[0].removeprefix("$ "): part.rstrip()
+    for part in re.split(r"(?m)^(?=\$ )", TRANSCRIPT.read_text())
+    if part
+}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +53,9 @@ def answer(runner, folder, entry):
     """(the answer as the transcript keeps it, where its message was made)."""
     words, command = re.fullmatch(r"(?:\[(.*?)\] )?plenocli ?(.*)", entry).groups()
     before = set(folder.iterdir())
-    outcome = runner.run(shlex.split(command), folder, limit=60, fault={"places": True, **fault(words or "")})
+    outcome = runner.run(
+        shlex.split(command), folder, limit=60, fault={"places": True, **fault(words or "")}
+    )
     left = sorted(set(folder.iterdir()) - before)
     for path in left:
         path.unlink() if path.is_file() else shutil.rmtree(path)
@@ -62,12 +69,23 @@ def test_refusals_read_as_they_did(runner, folder, campaign, count, request):
     """By default every fourth."""
     anew = request.config.getoption("--new-transcript")
     answers, reached = {}, set()
-    for entry in ENTRIES if anew else list(ENTRIES)[::campaign(4, 1)]:
+    for entry in ENTRIES if anew else list(ENTRIES)[:: campaign(4, 1)]:
         answers[entry], notes = answer(runner, folder, entry)
         reached.update(notes.split())
     request.node.user_properties.append(("places", " ".join(reached)))
     if anew:
         TRANSCRIPT.write_text("\n".join(answers.values()))
-    assert {entry: said.rstrip() for entry, said in answers.items()} == {entry: said.rstrip() if anew else ENTRIES[entry] for entry, said in answers.items()}
-    assert not [said for said in answers.values() if not re.search(r"\n\[[2345]\] ", said) or "internal error" in said or "Traceback" in said]
-    count("transcript of refusals", commands=len(answers), different_messages=len({a.partition("\n")[2] for a in answers.values()}), places_in_the_code=len(shown_places(reached)))
+    assert {entry: said.rstrip() for entry, said in answers.items()} == {
+        entry: said.rstrip() if anew else ENTRIES[entry] for entry, said in answers.items()
+    }
+    assert not [
+        said
+        for said in answers.values()
+        if not re.search(r"\n\[[2345]\] ", said) or "internal error" in said or "Traceback" in said
+    ]
+    count(
+        "transcript of refusals",
+        commands=len(answers),
+        different_messages=len({a.partition("\n")[2] for a in answers.values()}),
+        places_in_the_code=len(shown_places(reached)),
+    )

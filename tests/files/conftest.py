@@ -5,15 +5,17 @@ import os
 
 import pytest
 
-from plenocli.files import atomic
 from plenocli.base.errors import OutputError
+from plenocli.files import atomic
 
 
 @pytest.fixture
 def each_failure(monkeypatch):
-    """each_failure(call, action): runs action with the first, second, ... call of os.<call> out of space, until none is left to fail.
+    """each_failure(call, action): runs action with the first, second, ... call of os.<call> out of
+    space, until none is left to fail.
 
-    Yields whether it came through; else OutputError must have given the reason. The first time it may not, the last time it must.
+    Yields whether it came through; else OutputError must have given the reason. The first time it
+    may not, the last time it must.
     """
 
     def run(call, action):

@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from plenocli.files.atomic import check_output, publish
-from plenocli.files import atomic
 from plenocli.base.errors import OutputError, UsageError
+from plenocli.files import atomic
+from plenocli.files.atomic import check_output, publish
 
 
 def test_pieces_are_joined_and_nothing_else_is_left(tmp_path):
@@ -46,7 +46,9 @@ def test_a_link_planted_at_the_temporary_name_is_not_followed(tmp_path):
 def test_failing_the_nth_call_leaves_the_old_file_and_no_leftovers(tmp_path, each_failure, call):
     publish(tmp_path / "a", b"old")
     for done in each_failure(call, lambda: publish(tmp_path / "a", [b"new"] * 3, overwrite=True)):
-        assert (tmp_path / "a").read_bytes() in (b"old", b"newnewnew") and os.listdir(tmp_path) == ["a"]
+        assert (tmp_path / "a").read_bytes() in (b"old", b"newnewnew") and os.listdir(tmp_path) == [
+            "a"
+        ]
         if not done and call in ("write", "replace", "ftruncate"):
             assert (tmp_path / "a").read_bytes() == b"old"
 
@@ -69,9 +71,12 @@ def test_two_runs_with_one_target_do_not_mix(tmp_path):
 
 def test_killed_at_any_moment_the_target_is_old_or_new(tmp_path):
     target = tmp_path / "a"
-    code = ("import sys; from plenocli.files.atomic import publish\n"
-            "print('ready', flush=True)\n"
-            "for n in range(10**6): publish(sys.argv[1], [bytes([n % 251]) * (1 << 20)] * 2, overwrite=True)")
+    code = (
+        "import sys; from plenocli.files.atomic import publish\n"
+        "print('ready', flush=True)\n"
+        "for n in range(10**6): publish(sys.argv[1], [bytes([n % 251]) * (1 << 20)] "
+        "* 2, overwrite=True)"
+    )
     for round_ in range(6):
         child = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE)
         child.stdout.readline()
@@ -113,7 +118,8 @@ def test_read_only_folder_is_refused(tmp_path):
 
 def test_names_that_cannot_be_and_suffixes_that_mislead(tmp_path):
     with pytest.raises(OutputError, match="possible file name"):
-        check_output(tmp_path / ("y" * 246 + ".h5"))  # the temporary name beside it would be too long
+        # the temporary name beside it would be too long
+        check_output(tmp_path / ("y" * 246 + ".h5"))
     with pytest.raises(UsageError, match="written as .h5"):
         check_output(tmp_path / "camera.toml", overwrite=True, suffixes=(".h5",))
     check_output(tmp_path / "pif.h5", suffixes=(".h5",))

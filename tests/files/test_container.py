@@ -1,4 +1,6 @@
-"""Artefacts: what is written is read back, by us and by plain h5py; same input, same bytes; damage and hostile files are refused."""
+"""Artefacts: what is written is read back, by us and by plain h5py; same input, same bytes;
+damage and hostile files are refused.
+"""
 
 import hashlib
 import json
@@ -10,11 +12,18 @@ import h5py
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import Artefact, cfa_text, read_artefact, write_artefact
+from plenocli.base.errors import InputError
+from plenocli.files.artefacts.container import (
+    HEADER_BYTES,
+    MAGIC,
+    Artefact,
+    build_image,
+    cfa_text,
+    read_artefact,
+    write_artefact,
+)
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, build_image
-from plenocli.base.errors import InputError
 from tests.faults.harness import mutants
 
 
@@ -22,18 +31,43 @@ def spectra(seed=0, bands=3, shape=(4, 5)):
     rng = np.random.default_rng(seed)
     return Artefact(
         "spectra",
-        {"spectra/value": rng.random((bands, *shape)), "spectra/sigma": rng.random((bands, *shape), dtype=np.float32),
-         "spectra/wavelength": np.linspace(450e-9, 650e-9, bands)},
-        {"spectra": {"quantity": "reflectance", "method": "pinv", "parameters": {"z": 1, "a": [1.5, None]}}},
-        Provenance("plenocli demux", {"capture": {"name": "c.h5", "sha256": "0" * 64}}, 7, "# Öl, 5 µm\n[light]\n", {"asked": 1e-3}))
+        {
+            "spectra/value": rng.random((bands, *shape)),
+            "spectra/sigma": rng.random((bands, *shape), dtype=np.float32),
+            "spectra/wavelength": np.linspace(450e-9, 650e-9, bands),
+        },
+        {
+            "spectra": {
+                "quantity": "reflectance",
+                "method": "pinv",
+                "parameters": {"z": 1, "a": [1.5, None]},
+            }
+        },
+        Provenance(
+            "plenocli demux",
+            {"capture": {"name": "c.h5", "sha256": "0" * 64}},
+            7,
+            "# Öl, 5 µm\n[light]\n",
+            {"asked": 1e-3},
+        ),
+    )
 
 
 def pif():
     rng = np.random.default_rng(3)
-    return Artefact("pif", {
-        "pif/A": rng.random((2, 1, 6, 4)), "pif/wavelength": [5e-7, 6e-7], "pif/lenslet_offset": np.zeros((1, 2), int),
-        "pif/pixel_shape": [2, 3], "pif/object_shape": [2, 2], "pif/column_energy": rng.random((2, 4)),
-        "pif/singular_values": np.ones((2, 4))}, {"pif": {"rank": [4, 4], "condition": np.inf, "kappa": -0.5}})
+    return Artefact(
+        "pif",
+        {
+            "pif/A": rng.random((2, 1, 6, 4)),
+            "pif/wavelength": [5e-7, 6e-7],
+            "pif/lenslet_offset": np.zeros((1, 2), int),
+            "pif/pixel_shape": [2, 3],
+            "pif/object_shape": [2, 2],
+            "pif/column_energy": rng.random((2, 4)),
+            "pif/singular_values": np.ones((2, 4)),
+        },
+        {"pif": {"rank": [4, 4], "condition": np.inf, "kappa": -0.5}},
+    )
 
 
 def signed(image):
@@ -43,7 +77,9 @@ def signed(image):
 
 
 def hostile(path, make):
-    """Write an HDF5 file of the kind spectra, change it with `make(file)`, and give it a correct digest."""
+    """Write an HDF5 file of the kind spectra, change it with `make(file)`, and give
+    it a correct digest.
+    """
     plain = path.with_suffix(".plain")
     plain.write_bytes(build_image(spectra()))
     with h5py.File(plain, "a") as file:
@@ -74,7 +110,9 @@ def test_plain_h5py_opens_the_result_and_finds_units_and_plot_attributes(tmp_pat
         assert file.attrs["default"] == b"spectra" and file.attrs["plenocli_kind"] == b"spectra"
         group = file["spectra"].attrs
         assert group["NX_class"] == b"NXdata" and group["signal"] == b"value"
-        assert list(group["axes"]) == [b"wavelength", b".", b"."] and group["wavelength_indices"] == 0
+        assert (
+            list(group["axes"]) == [b"wavelength", b".", b"."] and group["wavelength_indices"] == 0
+        )
         assert file["spectra/wavelength"].attrs["units"] == b"m"
         assert json.loads(file.attrs["inputs"])["capture"]["name"] == "c.h5"
 
@@ -89,11 +127,18 @@ def test_signal_of_each_kind_is_a_field_of_its_table(kind):
 
 def test_same_input_gives_same_bytes_in_another_process_folder_zone_and_hash_seed(tmp_path):
     write_artefact(tmp_path / "here.h5", spectra())
-    code = ("import sys; sys.path[:0] = [sys.argv[1], sys.argv[2]]; from test_container import spectra; "
-            "from plenocli.files.artefacts.container import write_artefact; write_artefact('there.h5', spectra())")
+    code = (
+        "import sys; sys.path[:0] = [sys.argv[1], sys.argv[2]]; from test_container import "
+        "spectra; from plenocli.files.artefacts.container import write_artefact; "
+        "write_artefact('there.h5', spectra())"
+    )
     root = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
-    subprocess.run([sys.executable, "-c", code, root, os.path.dirname(__file__)], check=True, cwd=tmp_path,
-                   env={**os.environ, "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "99", "LC_ALL": "C"})
+    subprocess.run(
+        [sys.executable, "-c", code, root, os.path.dirname(__file__)],
+        check=True,
+        cwd=tmp_path,
+        env={**os.environ, "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "99", "LC_ALL": "C"},
+    )
     assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
 
 
@@ -104,9 +149,14 @@ def test_a_config_longer_than_64_kib_survives(tmp_path):
     assert read_artefact(tmp_path / "x.h5").provenance.config == artefact.provenance.config
 
 
-@pytest.mark.parametrize("given,text", [("mono", "mono"), ("RGGB", "RGGB"), (np.array([["G", "B"], ["R", "G"]]), "GBRG")])
+@pytest.mark.parametrize(
+    "given,text", [("mono", "mono"), ("RGGB", "RGGB"), (np.array([["G", "B"], ["R", "G"]]), "GBRG")]
+)
 def test_colour_filter_array_as_text_or_letters(tmp_path, given, text):
-    artefact = Artefact("capture", {"capture/mosaic": np.arange(6, dtype=np.uint16).reshape(2, 3), "capture/cfa": given})
+    artefact = Artefact(
+        "capture",
+        {"capture/mosaic": np.arange(6, dtype=np.uint16).reshape(2, 3), "capture/cfa": given},
+    )
     write_artefact(tmp_path / "c.h5", artefact)
     assert cfa_text(read_artefact(tmp_path / "c.h5").data["capture/cfa"]) == text
 
@@ -119,7 +169,14 @@ def test_writer_lists_every_broken_rule_at_once(tmp_path):
     bad.attrs["spectra"]["methd"] = "pinv"
     with pytest.raises(ValueError) as caught:
         write_artefact(tmp_path / "x.h5", bad)
-    for fragment in ("complex128 where f is due", "'spectra/surprise' is unknown", "has 3 along 'band'", "does not ascend", "NaN", "'methd'"):
+    for fragment in (
+        "complex128 where f is due",
+        "'spectra/surprise' is unknown",
+        "has 3 along 'band'",
+        "does not ascend",
+        "NaN",
+        "'methd'",
+    ):
         assert fragment in str(caught.value)
     assert os.listdir(tmp_path) == []
 
@@ -138,7 +195,8 @@ def test_nan_is_allowed_only_where_the_table_says_so(tmp_path):
         write_artefact(tmp_path / "y.h5", system)
 
 
-# --- files that are refused ---------------------------------------------------------------------------------------------
+# --- files that are refused -----------------------------------------------------------------------
+
 
 def test_missing_empty_folder_foreign_and_wrong_kind_each_have_their_own_words(tmp_path):
     write_artefact(tmp_path / "s.h5", spectra())
@@ -148,12 +206,21 @@ def test_missing_empty_folder_foreign_and_wrong_kind_each_have_their_own_words(t
         file["pif/A"] = np.zeros(3)
     (tmp_path / "short.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:300])
     (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-1])
-    for name, words in {"none.h5": "does not exist", "": "is a folder", "empty.h5": "0 bytes", "text.h5": "not a plenocli artefact",
-                        "foreign.h5": "not one that plenocli wrote", "short.h5": "damaged digest block", "cut.h5": "truncated"}.items():
+    for name, words in {
+        "none.h5": "does not exist",
+        "": "is a folder",
+        "empty.h5": "0 bytes",
+        "text.h5": "not a plenocli artefact",
+        "foreign.h5": "not one that plenocli wrote",
+        "short.h5": "damaged digest block",
+        "cut.h5": "truncated",
+    }.items():
         with pytest.raises(InputError, match=words) as caught:
             read_artefact(tmp_path / name)
         assert str(tmp_path / name) in str(caught.value) and caught.value.fix
-    with pytest.raises(InputError, match="artefact of kind 'spectra' where 'pif or capture' is due"):
+    with pytest.raises(
+        InputError, match="artefact of kind 'spectra' where 'pif or capture' is due"
+    ):
         read_artefact(tmp_path / "s.h5", ("pif", "capture"))
 
 
@@ -200,7 +267,9 @@ def _reference(file):
 
 
 def _bomb(file):
-    file.create_dataset("spectra/leak", (200_000, 200_000), "f8", chunks=(1000, 1000), compression="gzip")
+    file.create_dataset(
+        "spectra/leak", (200_000, 200_000), "f8", chunks=(1000, 1000), compression="gzip"
+    )
 
 
 def _overflowing_bomb(file):
@@ -224,7 +293,9 @@ def _attribute_object(file):
 
 
 def _attribute_of_dataset(file):
-    file["spectra/value"].attrs.create("leak", data=np.array(["x"], dtype=object), dtype=h5py.string_dtype())
+    file["spectra/value"].attrs.create(
+        "leak", data=np.array(["x"], dtype=object), dtype=h5py.string_dtype()
+    )
 
 
 def _unknown_dataset(file):
@@ -256,14 +327,36 @@ def _infinite(file):
     file["spectra/value"][0, 0, 0] = np.inf
 
 
-@pytest.mark.parametrize("make,words", [
-    (_external_link, "external link"), (_soft_link, "soft link"), (_twice, "linked twice"), (_loop, "linked twice"),
-    (_external_storage, "external storage"), (_virtual, "virtual"), (_objects, "variable length"), (_ragged, "objects"),
-    (_compound, "compounds"), (_reference, "references"), (_bomb, "memory limit"), (_overflowing_bomb, "memory limit"),
-    (_filter, "filter"), (_named_type, "neither a group nor a dataset"), (_null, "no data"), (_attribute_object, "variable length"),
-    (_attribute_of_dataset, "variable length"), (_unknown_dataset, "unknown"), (_unknown_attribute, "'other'"),
-    (_newer, "update plenocli"), (_other_kind, "unknown kind 'recipe'"), (_no_command, "missing: command"),
-    (_wrong_shape, "has 5 along 'lenslet_column'|has 6 along"), (_infinite, "infinities")], ids=lambda v: getattr(v, "__name__", ""))
+@pytest.mark.parametrize(
+    "make,words",
+    [
+        (_external_link, "external link"),
+        (_soft_link, "soft link"),
+        (_twice, "linked twice"),
+        (_loop, "linked twice"),
+        (_external_storage, "external storage"),
+        (_virtual, "virtual"),
+        (_objects, "variable length"),
+        (_ragged, "objects"),
+        (_compound, "compounds"),
+        (_reference, "references"),
+        (_bomb, "memory limit"),
+        (_overflowing_bomb, "memory limit"),
+        (_filter, "filter"),
+        (_named_type, "neither a group nor a dataset"),
+        (_null, "no data"),
+        (_attribute_object, "variable length"),
+        (_attribute_of_dataset, "variable length"),
+        (_unknown_dataset, "unknown"),
+        (_unknown_attribute, "'other'"),
+        (_newer, "update plenocli"),
+        (_other_kind, "unknown kind 'recipe'"),
+        (_no_command, "missing: command"),
+        (_wrong_shape, "has 5 along 'lenslet_column'|has 6 along"),
+        (_infinite, "infinities"),
+    ],
+    ids=lambda v: getattr(v, "__name__", ""),
+)
 def test_hostile_files_with_a_valid_digest_are_refused_with_the_reason(tmp_path, make, words):
     path = hostile(tmp_path / "x.h5", make)
     with pytest.raises(InputError, match=words) as caught:
@@ -308,5 +401,12 @@ def test_threads_that_read_at_the_same_time_get_their_own_files(tmp_path):
         artefact.data["spectra/value"] = artefact.data["spectra/value"] * 0 + number
         write_artefact(tmp_path / f"{number}.h5", artefact)
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda number: read_artefact(tmp_path / f"{number % 8}.h5").data["spectra/value"].ravel()[0], range(160)))
+        found = list(
+            pool.map(
+                lambda number: (
+                    read_artefact(tmp_path / f"{number % 8}.h5").data["spectra/value"].ravel()[0]
+                ),
+                range(160),
+            )
+        )
     assert found == [number % 8 for number in range(160)]

@@ -4,17 +4,19 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.images.exr import write_exr
 from plenocli.files.images.mosaic import read_mosaic, write_capture_exr
 from plenocli.files.images.pictures import read_picture, srgb_to_linear
-from plenocli.base.errors import InputError
 
 
 def save(path, values, **attributes):
     """Write an integer or float array (row, column[, channel]) with OpenImageIO as it is."""
     values = np.ascontiguousarray(values if values.ndim == 3 else values[..., None])
-    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], str(values.dtype).replace("32", ""))
+    spec = oiio.ImageSpec(
+        values.shape[1], values.shape[0], values.shape[2], str(values.dtype).replace("32", "")
+    )
     for name, value in attributes.items():
         spec.attribute(name.replace("__", ":"), value)
     output = oiio.ImageOutput.create(str(path))
@@ -32,7 +34,11 @@ def test_mosaic_of_an_image_is_untouched(tmp_path, suffix, dtype, white):
     values = numbers((9, 13), dtype)
     back = read_mosaic(save(tmp_path / f"x{suffix}", values), cfa="GBRG")
     np.testing.assert_array_equal(back.values, values)
-    assert back.values.dtype == dtype and (back.cfa, back.white, back.source) == ("GBRG", white, "image")
+    assert back.values.dtype == dtype and (back.cfa, back.white, back.source) == (
+        "GBRG",
+        white,
+        "image",
+    )
 
 
 def test_twelve_bit_tiff_is_not_scaled(tmp_path):
@@ -59,13 +65,32 @@ def test_colour_pictures_are_no_mosaics_unless_their_channels_agree(tmp_path):
 
 def test_capture_as_artefact_and_as_exr_says_the_same(tmp_path):
     values = numbers((6, 8), np.uint16)
-    attrs = {"black": 64.0, "white": 4095.0, "gain_e_per_dn": 2.0, "exposure_s": 0.01, "units": "DN", "band_m": 450e-9, "noise_sigma": 0.5}
-    write_artefact(tmp_path / "c.h5", Artefact("capture", {"capture/mosaic": values, "capture/cfa": "RGGB"}, {"capture": attrs}))
+    attrs = {
+        "black": 64.0,
+        "white": 4095.0,
+        "gain_e_per_dn": 2.0,
+        "exposure_s": 0.01,
+        "units": "DN",
+        "band_m": 450e-9,
+        "noise_sigma": 0.5,
+    }
+    write_artefact(
+        tmp_path / "c.h5",
+        Artefact("capture", {"capture/mosaic": values, "capture/cfa": "RGGB"}, {"capture": attrs}),
+    )
     write_capture_exr(tmp_path / "c.exr", values, attrs | {"cfa": "RGGB"}, attrs={"other": "text"})
     for path, source in ((tmp_path / "c.h5", "capture"), (tmp_path / "c.exr", "exr")):
         back = read_mosaic(path)
         np.testing.assert_array_equal(back.values, values)
-        assert (back.cfa, back.white, back.gain, back.exposure_s, back.units, back.band_m, back.source) == ("RGGB", 4095, 0.5, 0.01, "DN", 450e-9, source)
+        assert (
+            back.cfa,
+            back.white,
+            back.gain,
+            back.exposure_s,
+            back.units,
+            back.band_m,
+            back.source,
+        ) == ("RGGB", 4095, 0.5, 0.01, "DN", 450e-9, source)
         assert (back.black == 64).all() and back.meta["noise_sigma"] == 0.5
     with pytest.raises(InputError, match="RGGB, not mono"):
         read_mosaic(tmp_path / "c.h5", cfa="mono")
@@ -79,18 +104,30 @@ def test_capture_as_artefact_and_as_exr_says_the_same(tmp_path):
 
 def test_real_plenoptic_and_colour_filter_images(shared_data):
     folder = shared_data / "plenoptic"
-    for name, shape, dtype in (("letters/letters_ULF_M1_white.png", (960, 1280), np.uint8), ("letters/letters_ULF_M1_dark.png", (960, 1280), np.uint8),
-                               ("lfm_guv/Radiometry_GUVExperim1.tif", (436, 436), np.uint16), ("lfm_antleg/radiometry_frame.png", (2160, 2592), np.uint16)):
+    for name, shape, dtype in (
+        ("letters/letters_ULF_M1_white.png", (960, 1280), np.uint8),
+        ("letters/letters_ULF_M1_dark.png", (960, 1280), np.uint8),
+        ("lfm_guv/Radiometry_GUVExperim1.tif", (436, 436), np.uint16),
+        ("lfm_antleg/radiometry_frame.png", (2160, 2592), np.uint16),
+    ):
         back = read_mosaic(folder / name)
         assert back.values.shape == shape and back.values.dtype == dtype and back.cfa == "mono"
-    name = next((shared_data / "spectra/colorchecker_filtered/captured_images/images_filtered_light/color_checker").glob("*550nm_100ms*.tif"))
+    name = next(
+        (
+            shared_data
+            / "spectra/colorchecker_filtered/captured_images/images_filtered_light/color_checker"
+        ).glob("*550nm_100ms*.tif")
+    )
     assert read_mosaic(name, cfa="GBRG").values.shape == (342, 408)
 
 
-# --- photographs --------------------------------------------------------------------------------------------------------
+# --- photographs ----------------------------------------------------------------------------------
+
 
 def test_srgb_decoding_at_the_points_of_the_standard():
-    np.testing.assert_allclose(srgb_to_linear([0, 0.04045, 0.5, 1]), [0, 0.0031308, 0.21404114, 1], rtol=2e-5)
+    np.testing.assert_allclose(
+        srgb_to_linear([0, 0.04045, 0.5, 1]), [0, 0.0031308, 0.21404114, 1], rtol=2e-5
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -98,8 +135,14 @@ def test_srgb_decoding_at_the_points_of_the_standard():
 def test_photographs_become_linear(tmp_path, dtype, channels):
     values = numbers((5, 6, channels), dtype)
     back = read_picture(save(tmp_path / "x.png", values))
-    assert back.values.dtype == np.float32 and back.values.shape == values.shape and not back.is_spectral
-    np.testing.assert_allclose(back.values, srgb_to_linear(values / np.iinfo(dtype).max), rtol=1e-6, atol=1e-9)
+    assert (
+        back.values.dtype == np.float32
+        and back.values.shape == values.shape
+        and not back.is_spectral
+    )
+    np.testing.assert_allclose(
+        back.values, srgb_to_linear(values / np.iinfo(dtype).max), rtol=1e-6, atol=1e-9
+    )
 
 
 def test_alpha_is_dropped_without_touching_the_colours(tmp_path):
@@ -108,12 +151,16 @@ def test_alpha_is_dropped_without_touching_the_colours(tmp_path):
     values = numbers((5, 6, 4), np.uint8)
     values[..., 3] = 7
     Image.fromarray(values, "RGBA" if values.shape[2] == 4 else None).save(tmp_path / "x.png")
-    np.testing.assert_allclose(read_picture(tmp_path / "x.png").values, srgb_to_linear(values[..., :3] / 255), rtol=1e-6)
+    np.testing.assert_allclose(
+        read_picture(tmp_path / "x.png").values, srgb_to_linear(values[..., :3] / 255), rtol=1e-6
+    )
 
 
 def test_jpeg_float_tiff_and_exr(tmp_path):
     flat = np.full((16, 16, 3), 188, np.uint8)
-    np.testing.assert_allclose(read_picture(save(tmp_path / "x.jpg", flat)).values, srgb_to_linear(188 / 255), atol=0.01)
+    np.testing.assert_allclose(
+        read_picture(save(tmp_path / "x.jpg", flat)).values, srgb_to_linear(188 / 255), atol=0.01
+    )
     values = np.random.default_rng(1).random((4, 5, 3), dtype=np.float32)
     np.testing.assert_array_equal(read_picture(save(tmp_path / "x.tif", values)).values, values)
     write_exr(tmp_path / "x.exr", dict(zip("RGBA", [*np.moveaxis(values, -1, 0), np.ones((4, 5))])))
@@ -125,12 +172,23 @@ def test_jpeg_float_tiff_and_exr(tmp_path):
 def test_pictures_that_cannot_be_used_say_why(tmp_path):
     (tmp_path / "t.png").write_text("text")
     good = save(tmp_path / "good.png", numbers((64, 64, 3), np.uint8)).read_bytes()
-    (tmp_path / "cut.png").write_bytes(good[:len(good) // 2])
-    (tmp_path / "cut.tif").write_bytes(save(tmp_path / "good.tif", numbers((64, 64), np.uint16), compression="zip").read_bytes()[:2000])
+    (tmp_path / "cut.png").write_bytes(good[: len(good) // 2])
+    (tmp_path / "cut.tif").write_bytes(
+        save(tmp_path / "good.tif", numbers((64, 64), np.uint16), compression="zip").read_bytes()[
+            :2000
+        ]
+    )
     write_exr(tmp_path / "odd.exr", {"depth": np.ones((2, 2)), "id": np.ones((2, 2))})
     write_exr(tmp_path / "inf.exr", {"Y": np.full((2, 2), np.inf)})
-    for name, words in {"none.png": "does not exist", "t.png": "no PNG, JPEG, TIFF or EXR", "cut.png": "damaged|no readable", "cut.tif": "damaged|no readable",
-                        "odd.exr": "neither Y nor", "inf.exr": "NaN or infinite", "": "is a folder"}.items():
+    for name, words in {
+        "none.png": "does not exist",
+        "t.png": "no PNG, JPEG, TIFF or EXR",
+        "cut.png": "damaged|no readable",
+        "cut.tif": "damaged|no readable",
+        "odd.exr": "neither Y nor",
+        "inf.exr": "NaN or infinite",
+        "": "is a folder",
+    }.items():
         with pytest.raises(InputError, match=words) as caught:
             read_picture(tmp_path / name)
         assert str(tmp_path / name) in str(caught.value)

@@ -5,10 +5,19 @@ import pytest
 from plenocli.files.artefacts.provenance import Provenance, provenance_texts, read_provenance_texts
 
 
-@pytest.mark.parametrize("provenance", [
-    Provenance(""),
-    Provenance("plenocli demux a.h5", {"capture": {"name": "a.h5", "sha256": "0" * 64}}, 0, "[sensor]\n", {"asked": 1e-3}),
-])
+@pytest.mark.parametrize(
+    "provenance",
+    [
+        Provenance(""),
+        Provenance(
+            "plenocli demux a.h5",
+            {"capture": {"name": "a.h5", "sha256": "0" * 64}},
+            0,
+            "[sensor]\n",
+            {"asked": 1e-3},
+        ),
+    ],
+)
 def test_texts_bring_everything_back(provenance):
     texts = provenance_texts(provenance)
     assert all(isinstance(text, str) and text for text in texts.values())
@@ -16,5 +25,7 @@ def test_texts_bring_everything_back(provenance):
 
 
 def test_broken_texts_count_as_absent():
-    assert read_provenance_texts({"plenocli:inputs": "{", "plenocli:command": "c"}) == Provenance("c")
+    assert read_provenance_texts({"plenocli:inputs": "{", "plenocli:command": "c"}) == Provenance(
+        "c"
+    )
     assert read_provenance_texts({"plenocli:inputs": "[1]", "plenocli:seed": "x"}) == Provenance("")

@@ -1,16 +1,17 @@
-"""RAW and DNG: mosaics bit by bit, levels by position, and a reason for every file that is refused."""
+"""RAW and DNG: mosaics bit by bit, levels by position, and a reason for every
+file that is refused.
+"""
 
 import struct
 
 import numpy as np
 import pytest
 
-from plenocli.files.images.dng import write_dng
+from plenocli.base.errors import InputError, OutputError
+from plenocli.files.images import raw as raw_module
+from plenocli.files.images.dng import read_notes, write_dng
 from plenocli.files.images.mosaic import read_mosaic
 from plenocli.files.images.raw import read_raw
-from plenocli.files.images import raw as raw_module
-from plenocli.files.images.dng import read_notes
-from plenocli.base.errors import InputError, OutputError
 
 
 def mosaic(shape, seed=0, top=16384):
@@ -23,7 +24,15 @@ def test_rawpy_reads_the_numbers_we_wrote(tmp_path, cfa, shape):
     import rawpy
 
     values, black = mosaic(shape), np.array([[512, 513], [514, 515]])
-    write_dng(tmp_path / "x.dng", values, cfa=cfa, black=black if cfa != "mono" else 512, white=16383, exposure_s=1 / 60, iso=200)
+    write_dng(
+        tmp_path / "x.dng",
+        values,
+        cfa=cfa,
+        black=black if cfa != "mono" else 512,
+        white=16383,
+        exposure_s=1 / 60,
+        iso=200,
+    )
     with rawpy.imread(str(tmp_path / "x.dng")) as file:
         np.testing.assert_array_equal(file.raw_image, values)
         assert file.white_level == 16383 and file.other.iso_speed == 200
@@ -33,17 +42,34 @@ def test_rawpy_reads_the_numbers_we_wrote(tmp_path, cfa, shape):
         else:
             letters = "".join(file.color_desc.decode()[i] for i in file.raw_pattern.ravel())
             assert letters == cfa
-            np.testing.assert_array_equal(np.array(file.black_level_per_channel)[file.raw_pattern], black)
+            np.testing.assert_array_equal(
+                np.array(file.black_level_per_channel)[file.raw_pattern], black
+            )
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GBRG", "mono"])
 def test_our_reader_gives_back_everything(tmp_path, cfa):
     values = mosaic((40, 30))
-    notes = {"gain_e_per_dn": 4.0, "band_m": 450e-9, "target": "<µ & \"quotes\">"}
-    write_dng(tmp_path / "x.dng", values, cfa=cfa, black=[[64.5, 65], [66, 67]], white=16000, exposure_s=0.0125, xmp_json=notes)
+    notes = {"gain_e_per_dn": 4.0, "band_m": 450e-9, "target": '<µ & "quotes">'}
+    write_dng(
+        tmp_path / "x.dng",
+        values,
+        cfa=cfa,
+        black=[[64.5, 65], [66, 67]],
+        white=16000,
+        exposure_s=0.0125,
+        xmp_json=notes,
+    )
     back = read_mosaic(tmp_path / "x.dng")
     np.testing.assert_array_equal(back.values, values)
-    assert (back.cfa, back.white, back.gain, back.band_m, back.source, back.units) == (cfa, 16000, 0.25, 450e-9, "dng", "DN")
+    assert (back.cfa, back.white, back.gain, back.band_m, back.source, back.units) == (
+        cfa,
+        16000,
+        0.25,
+        450e-9,
+        "dng",
+        "DN",
+    )
     np.testing.assert_array_equal(back.black, [[64.5, 65], [66, 67]])
     assert back.exposure_s == pytest.approx(0.0125, rel=1e-6)
     assert back.meta["target"] == notes["target"] and back.meta["verified"]
@@ -51,11 +77,22 @@ def test_our_reader_gives_back_everything(tmp_path, cfa):
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_levels_of_a_dng_without_our_notes_are_put_in_their_positions(tmp_path, cfa):
-    write_dng(tmp_path / "x.dng", mosaic((40, 30)), cfa=cfa, black=[[512, 513], [514, 515]], white=16383, exposure_s=1 / 250)
+    write_dng(
+        tmp_path / "x.dng",
+        mosaic((40, 30)),
+        cfa=cfa,
+        black=[[512, 513], [514, 515]],
+        white=16383,
+        exposure_s=1 / 250,
+    )
     content = (tmp_path / "x.dng").read_bytes().replace(b"mosaic_sha256", b"mosaic_sha25x")
     (tmp_path / "x.dng").write_bytes(content)
     back = read_mosaic(tmp_path / "x.dng")
-    assert back.cfa == cfa and not back.meta["verified"] and back.exposure_s == pytest.approx(0.004, rel=1e-6)
+    assert (
+        back.cfa == cfa
+        and not back.meta["verified"]
+        and back.exposure_s == pytest.approx(0.004, rel=1e-6)
+    )
     np.testing.assert_array_equal(back.black, [[512, 513], [514, 515]])
 
 
@@ -66,13 +103,24 @@ def test_independent_tiff_reader_agrees(tmp_path):
     with tifffile.TiffFile(tmp_path / "x.dng") as file:
         page = file.pages[0]
         np.testing.assert_array_equal(page.asarray(), values)
-        assert page.tags[33422].value == b"\x00\x01\x01\x02" and page.tags[50706].value == b"\x01\x04\x00\x00"
+        assert (
+            page.tags[33422].value == b"\x00\x01\x01\x02"
+            and page.tags[50706].value == b"\x01\x04\x00\x00"
+        )
         assert page.tags[34665].value["ExposureTime"] == (2, 1)
 
 
 def test_same_input_same_bytes(tmp_path):
     for name in "ab":
-        write_dng(tmp_path / f"{name}.dng", mosaic((30, 30)), cfa="mono", black=3, white=4095, exposure_s=0.1, xmp_json={"b": 1, "a": 2})
+        write_dng(
+            tmp_path / f"{name}.dng",
+            mosaic((30, 30)),
+            cfa="mono",
+            black=3,
+            white=4095,
+            exposure_s=0.1,
+            xmp_json={"b": 1, "a": 2},
+        )
     assert (tmp_path / "a.dng").read_bytes() == (tmp_path / "b.dng").read_bytes()
 
 
@@ -96,13 +144,17 @@ def unsigned(path):
     return path
 
 
-@pytest.mark.parametrize("values,black,white,words", [
-    (np.zeros((40, 40)), 0, 4095, "100.0% zeros"),
-    (np.where(np.arange(4000).reshape(50, 80) % 200 == 7, 900, 0), 0, 4095, "99.5% zeros"),
-    (np.full((40, 40), 300), 0, 4095, "one single value"),
-    (mosaic((40, 40)), 0, 255, "above its white level"),
-    (mosaic((40, 40), top=100), 2048, 4095, "far below its black level"),
-    (mosaic((40, 40)), 5000, 4095, "not above its black level")])
+@pytest.mark.parametrize(
+    "values,black,white,words",
+    [
+        (np.zeros((40, 40)), 0, 4095, "100.0% zeros"),
+        (np.where(np.arange(4000).reshape(50, 80) % 200 == 7, 900, 0), 0, 4095, "99.5% zeros"),
+        (np.full((40, 40), 300), 0, 4095, "one single value"),
+        (mosaic((40, 40)), 0, 255, "above its white level"),
+        (mosaic((40, 40), top=100), 2048, 4095, "far below its black level"),
+        (mosaic((40, 40)), 5000, 4095, "not above its black level"),
+    ],
+)
 def test_implausible_mosaics_are_refused_with_the_reason(tmp_path, values, black, white, words):
     write_dng(tmp_path / "x.dng", values.astype(np.uint16), cfa="RGGB", black=black, white=white)
     with pytest.raises(InputError, match=words):
@@ -111,8 +163,13 @@ def test_implausible_mosaics_are_refused_with_the_reason(tmp_path, values, black
 
 def test_wrong_numbers_are_refused_by_the_writer(tmp_path):
     good = dict(cfa="RGGB", black=0, white=4095)
-    for values, settings in ((np.zeros((30, 30)), good), (np.full((30, 30), 70000), good), (np.zeros((3, 30, 30), int), good),
-                             (mosaic((30, 30)), good | {"cfa": "CMYG"}), (mosaic((30, 30)), good | {"white": 0})):
+    for values, settings in (
+        (np.zeros((30, 30)), good),
+        (np.full((30, 30), 70000), good),
+        (np.zeros((3, 30, 30), int), good),
+        (mosaic((30, 30)), good | {"cfa": "CMYG"}),
+        (mosaic((30, 30)), good | {"white": 0}),
+    ):
         with pytest.raises(ValueError):
             write_dng(tmp_path / "x.dng", values, **settings)
     with pytest.raises(OutputError, match="too few for a DNG"):
@@ -154,11 +211,21 @@ HOSTILE = {  # what a file might make LibRaw do, after the child has bound itsel
     "disk": ("open(sys.argv[1] + '.new', 'wb', buffering=0).write(b'x')", "File too large"),
     "exit": ("os._exit(7)", "no answer"),
     "garbage": ("os.write(channel.fileno(), b'[1, 2\\n\\0\\0'); os._exit(0)", "garbled"),
-    "short": ("found, pixels = {'shape': [30, 30], 'refused_': 0}, b'12'; channel.write(json.dumps(found).encode() + b'\\n' + pixels); channel.flush(); os._exit(0)", "incomplete")}
+    "short": (
+        (
+            "found, pixels = {'shape': [30, 30], 'refused_': 0}, b'12'; "
+            "channel.write(json.dumps(found).encode() + b'\\n' + pixels); "
+            "channel.flush(); os._exit(0)"
+        ),
+        "incomplete",
+    ),
+}
 
 
 @pytest.mark.parametrize("deed", HOSTILE)
-def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(tmp_path, monkeypatch, deed, capsys):
+def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(
+    tmp_path, monkeypatch, deed, capsys
+):
     """The deed stands in the place of LibRaw's call, within the child's own limits."""
     from plenocli.cli.main import run
 
@@ -167,7 +234,9 @@ def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(tmp_path
     call = "        found, pixels = read(path)\n"
     assert call in source
     child = tmp_path / "child.py"
-    child.write_text("import signal, time\n" + source.replace(call, f"        {HOSTILE[deed][0]}\n"))
+    child.write_text(
+        "import signal, time\n" + source.replace(call, f"        {HOSTILE[deed][0]}\n")
+    )
     monkeypatch.setattr(raw_module, "CHILD", child)
     monkeypatch.setattr(raw_module, "_CPU_S", 1)
     if deed == "sleep":
@@ -187,10 +256,13 @@ def test_notes_of_other_files_are_empty(tmp_path):
     assert read_notes(tmp_path / "x") == {}
 
 
-# --- real files ---------------------------------------------------------------------------------------------------------
+# --- real files -----------------------------------------------------------------------------------
 
-REAL = {"nikon_d1.NEF": ((1324, 2012), "BGGR", 0, 4095, 1 / 250, "NIKON D1"), "kodak_dc50.KDC": ((512, 768), "GRBG", 0, 16383, 0.00435, "DC50"),
-        "blackmagic_cinemadng.dng": ((2176, 4128), "RGGB", 512, 65535, None, None)}
+REAL = {
+    "nikon_d1.NEF": ((1324, 2012), "BGGR", 0, 4095, 1 / 250, "NIKON D1"),
+    "kodak_dc50.KDC": ((512, 768), "GRBG", 0, 16383, 0.00435, "DC50"),
+    "blackmagic_cinemadng.dng": ((2176, 4128), "RGGB", 512, 65535, None, None),
+}
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -199,7 +271,12 @@ def test_real_camera_files(shared_data, name):
 
     shape, cfa, black, white, exposure, model = REAL[name]
     back = read_mosaic(shared_data / "raw" / name)
-    assert back.values.shape == shape and back.cfa == cfa and (back.black == black).all() and back.white == white
+    assert (
+        back.values.shape == shape
+        and back.cfa == cfa
+        and (back.black == black).all()
+        and back.white == white
+    )
     assert back.exposure_s == (exposure and pytest.approx(exposure, rel=1e-3))
     assert model is None or model in back.meta["model"]
     with rawpy.imread(str(shared_data / "raw" / name)) as file:
@@ -207,15 +284,27 @@ def test_real_camera_files(shared_data, name):
         assert [file.color_desc.decode()[i] for i in file.raw_pattern.ravel()] == list(cfa)
 
 
-BROKEN = {"corrupt_exiv2_issue_857_poc.raf": "not a RAW file", "derived_empty.NEF": "0 bytes", "derived_truncated_nikon_d1.NEF": "ends before",
-          "trunc_exiftool_CanonRaw.cr2": "not a RAW file", "trunc_exiftool_CanonRaw.cr3": "ends before", "trunc_exiftool_FujiFilm.raf": "ends before",
-          "trunc_exiftool_Nikon.nef": "corrupt image data", "trunc_exiftool_Panasonic.rw2": "99.8% zeros", "trunc_exiftool_SigmaDP2.x3f": "too big"}
+BROKEN = {
+    "corrupt_exiv2_issue_857_poc.raf": "not a RAW file",
+    "derived_empty.NEF": "0 bytes",
+    "derived_truncated_nikon_d1.NEF": "ends before",
+    "trunc_exiftool_CanonRaw.cr2": "not a RAW file",
+    "trunc_exiftool_CanonRaw.cr3": "ends before",
+    "trunc_exiftool_FujiFilm.raf": "ends before",
+    "trunc_exiftool_Nikon.nef": "corrupt image data",
+    "trunc_exiftool_Panasonic.rw2": "99.8% zeros",
+    "trunc_exiftool_SigmaDP2.x3f": "too big",
+}
 
 
 def test_every_broken_or_mosaicless_file_says_why(shared_data):
-    files = sorted((shared_data / "raw" / "broken").iterdir()) + sorted((shared_data / "raw" / "no_cfa").iterdir())
+    files = sorted((shared_data / "raw" / "broken").iterdir()) + sorted(
+        (shared_data / "raw" / "no_cfa").iterdir()
+    )
     assert len(files) >= 12
     for path in files:
-        with pytest.raises(InputError, match=BROKEN.get(path.name, "values a pixel, not a colour filter mosaic")) as caught:
+        with pytest.raises(
+            InputError, match=BROKEN.get(path.name, "values a pixel, not a colour filter mosaic")
+        ) as caught:
             read_mosaic(path)
         assert str(path) in str(caught.value) and caught.value.fix

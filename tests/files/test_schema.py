@@ -8,7 +8,12 @@ from plenocli.files.artefacts.schema import ROOT_ATTRIBUTES
 
 
 def test_documentation_page_names_everything():
-    done = subprocess.run([sys.executable, "-m", "plenocli.files.artefacts"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "plenocli.files.artefacts"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     for name in ROOT_ATTRIBUTES:
         assert f"`{name}`" in done.stdout
     for schema in SCHEMAS.values():
@@ -23,15 +28,38 @@ def test_documentation_page_names_everything():
 def test_every_field_and_attribute_is_explained():
     for schema in SCHEMAS.values():
         assert all(len(field.doc) > 5 for field in schema.fields)
-        assert all(attr.doc and attr.type in ("number", "text", "json", "flag") for attrs in schema.attrs.values() for attr in attrs)
+        assert all(
+            attr.doc and attr.type in ("number", "text", "json", "flag")
+            for attrs in schema.attrs.values()
+            for attr in attrs
+        )
 
 
 def test_contract_names_are_there():
     due = {
-        "pif": ("pif/A", "pif/wavelength", "pif/lenslet_offset", "pif/pixel_shape", "pif/object_shape", "pif/column_energy", "pif/singular_values"),
+        "pif": (
+            "pif/A",
+            "pif/wavelength",
+            "pif/lenslet_offset",
+            "pif/pixel_shape",
+            "pif/object_shape",
+            "pif/column_energy",
+            "pif/singular_values",
+        ),
         "capture": ("capture/mosaic", "capture/cfa", "capture/lenslet_centre", "capture/scene"),
-        "calibration": ("grid/centre", "grid/valid", "grid/residual", "white/flat", "dark/mean", "response/F", "response/origin",
-                        "response/window", "response/covariance", "response/wavelength", "response/white"),
+        "calibration": (
+            "grid/centre",
+            "grid/valid",
+            "grid/residual",
+            "white/flat",
+            "dark/mean",
+            "response/F",
+            "response/origin",
+            "response/window",
+            "response/covariance",
+            "response/wavelength",
+            "response/white",
+        ),
         "spectra": ("spectra/value", "spectra/sigma", "spectra/wavelength"),
         "dictionary": ("dictionary/atoms", "dictionary/history/objective", "dictionary/state/rng"),
         "image": ("image/value", "image/sigma"),

@@ -1,4 +1,6 @@
-"""Artefacts written in pieces: the same bytes as held in memory, whole or not at all; matrices split into shards."""
+"""Artefacts written in pieces: the same bytes as held in memory, whole or not at all; matrices
+split into shards.
+"""
 
 import os
 import subprocess
@@ -7,13 +9,13 @@ import sys
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError, UsageError
+from plenocli.files import atomic
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.shards import pif_parts, read_pif, shard_path, writing_pif
-from plenocli.files.artefacts.stream import streamed_artefact
-from plenocli.files import atomic
 from plenocli.files.artefacts.sparse import PAGE, SparseFile
-from plenocli.base.errors import InputError, UsageError
+from plenocli.files.artefacts.stream import streamed_artefact
 from tests.peak import PEAK
 
 SHAPE = (2, 3, 6, 4)
@@ -21,10 +23,20 @@ SHAPE = (2, 3, 6, 4)
 
 def pif(A, notes="short"):
     rng = np.random.default_rng(3)
-    return Artefact("pif", {
-        "pif/A": A, "pif/wavelength": [5e-7, 6e-7], "pif/lenslet_offset": np.array([[0, -1], [0, 0], [0, 1]]), "pif/pixel_shape": [2, 3],
-        "pif/object_shape": [2, 2], "pif/column_energy": rng.random((2, 4)), "pif/singular_values": np.ones((2, 4))},
-        {"pif": {"rank": [4, 4], "condition": np.inf, "kappa": -0.5, "notes": {"text": notes}}}, Provenance("plenocli simulate-pif", config="# µm\n"))
+    return Artefact(
+        "pif",
+        {
+            "pif/A": A,
+            "pif/wavelength": [5e-7, 6e-7],
+            "pif/lenslet_offset": np.array([[0, -1], [0, 0], [0, 1]]),
+            "pif/pixel_shape": [2, 3],
+            "pif/object_shape": [2, 2],
+            "pif/column_energy": rng.random((2, 4)),
+            "pif/singular_values": np.ones((2, 4)),
+        },
+        {"pif": {"rank": [4, 4], "condition": np.inf, "kappa": -0.5, "notes": {"text": notes}}},
+        Provenance("plenocli simulate-pif", config="# µm\n"),
+    )
 
 
 def matrix(dtype=np.float32):
@@ -53,7 +65,8 @@ def test_pieces_in_any_order_give_the_bytes_of_the_whole(tmp_path, dtype, notes)
 @pytest.mark.parametrize("call", ["pwrite", "fsync", "replace", "ftruncate", "pread"])
 def test_failing_the_nth_call_leaves_no_file(tmp_path, each_failure, call):
     for done in each_failure(call, lambda: write_streamed(tmp_path / "a.h5", matrix())):
-        if done or (call == "fsync" and (tmp_path / "a.h5").exists()):  # the folder's own: the file is whole by then
+        # the folder's own: the file is whole by then
+        if done or (call == "fsync" and (tmp_path / "a.h5").exists()):
             read_artefact(tmp_path / "a.h5", "pif")
             (tmp_path / "a.h5").unlink()
         assert os.listdir(tmp_path) == []
@@ -62,19 +75,27 @@ def test_failing_the_nth_call_leaves_no_file(tmp_path, each_failure, call):
 def test_short_writes_are_continued(tmp_path, monkeypatch):
     real = os.pwrite
     write_streamed(tmp_path / "whole.h5", matrix())
-    monkeypatch.setattr(atomic.os, "pwrite", lambda descriptor, view, offset: real(descriptor, view[:100], offset))
+    monkeypatch.setattr(
+        atomic.os, "pwrite", lambda descriptor, view, offset: real(descriptor, view[:100], offset)
+    )
     write_streamed(tmp_path / "short.h5", matrix())
     assert (tmp_path / "whole.h5").read_bytes() == (tmp_path / "short.h5").read_bytes()
 
 
 def test_a_file_size_limit_is_an_output_error(tmp_path):
-    code = ("import signal, sys, resource; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-            "import numpy as np; from plenocli.files.artefacts.stream import streamed_artefact; from plenocli.base.errors import OutputError\n"
-            "resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))\n"
-            "try:\n"
-            "    with streamed_artefact(sys.argv[1], 'pif', 'pif/A', (1, 1, 500, 100), 'f4') as s: s.put((0, 0), np.ones((500, 100)))\n"
-            "except OutputError as e: print('refused', e)\n")
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.h5")], capture_output=True, text=True)
+    code = (
+        "import signal, sys, resource; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "import numpy as np; from plenocli.files.artefacts.stream import streamed_artefact; from "
+        "plenocli.base.errors import OutputError\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))\n"
+        "try:\n"
+        "    with streamed_artefact(sys.argv[1], 'pif', 'pif/A', (1, 1, 500, 100), 'f4') as s: "
+        "s.put((0, 0), np.ones((500, 100)))\n"
+        "except OutputError as e: print('refused', e)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "a.h5")], capture_output=True, text=True
+    )
     assert done.returncode == 0 and "refused" in done.stdout and os.listdir(tmp_path) == []
 
 
@@ -112,10 +133,10 @@ def test_sparse_file_behaves_as_a_file():
         assert sparse.write(data) == length
         if length:
             plain.extend(bytes(max(0, offset + length - len(plain))))
-            plain[offset:offset + length] = data
+            plain[offset : offset + length] = data
         start, count = int(rng.integers(0, 8 * PAGE)), int(rng.integers(0, 3 * PAGE))
         sparse.seek(start)
-        assert sparse.read(count) == bytes(plain[start:start + count])
+        assert sparse.read(count) == bytes(plain[start : start + count])
     assert sparse.seek(0, os.SEEK_END) == len(plain)
     sparse.seek(10**15)
     sparse.write(b"far")
@@ -135,12 +156,16 @@ def test_shards_are_artefacts_and_come_back_together(tmp_path):
     write_shards(tmp_path / "pif.h5", A)
     assert sorted(os.listdir(tmp_path)) == ["pif.000.h5", "pif.001.h5", "pif.h5"]
     second = read_artefact(shard_path(tmp_path / "pif.h5", 1), "pif")
-    assert np.array_equal(second.data["pif/A"], A[:, 1:]) and second.data["pif/lenslet_offset"].tolist() == [[0, 0], [0, 1]]
+    assert np.array_equal(second.data["pif/A"], A[:, 1:]) and second.data[
+        "pif/lenslet_offset"
+    ].tolist() == [[0, 0], [0, 1]]
     assert second.data["pif/column_energy"] == pytest.approx(A[:, 1:].sum(axis=(1, 2)), rel=1e-6)
     whole = read_pif(tmp_path / "pif.h5")
     write_artefact(tmp_path / "whole.h5", pif(A))
     other = read_pif(tmp_path / "whole.h5")
-    assert set(whole.data) == set(other.data) and all(np.array_equal(whole.data[k], other.data[k]) for k in other.data)
+    assert set(whole.data) == set(other.data) and all(
+        np.array_equal(whole.data[k], other.data[k]) for k in other.data
+    )
     assert repr(whole.attrs) == repr(other.attrs) and whole.kind == "pif"
     assert [lenslets.tolist() for lenslets, _ in pif_parts(tmp_path / "pif.h5")] == [[0], [1, 2]]
     with pytest.raises(UsageError):
@@ -186,13 +211,24 @@ def test_failure_in_the_middle_leaves_no_shard(tmp_path):
 
 
 def test_streaming_holds_one_piece_in_memory(tmp_path):
-    code = ("import sys, numpy as np; from plenocli.files.artefacts.stream import streamed_artefact; from plenocli.files.artefacts.container import Artefact; from plenocli.files.artefacts.provenance import Provenance\n"
-            "shape = (1, 40, 1000, 1000); piece = np.full(shape[2:], 1e-6, 'f4')\n"
-            f"before = {PEAK}\n"
-            "with streamed_artefact(sys.argv[1], 'pif', 'pif/A', shape, 'f4') as s:\n"
-            "    for l in range(40): s.put((0, l), piece)\n"
-            "    s.close(Artefact('pif', {'pif/wavelength': [5e-7], 'pif/lenslet_offset': np.zeros((40, 2), int), 'pif/pixel_shape': [10, 100],\n"
-            "        'pif/object_shape': [10, 100], 'pif/column_energy': np.ones((1, 1000))}, {}, Provenance('test')))\n"
-            f"print({PEAK} - before)\n")
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.h5")], capture_output=True, text=True, check=True)
+    code = (
+        "import sys, numpy as np; from plenocli.files.artefacts.stream import streamed_artefact; "
+        "from plenocli.files.artefacts.container import Artefact; from "
+        "plenocli.files.artefacts.provenance import Provenance\n"
+        "shape = (1, 40, 1000, 1000); piece = np.full(shape[2:], 1e-6, 'f4')\n"
+        f"before = {PEAK}\n"
+        "with streamed_artefact(sys.argv[1], 'pif', 'pif/A', shape, 'f4') as s:\n"
+        "    for l in range(40): s.put((0, l), piece)\n"
+        "    s.close(Artefact('pif', {'pif/wavelength': [5e-7], 'pif/lenslet_offset': "
+        "np.zeros((40, 2), int), 'pif/pixel_shape': [10, 100],\n"
+        "        'pif/object_shape': [10, 100], 'pif/column_energy': np.ones((1, 1000))}, {}, "
+        "Provenance('test')))\n"
+        f"print({PEAK} - before)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "a.h5")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert os.path.getsize(tmp_path / "a.h5") > 160_000_000 and int(done.stdout) < 40_000  # KiB

@@ -1,4 +1,6 @@
-"""Solvers at the edges of arithmetic: any condition, deficient matrices, any scale, sizes from one, nothing but zeros."""
+"""Solvers at the edges of arithmetic: any condition, deficient matrices, any scale, sizes from
+one, nothing but zeros.
+"""
 
 import warnings
 
@@ -6,9 +8,10 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.picture import least_squares as linear, lmmse, nnls
-from plenocli.inverse.spectra import demultiplex as spectral
+from plenocli.inverse.picture import least_squares as linear
+from plenocli.inverse.picture import lmmse, nnls
 from plenocli.inverse.sparse.l1.solve import sparse_code
+from plenocli.inverse.spectra import demultiplex as spectral
 from tests.reference import extremes
 from tests.reference.extremes import CONDITIONS, KINDS, SIZES
 
@@ -34,14 +37,29 @@ def test_answers_solve_their_equations_as_well_as_arithmetic_allows(count, kind,
             for relative in (1e-16, 1e-12, 1e-4, 1e4):
                 assert extremes.tikhonov(a, y, relative) < MOST, (shape, condition, relative)
             assert extremes.truncated(a, y) < MOST, (shape, condition)
-            for found in (extremes.nonnegative(a, y), extremes.demultiplexed(a, y, "pinv"), extremes.demultiplexed(a, y, "wls")):
+            for found in (
+                extremes.nonnegative(a, y),
+                extremes.demultiplexed(a, y, "pinv"),
+                extremes.demultiplexed(a, y, "wls"),
+            ):
                 assert found is None or found < MOST, (shape, condition)
                 refused, answers = refused + (found is None), answers + 1
             for relative in (1e-12, 1e-6, 1e-2, 1.0, 1e6):
                 gap, excess = extremes.coded(a, y, relative)
-                assert excess < 1e-3 and (gap <= 1e-6 or relative < 1e-8), (shape, condition, relative, gap, excess)
+                assert excess < 1e-3 and (gap <= 1e-6 or relative < 1e-8), (
+                    shape,
+                    condition,
+                    relative,
+                    gap,
+                    excess,
+                )
     assert answers > 20 and refused < answers
-    count("solvers x matrices, residuals of their equations in rounding errors", answers=answers - refused, refused=refused, above_30=0)
+    count(
+        "solvers x matrices, residuals of their equations in rounding errors",
+        answers=answers - refused,
+        refused=refused,
+        above_30=0,
+    )
 
 
 def test_the_report_has_a_row_for_each_condition():
@@ -57,22 +75,40 @@ def test_data_times_s_give_results_times_s(scale):
     alpha = linear.discrepancy_alpha(svd, svd.compress(y), 1e-3)
     scaled = linear.discrepancy_alpha(svd, svd.compress(scale * y), scale * 1e-3)
     assert scaled == pytest.approx(alpha, rel=1e-9)
-    assert linear.best_rank(svd, svd.compress(scale * y), scale * 1e-3) == linear.best_rank(svd, svd.compress(y), 1e-3)
-    assert linear.estimate_noise(svd, scale * y) == pytest.approx(scale * linear.estimate_noise(svd, y), rel=1e-9)
-    assert nnls.converged(a, scale * y).x == pytest.approx(scale * nnls.converged(a, y).x, rel=1e-6, abs=1e-9 * scale)
+    assert linear.best_rank(svd, svd.compress(scale * y), scale * 1e-3) == linear.best_rank(
+        svd, svd.compress(y), 1e-3
+    )
+    assert linear.estimate_noise(svd, scale * y) == pytest.approx(
+        scale * linear.estimate_noise(svd, y), rel=1e-9
+    )
+    assert nnls.converged(a, scale * y).x == pytest.approx(
+        scale * nnls.converged(a, y).x, rel=1e-6, abs=1e-9 * scale
+    )
     for method in ("pinv", "wls", "nnls"):
         found, sigma = spectral.demultiplex(a, scale * y.T, method, variance=1e-6 * scale**2)
         expected, spread = spectral.demultiplex(a, y.T, method, variance=1e-6)
-        assert found == pytest.approx(scale * expected, rel=1e-8, abs=1e-12 * scale) and sigma == pytest.approx(scale * spread, rel=1e-9)
+        assert found == pytest.approx(
+            scale * expected, rel=1e-8, abs=1e-12 * scale
+        ) and sigma == pytest.approx(scale * spread, rel=1e-9)
     lam = 0.05 * 2 * np.abs(a.T @ y).max()
-    assert sparse_code(a, scale * y, scale * lam, workers=1).c == pytest.approx(scale * sparse_code(a, y, lam, workers=1).c, rel=1e-5, abs=1e-9 * scale)
+    assert sparse_code(a, scale * y, scale * lam, workers=1).c == pytest.approx(
+        scale * sparse_code(a, y, lam, workers=1).c, rel=1e-5, abs=1e-9 * scale
+    )
     for factor in (scale, 1 / scale):  # the matrix in other units, the object in theirs
         other = linear.decompose(a * factor)
-        assert linear.tikhonov(other, other.compress(y), alpha * factor**2) == pytest.approx(linear.tikhonov(svd, svd.compress(y), alpha) / factor, rel=1e-8)
+        assert linear.tikhonov(other, other.compress(y), alpha * factor**2) == pytest.approx(
+            linear.tikhonov(svd, svd.compress(y), alpha) / factor, rel=1e-8
+        )
     points, covariance = np.full(7, 0.4), 0.05 * np.eye(7)
-    found = lmmse.prepare(svd, scale * points, scale**2 * covariance, scale * 1e-2).adaptive(scale * y)
+    found = lmmse.prepare(svd, scale * points, scale**2 * covariance, scale * 1e-2).adaptive(
+        scale * y
+    )
     expected = lmmse.prepare(svd, points, covariance, 1e-2).adaptive(y)
-    assert found[0] == pytest.approx(scale * expected[0], rel=1e-8) and found[1] == pytest.approx(scale * expected[1], rel=1e-8) and found[2] == pytest.approx(expected[2], rel=1e-8)
+    assert (
+        found[0] == pytest.approx(scale * expected[0], rel=1e-8)
+        and found[1] == pytest.approx(scale * expected[1], rel=1e-8)
+        and found[2] == pytest.approx(expected[2], rel=1e-8)
+    )
 
 
 @pytest.mark.parametrize("values", [0.0, 1.0, 5e-324, 1e-310, 1e-160, 1e150], ids=str)
@@ -82,8 +118,14 @@ def test_constant_zero_and_denormal_data_give_finite_answers(values):
     svd = linear.decompose(a)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        answers = [linear.tikhonov(svd, svd.compress(y), 1e-6), linear.truncated(svd, svd.compress(y), 4), nnls.projected_gradient(a, y, 20).x,
-                   spectral.demultiplex(a, y.T, "pinv")[0], sparse_code(a, y, 1e-3, workers=1).c, *lmmse.prepare(svd, np.full(6, 0.4), 0.05 * np.eye(6), 1e-3).adaptive(y)[:2]]
+        answers = [
+            linear.tikhonov(svd, svd.compress(y), 1e-6),
+            linear.truncated(svd, svd.compress(y), 4),
+            nnls.projected_gradient(a, y, 20).x,
+            spectral.demultiplex(a, y.T, "pinv")[0],
+            sparse_code(a, y, 1e-3, workers=1).c,
+            *lmmse.prepare(svd, np.full(6, 0.4), 0.05 * np.eye(6), 1e-3).adaptive(y)[:2],
+        ]
     assert all(np.isfinite(x).all() for x in answers)
     if values == 0:
         assert all(not x.any() for x in answers[:5])
@@ -101,8 +143,14 @@ def test_any_noise_from_overwhelming_to_none(noise_db):
     alpha = linear.discrepancy_alpha(svd, z, sigma)
     estimate, spread, _ = extremes.wiener(a, y, sigma)
     level = np.linalg.norm(truth)
-    assert np.linalg.norm(linear.tikhonov(svd, z, alpha) - truth) < 1.5 * level and 1 <= linear.best_rank(svd, z, sigma) <= 25
-    assert np.isfinite(spread).all() and np.linalg.norm(estimate - truth) < (40 if noise_db < 0 else 1.5) * level
+    assert (
+        np.linalg.norm(linear.tikhonov(svd, z, alpha) - truth) < 1.5 * level
+        and 1 <= linear.best_rank(svd, z, sigma) <= 25
+    )
+    assert (
+        np.isfinite(spread).all()
+        and np.linalg.norm(estimate - truth) < (40 if noise_db < 0 else 1.5) * level
+    )
 
 
 def test_without_light_or_with_wrong_numbers_there_is_a_named_refusal():

@@ -1,7 +1,8 @@
 """White images of lenslet arrays with known centres, rendered pixel by pixel from the definition.
 
-Every lenslet is one flat disc with a soft edge, or one bell, rigid, at its own true centre; a pixel is the mean of the
-light over its area (Gauss-Legendre nodes). Nothing here knows how grids are found.
+Every lenslet is one flat disc with a soft edge, or one bell, rigid, at its own true centre; a pixel
+is the mean of the light over its area (Gauss-Legendre nodes). Nothing here knows
+how grids are found.
 """
 
 from dataclasses import dataclass
@@ -13,10 +14,16 @@ import numpy as np
 class Array:
     """What is photographed. Lengths in px, angles in degrees, brightness relative to a full spot.
 
-    perspective: relative change of the pitch from the middle of the frame to its corner; cubic: relative radial
-    displacement at the corner; vignetting: loss of light at the corner, of whole lenslets ("lenslet") or of the sensor
-    ("sensor", continuous); blur: soft edge of a disc, of the pitch; dust: number of dark blobs; dead: share of dead and
-    hot pixels; gains: of the 2x2 mosaic, row by row; electrons: of a full spot (shot noise); read: noise of a pixel.
+    perspective: relative change of the pitch from the middle of the frame to its corner;
+    cubic: relative radial displacement at the corner;
+    vignetting: loss of light at the corner, of whole lenslets ("lenslet") or of the sensor
+        ("sensor", continuous);
+    blur: soft edge of a disc, of the pitch;
+    dust: number of dark blobs;
+    dead: share of dead and hot pixels;
+    gains: of the 2x2 mosaic, row by row;
+    electrons: of a full spot (shot noise);
+    read: noise of a pixel.
     """
 
     kind: str
@@ -40,12 +47,16 @@ class Array:
 
     @property
     def shape(self):
-        rows, columns = (2 * int(np.ceil(n * self.pitch / 2)) for n in (self.sites, 1.15 * self.sites))
+        rows, columns = (
+            2 * int(np.ceil(n * self.pitch / 2)) for n in (self.sites, 1.15 * self.sites)
+        )
         return rows, columns
 
 
 def lattice_vectors(array):
-    """(2, 2): down and right, px; the hexagonal lattice is close-packed, 60 degrees between them."""
+    """(2, 2): down and right, px; the hexagonal lattice is close-packed, 60
+    degrees between them.
+    """
     turn = np.radians(array.angle)
     steep = turn + np.radians(60 if array.kind == "hexagonal" else 90)
     return array.pitch * np.array([[np.sin(steep), np.cos(steep)], [np.sin(turn), np.cos(turn)]])
@@ -56,7 +67,9 @@ def true_centres(array):
     shape = np.array(array.shape)
     middle, corner = (shape - 1) / 2, np.hypot(*shape) / 2
     reach = int(1.6 * np.hypot(*shape) / array.pitch) + 2
-    index = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    index = np.stack(
+        np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1
+    ).reshape(-1, 2)
     offset = index @ lattice_vectors(array) + np.array(array.phase) * array.pitch
     near = np.hypot(*offset.T) < 1.4 * corner
     index, offset = index[near], offset[near]
@@ -69,17 +82,24 @@ def true_centres(array):
 
 
 def whole(centres, array):
-    """Which centres' circles, half a pitch in radius, lie in the frame, which ends half a pixel beyond the outer pixel centres."""
+    """Which centres' circles, half a pitch in radius, lie in the frame, which ends half a pixel
+    beyond the outer pixel centres.
+    """
     margin = array.pitch / 2 - 0.5
     return ((centres >= margin) & (centres <= np.array(array.shape) - 1 - margin)).all(axis=1)
 
 
 def render(array):
-    """(white, centres): uint16 mosaic, black level 400, full spot 12400 before gains; true centres (N, 2) px."""
+    """(white, centres): uint16 mosaic, black level 400, full spot 12400 before gains; true
+    centres (N, 2) px.
+    """
     rng = np.random.default_rng(array.seed)
     centres, shape = true_centres(array)[1], array.shape
     light = np.zeros(shape)
-    for centre, level in zip(centres, _illumination(array, centres) if array.falloff == "lenslet" else np.ones(len(centres))):
+    for centre, level in zip(
+        centres,
+        _illumination(array, centres) if array.falloff == "lenslet" else np.ones(len(centres)),
+    ):
         _add_spot(light, array, centre, level)
     pixels = np.stack(np.indices(shape), axis=-1).astype(float)
     if array.falloff == "sensor":
@@ -89,7 +109,9 @@ def render(array):
         light *= 1 - 0.7 * np.exp(-0.5 * (((pixels - place) / size) ** 2).sum(axis=-1))
     if array.gains:
         light *= np.tile(np.reshape(array.gains, (2, 2)), (shape[0] // 2, shape[1] // 2))
-    light = rng.poisson(light * array.electrons) / array.electrons + rng.normal(0, array.read, shape)
+    light = rng.poisson(light * array.electrons) / array.electrons + rng.normal(
+        0, array.read, shape
+    )
     image = np.clip(np.rint(400 + 12000 * light), 0, 16383)
     spoilt = rng.uniform(size=shape) < array.dead
     image[spoilt] = rng.choice([0, 16383], spoilt.sum())
@@ -98,7 +120,12 @@ def render(array):
 
 def _illumination(array, place):
     shape = np.array(array.shape)
-    return 1 - array.vignetting * ((place - (shape - 1) / 2) ** 2).sum(axis=-1) / (np.hypot(*shape) / 2) ** 2
+    return (
+        1
+        - array.vignetting
+        * ((place - (shape - 1) / 2) ** 2).sum(axis=-1)
+        / (np.hypot(*shape) / 2) ** 2
+    )
 
 
 def _add_spot(light, array, centre, level):
@@ -112,8 +139,16 @@ def _add_spot(light, array, centre, level):
         return
     count = 5 if edge < 1 or array.pitch < 12 else 3 if edge < 3 else 2
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    y, x = ((np.arange(a, b)[:, None] + nodes / 2).ravel() - c for a, b, c in zip(low, high, centre))
+    y, x = (
+        (np.arange(a, b)[:, None] + nodes / 2).ravel() - c for a, b, c in zip(low, high, centre)
+    )
     far = np.hypot(y[:, None], x[None, :])
-    value = ndtr((array.radius * array.pitch - far) / edge) if array.spot == "disc" else np.exp(-0.5 * (far / (0.2 * array.pitch)) ** 2)
+    value = (
+        ndtr((array.radius * array.pitch - far) / edge)
+        if array.spot == "disc"
+        else np.exp(-0.5 * (far / (0.2 * array.pitch)) ** 2)
+    )
     cells = value.reshape(high[0] - low[0], count, high[1] - low[1], count)
-    light[low[0] : high[0], low[1] : high[1]] += level * np.einsum("aibj,i,j->ab", cells, weights / 2, weights / 2)
+    light[low[0] : high[0], low[1] : high[1]] += level * np.einsum(
+        "aibj,i,j->ab", cells, weights / 2, weights / 2
+    )

@@ -1,4 +1,6 @@
-"""A page as headless Chromium shows it, through the DevTools protocol: what it asked for, what it complained about, a picture of it."""
+"""A page as headless Chromium shows it, through the DevTools protocol: what it asked for, what
+it complained about, a picture of it.
+"""
 
 import asyncio
 import base64
@@ -10,22 +12,53 @@ import signal
 import subprocess
 from pathlib import Path
 
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+CHROMIUM = next(
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (found := shutil.which(name))
+    ),
+    None,
+)
 WAIT = 60
 """Seconds for any answer."""
 
 
 def look_at(path, width, height, expression, profile):
-    """{"requests": addresses asked for, "messages": what the console said, "value": of a JavaScript expression, "png": the whole page}.
+    """{"requests": addresses asked for, "messages": what the console said, "value": of a JavaScript
+    expression, "png": the whole page}.
 
-    path: an HTML file; width, height: of the window, px; profile: an empty folder for the browser.
+    path: an HTML file;
+    width, height: of the window, px;
+    profile: an empty folder for the browser.
     """
-    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run", "--hide-scrollbars", "--host-resolver-rules=MAP * ~NOTFOUND",
-               f"--user-data-dir={profile}", "--remote-debugging-port=0", "about:blank"]
+    command = [
+        CHROMIUM,
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--no-first-run",
+        "--hide-scrollbars",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+        f"--user-data-dir={profile}",
+        "--remote-debugging-port=0",
+        "about:blank",
+    ]
     with open(Path(profile) / "log", "wb") as log:
-        child = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=os.environ | {"HOME": str(profile)})
+        child = subprocess.Popen(
+            command,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=os.environ | {"HOME": str(profile)},
+        )
         try:
-            return asyncio.run(asyncio.wait_for(_look(Path(path), width, height, expression, Path(profile)), 3 * WAIT))
+            return asyncio.run(
+                asyncio.wait_for(
+                    _look(Path(path), width, height, expression, Path(profile)), 3 * WAIT
+                )
+            )
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
@@ -43,7 +76,10 @@ async def _look(path, width, height, expression, profile):
         await asyncio.sleep(0.1)
     port = known.read_text().splitlines()[0]
     tabs = json.loads((await AsyncHTTPClient().fetch(f"http://127.0.0.1:{port}/json")).body)
-    socket = await websocket_connect(next(t["webSocketDebuggerUrl"] for t in tabs if t["type"] == "page"), max_message_size=1 << 28)
+    socket = await websocket_connect(
+        next(t["webSocketDebuggerUrl"] for t in tabs if t["type"] == "page"),
+        max_message_size=1 << 28,
+    )
     events, number = [], 0
 
     async def hear():
@@ -54,7 +90,9 @@ async def _look(path, width, height, expression, profile):
     async def ask(method, **parameters):
         nonlocal number
         number += 1
-        await socket.write_message(json.dumps({"id": number, "method": method, "params": parameters}))
+        await socket.write_message(
+            json.dumps({"id": number, "method": method, "params": parameters})
+        )
         while (told := await hear()).get("id") != number:
             pass
         assert "error" not in told, told
@@ -62,13 +100,33 @@ async def _look(path, width, height, expression, profile):
 
     for domain in ("Page", "Network", "Runtime", "Log"):
         await ask(f"{domain}.enable")
-    await ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+    await ask(
+        "Emulation.setDeviceMetricsOverride",
+        width=width,
+        height=height,
+        deviceScaleFactor=1,
+        mobile=width < 600,
+    )
     await ask("Page.navigate", url=path.resolve().as_uri())
     while not any(e.get("method") == "Page.loadEventFired" for e in events):
         await hear()
-    value = await ask("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+    value = await ask(
+        "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+    )
     shot = await ask("Page.captureScreenshot", format="png", captureBeyondViewport=True)
     socket.close()
-    return {"requests": [e["params"]["request"]["url"] for e in events if e.get("method") == "Network.requestWillBeSent"],
-            "messages": [e for e in events if e.get("method") in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")],
-            "value": value["result"]["value"], "png": base64.b64decode(shot["data"])}
+    return {
+        "requests": [
+            e["params"]["request"]["url"]
+            for e in events
+            if e.get("method") == "Network.requestWillBeSent"
+        ],
+        "messages": [
+            e
+            for e in events
+            if e.get("method")
+            in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
+        ],
+        "value": value["result"]["value"],
+        "png": base64.b64decode(shot["data"]),
+    }

@@ -1,14 +1,17 @@
-"""How stable the solvers are: what their answers violate of their own equations, in units of rounding errors.
+"""How stable the solvers are: what their answers violate of their own equations, in units
+of rounding errors.
 
-As in LAPACK's tests, a backward stable method stays below about 30: |residual| / (eps |A| (|A| |x| + |y|)).
+As in LAPACK's tests, a backward stable method stays below about 30: |residual| / (eps
+|A| (|A| |x| + |y|)).
 """
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.picture import least_squares as linear, lmmse, nnls
-from plenocli.inverse.spectra import demultiplex as spectral
+from plenocli.inverse.picture import least_squares as linear
+from plenocli.inverse.picture import lmmse, nnls
 from plenocli.inverse.sparse.l1.solve import sparse_code
+from plenocli.inverse.spectra import demultiplex as spectral
 
 EPS = np.finfo(float).eps
 SIZES = ((1, 1), (2, 1), (3, 2), (5, 3), (4, 4), (11, 10), (50, 50), (60, 17))
@@ -17,11 +20,22 @@ KINDS = ("spread", "step", "duplicate", "zero column", "rank one")
 
 
 def matrix(kind, shape, condition, dtype=float, seed=0):
-    """(rows, columns) with singular values from 1 to 1/condition: evenly in log ("spread"), or all but one at 1 ("step"); or deficient."""
+    """(rows, columns) with singular values from 1 to 1/condition: evenly in log ("spread"), or
+    all but one at 1 ("step"); or deficient.
+    """
     rng = np.random.default_rng([seed, *shape, int(np.log10(condition))])
     rows, columns = shape
-    u, v = np.linalg.qr(rng.normal(size=(rows, columns)))[0], np.linalg.qr(rng.normal(size=(columns, columns)))[0]
-    s = np.geomspace(1, 1 / condition, columns) if kind == "spread" else np.where(np.arange(columns) < columns - 1, 1, 1 / condition) if columns > 1 else np.ones(1)
+    u, v = (
+        np.linalg.qr(rng.normal(size=(rows, columns)))[0],
+        np.linalg.qr(rng.normal(size=(columns, columns)))[0],
+    )
+    s = (
+        np.geomspace(1, 1 / condition, columns)
+        if kind == "spread"
+        else np.where(np.arange(columns) < columns - 1, 1, 1 / condition)
+        if columns > 1
+        else np.ones(1)
+    )
     if kind == "rank one":
         s = np.where(np.arange(columns) == 0, 1.0, 0.0)
     a = (u * s) @ v.T
@@ -35,7 +49,10 @@ def matrix(kind, shape, condition, dtype=float, seed=0):
 def _units(residual, a, x, y, extra=0.0):
     """A residual of normal equations in units of rounding errors, the worst signal."""
     norm = np.linalg.norm(a, 2)
-    scale = EPS * (norm * (norm * np.linalg.norm(x, axis=0) + np.linalg.norm(y, axis=0)) + extra * np.linalg.norm(x, axis=0))
+    scale = EPS * (
+        norm * (norm * np.linalg.norm(x, axis=0) + np.linalg.norm(y, axis=0))
+        + extra * np.linalg.norm(x, axis=0)
+    )
     return float(np.max(np.linalg.norm(residual, axis=0) / np.maximum(scale, np.finfo(float).tiny)))
 
 
@@ -56,7 +73,9 @@ def truncated(a, y):
 
 
 def nonnegative(a, y):
-    """Units of the optimality conditions of converged non-negative least squares, or None where it refuses."""
+    """Units of the optimality conditions of converged non-negative least squares, or
+    None where it refuses.
+    """
     try:
         x = nnls.converged(a, y).x
     except NumericsError:
@@ -67,7 +86,9 @@ def nonnegative(a, y):
 
 
 def demultiplexed(a, y, method):
-    """Units of F^T (x - F b) for least squares by `spectral`, or None where all is refused as NaN."""
+    """Units of F^T (x - F b) for least squares by `spectral`, or None where all
+    is refused as NaN.
+    """
     b, _ = spectral.demultiplex(a, y.T, method, variance=1.0)
     if np.isnan(b).all():
         return None
@@ -76,17 +97,21 @@ def demultiplexed(a, y, method):
 
 
 def coded(a, y, relative, tol=1e-6):
-    """(largest relative duality gap, largest excess) of the l1 solver at lambda = relative times the largest useful one.
+    """(largest relative duality gap, largest excess) of the l1 solver at lambda = relative times
+    the largest useful one.
 
-    Excess: by how much the objective is above the better of no code and least squares, over it: no minimum is. Below 1e-8 of the
-    largest lambda the slopes that certify a gap drown in rounding, and the gap, which comes with every code, says so.
+    Excess: by how much the objective is above the better of no code and least squares, over it: no
+    minimum is. Below 1e-8 of the largest lambda the slopes that certify a gap drown in rounding,
+    and the gap, which comes with every code, says so.
     """
     most = 2 * np.abs(a.T @ y).max()
     lam = relative * (most if most > 0 else 1.0)
     code = sparse_code(a, y, lam, tol=tol, workers=1)
     assert np.isfinite(code.c).all()
     simple = np.linalg.pinv(a, rcond=1e-13) @ y
-    known = np.minimum((y**2).sum(axis=0), ((y - a @ simple) ** 2).sum(axis=0) + lam * np.abs(simple).sum(axis=0))
+    known = np.minimum(
+        (y**2).sum(axis=0), ((y - a @ simple) ** 2).sum(axis=0) + lam * np.abs(simple).sum(axis=0)
+    )
     return float(code.gap.max()), float(np.max((code.objective - known) / np.maximum(known, 1e-20)))
 
 
@@ -94,12 +119,22 @@ def wiener(a, y, sigma):
     """The LMMSE estimate for a stationary field of points in a row, whose neighbours are alike."""
     points = np.arange(a.shape[1])
     covariance = 0.05 * 0.9 ** np.abs(points[:, None] - points)
-    return lmmse.prepare(linear.decompose(a), np.full(a.shape[1], 0.4), covariance, sigma).adaptive(y)
+    return lmmse.prepare(linear.decompose(a), np.full(a.shape[1], 0.4), covariance, sigma).adaptive(
+        y
+    )
 
 
 def table(conditions=CONDITIONS, sizes=SIZES):
-    """Markdown: the worst of all matrices of a condition, for each method; the numbers of `make extremes`."""
-    rows = ["| condition | Tikhonov, 1e-12 | truncated | non-negative | pseudo-inverse of F | weighted F | l1 gap, 1e-4 | l1 gap, 1e-10 |", "|---|---|---|---|---|---|---|---|"]
+    """Markdown: the worst of all matrices of a condition, for each method; the numbers
+    of `make extremes`.
+    """
+    rows = [
+        (
+            "| condition | Tikhonov, 1e-12 | truncated | non-negative | pseudo-inverse of F | "
+            "weighted F | l1 gap, 1e-4 | l1 gap, 1e-10 |"
+        ),
+        "|---|---|---|---|---|---|---|---|",
+    ]
     rng = np.random.default_rng(1)
     for condition in conditions:
         worst = [[] for _ in range(7)]
@@ -108,9 +143,23 @@ def table(conditions=CONDITIONS, sizes=SIZES):
                 for dtype in (np.float32, np.float64):
                     a = matrix(kind, shape, condition, dtype).astype(float)
                     y = a @ rng.random((shape[1], 3)) + 1e-3 * rng.normal(size=(shape[0], 3))
-                    found = tikhonov(a, y, 1e-12), truncated(a, y), nonnegative(a, y), demultiplexed(a, y, "pinv"), demultiplexed(a, y, "wls"), coded(a, y, 1e-4)[0], coded(a, y, 1e-10)[0]
+                    found = (
+                        tikhonov(a, y, 1e-12),
+                        truncated(a, y),
+                        nonnegative(a, y),
+                        demultiplexed(a, y, "pinv"),
+                        demultiplexed(a, y, "wls"),
+                        coded(a, y, 1e-4)[0],
+                        coded(a, y, 1e-10)[0],
+                    )
                     for column, value in zip(worst, found):
                         column.append(value)
-        cells = ["refused" if all(v is None for v in column) else f"{max(v for v in column if v is not None):.2g}" + (" or refused" if None in column else "") for column in worst]
+        cells = [
+            "refused"
+            if all(v is None for v in column)
+            else f"{max(v for v in column if v is not None):.2g}"
+            + (" or refused" if None in column else "")
+            for column in worst
+        ]
         rows.append(f"| {condition:.0e} | " + " | ".join(cells) + " |")
     return "\n".join(rows)

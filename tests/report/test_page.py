@@ -65,7 +65,11 @@ def test_the_page_needs_nothing_else():
     page.section("two")
     page.figure(pictures.picture(np.eye(4)), "c")
     text = page.render()
-    assert not re.search(r'(src|href)="(?!data:|#)', text) and "@import" not in text and "url(" not in text
+    assert (
+        not re.search(r'(src|href)="(?!data:|#)', text)
+        and "@import" not in text
+        and "url(" not in text
+    )
     assert text == page.render()
 
 
@@ -75,41 +79,102 @@ def rng():
 
 def patches(shift):
     return [
-        {"label": n, "name": f"patch {n}", "mean": [0.2 + shift] * 4, "std": [0.01] * 4, "truth": [0.2] * 4, "one_of_six": n in (7, 13)} for n in range(1, 25)
+        {
+            "label": n,
+            "name": f"patch {n}",
+            "mean": [0.2 + shift] * 4,
+            "std": [0.01] * 4,
+            "truth": [0.2] * 4,
+            "one_of_six": n in (7, 13),
+        }
+        for n in range(1, 25)
     ]
 
 
 def entry(label, psnr=None, snr=None):
-    return {"name": label, "label": label, "wavelengths_nm": [450, 540, 570, 650],
-            "metrics": {"psnr_db": psnr, "rmse_per_band": [0.01, 0.02, 0.03, None], "snr_capture_db": snr, "block_mean_psnr_db": 14.0}}
+    return {
+        "name": label,
+        "label": label,
+        "wavelengths_nm": [450, 540, 570, 650],
+        "metrics": {
+            "psnr_db": psnr,
+            "rmse_per_band": [0.01, 0.02, 0.03, None],
+            "snr_capture_db": snr,
+            "block_mean_psnr_db": 14.0,
+        },
+    }
 
 
 DRAWN = {
     "capture": lambda: pictures.capture_picture(rng().random((60, 80)), "DN", pitch=(10, 10)),
     "capture without grid": lambda: pictures.capture_picture(rng().random((7, 9))),
-    "black capture": lambda: pictures.capture_picture(np.zeros((30, 30)), "DN", centres=np.full((3, 3, 2), np.nan)),
+    "black capture": lambda: pictures.capture_picture(
+        np.zeros((30, 30)), "DN", centres=np.full((3, 3, 2), np.nan)
+    ),
     "one lenslet": lambda: pictures.capture_picture(rng().random((10, 10)), "DN", pitch=(10, 10)),
-    "pif": lambda: pictures.pif_columns(rng().random((9, 20, 6)), (5, 4), (2, 3), np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(-1, 2)),
-    "pif of one point": lambda: pictures.pif_columns(np.ones((1, 20, 1)), (5, 4), (1, 1), np.zeros((1, 2), int)),
-    "matrix": lambda: pictures.matrix_summary(np.array([[1.0, 0.1, 0]]), np.ones((1, 6)), [550e-9], (2, 3), [2]),
-    "matrix without singular values": lambda: pictures.matrix_summary(None, np.ones((2, 6)), [450e-9, 550e-9], (2, 3)),
-    "reconstructions": lambda: pictures.reconstructions([(f"m{i}", rng().random((24, 30)), "20 dB") for i in range(5)], rng().random((24, 30))),
-    "a perfect reconstruction": lambda: pictures.reconstructions([("m", np.ones((9, 9)), "")], np.ones((9, 9))),
-    "close-ups": lambda: pictures.close_ups([("m", rng().random((24, 30)), "")], rng().random((24, 30)), (6, 6)),
-    "methods": lambda: pictures.method_bars([("a", [entry("x", 20.0), entry("y", -3.0)]), ("b", [entry("x", 21.0)])]),
-    "atoms": lambda: pictures.dictionary_atoms(rng().standard_normal((12, 7)), (3, 4), rng().random((20, 12)), (5, 4)),
+    "pif": lambda: pictures.pif_columns(
+        rng().random((9, 20, 6)),
+        (5, 4),
+        (2, 3),
+        np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(-1, 2),
+    ),
+    "pif of one point": lambda: pictures.pif_columns(
+        np.ones((1, 20, 1)), (5, 4), (1, 1), np.zeros((1, 2), int)
+    ),
+    "matrix": lambda: pictures.matrix_summary(
+        np.array([[1.0, 0.1, 0]]), np.ones((1, 6)), [550e-9], (2, 3), [2]
+    ),
+    "matrix without singular values": lambda: pictures.matrix_summary(
+        None, np.ones((2, 6)), [450e-9, 550e-9], (2, 3)
+    ),
+    "reconstructions": lambda: pictures.reconstructions(
+        [(f"m{i}", rng().random((24, 30)), "20 dB") for i in range(5)], rng().random((24, 30))
+    ),
+    "a perfect reconstruction": lambda: pictures.reconstructions(
+        [("m", np.ones((9, 9)), "")], np.ones((9, 9))
+    ),
+    "close-ups": lambda: pictures.close_ups(
+        [("m", rng().random((24, 30)), "")], rng().random((24, 30)), (6, 6)
+    ),
+    "methods": lambda: pictures.method_bars(
+        [("a", [entry("x", 20.0), entry("y", -3.0)]), ("b", [entry("x", 21.0)])]
+    ),
+    "atoms": lambda: pictures.dictionary_atoms(
+        rng().standard_normal((12, 7)), (3, 4), rng().random((20, 12)), (5, 4)
+    ),
     "a zero atom": lambda: pictures.dictionary_atoms(np.zeros((12, 1)), (3, 4)),
-    "history": lambda: pictures.learning_history({"psnr": [1.0, np.nan, 3], "dead atoms": [0, 0, 1], "table": np.ones((2, 2))}),
+    "history": lambda: pictures.learning_history(
+        {"psnr": [1.0, np.nan, 3], "dead atoms": [0, 0, 1], "table": np.ones((2, 2))}
+    ),
     "bands": lambda: spectral_pictures.band_pictures(rng().random((4, 6, 9)), BANDS, "reflectance"),
-    "bands with gaps": lambda: spectral_pictures.band_pictures(np.where(rng().random((4, 6, 9)) < 0.2, np.nan, 0.5), BANDS, "radiance"),
+    "bands with gaps": lambda: spectral_pictures.band_pictures(
+        np.where(rng().random((4, 6, 9)) < 0.2, np.nan, 0.5), BANDS, "radiance"
+    ),
     "one band": lambda: spectral_pictures.band_pictures(rng().random((1, 6, 9)), BANDS[:1]),
-    "31 bands": lambda: spectral_pictures.band_pictures(rng().random((31, 6, 9)), np.arange(400, 701, 10) * 1e-9),
-    "patches": lambda: spectral_pictures.patch_spectra([("a", patches(0)), ("b", patches(0.1))], BANDS * 1e9),
-    "six patches": lambda: spectral_pictures.patch_spectra([("a", patches(0))], BANDS * 1e9, only_six=True),
-    "patch errors": lambda: spectral_pictures.patch_errors([("a", patches(0.01)), ("b", patches(0.1))], BANDS * 1e9),
-    "bars": lambda: spectral_pictures.accuracy_bars([entry("a", snr=[40, 41, 42, None]), entry("b")]),
-    "calibration": lambda: spectral_pictures.calibration_picture(rng().random((60, 60)), pictures._tiling((60, 60), (10, 10)), np.ones((6, 6), bool), np.ones((6, 6))),
-    "calibration without white": lambda: spectral_pictures.calibration_picture(None, pictures._tiling((60, 60), (10, 10)), np.ones((6, 6), bool)),
+    "31 bands": lambda: spectral_pictures.band_pictures(
+        rng().random((31, 6, 9)), np.arange(400, 701, 10) * 1e-9
+    ),
+    "patches": lambda: spectral_pictures.patch_spectra(
+        [("a", patches(0)), ("b", patches(0.1))], BANDS * 1e9
+    ),
+    "six patches": lambda: spectral_pictures.patch_spectra(
+        [("a", patches(0))], BANDS * 1e9, only_six=True
+    ),
+    "patch errors": lambda: spectral_pictures.patch_errors(
+        [("a", patches(0.01)), ("b", patches(0.1))], BANDS * 1e9
+    ),
+    "bars": lambda: spectral_pictures.accuracy_bars(
+        [entry("a", snr=[40, 41, 42, None]), entry("b")]
+    ),
+    "calibration": lambda: spectral_pictures.calibration_picture(
+        rng().random((60, 60)),
+        pictures._tiling((60, 60), (10, 10)),
+        np.ones((6, 6), bool),
+        np.ones((6, 6)),
+    ),
+    "calibration without white": lambda: spectral_pictures.calibration_picture(
+        None, pictures._tiling((60, 60), (10, 10)), np.ones((6, 6), bool)
+    ),
     "response": lambda: spectral_pictures.response_picture(rng().random((30, 4)), (5, 6), BANDS),
 }
 
@@ -131,7 +196,9 @@ def test_no_history_gives_no_picture():
 
 
 def test_the_grid_lies_between_superpixels():
-    """Bright dots at the superpixels' corners must vanish under the lattice lines, dots in the middle must not."""
+    """Bright dots at the superpixels' corners must vanish under the lattice lines, dots in
+    the middle must not.
+    """
     centres = pictures._tiling((30, 30), (10, 10))
     np.testing.assert_allclose(centres[1, 2], [14.5, 24.5])
     between = (centres[1:] + centres[:-1]) / 2

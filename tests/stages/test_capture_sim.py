@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.files.images.mosaic import read_mosaic
-from plenocli.cli.main import run
 from plenocli.files.config.camera_file import load_camera, parse_camera
+from plenocli.files.images.mosaic import read_mosaic
 from plenocli.forward.accuracy.dial import system_matrix
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
@@ -26,7 +26,13 @@ filters = [{ center = "460 nm", fwhm = "40 nm" }, { center = "620 nm", fwhm = "4
 def camera(tmp_path):
     """A camera of 3 x 4 lenslets, 4 x 4 points and 9 x 9 pixels."""
     text = TINY.read_text()
-    for old, new in [("[8, 8]", "[4, 4]"), ("[13, 13]", "[9, 9]"), ('"26 um"', '"18 um"'), ('"208 um"', '"144 um"'), ("[5, 5]", "[3, 4]")]:
+    for old, new in [
+        ("[8, 8]", "[4, 4]"),
+        ("[13, 13]", "[9, 9]"),
+        ('"26 um"', '"18 um"'),
+        ('"208 um"', '"144 um"'),
+        ("[5, 5]", "[3, 4]"),
+    ]:
         assert old in text
         text = text.replace(old, new)
     path = tmp_path / "camera.toml"
@@ -37,7 +43,9 @@ def camera(tmp_path):
 @pytest.fixture
 def scene(tmp_path):
     values = np.random.default_rng(3).uniform(size=(12, 16)).astype(np.float32)
-    write_artefact(tmp_path / "scene.h5", Artefact("image", {"image/value": values}, {}, Provenance("test")))
+    write_artefact(
+        tmp_path / "scene.h5", Artefact("image", {"image/value": values}, {}, Provenance("test"))
+    )
     return tmp_path / "scene.h5", values
 
 
@@ -50,8 +58,31 @@ def capture(*arguments):
 
 def test_the_mosaic_is_the_sum_over_points_and_neighbours(camera, scene, tmp_path):
     path, x = scene
-    got = capture(camera, "--scene", path, "--noise", "none", "--superpixels", "3x3", "--coherent-ring", "1", "--accuracy", "1e-5", "--model", "fresnel", "-o", tmp_path / "c.h5").data["capture/mosaic"]
-    pif = system_matrix(load_camera(camera), superpixels=(3, 3), coherent_ring=1, accuracy=1e-5, dtype=np.float64, model="fresnel")
+    got = capture(
+        camera,
+        "--scene",
+        path,
+        "--noise",
+        "none",
+        "--superpixels",
+        "3x3",
+        "--coherent-ring",
+        "1",
+        "--accuracy",
+        "1e-5",
+        "--model",
+        "fresnel",
+        "-o",
+        tmp_path / "c.h5",
+    ).data["capture/mosaic"]
+    pif = system_matrix(
+        load_camera(camera),
+        superpixels=(3, 3),
+        coherent_ring=1,
+        accuracy=1e-5,
+        dtype=np.float64,
+        model="fresnel",
+    )
     expected = np.zeros((27, 36))
     mirrored = [3, 2, 1, 0, *range(12), 11, 10, 9, 8], [3, 2, 1, 0, *range(16), 15, 14, 13, 12]
     wide = x[np.ix_(*mirrored)]  # the scene goes on mirrored for one lenslet
@@ -61,49 +92,97 @@ def test_the_mosaic_is_the_sum_over_points_and_neighbours(camera, scene, tmp_pat
             for block, (down, right) in enumerate(pif.lenslet_offset):
                 r, c = home[0] + down, home[1] + right
                 if 0 <= r < 3 and 0 <= c < 4:
-                    expected[9 * r : 9 * r + 9, 9 * c : 9 * c + 9] += wide[row + 4, column + 4] * pif.A[0, block, :, point].reshape(9, 9)
+                    expected[9 * r : 9 * r + 9, 9 * c : 9 * c + 9] += wide[
+                        row + 4, column + 4
+                    ] * pif.A[0, block, :, point].reshape(9, 9)
     assert np.abs(got - expected).max() < 1e-5 * expected.max()
 
 
 def test_white_noise_has_the_sigma_that_is_promised(camera, scene, tmp_path):
     # by itself the dial computes no finer than each capture's own noise
     same = ("--scene", scene[0], "--accuracy", "1e-3")
-    clean = capture(camera, *same, "--noise", "none", "-o", tmp_path / "a.h5").data["capture/mosaic"]
+    clean = capture(camera, *same, "--noise", "none", "-o", tmp_path / "a.h5").data[
+        "capture/mosaic"
+    ]
     noisy = capture(camera, *same, "--snr", "30dB", "-o", tmp_path / "b.h5")
     sigma = noisy.attrs["capture"]["noise_sigma"]
     assert sigma == pytest.approx(np.sqrt(np.mean(clean**2) * 1e-3), rel=1e-6)
-    assert np.std(noisy.data["capture/mosaic"] - clean) == pytest.approx(sigma, rel=4 / np.sqrt(2 * clean.size))
+    assert np.std(noisy.data["capture/mosaic"] - clean) == pytest.approx(
+        sigma, rel=4 / np.sqrt(2 * clean.size)
+    )
 
 
 def test_the_truth_is_kept_and_averaged(camera, scene, tmp_path):
-    fine = capture(camera, "--scene", scene[0], "--refine", 2, "--noise", "none", "--scene-out", tmp_path / "truth.h5", "-o", tmp_path / "c.h5")
+    fine = capture(
+        camera,
+        "--scene",
+        scene[0],
+        "--refine",
+        2,
+        "--noise",
+        "none",
+        "--scene-out",
+        tmp_path / "truth.h5",
+        "-o",
+        tmp_path / "c.h5",
+    )
     assert fine.data["capture/scene"].shape == (1, 12, 16)
     np.testing.assert_allclose(fine.data["capture/scene"][0], scene[1], atol=1e-6)
-    np.testing.assert_array_equal(read_artefact(tmp_path / "truth.h5", "image").data["image/value"], fine.data["capture/scene"][0])
+    np.testing.assert_array_equal(
+        read_artefact(tmp_path / "truth.h5", "image").data["image/value"],
+        fine.data["capture/scene"][0],
+    )
 
 
 def test_finer_points_bring_the_same_light(camera, tmp_path):
-    light = [capture(camera, "--target", "white", "--noise", "none", "--refine", n, "--superpixels", "3x3", "-o", tmp_path / f"{n}.h5").data["capture/mosaic"].sum() for n in (1, 3)]
+    light = [
+        capture(
+            camera,
+            "--target",
+            "white",
+            "--noise",
+            "none",
+            "--refine",
+            n,
+            "--superpixels",
+            "3x3",
+            "-o",
+            tmp_path / f"{n}.h5",
+        )
+        .data["capture/mosaic"]
+        .sum()
+        for n in (1, 3)
+    ]
     assert light[1] == pytest.approx(light[0], rel=0.01)
     # the lenslets are 4 Airy cells wide: their neighbours beyond 3x3 hold a few percent
     assert 0.93 * 0.99 < light[0] / 16 / 12 < 0.99
 
 
 def test_detector_follows_emva_1288(camera, tmp_path):
-    frames = [capture(camera, "--target", "white", "--seed", s, "-o", tmp_path / f"{s}.h5").data["capture/mosaic"].astype(float) for s in range(40)]
+    frames = [
+        capture(camera, "--target", "white", "--seed", s, "-o", tmp_path / f"{s}.h5")
+        .data["capture/mosaic"]
+        .astype(float)
+        for s in range(40)
+    ]
     sensor = load_camera(camera).sensor
     mean, variance = np.mean(frames, axis=0), np.var(frames, axis=0, ddof=1)
-    # photon transfer: variance over mean is the gain, once read and quantisation noise are taken off
+    # photon transfer: variance over mean is the gain, once read and quantisation
+    # noise are taken off
     dark = sensor.gain**2 * sensor.read_noise**2 + 1 / 12
     assert np.sum(variance - dark) / np.sum(mean) == pytest.approx(sensor.gain, rel=0.02)
-    assert mean.max() == pytest.approx(0.99 * 0.8 * sensor.full_well * sensor.gain, rel=0.01), "white fills 80 % of full well"
+    assert mean.max() == pytest.approx(0.99 * 0.8 * sensor.full_well * sensor.gain, rel=0.01), (
+        "white fills 80 % of full well"
+    )
 
 
 def test_exposure_scales_electrons(camera, tmp_path):
     long = capture(camera, "--target", "white", "-o", tmp_path / "l.h5")
     short = capture(camera, "--target", "white", "--exposure", "2.5ms", "-o", tmp_path / "s.h5")
     assert short.attrs["capture"]["exposure_s"] == 0.0025
-    assert long.data["capture/mosaic"].mean() / short.data["capture/mosaic"].mean() == pytest.approx(4, rel=0.01)
+    assert long.data["capture/mosaic"].mean() / short.data[
+        "capture/mosaic"
+    ].mean() == pytest.approx(4, rel=0.01)
 
 
 def test_same_seed_same_bytes_other_seed_other_noise(camera, tmp_path):
@@ -115,22 +194,51 @@ def test_same_seed_same_bytes_other_seed_other_noise(camera, tmp_path):
 
 def test_filters_part_the_superpixel_by_wavelength(camera, tmp_path):
     camera.write_text(camera.read_text().replace('["550 nm"]', '["460 nm", "620 nm"]') + FILTERS)
-    blue, red = (capture(camera, "--target", f"mono:{w}nm", "--noise", "none", "-o", tmp_path / f"{w}.h5") for w in (460, 620))
-    halves = [np.array([m.data["capture/mosaic"][9:18, 9:13].sum(), m.data["capture/mosaic"][9:18, 14:18].sum()]) for m in (blue, red)]
+    blue, red = (
+        capture(camera, "--target", f"mono:{w}nm", "--noise", "none", "-o", tmp_path / f"{w}.h5")
+        for w in (460, 620)
+    )
+    halves = [
+        np.array(
+            [
+                m.data["capture/mosaic"][9:18, 9:13].sum(),
+                m.data["capture/mosaic"][9:18, 14:18].sum(),
+            ]
+        )
+        for m in (blue, red)
+    ]
     # the pupil stands on its head in a superpixel: the left filter lights the right half
     assert halves[0][1] > 5 * halves[0][0] and halves[1][0] > 5 * halves[1][1]
     assert blue.attrs["capture"]["band_m"] == 460e-9
 
 
 def test_colour_filters_of_the_sensor_are_in_the_mosaic(camera, tmp_path):
-    camera.write_text(camera.read_text().replace("[light]", 'cfa = "RGGB"\ncamera = "Nikon 5100 (NPL)"\n[light]'))
-    m = capture(camera, "--target", "mono:450nm", "--noise", "none", "-o", tmp_path / "m.h5").data["capture/mosaic"]
+    camera.write_text(
+        camera.read_text().replace("[light]", 'cfa = "RGGB"\ncamera = "Nikon 5100 (NPL)"\n[light]')
+    )
+    m = capture(camera, "--target", "mono:450nm", "--noise", "none", "-o", tmp_path / "m.h5").data[
+        "capture/mosaic"
+    ]
     assert m[1::2, 1::2].mean() > 3 * m[::2, ::2].mean()
 
 
 def test_raw_file_brings_back_every_pixel_and_setting(camera, tmp_path):
     inside = capture(camera, "--target", "white", "--seed", 2, "-o", tmp_path / "w.h5")
-    assert run(["capture-sim", str(camera), "--target", "white", "--seed", "2", "-o", str(tmp_path / "w.dng")]) == 0
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(camera),
+                "--target",
+                "white",
+                "--seed",
+                "2",
+                "-o",
+                str(tmp_path / "w.dng"),
+            ]
+        )
+        == 0
+    )
     outside = read_mosaic(tmp_path / "w.dng")
     np.testing.assert_array_equal(outside.values, inside.data["capture/mosaic"])
     assert outside.cfa == "mono" and outside.exposure_s == 0.01 and outside.gain == 0.25
@@ -142,33 +250,134 @@ def test_libraw_and_exiftool_take_the_dng_for_what_it_is(camera, tmp_path, cfa):
     import rawpy
 
     if cfa != "mono":
-        camera.write_text(camera.read_text().replace("[light]", f'cfa = "{cfa}"\ncamera = "Nikon 5100 (NPL)"\n[light]'))
-    arguments = [str(camera), "--target", "mono:550nm", "--model", "fresnel", "--accuracy", "1e-2", "--seed", "2", "-o"]
+        camera.write_text(
+            camera.read_text().replace(
+                "[light]", f'cfa = "{cfa}"\ncamera = "Nikon 5100 (NPL)"\n[light]'
+            )
+        )
+    arguments = [
+        str(camera),
+        "--target",
+        "mono:550nm",
+        "--model",
+        "fresnel",
+        "--accuracy",
+        "1e-2",
+        "--seed",
+        "2",
+        "-o",
+    ]
     inside = capture(*arguments, tmp_path / "w.h5")
     assert run(["capture-sim", *arguments, str(tmp_path / "w.dng")]) == 0
     with rawpy.imread(str(tmp_path / "w.dng")) as file:
         np.testing.assert_array_equal(file.raw_image, inside.data["capture/mosaic"])
-        assert file.num_colors == (1 if cfa == "mono" else 3) and file.white_level == inside.attrs["capture"]["white"]
+        assert (
+            file.num_colors == (1 if cfa == "mono" else 3)
+            and file.white_level == inside.attrs["capture"]["white"]
+        )
     if not shutil.which("exiftool"):
         pytest.skip("exiftool is not installed: the tags are checked by LibRaw alone")
-    said = subprocess.run(["exiftool", "-validate", "-warning", "-a", "-s", str(tmp_path / "w.dng")], capture_output=True, text=True, check=True).stdout.splitlines()
+    said = subprocess.run(
+        ["exiftool", "-validate", "-warning", "-a", "-s", str(tmp_path / "w.dng")],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
     assert said[0].startswith("Validate") and all("padding" in line for line in said[1:]), said
 
 
 def test_exr_holds_the_mosaic(camera, tmp_path):
     inside = capture(camera, "--target", "white", "--seed", 2, "-o", tmp_path / "w.h5")
-    assert run(["capture-sim", str(camera), "--target", "white", "--seed", "2", "-o", str(tmp_path / "w.exr")]) == 0
-    np.testing.assert_array_equal(read_mosaic(tmp_path / "w.exr").values, inside.data["capture/mosaic"])
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(camera),
+                "--target",
+                "white",
+                "--seed",
+                "2",
+                "-o",
+                str(tmp_path / "w.exr"),
+            ]
+        )
+        == 0
+    )
+    np.testing.assert_array_equal(
+        read_mosaic(tmp_path / "w.exr").values, inside.data["capture/mosaic"]
+    )
 
 
-def test_a_matrix_from_disk_gives_the_same_and_another_cameras_is_refused(camera, scene, tmp_path, capfd):
-    assert run(["simulate-pif", str(camera), "--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel", "--accuracy", "1e-5", "-o", str(tmp_path / "pif.h5")]) == 0
-    direct = capture(camera, "--scene", scene[0], "--noise", "none", "--superpixels", "1x1", "--coherent-ring", 0, "--accuracy", "1e-5", "--model", "fresnel", "-o", tmp_path / "a.h5")
-    stored = capture(camera, "--scene", scene[0], "--noise", "none", "--pif", tmp_path / "pif.h5", "-o", tmp_path / "b.h5")
-    np.testing.assert_allclose(stored.data["capture/mosaic"], direct.data["capture/mosaic"], rtol=1e-4, atol=1e-7)
+def test_a_matrix_from_disk_gives_the_same_and_another_cameras_is_refused(
+    camera, scene, tmp_path, capfd
+):
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(camera),
+                "--superpixels",
+                "1x1",
+                "--coherent-ring",
+                "0",
+                "--model",
+                "fresnel",
+                "--accuracy",
+                "1e-5",
+                "-o",
+                str(tmp_path / "pif.h5"),
+            ]
+        )
+        == 0
+    )
+    direct = capture(
+        camera,
+        "--scene",
+        scene[0],
+        "--noise",
+        "none",
+        "--superpixels",
+        "1x1",
+        "--coherent-ring",
+        0,
+        "--accuracy",
+        "1e-5",
+        "--model",
+        "fresnel",
+        "-o",
+        tmp_path / "a.h5",
+    )
+    stored = capture(
+        camera,
+        "--scene",
+        scene[0],
+        "--noise",
+        "none",
+        "--pif",
+        tmp_path / "pif.h5",
+        "-o",
+        tmp_path / "b.h5",
+    )
+    np.testing.assert_allclose(
+        stored.data["capture/mosaic"], direct.data["capture/mosaic"], rtol=1e-4, atol=1e-7
+    )
     other = tmp_path / "other.toml"
     other.write_text(camera.read_text().replace("f_number = 8", "f_number = 9"))
-    assert run(["capture-sim", str(other), "--scene", str(scene[0]), "--pif", str(tmp_path / "pif.h5"), "-o", str(tmp_path / "c.h5")]) == 3
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(other),
+                "--scene",
+                str(scene[0]),
+                "--pif",
+                str(tmp_path / "pif.h5"),
+                "-o",
+                str(tmp_path / "c.h5"),
+            ]
+        )
+        == 3
+    )
     assert "[main_lens] differs" in capfd.readouterr().err
 
 
@@ -184,8 +393,18 @@ def test_a_matrix_from_disk_gives_the_same_and_another_cameras_is_refused(camera
         (None, ["--scene", "absent.png"], 3, "absent.png"),
         (None, ["--scene", "skimage:nobody"], 2, "astronaut"),
         (("[3, 4]", '[3, 4]\nlattice = "hexagonal"'), ["--target", "white"], 2, "hexagonal"),
-        (('wavelengths = ["550 nm"]', 'band = { center = "550 nm", fwhm = "20 nm" }'), ["--target", "white", "--bandwidth", "10nm"], 2, "a band already"),
-        (('superpixel_pitch = "18 um"', 'pitch = "18 um"'), ["--target", "white"], None, "pixels off"),
+        (
+            ('wavelengths = ["550 nm"]', 'band = { center = "550 nm", fwhm = "20 nm" }'),
+            ["--target", "white", "--bandwidth", "10nm"],
+            2,
+            "a band already",
+        ),
+        (
+            ('superpixel_pitch = "18 um"', 'pitch = "18 um"'),
+            ["--target", "white"],
+            None,
+            "pixels off",
+        ),
     ],
 )
 def test_refusals(camera, tmp_path, capfd, change, arguments, code, message):
@@ -194,14 +413,32 @@ def test_refusals(camera, tmp_path, capfd, change, arguments, code, message):
         assert change[0] in text
         text = text.replace(*change)
         camera.write_text(text.replace("[3, 4]", "[30, 40]") if code is None else text)
-    assert run(["capture-sim", str(camera), *arguments, "-o", str(tmp_path / "out.h5")]) == (code or 2)
+    assert run(["capture-sim", str(camera), *arguments, "-o", str(tmp_path / "out.h5")]) == (
+        code or 2
+    )
     assert message in capfd.readouterr().err
     assert not (tmp_path / "out.h5").exists()
 
 
 def test_raw_cannot_hold_real_numbers_and_results_are_not_replaced(camera, tmp_path, capfd):
-    assert run(["capture-sim", str(camera), "--target", "white", "--snr", "60dB", "-o", str(tmp_path / "a.dng")]) == 2
-    assert run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "a.png")]) == 2
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(camera),
+                "--target",
+                "white",
+                "--snr",
+                "60dB",
+                "-o",
+                str(tmp_path / "a.dng"),
+            ]
+        )
+        == 2
+    )
+    assert (
+        run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "a.png")]) == 2
+    )
     (tmp_path / "a.h5").write_text("mine")
     assert run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "a.h5")]) == 2
     assert (tmp_path / "a.h5").read_text() == "mine" and "--overwrite" in capfd.readouterr().err
@@ -218,11 +455,28 @@ def test_light_below_zero_is_refused_by_a_sensor(camera, tmp_path, capsys):
     from plenocli.files.images.exr import write_exr
 
     write_exr(tmp_path / "negative.exr", {"Y": np.full((20, 20), -1, np.float32)}, {})
-    arguments = ["capture-sim", str(camera), "--scene", str(tmp_path / "negative.exr"), "--superpixels", "1x1", "--coherent-ring", "0", "-o", str(tmp_path / "out.h5")]
-    assert run(arguments) == 3 and "below 0" in capsys.readouterr().err and not (tmp_path / "out.h5").exists()
+    arguments = [
+        "capture-sim",
+        str(camera),
+        "--scene",
+        str(tmp_path / "negative.exr"),
+        "--superpixels",
+        "1x1",
+        "--coherent-ring",
+        "0",
+        "-o",
+        str(tmp_path / "out.h5"),
+    ]
+    assert (
+        run(arguments) == 3
+        and "below 0" in capsys.readouterr().err
+        and not (tmp_path / "out.h5").exists()
+    )
 
 
 def test_more_memory_than_granted_is_refused_before_it_is_taken(camera, tmp_path, capsys):
     camera.write_text(camera.read_text().replace("count = [3, 4]", "count = [4096, 4096]"))
-    assert run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.h5")]) == 5
+    assert (
+        run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.h5")]) == 5
+    )
     assert "--mem-limit" in capsys.readouterr().err

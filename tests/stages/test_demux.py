@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError, NumericsError, UsageError
+from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.images.spectral_exr import read_spectral_exr
-from plenocli.cli.main import run
-from plenocli.base.errors import InputError, NumericsError, UsageError
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
 
@@ -16,16 +16,27 @@ PITCH, COUNT, BANDS = 12, 7, (480e-9, 620e-9)
 
 
 def capture(path, radiance, seed=0, **attrs):
-    """A lenslet image with a left and a right half, one band each with 3 % leak; 2 DN white noise on 100 DN black."""
+    """A lenslet image with a left and a right half, one band each with 3 % leak; 2 DN white
+    noise on 100 DN black.
+    """
     y, x = np.indices((PITCH, PITCH)) - (PITCH - 1) / 2
     edge = np.clip((5.2 - np.abs(y)) / 1.5, 0, 1) * np.clip((5.2 - np.abs(x)) / 1.5, 0, 1)
-    response = 1000 * edge[..., None] * np.where((x > 0)[..., None] == (np.arange(2) == 1), 0.97, 0.03)
+    response = (
+        1000 * edge[..., None] * np.where((x > 0)[..., None] == (np.arange(2) == 1), 0.97, 0.03)
+    )
     radiance = np.broadcast_to(radiance, (COUNT, COUNT, 2))
     image = np.einsum("rcb,yxb->rycx", radiance, response).reshape(COUNT * PITCH, -1)
     values = 100 + image + np.random.default_rng(seed).normal(0, 2.0, image.shape)
     known = dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1) | attrs
-    data = {"capture/mosaic": np.rint(values).clip(0, 4095).astype(np.uint16), "capture/cfa": "mono"}
-    write_artefact(path, Artefact("capture", data, {"capture": {k: v for k, v in known.items() if v is not None}}), overwrite=True)
+    data = {
+        "capture/mosaic": np.rint(values).clip(0, 4095).astype(np.uint16),
+        "capture/cfa": "mono",
+    }
+    write_artefact(
+        path,
+        Artefact("capture", data, {"capture": {k: v for k, v in known.items() if v is not None}}),
+        overwrite=True,
+    )
     return path
 
 
@@ -46,13 +57,26 @@ def test_a_folder_of_captures_with_a_bad_one_and_a_rerun(files, tmp_path, capsys
     bad = tmp_path / "bad.h5"
     bad.write_bytes(files["shots"][0].read_bytes()[:3000])
     out = tmp_path / "spectra"
-    arguments = ["demux", str(files["shots"][0]), str(bad), *map(str, files["shots"][1:]), "--calibration", str(files["calibration"]), "--format", "h5", "-o", str(out)]
+    arguments = [
+        "demux",
+        str(files["shots"][0]),
+        str(bad),
+        *map(str, files["shots"][1:]),
+        "--calibration",
+        str(files["calibration"]),
+        "--format",
+        "h5",
+        "-o",
+        str(out),
+    ]
     assert run(arguments) == 3
     err = capsys.readouterr().err
     assert "bad.h5" in err and "1 of 5 captures failed" in err and "Traceback" not in err
     assert sorted(p.name for p in out.iterdir()) == [f"shot{i}.h5" for i in range(4)]
     for i in range(4):
-        value = np.moveaxis(read_artefact(out / f"shot{i}.h5", "spectra").data["spectra/value"], 0, -1)
+        value = np.moveaxis(
+            read_artefact(out / f"shot{i}.h5", "spectra").data["spectra/value"], 0, -1
+        )
         np.testing.assert_allclose(value, files["truth"][i], atol=0.01)
     before = {p: p.stat().st_mtime_ns for p in out.iterdir()}
     (out / "shot2.h5").unlink()
@@ -64,31 +88,53 @@ def test_a_folder_of_captures_with_a_bad_one_and_a_rerun(files, tmp_path, capsys
 
 def test_workers_write_the_same_bytes(files, tmp_path):
     for name, workers in (("one", 1), ("two", 2)):
-        run_demux(files["shots"], tmp_path / name, calibration=files["calibration"], suffix=".h5", workers=workers)
+        run_demux(
+            files["shots"],
+            tmp_path / name,
+            calibration=files["calibration"],
+            suffix=".h5",
+            workers=workers,
+        )
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
 def test_exr_holds_value_and_preview(files, tmp_path):
-    report = run_demux([files["shots"][1]], tmp_path / "s.exr", calibration=files["calibration"], settings=Settings("pinv", files["white"]))
+    report = run_demux(
+        [files["shots"][1]],
+        tmp_path / "s.exr",
+        calibration=files["calibration"],
+        settings=Settings("pinv", files["white"]),
+    )
     found = read_spectral_exr(tmp_path / "s.exr")
     assert report["captures"][0]["quantity"] == "reflectance"
     np.testing.assert_allclose(found.wavelengths, BANDS, rtol=1e-9)
     cube = found.values if hasattr(found, "values") else found.cube
-    np.testing.assert_allclose(np.moveaxis(np.asarray(cube), 0, -1), 0.99 * files["truth"][1], atol=0.012)
+    np.testing.assert_allclose(
+        np.moveaxis(np.asarray(cube), 0, -1), 0.99 * files["truth"][1], atol=0.012
+    )
 
 
 def test_both_files_hold_the_same_and_others_read_them(files, tmp_path):
-    """HDF5 by h5py alone and as NXdata, EXR by the OpenEXR package: value, sigma and bands, nothing lost."""
+    """HDF5 by h5py alone and as NXdata, EXR by the OpenEXR package: value, sigma and
+    bands, nothing lost.
+    """
     import h5py
 
     OpenEXR = pytest.importorskip("OpenEXR")
     for name in ("s.h5", "s.exr"):
         run_demux([files["shots"][1]], tmp_path / name, calibration=files["calibration"])
-    with h5py.File(tmp_path / "s.h5") as file, OpenEXR.File(str(tmp_path / "s.exr"), separate_channels=True) as picture:
+    with (
+        h5py.File(tmp_path / "s.h5") as file,
+        OpenEXR.File(str(tmp_path / "s.exr"), separate_channels=True) as picture,
+    ):
         group, channels, header = file["spectra"], picture.channels(), picture.header()
         assert file.attrs["default"] == b"spectra" and group.attrs["NX_class"] == b"NXdata"
-        assert group.attrs["signal"] == b"value" and list(group.attrs["axes"]) == [b"wavelength", b".", b"."]
+        assert group.attrs["signal"] == b"value" and list(group.attrs["axes"]) == [
+            b"wavelength",
+            b".",
+            b".",
+        ]
         for k, wavelength in enumerate(group["wavelength"]):
             label = f"{wavelength * 1e9:.6f}nm".replace(".", ",")
             np.testing.assert_array_equal(channels[f"S0.{label}"].pixels, group["value"][k])
@@ -100,17 +146,26 @@ def test_both_files_hold_the_same_and_others_read_them(files, tmp_path):
     nxdata = pytest.importorskip("silx.io.nxdata")
     with h5py.File(tmp_path / "s.h5") as file:
         plot = nxdata.get_default(file)
-        assert plot.is_valid and plot.signal_name == "value" and plot.axes_names[0] == "wavelength (m)"
+        assert (
+            plot.is_valid and plot.signal_name == "value" and plot.axes_names[0] == "wavelength (m)"
+        )
 
 
 def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files, tmp_path):
-    report = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])["captures"][0]
+    report = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])[
+        "captures"
+    ][0]
     assert report["method"] == "pinv" and "not known" in report["reason"]
     data = read_artefact(tmp_path / "s.h5", "spectra").data
     error = np.moveaxis(data["spectra/value"], 0, -1) - files["truth"][0]
     assert (error / np.moveaxis(data["spectra/sigma"], 0, -1)).std() == pytest.approx(1, abs=0.25)
     with pytest.raises(NumericsError, match="noise, which is not known"):
-        run_demux([files["shots"][0]], tmp_path / "w.h5", calibration=files["calibration"], settings=Settings("wls"))
+        run_demux(
+            [files["shots"][0]],
+            tmp_path / "w.h5",
+            calibration=files["calibration"],
+            settings=Settings("wls"),
+        )
 
 
 def test_captures_of_another_kind_are_refused(files, tmp_path):
@@ -123,7 +178,14 @@ def test_captures_of_another_kind_are_refused(files, tmp_path):
     attempt(tmp_path / "missing.h5", "missing.h5")
     attempt(files["calibration"], "c.h5")
     big = tmp_path / "big.h5"
-    write_artefact(big, Artefact("capture", {"capture/mosaic": np.full((90, 90), 120, np.uint16), "capture/cfa": "mono"}, {"capture": dict(units="DN", exposure_s=0.1)}))
+    write_artefact(
+        big,
+        Artefact(
+            "capture",
+            {"capture/mosaic": np.full((90, 90), 120, np.uint16), "capture/cfa": "mono"},
+            {"capture": dict(units="DN", exposure_s=0.1)},
+        ),
+    )
     attempt(big, "90 x 90 px, the calibration 84 x 84")
     assert not (tmp_path / "o.h5").exists()
 
@@ -139,12 +201,19 @@ def test_names_that_would_collide_and_wrong_suffixes_are_usage_errors(files, tmp
 
 
 def test_a_lenslet_cut_by_the_frame_is_masked(files, tmp_path):
-    """The lit array ends at the sensor's edge on all sides here; a grid shifted by half a cell has cut lenslets."""
+    """The lit array ends at the sensor's edge on all sides here; a grid shifted by half a
+    cell has cut lenslets.
+    """
+
     def shifted(path, radiance, seed):
         whole = read_artefact(capture(path, radiance, seed)).data["capture/mosaic"]
         cut = np.roll(whole, -6, axis=0)[:-12]
         attrs = dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1)
-        write_artefact(path, Artefact("capture", {"capture/mosaic": cut, "capture/cfa": "mono"}, {"capture": attrs}), overwrite=True)
+        write_artefact(
+            path,
+            Artefact("capture", {"capture/mosaic": cut, "capture/cfa": "mono"}, {"capture": attrs}),
+            overwrite=True,
+        )
         return path
 
     white = shifted(tmp_path / "w.h5", 1.0, 1)
@@ -160,12 +229,40 @@ def test_a_lenslet_cut_by_the_frame_is_masked(files, tmp_path):
 
 def test_a_saturated_capture_and_bands_that_do_not_differ_are_said(files, tmp_path, capsys):
     white = capture(tmp_path / "white.h5", 1.0, 1, gain_e_per_dn=2.0)
-    bands = [capture(tmp_path / f"b{k}.h5", np.eye(2)[k], 2 + k, gain_e_per_dn=2.0) for k in range(2)]
+    bands = [
+        capture(tmp_path / f"b{k}.h5", np.eye(2)[k], 2 + k, gain_e_per_dn=2.0) for k in range(2)
+    ]
     good, twins, over = tmp_path / "good.h5", tmp_path / "twins.h5", tmp_path / "over.h5"
     run_calibrate(good, whites=[white], bands=list(zip(BANDS, bands)))
     run_calibrate(twins, whites=[white], bands=[(w, bands[0]) for w in BANDS])
     data = {"capture/mosaic": np.full((COUNT * PITCH,) * 2, 4095, np.uint16), "capture/cfa": "mono"}
-    write_artefact(over, Artefact("capture", data, {"capture": dict(units="DN", black=100.0, white=4095.0, exposure_s=0.1, gain_e_per_dn=2.0)}))
+    write_artefact(
+        over,
+        Artefact(
+            "capture",
+            data,
+            {
+                "capture": dict(
+                    units="DN", black=100.0, white=4095.0, exposure_s=0.1, gain_e_per_dn=2.0
+                )
+            },
+        ),
+    )
     for shot, calibration in ((over, good), (files["shots"][0], twins)):
-        assert run(["demux", str(shot), "--calibration", str(calibration), "-o", str(tmp_path / "never.h5")]) == 5
-        assert "no lenslet could be demultiplexed" in capsys.readouterr().err and not (tmp_path / "never.h5").exists()
+        assert (
+            run(
+                [
+                    "demux",
+                    str(shot),
+                    "--calibration",
+                    str(calibration),
+                    "-o",
+                    str(tmp_path / "never.h5"),
+                ]
+            )
+            == 5
+        )
+        assert (
+            "no lenslet could be demultiplexed" in capsys.readouterr().err
+            and not (tmp_path / "never.h5").exists()
+        )

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError
+from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.cli.main import run
-from plenocli.base.errors import InputError
 from plenocli.files.read.training import DEFAULT, at_scales, read_training, split_by_scene
 
 
@@ -43,14 +43,33 @@ def test_scales_are_area_averages():
 @pytest.fixture
 def pif(tmp_path):
     a = np.random.default_rng(0).random((1, 1, 16, 9)) / 16
-    data = {"pif/A": a, "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": np.zeros((1, 2), int), "pif/pixel_shape": np.array([4, 4]),
-            "pif/object_shape": np.array([3, 3]), "pif/column_energy": a.sum(axis=(1, 2))}
+    data = {
+        "pif/A": a,
+        "pif/wavelength": np.array([550e-9]),
+        "pif/lenslet_offset": np.zeros((1, 2), int),
+        "pif/pixel_shape": np.array([4, 4]),
+        "pif/object_shape": np.array([3, 3]),
+        "pif/column_energy": a.sum(axis=(1, 2)),
+    }
     write_artefact(tmp_path / "pif.h5", Artefact("pif", data, {}, Provenance("test")))
     return tmp_path / "pif.h5"
 
 
 def learn(pif, *options):
-    return run(["learn-dict", "skimage:camera", "skimage:coins", "--pif", str(pif), "--batch", "40", "--lambda", "1e-4", *map(str, options)])
+    return run(
+        [
+            "learn-dict",
+            "skimage:camera",
+            "skimage:coins",
+            "--pif",
+            str(pif),
+            "--batch",
+            "40",
+            "--lambda",
+            "1e-4",
+            *map(str, options),
+        ]
+    )
 
 
 def test_refusals(pif, tmp_path, capsys):
@@ -58,9 +77,25 @@ def test_refusals(pif, tmp_path, capsys):
     assert learn(pif, "--iterations", 1, "-o", first) == 0
     assert learn(pif, "--iterations", 1, "-o", first) == 2
     assert "--overwrite" in capsys.readouterr().err
-    assert learn(pif, "--iterations", 2, "--resume", first, "--atoms", 5, "-o", tmp_path / "e.h5") == 2
+    assert (
+        learn(pif, "--iterations", 2, "--resume", first, "--atoms", 5, "-o", tmp_path / "e.h5") == 2
+    )
     assert learn(pif, "--iterations", 0, "--resume", first, "-o", tmp_path / "e.h5") == 2
-    assert run(["learn-dict", "skimage:moon", "--pif", str(pif), "--resume", str(first), "-o", str(tmp_path / "e.h5")]) == 2
+    assert (
+        run(
+            [
+                "learn-dict",
+                "skimage:moon",
+                "--pif",
+                str(pif),
+                "--resume",
+                str(first),
+                "-o",
+                str(tmp_path / "e.h5"),
+            ]
+        )
+        == 2
+    )
     assert "same pictures" in capsys.readouterr().err
     assert learn(first, "-o", tmp_path / "e.h5") == 3
     assert not (tmp_path / "e.h5").exists()
@@ -70,7 +105,21 @@ def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
     for name in "ab":
         assert learn(pif, "--iterations", 2, "--seed", 5, "-o", tmp_path / f"{name}.h5") == 0
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-    assert learn(pif, "--iterations", 3, "--seed", 5, "--resume", tmp_path / "a.h5", "-o", tmp_path / "a.h5", "--overwrite") == 0
+    assert (
+        learn(
+            pif,
+            "--iterations",
+            3,
+            "--seed",
+            5,
+            "--resume",
+            tmp_path / "a.h5",
+            "-o",
+            tmp_path / "a.h5",
+            "--overwrite",
+        )
+        == 0
+    )
 
 
 def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(pif, tmp_path):
@@ -80,9 +129,24 @@ def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(
     assert learn(pif, "--iterations", 20, "--synthesis", "-o", whole) == 0
     assert learn(pif, "--iterations", 1, "-o", part) == 0
     for done in range(2, 21):  # each goes on from what the one before left in the file
-        assert learn(pif, "--iterations", done, *(["--synthesis"] if done == 20 else []), "--resume", part, "-o", part, "--overwrite") == 0
+        assert (
+            learn(
+                pif,
+                "--iterations",
+                done,
+                *(["--synthesis"] if done == 20 else []),
+                "--resume",
+                part,
+                "-o",
+                part,
+                "--overwrite",
+            )
+            == 0
+        )
     whole, part = (read_artefact(path, "dictionary").data for path in (whole, part))
-    assert set(whole) == set(part) and all(whole[key].tobytes() == part[key].tobytes() for key in whole)
+    assert set(whole) == set(part) and all(
+        whole[key].tobytes() == part[key].tobytes() for key in whole
+    )
 
 
 def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkeypatch, capsys):
@@ -110,7 +174,9 @@ def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkey
     from plenocli.files.artefacts.container import read_artefact
 
     one, other = (read_artefact(path, "dictionary") for path in (whole, rest))
-    assert set(one.data) == set(other.data) and all(one.data[key].tobytes() == other.data[key].tobytes() for key in one.data)
+    assert set(one.data) == set(other.data) and all(
+        one.data[key].tobytes() == other.data[key].tobytes() for key in one.data
+    )
     for name in ("parameters", "notes", "coherence"):
         assert one.attrs["dictionary"][name] == other.attrs["dictionary"][name]
 
@@ -121,12 +187,30 @@ def test_a_checkpoint_with_other_defaults_is_not_taken(pif, tmp_path, monkeypatc
     kept = tmp_path / "kept.h5"
     with monkeypatch.context() as patch:
         patch.setattr(Learner, "synthesis", lambda *_: 1 / 0)
-        assert learn(pif, "--iterations", 1, "--delta", 0, "--synthesis", "--checkpoint", kept, "-o", tmp_path / "d.h5") != 0
+        assert (
+            learn(
+                pif,
+                "--iterations",
+                1,
+                "--delta",
+                0,
+                "--synthesis",
+                "--checkpoint",
+                kept,
+                "-o",
+                tmp_path / "d.h5",
+            )
+            != 0
+        )
     assert kept.exists()
-    assert learn(pif, "--iterations", 1, "--checkpoint", kept, "-o", tmp_path / "d.h5") == 2  # the default delta is another
+    # the default delta is another
+    assert learn(pif, "--iterations", 1, "--checkpoint", kept, "-o", tmp_path / "d.h5") == 2
     assert learn(pif, "--iterations", 1, "--checkpoint", kept, "-o", kept) == 2
     assert learn(pif, "--iterations", 1, "--checkpoint", pif, "-o", tmp_path / "d.h5") == 4
-    assert learn(pif, "--iterations", 1, "--delta", 0, "--checkpoint", kept, "-o", tmp_path / "d.h5") == 0
+    assert (
+        learn(pif, "--iterations", 1, "--delta", 0, "--checkpoint", kept, "-o", tmp_path / "d.h5")
+        == 0
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
@@ -159,18 +243,60 @@ def test_a_folder_stands_for_its_pictures(tmp_path, capsys):
 
 def test_pictures_that_do_not_fit_lie_in_a_file():
     names = ("skimage:camera", "skimage:coins")
-    held, spilled = (at_scales(read_training(names, (8, 8), limit=limit), (8, 8), limit=limit) for limit in (None, 300_000))
-    assert not any(isinstance(p, np.memmap) for _, p in held) and any(isinstance(p, np.memmap) for _, p in spilled)
+    held, spilled = (
+        at_scales(read_training(names, (8, 8), limit=limit), (8, 8), limit=limit)
+        for limit in (None, 300_000)
+    )
+    assert not any(isinstance(p, np.memmap) for _, p in held) and any(
+        isinstance(p, np.memmap) for _, p in spilled
+    )
     for (name, one), (other_name, other) in zip(held, spilled, strict=True):
         assert name == other_name
         np.testing.assert_array_equal(one, other)
 
 
 def test_history_is_told_line_by_line_and_lambda_may_come_from_the_noise(pif, tmp_path, capsys):
-    assert run(["learn-dict", "skimage:camera", "skimage:coins", "--pif", str(pif), "--batch", "40", "--lambda", "noise", "--iterations", "2", "-o", str(tmp_path / "d.h5")]) == 0
+    assert (
+        run(
+            [
+                "learn-dict",
+                "skimage:camera",
+                "skimage:coins",
+                "--pif",
+                str(pif),
+                "--batch",
+                "40",
+                "--lambda",
+                "noise",
+                "--iterations",
+                "2",
+                "-o",
+                str(tmp_path / "d.h5"),
+            ]
+        )
+        == 0
+    )
     told = capsys.readouterr().err
-    assert "from the noise" in told and "iteration 1: validation" in told and "iteration 2: validation" in told
-    assert run(["learn-dict", "skimage:camera", "--pif", str(pif), "--lambda", "loud", "-o", str(tmp_path / "e.h5")]) == 2
+    assert (
+        "from the noise" in told
+        and "iteration 1: validation" in told
+        and "iteration 2: validation" in told
+    )
+    assert (
+        run(
+            [
+                "learn-dict",
+                "skimage:camera",
+                "--pif",
+                str(pif),
+                "--lambda",
+                "loud",
+                "-o",
+                str(tmp_path / "e.h5"),
+            ]
+        )
+        == 2
+    )
 
 
 def test_atoms_that_paint_are_kept_beside_those_that_code(pif, tmp_path):
@@ -180,11 +306,29 @@ def test_atoms_that_paint_are_kept_beside_those_that_code(pif, tmp_path):
     assert learn(pif, "--iterations", 1, "-o", tmp_path / "b.h5") == 0
     one, other = (read_artefact(tmp_path / f"{n}.h5", "dictionary") for n in "ab")
     np.testing.assert_array_equal(one.data["dictionary/atoms"], other.data["dictionary/atoms"])
-    assert one.data["dictionary/synthesis"].shape == (9, 9) and "dictionary/synthesis" not in other.data
+    assert (
+        one.data["dictionary/synthesis"].shape == (9, 9)
+        and "dictionary/synthesis" not in other.data
+    )
 
 
 def test_gradient_steps_are_part_of_what_a_resumed_run_keeps(pif, tmp_path, capsys):
     assert learn(pif, "--iterations", 1, "--gradient-steps", 5, "-o", tmp_path / "a.h5") == 0
-    assert learn(pif, "--iterations", 2, "--gradient-steps", 6, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 2
+    assert (
+        learn(
+            pif,
+            "--iterations",
+            2,
+            "--gradient-steps",
+            6,
+            "--resume",
+            tmp_path / "a.h5",
+            "-o",
+            tmp_path / "b.h5",
+        )
+        == 2
+    )
     assert "gradient_steps = 5" in capsys.readouterr().err
-    assert learn(pif, "--iterations", 2, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 0
+    assert (
+        learn(pif, "--iterations", 2, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 0
+    )

@@ -1,4 +1,6 @@
-"""`plenocli` alone: the pipeline, and a command that works here and now; silence and costs on request."""
+"""`plenocli` alone: the pipeline, and a command that works here and now; silence
+and costs on request.
+"""
 
 import shlex
 from pathlib import Path
@@ -24,12 +26,24 @@ def test_following_the_advice_leads_to_a_score(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert run([]) == 0
     out = capsys.readouterr().out
-    assert "--simulate-pif-->" in out and out.rstrip().splitlines()[-1].startswith("Next: plenocli score")
+    assert "--simulate-pif-->" in out and out.rstrip().splitlines()[-1].startswith(
+        "Next: plenocli score"
+    )
 
 
 def test_quiet_says_results_only_and_verbose_what_they_cost(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    command = ["simulate-pif", str(TINY), "--superpixels", "1x1", "--coherent-ring", "0", "--overwrite", "-o", "pif.h5"]
+    command = [
+        "simulate-pif",
+        str(TINY),
+        "--superpixels",
+        "1x1",
+        "--coherent-ring",
+        "0",
+        "--overwrite",
+        "-o",
+        "pif.h5",
+    ]
     assert run(["--quiet", *command]) == 0
     out, err = capfd.readouterr()
     assert out.startswith("pif.h5: A of") and err == ""

@@ -1,14 +1,17 @@
-"""The search: the same points from the same seed however it is run, results that are kept, and better than chance."""
+"""The search: the same points from the same seed however it is run, results that are kept, and
+better than chance.
+"""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
-from plenocli.cli.main import run
 from plenocli.base.errors import ConfigError, UsageError
-from plenocli.stages.sweep import optimise, store as sweep_store
+from plenocli.cli.main import run
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.stages.sweep import optimise
+from plenocli.stages.sweep import store as sweep_store
 
 pytest.importorskip("optuna")
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +40,13 @@ psnr_db = "max"
 @pytest.fixture
 def space(tmp_path):
     text = (ROOT / "sample_configs" / "tiny.toml").read_text()
-    for old, new in [("[8, 8]", "[4, 4]"), ("[13, 13]", "[9, 9]"), ('"26 um"', '"18 um"'), ('"208 um"', '"144 um"'), ("[5, 5]", "[3, 3]")]:
+    for old, new in [
+        ("[8, 8]", "[4, 4]"),
+        ("[13, 13]", "[9, 9]"),
+        ('"26 um"', '"18 um"'),
+        ('"208 um"', '"144 um"'),
+        ("[5, 5]", "[3, 3]"),
+    ]:
         text = text.replace(old, new)
     (tmp_path / "camera.toml").write_text(text)
     (tmp_path / "space.toml").write_text(SPACE)
@@ -57,31 +66,53 @@ def test_the_same_seed_tries_the_same_points_stopped_or_not(space, tmp_path):
     assert run([*arguments, "--trials", "14", "--overwrite", "-o", str(tmp_path / "part.h5")]) == 0
     whole = table(tmp_path / "whole.h5")
     assert (tmp_path / "part.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
-    assert whole.data["sweep/key"][: len(first.data["sweep/key"])].tolist() == first.data["sweep/key"].tolist()
+    assert (
+        whole.data["sweep/key"][: len(first.data["sweep/key"])].tolist()
+        == first.data["sweep/key"].tolist()
+    )
     f = whole.data["sweep/parameter"][:, 0]
-    assert 4 <= f.min() < f.max() <= 12 and set(whole.data["sweep/parameter"][:, 2]) <= {0.5, 0.75, 1.0}
+    assert 4 <= f.min() < f.max() <= 12 and set(whole.data["sweep/parameter"][:, 2]) <= {
+        0.5,
+        0.75,
+        1.0,
+    }
     names = [m["name"] for m in whole.attrs["sweep"]["metrics"]]
     psnr = whole.data["sweep/metric"][:, names.index("psnr_db")]
-    assert np.flatnonzero(whole.data["sweep/front"]).tolist() == np.flatnonzero(psnr == psnr.max()).tolist()
+    assert (
+        np.flatnonzero(whole.data["sweep/front"]).tolist()
+        == np.flatnonzero(psnr == psnr.max()).tolist()
+    )
 
 
 def test_the_search_finds_what_chance_does_not(space, tmp_path, monkeypatch):
-    """On a function with a known best, the points tried last lie nearer to it than the first ones."""
+    """On a function with a known best, the points tried last lie nearer to it
+    than the first ones.
+    """
+
     def figures(store, rows, *surroundings, **options):
         for row in rows:
             f, choice = row.point["main_lens.f_number"], row.point["reconstruct.method"]
-            row.result = {"status": 0, "reason": "", "notes": [], "seconds": 0.0, "metrics": {"psnr_db": -abs(f - 7) - (choice == "block-mean")}}
+            row.result = {
+                "status": 0,
+                "reason": "",
+                "notes": [],
+                "seconds": 0.0,
+                "metrics": {"psnr_db": -abs(f - 7) - (choice == "block-mean")},
+            }
         return len(rows)
 
     monkeypatch.setattr(sweep_store.Store, "evaluate", figures)
     assert run(["optimise", str(space), "--trials", "80", "-o", str(tmp_path / "best.h5")]) == 0
     values = table(tmp_path / "best.h5").data["sweep/parameter"]
     assert np.abs(values[-30:, 0] - 7).mean() < 0.6 * np.abs(values[:10, 0] - 7).mean()
-    assert (values[-30:, 3] == table(tmp_path / "best.h5").attrs["sweep"]["parameters"][3]["choices"].index("tikhonov")).mean() > 0.7
+    assert (
+        values[-30:, 3]
+        == table(tmp_path / "best.h5").attrs["sweep"]["parameters"][3]["choices"].index("tikhonov")
+    ).mean() > 0.7
 
 
 def test_refused_points_are_heard_as_failures(space, tmp_path):
-    space.write_text(SPACE.replace("from = 4.0, to = 12.0", "from = 4.0, to = 1e5, scale = \"log\""))
+    space.write_text(SPACE.replace("from = 4.0, to = 12.0", 'from = 4.0, to = 1e5, scale = "log"'))
     assert run(["optimise", str(space), "--trials", "8", "-o", str(tmp_path / "out.h5")]) == 0
     status = table(tmp_path / "out.h5").data["sweep/status"]
     assert 0 < (status == 2).sum() < len(status)

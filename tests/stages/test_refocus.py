@@ -1,4 +1,6 @@
-"""`plenocli refocus`: captures of cameras out of focus, the letters of a real camera, wrong requests."""
+"""`plenocli refocus`: captures of cameras out of focus, the letters of a real
+camera, wrong requests.
+"""
 
 import json
 import shutil
@@ -6,8 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
+from plenocli.files.artefacts.container import read_artefact
 from plenocli.inverse.lightfield import refocus as lightfield
 
 CAMERA = """
@@ -41,10 +43,34 @@ def folder(tmp_path_factory):
 def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distance, reach):
     """capture-sim works with system matrices of waves and knows nothing of slopes."""
     name = distance.split()[0]
-    camera, capture, out = folder / f"{name}.toml", folder / f"{name}.h5", folder / f"{name}-planes.h5"
+    camera, capture, out = (
+        folder / f"{name}.toml",
+        folder / f"{name}.h5",
+        folder / f"{name}-planes.h5",
+    )
     camera.write_text(CAMERA.format(distance=distance))
     grid = f"{reach}x{reach}" if reach == 1 else "3x3"
-    assert run(["capture-sim", str(camera), "--scene", "skimage:camera", "--model", "ray", "--superpixels", grid, "--coherent-ring", "0", "--noise", "none", "-o", str(capture)]) == 0
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(camera),
+                "--scene",
+                "skimage:camera",
+                "--model",
+                "ray",
+                "--superpixels",
+                grid,
+                "--coherent-ring",
+                "0",
+                "--noise",
+                "none",
+                "-o",
+                str(capture),
+            ]
+        )
+        == 0
+    )
     assert run(["refocus", str(capture), "--camera", str(camera), "-o", str(out)]) == 0
     data = read_artefact(out, "lightfield").data
     true = lightfield.slope_of(float(name) * 1e-3, 0.05, 0.055, 352e-6)
@@ -52,26 +78,72 @@ def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distanc
     assert sure.sum() > 10
     assert np.median(data["depth/slope"][3:-3, 3:-3][sure]) == pytest.approx(true, abs=0.25)
     assert abs(data["refocus/slope"][np.argmax(data["refocus/sharpness"])] - true) <= 0.5
-    for number, truth in enumerate((distance.replace(" ", ""), str(capture))):  # told, or what the capture says of its camera
-        assert run(["score", str(out), "--truth", truth, "-o", str(folder / f"{name}-{number}.json")]) == 0
-    told, known = (json.loads((folder / f"{name}-{number}.json").read_text())["metrics"] for number in (0, 1))
+    # told, or what the capture says of its camera
+    for number, truth in enumerate((distance.replace(" ", ""), str(capture))):
+        assert (
+            run(["score", str(out), "--truth", truth, "-o", str(folder / f"{name}-{number}.json")])
+            == 0
+        )
+    told, known = (
+        json.loads((folder / f"{name}-{number}.json").read_text())["metrics"] for number in (0, 1)
+    )
     assert told == known
-    assert told["depth_slope"] == pytest.approx(true, abs=1e-6) and told["depth_slope_error"] < 0.15 and told["depth_sure_share"] > 0.8 and abs(told["sharpest_slope_error"]) < 0.05
+    assert (
+        told["depth_slope"] == pytest.approx(true, abs=1e-6)
+        and told["depth_slope_error"] < 0.15
+        and told["depth_sure_share"] > 0.8
+        and abs(told["sharpest_slope_error"]) < 0.05
+    )
     near = lightfield.distance_of(true + np.array([-0.5, 0.5]), 0.05, 0.055, 352e-6)
-    assert told["depth_limit_m"] == pytest.approx(abs(near[1] - near[0]), rel=0.01) and told["depth_distance_error_m"] < 0.15 * told["depth_limit_m"]
+    assert (
+        told["depth_limit_m"] == pytest.approx(abs(near[1] - near[0]), rel=0.01)
+        and told["depth_distance_error_m"] < 0.15 * told["depth_limit_m"]
+    )
 
 
 def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
-    """The white sheet with the t at the left is farther away than the grey one with a and b, and each is sharpest at its own slope."""
-    real, cal, out = shared_data / "plenoptic" / "letters", folder / "letters-cal.h5", folder / "letters.h5"
-    assert run(["calibrate", "--white", str(real / "letters_ULF_M1_white.png"), "--dark", str(real / "letters_ULF_M1_dark.png"), "-o", str(cal)]) == 0
+    """The white sheet with the t at the left is farther away than the grey one with a and b, and
+    each is sharpest at its own slope.
+    """
+    real, cal, out = (
+        shared_data / "plenoptic" / "letters",
+        folder / "letters-cal.h5",
+        folder / "letters.h5",
+    )
+    assert (
+        run(
+            [
+                "calibrate",
+                "--white",
+                str(real / "letters_ULF_M1_white.png"),
+                "--dark",
+                str(real / "letters_ULF_M1_dark.png"),
+                "-o",
+                str(cal),
+            ]
+        )
+        == 0
+    )
     slopes = [w for s in np.linspace(-1.5, 2, 15) for w in ("--slope", f"{s:.3f}")]
-    assert run(["refocus", str(real / "letters_ULF_M1.png"), "--calibration", str(cal), *slopes, "-o", str(out)]) == 0
+    assert (
+        run(
+            [
+                "refocus",
+                str(real / "letters_ULF_M1.png"),
+                "--calibration",
+                str(cal),
+                *slopes,
+                "-o",
+                str(out),
+            ]
+        )
+        == 0
+    )
     data = read_artefact(out, "lightfield").data
     step = lightfield.STEP
 
     def sharpest(columns):
-        part = data["refocus/value"][:, 2 * step:18 * step, columns[0] * step:columns[1] * step]
+        part = data["refocus/value"][:, 2 * step : 18 * step, columns[0] * step : columns[1] * step]
         return data["refocus/slope"][np.argmax([lightfield.sharpness(p) for p in part])]
 
     t, ab = sharpest((4, 7)), sharpest((9, 16))
@@ -80,9 +152,16 @@ def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
     assert np.median(depth[4:16, 4:7]) < 0.2 < np.median(depth[4:16, 9:16])
 
 
-@pytest.mark.parametrize("arguments, code, words", [
-    (["--distance", "500mm"], 2, "--camera"), (["--distance", "500mm", "--slope", "1", "--camera", "550.toml"], 2, "not both"), (["--slope", "nan"], 2, "0.5"),
-    (["--calibration", "550.h5"], 3, "capture"), (["--camera", "none.toml"], 3, "none.toml")])
+@pytest.mark.parametrize(
+    "arguments, code, words",
+    [
+        (["--distance", "500mm"], 2, "--camera"),
+        (["--distance", "500mm", "--slope", "1", "--camera", "550.toml"], 2, "not both"),
+        (["--slope", "nan"], 2, "0.5"),
+        (["--calibration", "550.h5"], 3, "capture"),
+        (["--camera", "none.toml"], 3, "none.toml"),
+    ],
+)
 def test_wrong_requests_have_one_message(folder, capfd, monkeypatch, arguments, code, words):
     monkeypatch.chdir(folder)
     assert run(["refocus", "550.h5", *arguments, "-o", "never.h5"]) == code
@@ -104,10 +183,26 @@ def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
 def test_a_report_shows_planes_and_how_good_they_are(folder):
     (folder / "run").mkdir()
     shutil.copy(folder / "550-planes.h5", folder / "run")
-    assert run(["score", str(folder / "run" / "550-planes.h5"), "--truth", "550mm", "-o", str(folder / "run" / "depth.json")]) == 0
+    assert (
+        run(
+            [
+                "score",
+                str(folder / "run" / "550-planes.h5"),
+                "--truth",
+                "550mm",
+                "-o",
+                str(folder / "run" / "depth.json"),
+            ]
+        )
+        == 0
+    )
     assert run(["report", str(folder / "run"), "-o", str(folder / "run.html")]) == 0
     page = (folder / "run.html").read_text()
-    assert page.count("<figure>") == 4 and ">Depth</h2>" in page and "error of the slope over the geometric limit, median" in page
+    assert (
+        page.count("<figure>") == 4
+        and ">Depth</h2>" in page
+        and "error of the slope over the geometric limit, median" in page
+    )
 
 
 def test_show_draws_it(folder):
@@ -115,11 +210,29 @@ def test_show_draws_it(folder):
     assert (folder / "550.png").stat().st_size > 20_000
 
 
-@pytest.mark.parametrize("arguments, code, words", [
-    ([], 2, "--truth 620mm"), (["--truth", "far"], 2, "620mm"), (["--truth", "550mm"], 3, "--camera"), (["--truth", "550mm", "--metric", "psnr"], 3, "--camera")])
+@pytest.mark.parametrize(
+    "arguments, code, words",
+    [
+        ([], 2, "--truth 620mm"),
+        (["--truth", "far"], 2, "620mm"),
+        (["--truth", "550mm"], 3, "--camera"),
+        (["--truth", "550mm", "--metric", "psnr"], 3, "--camera"),
+    ],
+)
 def test_depth_is_not_scored_without_distances(folder, capfd, monkeypatch, arguments, code, words):
     monkeypatch.chdir(folder)
     if not (folder / "plain.h5").exists():
         assert run(["refocus", "550.h5", "-o", "plain.h5"]) == 0
-    assert run(["score", "plain.h5" if len(arguments) > 1 and "mm" in arguments[1] else "550-planes.h5", *arguments, "-o", "never.json"]) == code
+    assert (
+        run(
+            [
+                "score",
+                "plain.h5" if len(arguments) > 1 and "mm" in arguments[1] else "550-planes.h5",
+                *arguments,
+                "-o",
+                "never.json",
+            ]
+        )
+        == code
+    )
     assert words in capfd.readouterr().err and not (folder / "never.json").exists()

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError, UsageError
+from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.cli.main import run
-from plenocli.base.errors import InputError, UsageError
 from plenocli.forward.scene.chart import chart_labels, chart_scene
 from plenocli.stages.evaluation.score import run_score, table
 
@@ -14,22 +14,44 @@ BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 
 
 def put(path, kind, data, **attrs):
-    write_artefact(path, Artefact(kind, data, {kind: attrs} if attrs else {}, Provenance("test")), overwrite=True)
+    write_artefact(
+        path,
+        Artefact(kind, data, {kind: attrs} if attrs else {}, Provenance("test")),
+        overwrite=True,
+    )
     return path
 
 
 @pytest.fixture
 def picture(tmp_path):
-    """A capture that holds its scene 3 times finer (36 x 36), and two results of 12 x 12 points, 3 x 3 lenslets."""
+    """A capture that holds its scene 3 times finer (36 x 36), and two results of 12 x 12
+    points, 3 x 3 lenslets.
+    """
     scene = np.random.default_rng(0).random((1, 36, 36)).astype("f4")
     capture = put(
-        tmp_path / "capture.h5", "capture",
-        {"capture/mosaic": np.full((15, 15), 2.0, "f4"), "capture/cfa": "mono", "capture/scene": scene, "capture/wavelength": np.array([550e-9])},
-        units="electron", black=0.0, lenslet_count=[3, 3], noise_sigma=0.002,
+        tmp_path / "capture.h5",
+        "capture",
+        {
+            "capture/mosaic": np.full((15, 15), 2.0, "f4"),
+            "capture/cfa": "mono",
+            "capture/scene": scene,
+            "capture/wavelength": np.array([550e-9]),
+        },
+        units="electron",
+        black=0.0,
+        lenslet_count=[3, 3],
+        noise_sigma=0.002,
     )
     truth = scene[0].reshape(12, 3, 12, 3).mean(axis=(1, 3))
-    good = put(tmp_path / "good.h5", "image", {"image/value": (truth + 0.01).astype("f4")}, method="lmmse")
-    poor = put(tmp_path / "poor.h5", "image", {"image/value": (truth + 0.1).astype("f4")}, method="block-mean")
+    good = put(
+        tmp_path / "good.h5", "image", {"image/value": (truth + 0.01).astype("f4")}, method="lmmse"
+    )
+    poor = put(
+        tmp_path / "poor.h5",
+        "image",
+        {"image/value": (truth + 0.1).astype("f4")},
+        method="block-mean",
+    )
     return tmp_path, capture, good, poor, truth
 
 
@@ -39,10 +61,14 @@ def test_pictures_side_by_side(picture):
     assert json.loads((folder / "score.json").read_text()) == document
     first, second = (entry["metrics"] for entry in document["results"])
     assert document["metrics"] == first
-    assert first["psnr_db"] == pytest.approx(40, abs=1e-4) and second["psnr_db"] == pytest.approx(20, abs=1e-4)
+    assert first["psnr_db"] == pytest.approx(40, abs=1e-4) and second["psnr_db"] == pytest.approx(
+        20, abs=1e-4
+    )
     assert first["psnr_inner_db"] == pytest.approx(40, abs=1e-4)
     blocks = truth.reshape(3, 4, 3, 4).transpose(0, 2, 1, 3).reshape(9, 16)
-    assert first["block_mean_psnr_db"] == pytest.approx(-10 * np.log10(blocks.var(axis=1).mean()), abs=1e-4)
+    assert first["block_mean_psnr_db"] == pytest.approx(
+        -10 * np.log10(blocks.var(axis=1).mean()), abs=1e-4
+    )
     assert first["snr_sensor_db"] == pytest.approx(60, abs=1e-4)
     assert set(first) <= set(document["definitions"])
     lines = table(document).splitlines()
@@ -76,7 +102,9 @@ def test_one_bad_result_does_not_stop_the_others(picture, capfd):
     assert "error" in document["results"][0] and str(folder) not in document["results"][0]["error"]
     assert document["metrics"]["psnr_db"] == pytest.approx(40, abs=1e-4)
     capfd.readouterr()
-    with pytest.raises(InputError, match="2 of 2 results failed: torn.h5, none.h5; nothing is written"):
+    with pytest.raises(
+        InputError, match="2 of 2 results failed: torn.h5, none.h5; nothing is written"
+    ):
         run_score([folder / "torn.h5", folder / "none.h5"], folder / "never.json", truth=capture)
     assert capfd.readouterr().err.count("error: ") == 2 and not (folder / "never.json").exists()
 
@@ -90,19 +118,35 @@ def test_another_grid_is_refused(picture):
 
 @pytest.fixture
 def chart(tmp_path):
-    """Spectra of a chart over 24 x 36 lenslets with known errors, and two frames of a white target."""
+    """Spectra of a chart over 24 x 36 lenslets with known errors, and two frames
+    of a white target.
+    """
     rng = np.random.default_rng(1)
     fine = chart_scene(480, 720, BANDS)[0].astype("f8")
     truth = fine.reshape(4, 24, 20, 36, 20).mean(axis=(2, 4))
     sigma = np.full(truth.shape, 0.01)
     result = put(
-        tmp_path / "chart.h5", "spectra",
-        {"spectra/value": truth + np.array([0.0, 0.01, 0.02, 0.03])[:, None, None], "spectra/wavelength": BANDS, "spectra/sigma": sigma},
-        quantity="reflectance", method="pinv",
+        tmp_path / "chart.h5",
+        "spectra",
+        {
+            "spectra/value": truth + np.array([0.0, 0.01, 0.02, 0.03])[:, None, None],
+            "spectra/wavelength": BANDS,
+            "spectra/sigma": sigma,
+        },
+        quantity="reflectance",
+        method="pinv",
     )
     whites = [
-        put(tmp_path / f"white{i}.h5", "spectra",
-            {"spectra/value": 1 + 0.01 * rng.standard_normal(truth.shape), "spectra/wavelength": BANDS, "spectra/sigma": sigma}, quantity="reflectance")
+        put(
+            tmp_path / f"white{i}.h5",
+            "spectra",
+            {
+                "spectra/value": 1 + 0.01 * rng.standard_normal(truth.shape),
+                "spectra/wavelength": BANDS,
+                "spectra/sigma": sigma,
+            },
+            quantity="reflectance",
+        )
         for i in range(2)
     ]
     return tmp_path, result, whites, truth
@@ -131,15 +175,27 @@ def test_truth_as_spectral_cube_finer_in_space_and_wavelength(chart):
     cube = chart_scene(240, 360, fine)[0]
     scene = put(folder / "scene.h5", "image", {"image/value": cube, "image/wavelength": fine})
     document = run_score([result], folder / "s.json", truth=scene, patches="colorchecker")
-    np.testing.assert_allclose(document["metrics"]["six_patch_rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=2e-4)
+    np.testing.assert_allclose(
+        document["metrics"]["six_patch_rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=2e-4
+    )
 
 
 def test_radiance_is_divided_by_the_white_target(chart):
     folder, _, _, truth = chart
     light = np.array([2.0, 3.0, 0.5, 7.0])[:, None, None] * np.linspace(0.5, 1, 36)
     data = {"spectra/wavelength": BANDS}
-    result = put(folder / "radiance.h5", "spectra", data | {"spectra/value": truth * light}, quantity="radiance")
-    white = put(folder / "white.h5", "spectra", data | {"spectra/value": 0.99 * light * np.ones(truth.shape)}, quantity="radiance")
+    result = put(
+        folder / "radiance.h5",
+        "spectra",
+        data | {"spectra/value": truth * light},
+        quantity="radiance",
+    )
+    white = put(
+        folder / "white.h5",
+        "spectra",
+        data | {"spectra/value": 0.99 * light * np.ones(truth.shape)},
+        quantity="radiance",
+    )
     with pytest.raises(UsageError, match="--white"):
         run_score([result], folder / "s.json", truth="colorchecker")
     document = run_score([result], folder / "s.json", truth="colorchecker", whites=[white])
@@ -151,7 +207,9 @@ def test_label_map_from_a_file(chart):
 
     folder, result, _, _ = chart
     Image.fromarray(chart_labels(48, 72)).save(folder / "map.png")
-    document = run_score([result], folder / "s.json", truth="colorchecker", patches=folder / "map.png")
+    document = run_score(
+        [result], folder / "s.json", truth="colorchecker", patches=folder / "map.png"
+    )
     assert document["metrics"]["patches"] == 24
     Image.fromarray(chart_labels(25, 36)).save(folder / "bad.png")
     with pytest.raises(InputError, match="24 x 36"):
@@ -161,16 +219,26 @@ def test_label_map_from_a_file(chart):
 def test_dictionary_needs_its_matrix(tmp_path):
     rng = np.random.default_rng(2)
     system = rng.random((1, 1, 25, 16)).astype("f4")
-    pif = put(tmp_path / "pif.h5", "pif", {
-        "pif/A": system, "pif/wavelength": np.array([550e-9]), "pif/lenslet_offset": np.zeros((1, 2), int), "pif/pixel_shape": np.array([5, 5]),
-        "pif/object_shape": np.array([4, 4]), "pif/column_energy": system.sum(axis=(1, 2)),
-    })
+    pif = put(
+        tmp_path / "pif.h5",
+        "pif",
+        {
+            "pif/A": system,
+            "pif/wavelength": np.array([550e-9]),
+            "pif/lenslet_offset": np.zeros((1, 2), int),
+            "pif/pixel_shape": np.array([5, 5]),
+            "pif/object_shape": np.array([4, 4]),
+            "pif/column_energy": system.sum(axis=(1, 2)),
+        },
+    )
     dictionary = put(tmp_path / "d.h5", "dictionary", {"dictionary/atoms": np.eye(16, dtype="f4")})
     with pytest.raises(UsageError, match="--pif"):
         run_score([dictionary], tmp_path / "s.json")
     document = run_score([dictionary], tmp_path / "s.json", pif=pif)
     unit = system[0, 0] / np.linalg.norm(system[0, 0], axis=0)
-    assert document["metrics"]["coherence_effective"] == pytest.approx(np.abs(unit.T @ unit - np.eye(16)).max(), rel=1e-4)
+    assert document["metrics"]["coherence_effective"] == pytest.approx(
+        np.abs(unit.T @ unit - np.eye(16)).max(), rel=1e-4
+    )
     assert document["metrics"]["coherence_raw"] == pytest.approx(system.max(), rel=1e-5)
 
 
@@ -187,22 +255,46 @@ def test_spectral_exr_results(chart):
     from plenocli.files.images.spectral_exr import write_spectral_exr
 
     folder, _, _, truth = chart
-    write_spectral_exr(folder / "c.exr", BANDS, (truth + 0.02).astype("f4"), "reflectance", overwrite=False)
+    write_spectral_exr(
+        folder / "c.exr", BANDS, (truth + 0.02).astype("f4"), "reflectance", overwrite=False
+    )
     document = run_score([folder / "c.exr"], folder / "s.json", truth="colorchecker")
     np.testing.assert_allclose(document["metrics"]["rmse_per_band"], 0.02, atol=1e-6)
 
 
 def test_command_line(picture, capsys):
     folder, capture, good, poor, _ = picture
-    arguments = ["score", str(good), str(poor), "--truth", str(capture), "-o", str(folder / "s.json")]
+    arguments = [
+        "score",
+        str(good),
+        str(poor),
+        "--truth",
+        str(capture),
+        "-o",
+        str(folder / "s.json"),
+    ]
     assert run(arguments) == 0
     assert "PSNR [dB]" in capsys.readouterr().out
     assert run(arguments) == 2 and "--overwrite" in capsys.readouterr().err
     assert run([*arguments, "--overwrite", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["metrics"]["psnr_db"] == pytest.approx(40, abs=1e-4)
     assert run(["score", str(good), "-o", str(folder / "t.json")]) == 2
-    assert run(["score", str(folder / "absent.h5"), "--truth", str(capture), "-o", str(folder / "t.json")]) == 3
-    assert run(["score", str(good), "--truth", str(capture), "-o", str(folder / "no" / "t.json")]) == 4
+    assert (
+        run(
+            [
+                "score",
+                str(folder / "absent.h5"),
+                "--truth",
+                str(capture),
+                "-o",
+                str(folder / "t.json"),
+            ]
+        )
+        == 3
+    )
+    assert (
+        run(["score", str(good), "--truth", str(capture), "-o", str(folder / "no" / "t.json")]) == 4
+    )
 
 
 def test_a_picture_is_no_white_target(tmp_path):

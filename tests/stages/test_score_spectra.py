@@ -1,4 +1,6 @@
-"""score's measures of spectra beside single pixel, through a camera's filters, and how often lenslets tell their patch."""
+"""score's measures of spectra beside single pixel, through a camera's filters, and how often
+lenslets tell their patch.
+"""
 
 import sys
 from pathlib import Path
@@ -6,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError, UsageError
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.config.camera_file import load_camera
-from plenocli.base.errors import InputError, UsageError
 from plenocli.forward.scene.chart import chart_scene
 from plenocli.forward.scene.tables import colorchecker, illuminant
 from plenocli.stages.evaluation.score import run_score, table
@@ -21,7 +23,13 @@ TRUTH = chart_scene(480, 720, BANDS)[0].astype("f8").reshape(4, 24, 20, 36, 20).
 
 def put(path, value, **attrs):
     data = {"spectra/value": value, "spectra/wavelength": BANDS}
-    write_artefact(path, Artefact("spectra", data, {"spectra": {"quantity": "reflectance"} | attrs}, Provenance("test")), overwrite=True)
+    write_artefact(
+        path,
+        Artefact(
+            "spectra", data, {"spectra": {"quantity": "reflectance"} | attrs}, Provenance("test")
+        ),
+        overwrite=True,
+    )
     return path
 
 
@@ -42,32 +50,48 @@ def test_every_method_is_set_against_single_pixel_with_its_own_white(methods):
     document = run_score(results, folder / "s.json", truth="colorchecker", whites=whites)
     own, single = (entry["metrics"] for entry in document["results"])
     assert own["snr_over_single_pixel_db"] == pytest.approx(20 * np.log10(3), abs=0.01)
-    assert own["rmse_over_single_pixel"] == pytest.approx(1 / 3, rel=1e-3) and own["six_patch_rmse_over_single_pixel"] == pytest.approx(1 / 3, rel=0.01)
+    assert own["rmse_over_single_pixel"] == pytest.approx(1 / 3, rel=1e-3) and own[
+        "six_patch_rmse_over_single_pixel"
+    ] == pytest.approx(1 / 3, rel=0.01)
     assert 0.2 < own["delta_e_over_single_pixel"] < 0.5
     assert not any("over_single" in name for name in single)
-    assert {name for name in own if "single" in name or "accuracy" in name} <= set(document["definitions"])
+    assert {name for name in own if "single" in name or "accuracy" in name} <= set(
+        document["definitions"]
+    )
     assert "capture SNR above single pixel's" in table(document)
-    only = run_score(results, folder / "t.json", truth="colorchecker", whites=whites, metrics=("rmse",))
+    only = run_score(
+        results, folder / "t.json", truth="colorchecker", whites=whites, metrics=("rmse",)
+    )
     assert set(only["metrics"]) == {"rmse", "rmse_per_band"}
 
 
 def test_a_white_of_another_method_serves_only_where_it_is_the_only_one(methods):
     folder, results, whites = methods
     other = put(folder / "wls.h5", TRUTH, method="wls")
-    assert run_score([other], folder / "s.json", truth="colorchecker", whites=whites[:1])["metrics"]["snr_capture_mean_db"] == pytest.approx(40, abs=0.3)
+    assert run_score([other], folder / "s.json", truth="colorchecker", whites=whites[:1])[
+        "metrics"
+    ]["snr_capture_mean_db"] == pytest.approx(40, abs=0.3)
     with pytest.raises(UsageError, match="made by wls"):
         run_score([other], folder / "t.json", truth="colorchecker", whites=whites)
 
 
 def test_lenslets_tell_their_patch_the_better_the_less_noise(methods, monkeypatch):
     folder, results, _ = methods
-    noisy = put(folder / "noisy.h5", TRUTH + 0.1 * np.random.default_rng(0).normal(size=TRUTH.shape), method="wls")
-    document = run_score([*results, noisy], folder / "s.json", truth="colorchecker", metrics=("classification",))
+    noisy = put(
+        folder / "noisy.h5",
+        TRUTH + 0.1 * np.random.default_rng(0).normal(size=TRUTH.shape),
+        method="wls",
+    )
+    document = run_score(
+        [*results, noisy], folder / "s.json", truth="colorchecker", metrics=("classification",)
+    )
     nearest = [entry["metrics"]["nearest_patch_accuracy"] for entry in document["results"]]
     assert nearest[0] > 0.97 and nearest[0] > nearest[1] > nearest[2] > 3 / 24
     monkeypatch.setitem(sys.modules, "sklearn.discriminant_analysis", None)
     without = run_score([noisy], folder / "t.json", truth="colorchecker")["metrics"]
-    assert "classification_accuracy" not in without and without["nearest_patch_accuracy"] == nearest[2]
+    assert (
+        "classification_accuracy" not in without and without["nearest_patch_accuracy"] == nearest[2]
+    )
 
 
 def test_a_trained_classifier_agrees(methods):
@@ -92,13 +116,21 @@ def test_the_truth_through_filters_is_the_integral_over_light_and_filter(tmp_pat
     result = put(tmp_path / "seen.h5", truth, method="pinv")
     assert camera.filter_array.filters[0].fwhm == pytest.approx(15e-9)
     plain = run_score([result], tmp_path / "p.json", truth="colorchecker")["metrics"]
-    through = run_score([result], tmp_path / "t.json", truth="colorchecker", camera=CAMERA)["metrics"]
-    assert plain["six_patch_rmse"] > 2e-3 > 3e-4 > through["six_patch_rmse"]  # nodes are 7.5 nm apart, spectra 5
+    through = run_score([result], tmp_path / "t.json", truth="colorchecker", camera=CAMERA)[
+        "metrics"
+    ]
+    # nodes are 7.5 nm apart, spectra 5
+    assert plain["six_patch_rmse"] > 2e-3 > 3e-4 > through["six_patch_rmse"]
 
 
 def test_filters_need_a_camera_with_them_and_a_scene_between_bands(tmp_path):
     result = put(tmp_path / "seen.h5", TRUTH, method="pinv")
     with pytest.raises(UsageError, match="filter_array"):
-        run_score([result], tmp_path / "s.json", truth="colorchecker", camera=CAMERA.with_name("tiny.toml"))
+        run_score(
+            [result],
+            tmp_path / "s.json",
+            truth="colorchecker",
+            camera=CAMERA.with_name("tiny.toml"),
+        )
     with pytest.raises(InputError, match="filters"):
         run_score([result], tmp_path / "s.json", truth=result, camera=CAMERA)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
 from plenocli.cli.main import run
+from plenocli.files.artefacts.container import read_artefact
 from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,41 +18,129 @@ TINY = ROOT / "sample_configs" / "tiny.toml"
 
 def test_artefact_summary_and_bytes(tmp_path, capsys):
     out, again = tmp_path / "pif.h5", tmp_path / "again.h5"
-    assert run(["simulate-pif", str(TINY), "-o", str(out), "--model", "fresnel", "--accuracy", "1e-4", "--json"]) == 0
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(TINY),
+                "-o",
+                str(out),
+                "--model",
+                "fresnel",
+                "--accuracy",
+                "1e-4",
+                "--json",
+            ]
+        )
+        == 0
+    )
     report = json.loads(capsys.readouterr().out)
-    assert run(["simulate-pif", str(TINY), "-o", str(again), "--model", "fresnel", "--accuracy", "1e-4"]) == 0
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(TINY),
+                "-o",
+                str(again),
+                "--model",
+                "fresnel",
+                "--accuracy",
+                "1e-4",
+            ]
+        )
+        == 0
+    )
     assert out.read_bytes() == again.read_bytes()
     artefact = read_artefact(out, "pif")
     A, offsets = artefact.data["pif/A"], artefact.data["pif/lenslet_offset"]
     assert A.shape == (1, 9, 169, 64) and A.dtype == np.float32 and [0, 0] in offsets.tolist()
-    assert report["superpixels"] == [3, 3] and report["rank"] == list(np.atleast_1d(artefact.attrs["pif"]["rank"]))
-    assert artefact.data["pif/column_energy"] == pytest.approx(A.sum(axis=(1, 2), dtype=float), rel=1e-6)
+    assert report["superpixels"] == [3, 3] and report["rank"] == list(
+        np.atleast_1d(artefact.attrs["pif"]["rank"])
+    )
+    assert artefact.data["pif/column_energy"] == pytest.approx(
+        A.sum(axis=(1, 2), dtype=float), rel=1e-6
+    )
     assert artefact.data["pif/singular_values"].shape == (1, 64)
     assert "pif" in artefact.provenance.command and artefact.provenance.accuracy["asked"] == 1e-4
 
 
 def test_the_diagnosis_stays_on_one_thread(tmp_path, monkeypatch):
-    # two threads that wait for each other cost a fifth of the command, and round singular values as the machine's cores have it
+    # two threads that wait for each other cost a fifth of the command, and round singular values as
+    # the machine's cores have it
     import threadpoolctl
+
     from plenocli.forward.propagation.diagnosis import Spectrum
 
     seen, values = [], Spectrum.values
-    monkeypatch.setattr(Spectrum, "values", lambda self: seen.append(threadpoolctl.threadpool_info()) or values(self))
+    monkeypatch.setattr(
+        Spectrum,
+        "values",
+        lambda self: seen.append(threadpoolctl.threadpool_info()) or values(self),
+    )
     with threadpoolctl.threadpool_limits(4, "blas"):
         camera = tmp_path / "many.toml"
-        camera.write_text(TINY.read_text().replace("samples_per_lenslet = [8, 8]", "samples_per_lenslet = [21, 21]"))
-        assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--model", "fresnel", "--accuracy", "1e-3"]) == 0
-    assert seen and all(library["num_threads"] == 1 for info in seen for library in info if library["user_api"] == "blas")
+        camera.write_text(
+            TINY.read_text().replace(
+                "samples_per_lenslet = [8, 8]", "samples_per_lenslet = [21, 21]"
+            )
+        )
+        assert (
+            run(
+                [
+                    "simulate-pif",
+                    str(camera),
+                    "-o",
+                    str(tmp_path / "pif.h5"),
+                    "--model",
+                    "fresnel",
+                    "--accuracy",
+                    "1e-3",
+                ]
+            )
+            == 0
+        )
+    assert seen and all(
+        library["num_threads"] == 1
+        for info in seen
+        for library in info
+        if library["user_api"] == "blas"
+    )
 
 
 def test_options_reach_the_matrix(tmp_path, capsys):
     out = tmp_path / "pif.h5"
-    code = run(["simulate-pif", str(TINY), "-o", str(out), "--wavelength", "650nm", "--wavelength", "450nm", "--superpixels", "1x1",
-                "--coherent-ring", "0", "--dtype", "float64", "--accuracy", "1e-3", "--model", "fresnel"])
+    code = run(
+        [
+            "simulate-pif",
+            str(TINY),
+            "-o",
+            str(out),
+            "--wavelength",
+            "650nm",
+            "--wavelength",
+            "450nm",
+            "--superpixels",
+            "1x1",
+            "--coherent-ring",
+            "0",
+            "--dtype",
+            "float64",
+            "--accuracy",
+            "1e-3",
+            "--model",
+            "fresnel",
+        ]
+    )
     assert code == 0
     artefact = read_artefact(out, "pif")
-    assert artefact.data["pif/A"].shape == (2, 1, 169, 64) and artefact.data["pif/A"].dtype == np.float64
-    assert artefact.data["pif/wavelength"].tolist() == [450e-9, 650e-9] and artefact.attrs["pif"]["coherent_ring"] == 0
+    assert (
+        artefact.data["pif/A"].shape == (2, 1, 169, 64)
+        and artefact.data["pif/A"].dtype == np.float64
+    )
+    assert (
+        artefact.data["pif/wavelength"].tolist() == [450e-9, 650e-9]
+        and artefact.attrs["pif"]["coherent_ring"] == 0
+    )
     assert "2 band(s)" in capsys.readouterr().out
 
 
@@ -64,20 +152,44 @@ def test_explain_writes_nothing(tmp_path, capsys):
 def test_warns_where_half_of_the_object_is_invisible(tmp_path, capsys):
     camera = tmp_path / "conjugate.toml"
     # f2 z2/(z2 - f2): the lenslets image the pupil onto the sensor
-    camera.write_text(TINY.read_text().replace('[sensor]\ndistance = "208 um"', '[sensor]\ndistance = "208.789605430890 um"'))
-    assert run(["simulate-pif", str(camera), "-o", str(tmp_path / "pif.h5"), "--model", "fresnel", "--superpixels", "1x1", "--coherent-ring", "0"]) == 0
+    camera.write_text(
+        TINY.read_text().replace(
+            '[sensor]\ndistance = "208 um"', '[sensor]\ndistance = "208.789605430890 um"'
+        )
+    )
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(camera),
+                "-o",
+                str(tmp_path / "pif.h5"),
+                "--model",
+                "fresnel",
+                "--superpixels",
+                "1x1",
+                "--coherent-ring",
+                "0",
+            ]
+        )
+        == 0
+    )
     assert "half of the object is invisible" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments, code, words", [
-    (["--model", "wrong", "-o", "x.h5"], 2, "auto"),
-    ([], 2, "no output file"),
-    (["-o", "x.h5", "--superpixels", "2x2"], 2, "odd"),
-    (["-o", "x.h5", "--accuracy", "1e-13"], 5, "cannot be reached"),
-    (["-o", "x.h5", "--mem-limit", "1MiB"], 5, "--mem-limit"),
-    (["-o", "x.h5", "--wavelength", "550"], 2, "unit"),
-    (["-o", "missing/x.h5"], 4, "missing"),
-], ids=str)
+@pytest.mark.parametrize(
+    "arguments, code, words",
+    [
+        (["--model", "wrong", "-o", "x.h5"], 2, "auto"),
+        ([], 2, "no output file"),
+        (["-o", "x.h5", "--superpixels", "2x2"], 2, "odd"),
+        (["-o", "x.h5", "--accuracy", "1e-13"], 5, "cannot be reached"),
+        (["-o", "x.h5", "--mem-limit", "1MiB"], 5, "--mem-limit"),
+        (["-o", "x.h5", "--wavelength", "550"], 2, "unit"),
+        (["-o", "missing/x.h5"], 4, "missing"),
+    ],
+    ids=str,
+)
 def test_refusals(tmp_path, monkeypatch, capsys, arguments, code, words):
     monkeypatch.chdir(tmp_path)
     assert run(["simulate-pif", str(TINY), *arguments]) == code
@@ -95,36 +207,98 @@ def test_existing_output_and_unreadable_camera(tmp_path, capsys):
 def test_spectral_step_gives_the_wavelengths_of_white_light(tmp_path):
     camera = ROOT / "sample_configs" / "demo_spectral.toml"
     out = tmp_path / "pif.h5"
-    assert run(["simulate-pif", str(camera), "-o", str(out), "--spectral-step", "50nm", "--superpixels", "1x1", "--accuracy", "1e-2", "--model", "fresnel"]) == 0
-    assert read_artefact(out, "pif").data["pif/wavelength"] == pytest.approx(np.arange(400e-9, 701e-9, 50e-9))
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(camera),
+                "-o",
+                str(out),
+                "--spectral-step",
+                "50nm",
+                "--superpixels",
+                "1x1",
+                "--accuracy",
+                "1e-2",
+                "--model",
+                "fresnel",
+            ]
+        )
+        == 0
+    )
+    assert read_artefact(out, "pif").data["pif/wavelength"] == pytest.approx(
+        np.arange(400e-9, 701e-9, 50e-9)
+    )
 
 
 def test_an_off_axis_lenslet_on_the_sensors_raster(tmp_path, capsys):
     camera, out, centred = tmp_path / "drift.toml", tmp_path / "pif.h5", tmp_path / "centred.h5"
-    camera.write_text(TINY.read_text().replace('superpixel_pitch = "26 um"', 'superpixel_pitch = "26.3 um"'))
-    common = ["--model", "fresnel", "--accuracy", "1e-4", "--superpixels", "1x1", "--coherent-ring", "0"]
+    camera.write_text(
+        TINY.read_text().replace('superpixel_pitch = "26 um"', 'superpixel_pitch = "26.3 um"')
+    )
+    common = [
+        "--model",
+        "fresnel",
+        "--accuracy",
+        "1e-4",
+        "--superpixels",
+        "1x1",
+        "--coherent-ring",
+        "0",
+    ]
     assert run(["simulate-pif", str(camera), "-o", str(out), "--lenslet", "0,1", *common]) == 0
     assert run(["simulate-pif", str(camera), "-o", str(centred), *common]) == 0
     artefact = read_artefact(out, "pif")
-    notes, count = artefact.attrs["pif"]["notes"], read_artefact(out, "pif").provenance.config.count("count")
+    notes, count = (
+        artefact.attrs["pif"]["notes"],
+        read_artefact(out, "pif").provenance.config.count("count"),
+    )
     assert notes["lenslet"] == [0, 1] and count == 1
-    # off by 0.15 pixel a lenslet from the middle one; the light is where the shifted window sees it, but for what it cuts off
+    # off by 0.15 pixel a lenslet from the middle one; the light is where the shifted window sees
+    # it, but for what it cuts off
     shift = np.array(notes["pixel_shift"])
     rows, columns = 13, 13
-    image, plain = (read_artefact(p, "pif").data["pif/A"][0, 0].sum(axis=1).reshape(rows, columns) for p in (out, centred))
-    centroid = lambda a: np.array([np.arange(rows) @ a.sum(axis=1), np.arange(columns) @ a.sum(axis=0)]) / a.sum()
-    assert centroid(image) - centroid(plain) == pytest.approx(-shift, abs=0.08) and np.abs(shift).max() > 0.25
+    image, plain = (
+        read_artefact(p, "pif").data["pif/A"][0, 0].sum(axis=1).reshape(rows, columns)
+        for p in (out, centred)
+    )
+    centroid = lambda a: (
+        np.array([np.arange(rows) @ a.sum(axis=1), np.arange(columns) @ a.sum(axis=0)]) / a.sum()
+    )
+    assert (
+        centroid(image) - centroid(plain) == pytest.approx(-shift, abs=0.08)
+        and np.abs(shift).max() > 0.25
+    )
     assert run(["simulate-pif", str(TINY), "--explain", "--lenslet", "9,9"]) == 2
     assert "is not on the array" in capsys.readouterr().err
 
 
 def test_pieces_and_shards_hold_what_the_whole_does(tmp_path, monkeypatch, capsys):
-    """The same bytes whether A is held or streamed and for any number of threads; shards together are the whole."""
-    from plenocli.files.artefacts.shards import read_pif
+    """The same bytes whether A is held or streamed and for any number of threads; shards
+    together are the whole.
+    """
     from plenocli.files.artefacts import pif_pieces
+    from plenocli.files.artefacts.shards import read_pif
 
     def matrix(name, *options):
-        assert run(["simulate-pif", str(TINY), "-o", str(tmp_path / name), "--superpixels", "3x3", "--model", "fresnel", "--accuracy", "1e-4", *options]) == 0
+        assert (
+            run(
+                [
+                    "simulate-pif",
+                    str(TINY),
+                    "-o",
+                    str(tmp_path / name),
+                    "--superpixels",
+                    "3x3",
+                    "--model",
+                    "fresnel",
+                    "--accuracy",
+                    "1e-4",
+                    *options,
+                ]
+            )
+            == 0
+        )
         return tmp_path / name
 
     whole = matrix("whole.h5")
@@ -134,12 +308,20 @@ def test_pieces_and_shards_hold_what_the_whole_does(tmp_path, monkeypatch, capsy
     streamed, held = read_artefact(tmp_path / "pieces.h5", "pif"), read_artefact(whole, "pif")
     assert np.array_equal(streamed.data["pif/A"], held.data["pif/A"])
     # few points: the whole goes through LAPACK, pieces through A^T A
-    assert streamed.data["pif/singular_values"][0, :40] == pytest.approx(held.data["pif/singular_values"][0, :40], rel=1e-6)
-    monkeypatch.setattr(pif_pieces, "layout", lambda *a: pif_pieces.Layout(True, ((0, 1, 2, 3), (4, 5, 6, 7), (8,))))
+    assert streamed.data["pif/singular_values"][0, :40] == pytest.approx(
+        held.data["pif/singular_values"][0, :40], rel=1e-6
+    )
+    monkeypatch.setattr(
+        pif_pieces, "layout", lambda *a: pif_pieces.Layout(True, ((0, 1, 2, 3), (4, 5, 6, 7), (8,)))
+    )
     sharded = read_pif(matrix("shards.h5"))
     assert len(list(tmp_path.glob("shards.00?.h5"))) == 3
-    assert np.array_equal(sharded.data["pif/A"], held.data["pif/A"]) and np.array_equal(sharded.data["pif/lenslet_offset"], held.data["pif/lenslet_offset"])
-    assert sharded.data["pif/column_energy"] == pytest.approx(held.data["pif/column_energy"], rel=1e-12)
+    assert np.array_equal(sharded.data["pif/A"], held.data["pif/A"]) and np.array_equal(
+        sharded.data["pif/lenslet_offset"], held.data["pif/lenslet_offset"]
+    )
+    assert sharded.data["pif/column_energy"] == pytest.approx(
+        held.data["pif/column_energy"], rel=1e-12
+    )
     capsys.readouterr()
 
 
@@ -150,13 +332,17 @@ def test_layouts_follow_the_memory_limit():
 
     def plan(superpixels, bands=1):
         size = bands * superpixels * 2704 * 1600 * 4
-        return SimpleNamespace(shape=(bands, superpixels, 2704, 1600), bytes=size, memory=size + (64 << 20))
+        return SimpleNamespace(
+            shape=(bands, superpixels, 2704, 1600), bytes=size, memory=size + (64 << 20)
+        )
 
     MiB = 1 << 20
     assert layout(plan(1), 512 * MiB, "x") == Layout(False)
     assert layout(plan(9), 512 * MiB, "x") == Layout(True)
     sharded = layout(plan(25), 512 * MiB, "x").groups
-    assert [n for group in sharded for n in group] == list(range(25)) and max(map(len, sharded)) * 17 < 64
+    assert [n for group in sharded for n in group] == list(range(25)) and max(
+        map(len, sharded)
+    ) * 17 < 64
     assert layout(plan(25), 8192 * MiB, "x") == Layout(True)
 
 
@@ -165,9 +351,33 @@ def test_layouts_follow_the_memory_limit():
 def test_memory_limit_is_kept(tmp_path, superpixels):
     """Peak of the whole command, measured in a child: below the limit, libraries included."""
     camera = ROOT / "sample_configs" / "seed_spatial_250um.toml"
-    code = ("import sys; from plenocli.cli.main import run; assert run(sys.argv[1:]) == 0\n"
-            f"print('PEAK', {PEAK})")
-    done = subprocess.run([sys.executable, "-c", code, "simulate-pif", str(camera), "--superpixels", superpixels, "--coherent-ring", "1", "--model", "fresnel",
-                           "--accuracy", "1e-2", "--mem-limit", "512MiB", "-o", str(tmp_path / "pif.h5")], capture_output=True, text=True, check=True)
+    code = (
+        "import sys; from plenocli.cli.main import run; assert run(sys.argv[1:]) == 0\n"
+        f"print('PEAK', {PEAK})"
+    )
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            code,
+            "simulate-pif",
+            str(camera),
+            "--superpixels",
+            superpixels,
+            "--coherent-ring",
+            "1",
+            "--model",
+            "fresnel",
+            "--accuracy",
+            "1e-2",
+            "--mem-limit",
+            "512MiB",
+            "-o",
+            str(tmp_path / "pif.h5"),
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert int(done.stdout.split("PEAK")[1]) < 512 * 1024
     assert (len(list(tmp_path.glob("pif.*.h5"))) > 1) == (superpixels == "5x5")

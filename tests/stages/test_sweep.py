@@ -1,4 +1,6 @@
-"""Sweeps: the table against the stages run by hand, the front against its definition, kills, workers, bad cameras, resuming."""
+"""Sweeps: the table against the stages run by hand, the front against its definition, kills,
+workers, bad cameras, resuming.
+"""
 
 import csv
 import json
@@ -12,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
-from plenocli.cli.sections import read_options
-from plenocli.files.config.sweep_file import number
 from plenocli.base.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
+from plenocli.cli.sections import read_options
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.config.sweep_file import number
 from plenocli.stages.sweep import point as chain
 from plenocli.stages.sweep.sweep import run_sweep
 from plenocli.stages.sweep.table import lines
@@ -48,7 +50,13 @@ sensor_pixels = "min"
 def camera_text():
     """A camera smaller than tiny.toml."""
     text = (ROOT / "sample_configs" / "tiny.toml").read_text()
-    for old, new in [("[8, 8]", "[4, 4]"), ("[13, 13]", "[9, 9]"), ('"26 um"', '"18 um"'), ('"208 um"', '"144 um"'), ("[5, 5]", "[3, 3]")]:
+    for old, new in [
+        ("[8, 8]", "[4, 4]"),
+        ("[13, 13]", "[9, 9]"),
+        ('"26 um"', '"18 um"'),
+        ('"208 um"', '"144 um"'),
+        ("[5, 5]", "[3, 3]"),
+    ]:
         assert old in text
         text = text.replace(old, new)
     return text
@@ -73,11 +81,17 @@ def whole(tmp_path_factory):
 
 
 def same(table, other):
-    return table.read_bytes() == other.read_bytes() and table.with_suffix(".csv").read_bytes() == other.with_suffix(".csv").read_bytes()
+    return (
+        table.read_bytes() == other.read_bytes()
+        and table.with_suffix(".csv").read_bytes() == other.with_suffix(".csv").read_bytes()
+    )
 
 
 def journal(table):
-    return [json.loads(line.split(" ", 1)[1]) for line in (table.with_suffix(".parts") / "points.jsonl").read_text().splitlines()]
+    return [
+        json.loads(line.split(" ", 1)[1])
+        for line in (table.with_suffix(".parts") / "points.jsonl").read_text().splitlines()
+    ]
 
 
 def test_the_table_holds_what_the_stages_say_by_hand(whole, tmp_path):
@@ -87,23 +101,69 @@ def test_the_table_holds_what_the_stages_say_by_hand(whole, tmp_path):
     path, table, _ = whole
     artefact = read_artefact(table, "sweep")
     attrs, data = artefact.attrs["sweep"], artefact.data
-    text = camera_text().replace("f_number = 8", "f_number = 6").replace("[9, 9]", "[7, 7]").replace('"18 um"', '"14 um"')
+    text = (
+        camera_text()
+        .replace("f_number = 8", "f_number = 6")
+        .replace("[9, 9]", "[7, 7]")
+        .replace('"18 um"', '"14 um"')
+    )
     (tmp_path / "c.toml").write_text(text)
-    pif, capture, image, score = (str(tmp_path / name) for name in ("pif.h5", "capture.h5", "image.h5", "score.json"))
-    assert run(["simulate-pif", str(tmp_path / "c.toml"), "--model", "fresnel", "--superpixels", "1x1", "--coherent-ring", "0", "--accuracy", "1e-2", "-o", pif]) == 0
-    assert run(["capture-sim", str(tmp_path / "c.toml"), "--pif", pif, "--scene", "skimage:coins", "--snr", "50dB", "-o", capture]) == 0
+    pif, capture, image, score = (
+        str(tmp_path / name) for name in ("pif.h5", "capture.h5", "image.h5", "score.json")
+    )
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(tmp_path / "c.toml"),
+                "--model",
+                "fresnel",
+                "--superpixels",
+                "1x1",
+                "--coherent-ring",
+                "0",
+                "--accuracy",
+                "1e-2",
+                "-o",
+                pif,
+            ]
+        )
+        == 0
+    )
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(tmp_path / "c.toml"),
+                "--pif",
+                pif,
+                "--scene",
+                "skimage:coins",
+                "--snr",
+                "50dB",
+                "-o",
+                capture,
+            ]
+        )
+        == 0
+    )
     assert run(["reconstruct", capture, "--pif", pif, "--method", "tikhonov", "-o", image]) == 0
     assert run(["score", image, "--truth", capture, "-o", score]) == 0
     metrics = json.loads(Path(score).read_text())["metrics"]
     names = [m["name"] for m in attrs["metrics"]]
     row = next(i for i in range(8) if data["sweep/parameter"][i].tolist() == [6.0, 0.0, 50.0])
-    assert attrs["parameters"] == [{"key": "main_lens.f_number", "unit": ""}, {"key": "sensor.pixels_per_lenslet", "unit": "", "choices": [[7, 7], [9, 9]]},
-                                   {"key": "capture-sim.snr", "unit": "dB"}]
+    assert attrs["parameters"] == [
+        {"key": "main_lens.f_number", "unit": ""},
+        {"key": "sensor.pixels_per_lenslet", "unit": "", "choices": [[7, 7], [9, 9]]},
+        {"key": "capture-sim.snr", "unit": "dB"},
+    ]
     for name in ("psnr_db", "ssim", "rmse"):
         assert data["sweep/metric"][row, names.index(name)] == metrics[name]
     assert data["sweep/metric"][row, names.index("sensor_pixels")] == 9 * 49
     assert data["sweep/metric"][row, names.index("matrix_bytes")] == 49 * 16 * 4
-    assert data["sweep/metric"][row, names.index("lenslet_field_m")] == pytest.approx(14e-6 / (1 + 144e-6 / 55e-3) * 10, rel=1e-6)
+    assert data["sweep/metric"][row, names.index("lenslet_field_m")] == pytest.approx(
+        14e-6 / (1 + 144e-6 / 55e-3) * 10, rel=1e-6
+    )
 
 
 def test_the_front_is_what_brute_force_finds(whole):
@@ -111,9 +171,15 @@ def test_the_front_is_what_brute_force_finds(whole):
     with open(table.with_suffix(".csv"), newline="") as file:
         rows = list(csv.DictReader(file))
     figures = [(float(r["psnr_db"]), -float(r["sensor_pixels"])) for r in rows]
-    expected = [i for i, a in enumerate(figures) if not any(all(x >= y for x, y in zip(b, a)) and b != a for b in figures)]
+    expected = [
+        i
+        for i, a in enumerate(figures)
+        if not any(all(x >= y for x, y in zip(b, a)) and b != a for b in figures)
+    ]
     assert [i for i, r in enumerate(rows) if r["front"] == "1"] == expected
-    assert sorted(entry["point"] for entry in report["front"]) == expected and 0 < len(expected) < len(rows)
+    assert sorted(entry["point"] for entry in report["front"]) == expected and 0 < len(
+        expected
+    ) < len(rows)
     assert np.flatnonzero(read_artefact(table, "sweep").data["sweep/front"]).tolist() == expected
     assert f"{len(expected)} on the front of psnr_db max, sensor_pixels min" in lines(report)
 
@@ -123,9 +189,12 @@ def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
 
     calls = []
     real = simulate_pif.run_simulate_pif
-    monkeypatch.setattr(simulate_pif, "run_simulate_pif", lambda *a, **k: calls.append(1) or real(*a, **k))
+    monkeypatch.setattr(
+        simulate_pif, "run_simulate_pif", lambda *a, **k: calls.append(1) or real(*a, **k)
+    )
     report = sweep(described(tmp_path), tmp_path / "out.h5")
-    assert report["computed"] == 8 and len(calls) == 4  # two signal-to-noise ratios share each camera's matrix
+    # two signal-to-noise ratios share each camera's matrix
+    assert report["computed"] == 8 and len(calls) == 4
     assert same(tmp_path / "out.h5", whole[1])
     assert not list((tmp_path / "out.parts").rglob("*.h5")), "matrices go when they have served"
     # more values: only those are computed; a finished sweep again: nothing
@@ -135,14 +204,39 @@ def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
     assert same(tmp_path / "out.h5", whole[1])
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 6))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 6))]
+)
 def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
     path, table, _ = whole
     out, rng = tmp_path / "whole.h5", np.random.default_rng(seed)
-    command = [sys.executable, "-m", "plenocli", "sweep", str(path), "-o", str(out), "--workers", str(1 + seed % 2)]
-    child = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True)
-    kept, wanted, deadline = tmp_path / "whole.parts" / "points.jsonl", int(rng.integers(2, 8)), time.monotonic() + 300
-    while child.poll() is None and time.monotonic() < deadline and (not kept.exists() or kept.read_bytes().count(b"\n") < wanted):
+    command = [
+        sys.executable,
+        "-m",
+        "plenocli",
+        "sweep",
+        str(path),
+        "-o",
+        str(out),
+        "--workers",
+        str(1 + seed % 2),
+    ]
+    child = subprocess.Popen(
+        command,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    kept, wanted, deadline = (
+        tmp_path / "whole.parts" / "points.jsonl",
+        int(rng.integers(2, 8)),
+        time.monotonic() + 300,
+    )
+    while (
+        child.poll() is None
+        and time.monotonic() < deadline
+        and (not kept.exists() or kept.read_bytes().count(b"\n") < wanted)
+    ):
         time.sleep(0.002)
     os.killpg(child.pid, signal.SIGKILL)
     assert child.wait() == -signal.SIGKILL and not out.exists()
@@ -156,17 +250,38 @@ def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
 
 @pytest.mark.slow
 def test_an_interrupt_ends_everything_with_one_line(whole, tmp_path):
-    command = [sys.executable, "-m", "plenocli", "sweep", str(whole[0]), "-o", str(tmp_path / "out.h5"), "--workers", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "plenocli",
+        "sweep",
+        str(whole[0]),
+        "-o",
+        str(tmp_path / "out.h5"),
+        "--workers",
+        "2",
+    ]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     kept, deadline = tmp_path / "out.parts" / "points.jsonl", time.monotonic() + 300
-    while child.poll() is None and time.monotonic() < deadline and (not kept.exists() or b'"status"' not in kept.read_bytes()):
+    while (
+        child.poll() is None
+        and time.monotonic() < deadline
+        and (not kept.exists() or b'"status"' not in kept.read_bytes())
+    ):
         time.sleep(0.02)
     os.killpg(child.pid, signal.SIGINT)
-    assert child.communicate(timeout=60)[1].split() == ["plenocli:", "error:", "interrupted"] and child.returncode == 130
+    assert (
+        child.communicate(timeout=60)[1].split() == ["plenocli:", "error:", "interrupted"]
+        and child.returncode == 130
+    )
 
 
 def journal_lines(path):
-    return [json.loads(line.split(" ", 1)[1]) for line in path.read_text().splitlines() if line.endswith("]")]
+    return [
+        json.loads(line.split(" ", 1)[1])
+        for line in path.read_text().splitlines()
+        if line.endswith("]")
+    ]
 
 
 def test_two_processes_give_the_same_bytes(whole, tmp_path):
@@ -175,14 +290,26 @@ def test_two_processes_give_the_same_bytes(whole, tmp_path):
 
 
 def test_cameras_that_are_refused_are_rows_with_the_reason(tmp_path):
-    text = SMALL.replace('"main_lens.f_number" = [6, 8]', '"main_lens.f_number" = [6, 8000]').replace("[7, 7], [9, 9]", "[9, 9], [9, 10]").replace('["30 dB", "50 dB"]', '["50 dB"]')
+    text = (
+        SMALL.replace('"main_lens.f_number" = [6, 8]', '"main_lens.f_number" = [6, 8000]')
+        .replace("[7, 7], [9, 9]", "[9, 9], [9, 10]")
+        .replace('["30 dB", "50 dB"]', '["50 dB"]')
+    )
     report = sweep(described(tmp_path, text), tmp_path / "out.h5")
     artefact = read_artefact(tmp_path / "out.h5", "sweep")
     reasons = artefact.attrs["sweep"]["reasons"]
     assert artefact.data["sweep/status"].tolist() == [0, 2, 2, 2] and report["refused"] == 3
-    assert "f_number" in reasons["2"] and "superpixel pitch is 9.0000 pixels, not 9 x 10" in reasons["1"] and str(tmp_path) not in str(reasons)
+    assert (
+        "f_number" in reasons["2"]
+        and "superpixel pitch is 9.0000 pixels, not 9 x 10" in reasons["1"]
+        and str(tmp_path) not in str(reasons)
+    )
     metric = artefact.data["sweep/metric"]
-    assert np.isfinite(metric[0]).all() and np.isnan(metric[1:]).all() and artefact.data["sweep/front"].tolist() == [True, False, False, False]
+    assert (
+        np.isfinite(metric[0]).all()
+        and np.isnan(metric[1:]).all()
+        and artefact.data["sweep/front"].tolist() == [True, False, False, False]
+    )
     again = tmp_path / "again.h5"
     sweep(tmp_path / "sweep.toml", again, workers=2)
     assert same(again, tmp_path / "out.h5")
@@ -195,18 +322,34 @@ def test_a_matrix_that_is_refused_refuses_its_points(tmp_path):
     assert caught.value.exit_code == 5
     assert not (tmp_path / "front.png").exists()
     artefact = read_artefact(tmp_path / "out.h5", "sweep")
-    assert artefact.data["sweep/status"].tolist() == [5] * 4 and "1e-12" in artefact.attrs["sweep"]["reasons"]["3"]
+    assert (
+        artefact.data["sweep/status"].tolist() == [5] * 4
+        and "1e-12" in artefact.attrs["sweep"]["reasons"]["3"]
+    )
 
 
-@pytest.mark.parametrize(("old", "new", "error", "said"), [
-    ('method = "tikhonov"', 'methd = "tikhonov"', UsageError, "reconstruct.methd: unknown option; did you mean method?"),
-    ('method = "tikhonov"', 'method = "tikhonof"', UsageError, "reconstruct.method"),
-    ('coherent-ring = 0', 'coherent-ring = true', UsageError, "simulate-pif.coherent-ring"),
-    ('"50 dB"', '"50"', UsageError, "capture-sim.snr"),
-    ('[reconstruct]\nmethod = "tikhonov"', '[demux]\nmethod = "pinv"', ConfigError, "demux is no stage of the spatial chain"),
-    ('psnr_db = "max"', 'psnr = "max"', ConfigError, "did you mean psnr_db?"),
-    ('camera = "camera.toml"', 'camera = "nowhere.toml"', InputError, "nowhere.toml"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "error", "said"),
+    [
+        (
+            'method = "tikhonov"',
+            'methd = "tikhonov"',
+            UsageError,
+            "reconstruct.methd: unknown option; did you mean method?",
+        ),
+        ('method = "tikhonov"', 'method = "tikhonof"', UsageError, "reconstruct.method"),
+        ("coherent-ring = 0", "coherent-ring = true", UsageError, "simulate-pif.coherent-ring"),
+        ('"50 dB"', '"50"', UsageError, "capture-sim.snr"),
+        (
+            '[reconstruct]\nmethod = "tikhonov"',
+            '[demux]\nmethod = "pinv"',
+            ConfigError,
+            "demux is no stage of the spatial chain",
+        ),
+        ('psnr_db = "max"', 'psnr = "max"', ConfigError, "did you mean psnr_db?"),
+        ('camera = "camera.toml"', 'camera = "nowhere.toml"', InputError, "nowhere.toml"),
+    ],
+)
 def test_mistakes_in_the_file_end_the_run_before_any_work(tmp_path, old, new, error, said):
     assert old in SMALL
     with pytest.raises(error) as caught:
@@ -247,7 +390,9 @@ def test_damaged_lines_of_the_journal_are_computed_again(whole, tmp_path):
     points = [i for i, line in enumerate(content) if b'"status"' in line]
     content[points[2]] = content[points[2]].replace(b'"psnr_db": ', b'"psnr_db": 9', 1)
     (parts / "points.jsonl").write_bytes(b"".join(content))
-    assert sweep(path, tmp_path / "whole.h5")["computed"] == 1 and same(tmp_path / "whole.h5", table)
+    assert sweep(path, tmp_path / "whole.h5")["computed"] == 1 and same(
+        tmp_path / "whole.h5", table
+    )
 
 
 def test_keys_follow_what_figures_depend_on_and_nothing_else(tmp_path):
@@ -258,15 +403,41 @@ def test_keys_follow_what_figures_depend_on_and_nothing_else(tmp_path):
     key = chain.point_key(task, {})
 
     def matrix(c, options=None):
-        return chain.matrix_key(chain.task_of("spatial", c, {"simulate-pif": options or {}}, 0), c, {})
+        return chain.matrix_key(
+            chain.task_of("spatial", c, {"simulate-pif": options or {}}, 0), c, {}
+        )
 
-    for change in ({"sensor.full_well": 9000.0}, {"sensor.bits": 10}, {"lenslet_array.count": (4, 3)}, {"object.distance": 0.6}):
-        assert chain.point_key(chain.task_of("spatial", camera.replace(**change), {"capture-sim": {"snr_db": 50.0}}, 0), {}) != key
-    assert chain.point_key(chain.task_of("spatial", camera, {"capture-sim": {"snr_db": 50.0}}, 1), {}) != key
-    assert matrix(camera.replace(**{"sensor.bits": 10, "lenslet_array.count": (4, 3)})) == matrix(camera)
-    assert matrix(camera.replace(**{"sensor.full_well": 9000.0})) != matrix(camera), "noise decides how exact is exact enough"
+    for change in (
+        {"sensor.full_well": 9000.0},
+        {"sensor.bits": 10},
+        {"lenslet_array.count": (4, 3)},
+        {"object.distance": 0.6},
+    ):
+        assert (
+            chain.point_key(
+                chain.task_of(
+                    "spatial", camera.replace(**change), {"capture-sim": {"snr_db": 50.0}}, 0
+                ),
+                {},
+            )
+            != key
+        )
+    assert (
+        chain.point_key(chain.task_of("spatial", camera, {"capture-sim": {"snr_db": 50.0}}, 1), {})
+        != key
+    )
+    assert matrix(camera.replace(**{"sensor.bits": 10, "lenslet_array.count": (4, 3)})) == matrix(
+        camera
+    )
+    assert matrix(camera.replace(**{"sensor.full_well": 9000.0})) != matrix(camera), (
+        "noise decides how exact is exact enough"
+    )
     asked = {"accuracy": 1e-2}
-    assert matrix(camera.replace(**{"sensor.full_well": 9000.0}), asked) == matrix(camera, asked) != matrix(camera)
+    assert (
+        matrix(camera.replace(**{"sensor.full_well": 9000.0}), asked)
+        == matrix(camera, asked)
+        != matrix(camera)
+    )
     assert matrix(camera.replace(**{"object.distance": 0.6})) != matrix(camera)
 
 
@@ -279,7 +450,12 @@ def test_files_count_by_what_they_hold_not_by_where_they_lie(tmp_path):
         image = oiio.ImageBuf(oiio.ImageSpec(24, 24, 1, "uint8"))
         image.set_pixels(oiio.ROI(0, 24, 0, 24), picture[..., None])
         assert image.write(str(folder / "scene.png"))
-        text = text.replace('"skimage:coins"', '"scene.png"').replace("[6, 8]", "[6]").replace("[[7, 7], [9, 9]]", "[[7, 7]]").replace('["30 dB", "50 dB"]', '["50 dB"]')
+        text = (
+            text.replace('"skimage:coins"', '"scene.png"')
+            .replace("[6, 8]", "[6]")
+            .replace("[[7, 7], [9, 9]]", "[[7, 7]]")
+            .replace('["30 dB", "50 dB"]', '["50 dB"]')
+        )
         sweep(described(folder, text), folder / "out.h5")
         return read_artefact(folder / "out.h5", "sweep").data["sweep/key"].tolist()
 
@@ -288,7 +464,9 @@ def test_files_count_by_what_they_hold_not_by_where_they_lie(tmp_path):
 
 
 def test_memory_that_does_not_suffice_is_no_verdict_for_good(tmp_path):
-    path = described(tmp_path, SMALL.replace("[6, 8]", "[6]").replace("[[7, 7], [9, 9]]", "[[7, 7]]"))
+    path = described(
+        tmp_path, SMALL.replace("[6, 8]", "[6]").replace("[[7, 7], [9, 9]]", "[[7, 7]]")
+    )
     with pytest.raises(PlenoError, match="none of 2 points") as caught:
         sweep(path, tmp_path / "out.h5", mem_limit=1000)
     assert caught.value.exit_code == 5
@@ -300,7 +478,10 @@ def test_files_that_a_worker_does_not_see_are_no_verdict_on_the_design(tmp_path)
     from plenocli.files.config.camera_file import parse_camera
 
     task = chain.task_of("spatial", parse_camera(camera_text()), {}, 0)
-    for missing in ({"matrix": str(tmp_path / "gone.h5"), "info": {}}, {"files": [str(tmp_path / "gone.png")]}):
+    for missing in (
+        {"matrix": str(tmp_path / "gone.h5"), "info": {}},
+        {"files": [str(tmp_path / "gone.png")]},
+    ):
         with pytest.raises(OutputError, match="does not see this file"):
             chain.run_point(task | missing)
 
@@ -312,7 +493,10 @@ def test_show_and_report_draw_the_front(whole, tmp_path):
     from plenocli.stages.evaluation.show import run_show
 
     ahead = int(read_artefact(whole[1], "sweep").data["sweep/front"].sum())
-    assert f"8 designs, 0 of them refused; {ahead} that no other beats" in run_show([whole[1]], tmp_path / "front.png")["captions"][0]
+    assert (
+        f"8 designs, 0 of them refused; {ahead} that no other beats"
+        in run_show([whole[1]], tmp_path / "front.png")["captions"][0]
+    )
     assert (tmp_path / "front.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "run").mkdir()
     shutil.copy(whole[1], tmp_path / "run" / "lenslets.h5")
@@ -320,15 +504,28 @@ def test_show_and_report_draw_the_front(whole, tmp_path):
     page = (tmp_path / "r.html").read_text()
     with open(whole[1].with_suffix(".csv"), newline="") as file:
         best = [r for r in csv.DictReader(file) if r["front"] == "1"]
-    assert all(f"<td>{r['point']}</td>" in page and f"{float(r['psnr_db']):.6g}" in page for r in best)
+    assert all(
+        f"<td>{r['point']}</td>" in page and f"{float(r['psnr_db']):.6g}" in page for r in best
+    )
 
 
 @pytest.mark.slow
 def test_a_spectral_sweep_with_predicted_and_with_measured_responses(tmp_path):
-    text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text().replace("[20, 30]", "[12, 18]")
+    text = (
+        (ROOT / "sample_configs" / "demo_spectral.toml").read_text().replace("[20, 30]", "[12, 18]")
+    )
     (tmp_path / "camera.toml").write_text(text)
-    body = ('camera = "camera.toml"\n[vary]\n"filter_array.filters.*.fwhm" = ["40 nm", "60 nm"]\n[simulate-pif]\nmodel = "fresnel"\naccuracy = 1e-2\n'
-            '[front]\nsix_patch_rmse = "min"\nspectral_angle_deg = "min"\n')
+    body = (
+        'camera = "camera.toml"\n'
+        "[vary]\n"
+        '"filter_array.filters.*.fwhm" = ["40 nm", "60 nm"]\n'
+        "[simulate-pif]\n"
+        'model = "fresnel"\n'
+        "accuracy = 1e-2\n"
+        "[front]\n"
+        'six_patch_rmse = "min"\n'
+        'spectral_angle_deg = "min"\n'
+    )
     found = {}
     for name, section in (("predicted", ""), ("measured", "[calibrate]\nresponse = 'shared'\n")):
         (tmp_path / "sweep.toml").write_text(body + section)
@@ -337,20 +534,26 @@ def test_a_spectral_sweep_with_predicted_and_with_measured_responses(tmp_path):
         column = [m["name"] for m in artefact.attrs["sweep"]["metrics"]].index("six_patch_rmse")
         assert not artefact.data["sweep/status"].any()
         found[name] = artefact.data["sweep/metric"][:, column]
-    assert (found["measured"] < 0.05).all() and (found["predicted"] < 0.05).all() and not np.array_equal(found["measured"], found["predicted"])
+    assert (
+        (found["measured"] < 0.05).all()
+        and (found["predicted"] < 0.05).all()
+        and not np.array_equal(found["measured"], found["predicted"])
+    )
 
 
 def test_values_are_written_as_given_and_read_as_numbers(whole):
     with open(whole[1].with_suffix(".csv"), newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {r["capture-sim.snr"] for r in rows} == {"30 dB", "50 dB"} and {r["sensor.pixels_per_lenslet"] for r in rows} == {"[7, 7]", "[9, 9]"}
+    assert {r["capture-sim.snr"] for r in rows} == {"30 dB", "50 dB"} and {
+        r["sensor.pixels_per_lenslet"] for r in rows
+    } == {"[7, 7]", "[9, 9]"}
     values = read_artefact(whole[1], "sweep").data["sweep/parameter"]
     assert [number(r["capture-sim.snr"]) for r in rows] == values[:, 2].tolist()
 
 
 def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
-    from plenocli.stages.sweep.space import Row
     from plenocli.execution.pool import Lost
+    from plenocli.stages.sweep.space import Row
     from plenocli.stages.sweep.store import open_store
 
     class Pool:
@@ -363,5 +566,11 @@ def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
             self.room = bool(self.asked)
             return self.asked.pop(), Lost("the worker died")
 
-    with open_store(tmp_path / "out.h5", None, False, []) as store, pytest.raises(OutputError, match="1 of 1 points have no result: the worker died.*run the command again"):
+    with (
+        open_store(tmp_path / "out.h5", None, False, []) as store,
+        pytest.raises(
+            OutputError,
+            match="1 of 1 points have no result: the worker died.*run the command again",
+        ),
+    ):
         store.evaluate([Row(0, {}, {}, "a", "m")], Pool())

@@ -10,11 +10,12 @@ from plenocli.cli import options
 @options.mem_limit
 @options.as_json
 def command(file, mem_limit, as_json):
-    """Verify FILE as a stage would and show what it holds: any artefact (.h5), EXR, camera RAW or DNG, PNG, TIFF or JPEG.
+    """Verify FILE as a stage would and show what it holds: any artefact (.h5), EXR, camera RAW or
+    DNG, PNG, TIFF or JPEG.
 
-    Artefacts: command, inputs, seed, accuracy, every dataset with unit and range. RAW: mosaic size, colour filter array,
-    black and white level in DN, exposure time in seconds. A file that a stage would refuse ends here with the same reason
-    and exit code 3.
+    Artefacts: command, inputs, seed, accuracy, every dataset with unit and range. RAW: mosaic size,
+    colour filter array, black and white level in DN, exposure time in seconds. A file that a stage
+    would refuse ends here with the same reason and exit code 3.
 
     \b
     Examples:

@@ -5,17 +5,21 @@ import click
 from plenocli.cli import options
 
 
-@click.command("report", short_help="One page with pictures and tables about everything in a run folder.")
+@click.command(
+    "report", short_help="One page with pictures and tables about everything in a run folder."
+)
 @options.input_path("run_folder")
 @options.output
 @click.option("--title", help="Title of the page; default the name of the folder.")
 @options.overwrite
 @options.as_json
 def command(run_folder, output, title, overwrite, as_json):
-    """Draw what lies in RUN_FOLDER and below (.h5, .exr, .dng, score*.json) on one self-contained HTML page.
+    """Draw what lies in RUN_FOLDER and below (.h5, .exr, .dng, score*.json) on one
+    self-contained HTML page.
 
-    Sections: spatial (system matrix, captures, reconstructions beside their truth, dictionary), spectral (calibration,
-    response, bands, spectra of patches, error and SNR), files with their provenance. Needs matplotlib: the extra [plot].
+    Sections: spatial (system matrix, captures, reconstructions beside their truth, dictionary),
+    spectral (calibration, response, bands, spectra of patches, error and SNR), files with their
+    provenance. Needs matplotlib: the extra [plot].
 
     \b
     Example:
@@ -25,4 +29,8 @@ def command(run_folder, output, title, overwrite, as_json):
 
     made = run_report(run_folder, output, title=title, overwrite=overwrite)
     missing = f", {len(made['unreadable'])} unreadable" if made["unreadable"] else ""
-    options.summary(made, as_json, f"{output}: {', '.join(made['sections']) or 'no pictures'}; {made['files']} files{missing}")
+    options.summary(
+        made,
+        as_json,
+        f"{output}: {', '.join(made['sections']) or 'no pictures'}; {made['files']} files{missing}",
+    )

@@ -4,40 +4,109 @@ import click
 
 from plenocli.cli import options
 
-METRICS = ("psnr", "ssim", "block-mean", "rmse", "patches", "spectral-angle", "delta-e", "snr", "classification", "single-pixel", "coherence", "response", "depth")
+METRICS = (
+    "psnr",
+    "ssim",
+    "block-mean",
+    "rmse",
+    "patches",
+    "spectral-angle",
+    "delta-e",
+    "snr",
+    "classification",
+    "single-pixel",
+    "coherence",
+    "response",
+    "depth",
+)
 
 
 @click.command("score", short_help="Compare results with the truth: JSON, a table, a report.")
 @options.input_path("results", nargs=-1, required=True, metavar="RESULT...")
-@click.option("--truth", metavar="TRUTH", help="Capture that holds its scene, photograph, spectral EXR, image or spectra .h5, skimage:astronaut, colorchecker, or for refocused planes a distance such as 620mm.")
+@click.option(
+    "--truth",
+    metavar="TRUTH",
+    help=(
+        "Capture that holds its scene, photograph, spectral EXR, image or spectra .h5, "
+        "skimage:astronaut, colorchecker, or for refocused planes a distance such as 620mm."
+    ),
+)
 @options.output
-@click.option("--report", type=options.FILE, help="Also write a page with pictures, such as report.html.")
-@click.option("--metric", "metrics", multiple=True, type=click.Choice(METRICS), help="Only these numbers. Repeatable; default all that apply.")
-@click.option("--white", "whites", multiple=True, type=options.FILE, help="Spectra of a white target, for the SNR and for radiance. Repeatable: frames over time, and for each method of the results.")
-@click.option("--patches", metavar="MAP", help="Label map on the lenslet grid (0 nothing, 1 to 24 the patches), or colorchecker.")
+@click.option(
+    "--report", type=options.FILE, help="Also write a page with pictures, such as report.html."
+)
+@click.option(
+    "--metric",
+    "metrics",
+    multiple=True,
+    type=click.Choice(METRICS),
+    help="Only these numbers. Repeatable; default all that apply.",
+)
+@click.option(
+    "--white",
+    "whites",
+    multiple=True,
+    type=options.FILE,
+    help=(
+        "Spectra of a white target, for the SNR and for radiance. Repeatable: frames over time, "
+        "and for each method of the results."
+    ),
+)
+@click.option(
+    "--patches",
+    metavar="MAP",
+    help="Label map on the lenslet grid (0 nothing, 1 to 24 the patches), or colorchecker.",
+)
 @click.option("--pif", type=options.FILE, help="System matrix; a dictionary is scored with it.")
 @click.option("--capture", type=options.FILE, help="Simulated capture, for its sensor-model SNR.")
-@click.option("--block", type=options.Grid(), help="Object samples under one lenslet, such as 40x40; default what the files say.")
-@click.option("--sampling", type=click.Choice(["fit", "crop"]), default="fit", show_default=True, help="How a photograph became the object, as in capture-sim.")
-@click.option("--illuminant", "light", default="D65", show_default=True, help='Light for colour differences: A, D50, D65, E or a temperature such as "3200 K".')
-@click.option("--camera", type=options.FILE, help="See the truth of spectra through this camera's filters (width, leak, light) instead of at their centres.")
+@click.option(
+    "--block",
+    type=options.Grid(),
+    help="Object samples under one lenslet, such as 40x40; default what the files say.",
+)
+@click.option(
+    "--sampling",
+    type=click.Choice(["fit", "crop"]),
+    default="fit",
+    show_default=True,
+    help="How a photograph became the object, as in capture-sim.",
+)
+@click.option(
+    "--illuminant",
+    "light",
+    default="D65",
+    show_default=True,
+    help='Light for colour differences: A, D50, D65, E or a temperature such as "3200 K".',
+)
+@click.option(
+    "--camera",
+    type=options.FILE,
+    help=(
+        "See the truth of spectra through this camera's filters (width, leak, light) instead "
+        "of at their centres."
+    ),
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, results, output, as_json, **settings):
-    """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr) with the truth, side by side in one table.
+    """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr)
+    with the truth, side by side in one table.
 
-    Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline. Spectra: error per band and over the six patches of the
-    paper, spectral angle, colour difference, SNR under three names, how often a lenslet tells its patch (with scikit-learn
-    installed also by a trained classifier), and all against single pixel where one of the RESULTs is that. Dictionaries: coherence.
-    Calibrations: response against response. Refocused planes (made with --camera): depth over the geometric limit. OUT is JSON with the definition of every number; null stands for "infinite" (no error
-    at all) or "does not apply".
+    Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline. Spectra: error per band and over
+    the six patches of the paper, spectral angle, colour difference, SNR under three names, how
+    often a lenslet tells its patch (with scikit-learn installed also by a trained classifier), and
+    all against single pixel where one of the RESULTs is that. Dictionaries: coherence.
+    Calibrations: response against response. Refocused planes (made with --camera): depth over the
+    geometric limit. OUT is JSON with the definition of every number; null stands for "infinite" (no
+    error at all) or "does not apply".
 
     \b
     Examples:
       plenocli score tikhonov.h5 lmmse.h5 --truth capture.h5 -o score.json --report report.html
-      plenocli score chart.exr --truth colorchecker --white white1.h5 --white white2.h5 -o score.json
+      plenocli score chart.exr --truth colorchecker --white white1.h5 \\
+          --white white2.h5 -o score.json
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
       plenocli score planes.h5 --truth 620mm -o depth.json

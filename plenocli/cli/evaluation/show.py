@@ -7,19 +7,49 @@ from plenocli.cli import options
 
 @click.command("show", short_help="Draw what is in a file, or results beside their truth.")
 @options.input_path("files", metavar="FILE...", nargs=-1, required=True)
-@click.option("-o", "--output", type=options.FILE, metavar="OUT", help="PNG to write; default the name of the first FILE, .png, in this folder.")
-@click.option("--truth", metavar="TRUTH", help="What pictures are compared with, as in score: the capture, a photograph, skimage:astronaut.")
-@click.option("--calibration", type=options.FILE, help="Calibration whose lenslet grid is drawn over captures.")
-@click.option("--point", "points", type=options.PLACE, multiple=True, help="Object point whose column of A is shown, counted from 0; repeatable; default nine.")
-@click.option("--lenslet", "lenslets", type=options.PLACE, multiple=True, help="Lenslet whose spectrum is shown, counted from 0; repeatable; default five.")
+@click.option(
+    "-o",
+    "--output",
+    type=options.FILE,
+    metavar="OUT",
+    help="PNG to write; default the name of the first FILE, .png, in this folder.",
+)
+@click.option(
+    "--truth",
+    metavar="TRUTH",
+    help=(
+        "What pictures are compared with, as in score: the capture, a "
+        "photograph, skimage:astronaut."
+    ),
+)
+@click.option(
+    "--calibration",
+    type=options.FILE,
+    help="Calibration whose lenslet grid is drawn over captures.",
+)
+@click.option(
+    "--point",
+    "points",
+    type=options.PLACE,
+    multiple=True,
+    help="Object point whose column of A is shown, counted from 0; repeatable; default nine.",
+)
+@click.option(
+    "--lenslet",
+    "lenslets",
+    type=options.PLACE,
+    multiple=True,
+    help="Lenslet whose spectrum is shown, counted from 0; repeatable; default five.",
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
 def command(files, as_json, **settings):
-    """Draw FILEs into one picture: system matrix, capture (with its lenslet grid), calibration, spectra, dictionary, image, as
-    artefact, EXR or RAW.
+    """Draw FILEs into one picture: system matrix, capture (with its lenslet grid), calibration,
+    spectra, dictionary, image, as artefact, EXR or RAW.
 
-    A dictionary is drawn on the sensor too when its pif is among the FILEs. Needs matplotlib: the extra [plot].
+    A dictionary is drawn on the sensor too when its pif is among the FILEs. Needs
+    matplotlib: the extra [plot].
 
     \b
     Examples:

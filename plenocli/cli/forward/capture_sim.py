@@ -7,43 +7,145 @@ from plenocli.cli import options
 
 @click.command("capture-sim", short_help="Simulate a capture of a scene or a calibration target.")
 @options.input_path("camera")
-@click.option("--scene", metavar="SCENE", help="Photograph, spectral EXR, image .h5, skimage:astronaut (a photograph that ships with scikit-image) or colorchecker.")
-@click.option("--target", metavar="TARGET", help="Instead of a scene: white (a reference of reflectance 0.99), dark, mono:450nm (the reference under narrow-band light) or colorchecker.")
+@click.option(
+    "--scene",
+    metavar="SCENE",
+    help=(
+        "Photograph, spectral EXR, image .h5, skimage:astronaut (a photograph that ships with "
+        "scikit-image) or colorchecker."
+    ),
+)
+@click.option(
+    "--target",
+    metavar="TARGET",
+    help=(
+        "Instead of a scene: white (a reference of reflectance 0.99), dark, mono:450nm (the "
+        "reference under narrow-band light) or colorchecker."
+    ),
+)
 @options.output
 @click.option("--pif", type=options.FILE, help="Use this system matrix instead of computing one.")
-@click.option("--snr", "snr_db", type=options.DECIBEL, help="White noise of this signal-to-noise ratio, such as 60dB, instead of the sensor's own: sigma^2 = mean(y^2) 10^(-SNR/10).")
-@click.option("--noise", type=click.Choice(["sensor", "none"]), default="sensor", show_default=True, help="Shot, read and quantisation noise of [sensor], or none (real numbers, relative to white).")
-@click.option("--exposure", type=options.DURATION, help="Exposure time, such as 2.5ms; default the camera's white_exposure, at which white reaches 80 % of full well.")
-@click.option("--sampling", type=click.Choice(["fit", "crop"]), default="fit", show_default=True, help="A photograph is fitted to the object grid by area averages, or cropped at native resolution.")
-@click.option("--refine", type=options.Whole(1, 8), default=1, show_default=True, help="Object points per side for each point of [object]: simulate finer than you invert.")
-@click.option("--bandwidth", type=options.LENGTH, default=None, help="Full width at half maximum of each line of light, such as 10nm; default one exact wavelength.")
-@click.option("--spectral-step", type=options.LENGTH, default=None, help="Spacing of wavelengths for cameras with colour; default half of the narrowest filter.")
+@click.option(
+    "--snr",
+    "snr_db",
+    type=options.DECIBEL,
+    help=(
+        "White noise of this signal-to-noise ratio, such as 60dB, instead of the sensor's own: "
+        "sigma^2 = mean(y^2) 10^(-SNR/10)."
+    ),
+)
+@click.option(
+    "--noise",
+    type=click.Choice(["sensor", "none"]),
+    default="sensor",
+    show_default=True,
+    help=(
+        "Shot, read and quantisation noise of [sensor], or none (real numbers, relative to white)."
+    ),
+)
+@click.option(
+    "--exposure",
+    type=options.DURATION,
+    help=(
+        "Exposure time, such as 2.5ms; default the camera's white_exposure, at which white "
+        "reaches 80 % of full well."
+    ),
+)
+@click.option(
+    "--sampling",
+    type=click.Choice(["fit", "crop"]),
+    default="fit",
+    show_default=True,
+    help=(
+        "A photograph is fitted to the object grid by area averages, or cropped "
+        "at native resolution."
+    ),
+)
+@click.option(
+    "--refine",
+    type=options.Whole(1, 8),
+    default=1,
+    show_default=True,
+    help="Object points per side for each point of [object]: simulate finer than you invert.",
+)
+@click.option(
+    "--bandwidth",
+    type=options.LENGTH,
+    default=None,
+    help=(
+        "Full width at half maximum of each line of light, such as 10nm; default "
+        "one exact wavelength."
+    ),
+)
+@click.option(
+    "--spectral-step",
+    type=options.LENGTH,
+    default=None,
+    help="Spacing of wavelengths for cameras with colour; default half of the narrowest filter.",
+)
 @options.superpixels("Superpixels that one lenslet's light may reach")
 @options.coherent_ring
-@click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of the light on the sensor; default: what its noise lets be seen.")
-@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Propagation model, as in simulate-pif.")
-@click.option("--scene-out", type=options.FILE, help="Also write the object as sampled (.h5 or .exr): the truth that score compares with.")
+@click.option(
+    "--accuracy",
+    type=options.POSITIVE,
+    default=None,
+    help="Relative error of the light on the sensor; default: what its noise lets be seen.",
+)
+@click.option(
+    "--model",
+    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
+    default="auto",
+    show_default=True,
+    help="Propagation model, as in simulate-pif.",
+)
+@click.option(
+    "--scene-out",
+    type=options.FILE,
+    help="Also write the object as sampled (.h5 or .exr): the truth that score compares with.",
+)
 @options.seed
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **settings):
-    """Simulate what CAMERA (a .toml file) records of a scene: light, filters, lenses, diffraction, colour filters, noise.
+    """Simulate what CAMERA (a .toml file) records of a scene: light, filters, lenses, diffraction,
+    colour filters, noise.
 
-    OUT is .h5 (with the object and all settings), .exr or .dng (a real RAW file, for cameras' own software too).
+    OUT is .h5 (with the object and all settings), .exr or .dng (a real RAW file, for cameras'
+    own software too).
 
     \b
     Examples:
       plenocli capture-sim camera.toml --scene photo.png --snr 60dB -o capture.h5
       plenocli capture-sim camera.toml --target mono:450nm --seed 3 -o band450.dng
       plenocli capture-sim camera.toml --target colorchecker --exposure 2.5ms -o chart.dng
-      plenocli capture-sim camera.toml --scene photo.png --refine 3 --superpixels 3x3 --snr 60dB -o fine.h5
+      plenocli capture-sim camera.toml --scene photo.png --refine 3 --superpixels 3x3 \\
+          --snr 60dB -o fine.h5
     """
     from plenocli.stages.forward.capture_sim import Settings, run_capture_sim
 
     settings["bandwidth"] = settings["bandwidth"] or 0.0
-    report = run_capture_sim(camera, output, Settings(**settings), scene=scene, pif=pif,
-                             scene_out=scene_out, overwrite=overwrite, command=options.command_line(ctx))
-    noise = f"SNR {settings['snr_db']:g} dB, sigma {report['noise_sigma']:.3g}" if settings["snr_db"] is not None else f"peak {report['peak']:.4g} {report['units']}"
-    options.summary(report, as_json, f"{output}: {report['rows']} x {report['columns']} pixels, {report['wavelengths']} wavelength{'s'[: report['wavelengths'] > 1]}, {noise}")
+    report = run_capture_sim(
+        camera,
+        output,
+        Settings(**settings),
+        scene=scene,
+        pif=pif,
+        scene_out=scene_out,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+    )
+    noise = (
+        f"SNR {settings['snr_db']:g} dB, sigma {report['noise_sigma']:.3g}"
+        if settings["snr_db"] is not None
+        else f"peak {report['peak']:.4g} {report['units']}"
+    )
+    options.summary(
+        report,
+        as_json,
+        (
+            f"{output}: {report['rows']} x {report['columns']} pixels, {report['wavelengths']} "
+            f"wavelength{'s'[: report['wavelengths'] > 1]}, {noise}"
+        ),
+    )

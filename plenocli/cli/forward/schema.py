@@ -14,8 +14,12 @@ def command(kind):
     Example:
       plenocli schema camera > camera.schema.json
     """
-    from plenocli.forward.camera.model import Camera
     from plenocli.files.config.lens_file import LensFile
     from plenocli.files.config.scene_file import Scene
+    from plenocli.forward.camera.model import Camera
 
-    click.echo(json.dumps({"camera": Camera, "scene": Scene, "lens": LensFile}[kind].model_json_schema(), indent=2))
+    click.echo(
+        json.dumps(
+            {"camera": Camera, "scene": Scene, "lens": LensFile}[kind].model_json_schema(), indent=2
+        )
+    )

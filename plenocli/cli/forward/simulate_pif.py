@@ -14,34 +14,106 @@ class _Step(click.ParamType):
 
 @click.command("simulate-pif", short_help="Compute the system matrix A of a camera by wave optics.")
 @options.input_path("camera")
-@click.option("-o", "--output", type=options.FILE, metavar="OUT", help="File to write, .h5; not needed with --explain.")
-@click.option("--wavelength", "wavelengths", type=options.WAVELENGTH, multiple=True, help="Wavelength such as 550nm; repeatable; default [light] wavelengths.")
-@click.option("--spectral-step", type=_Step(), default=None, help="Instead: the wavelengths at which capture-sim samples white light, at this spacing, or auto.")
+@click.option(
+    "-o",
+    "--output",
+    type=options.FILE,
+    metavar="OUT",
+    help="File to write, .h5; not needed with --explain.",
+)
+@click.option(
+    "--wavelength",
+    "wavelengths",
+    type=options.WAVELENGTH,
+    multiple=True,
+    help="Wavelength such as 550nm; repeatable; default [light] wavelengths.",
+)
+@click.option(
+    "--spectral-step",
+    type=_Step(),
+    default=None,
+    help=(
+        "Instead: the wavelengths at which capture-sim samples white light, at "
+        "this spacing, or auto."
+    ),
+)
 @options.superpixels("Superpixels whose pixels are kept, odd")
 @options.coherent_ring
-@click.option("--lenslet", type=options.PLACE, default=None, help="Lenslet of the array, counted from 0, with its pixels where the sensor's raster has them; default the one on the axis.")
-@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Propagation model; auto takes the cheapest that meets the accuracy, a named one is accurate within itself.")
-@click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of the worst column, against the finest model; default: what the sensor's noise lets be seen.")
-@click.option("--scene", type=options.FILE, metavar="SCENE", help="Model only what this scene requires: a scene .toml (depth, spectrum, lenslets, snr), a photograph or a spectral EXR.")
-@click.option("--dtype", type=click.Choice(["auto", "float32", "float64"]), default="auto", show_default=True, help="Type of the stored matrix.")
-@click.option("--explain", is_flag=True, help="Print the plan, its cost and its reasons; compute nothing.")
+@click.option(
+    "--lenslet",
+    type=options.PLACE,
+    default=None,
+    help=(
+        "Lenslet of the array, counted from 0, with its pixels where the sensor's raster has them; "
+        "default the one on the axis."
+    ),
+)
+@click.option(
+    "--model",
+    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
+    default="auto",
+    show_default=True,
+    help=(
+        "Propagation model; auto takes the cheapest that meets the accuracy, a named one is "
+        "accurate within itself."
+    ),
+)
+@click.option(
+    "--accuracy",
+    type=options.POSITIVE,
+    default=None,
+    help=(
+        "Relative error of the worst column, against the finest model; default: what the "
+        "sensor's noise lets be seen."
+    ),
+)
+@click.option(
+    "--scene",
+    type=options.FILE,
+    metavar="SCENE",
+    help=(
+        "Model only what this scene requires: a scene .toml (depth, spectrum, lenslets, snr), a "
+        "photograph or a spectral EXR."
+    ),
+)
+@click.option(
+    "--dtype",
+    type=click.Choice(["auto", "float32", "float64"]),
+    default="auto",
+    show_default=True,
+    help="Type of the stored matrix.",
+)
+@click.option(
+    "--explain", is_flag=True, help="Print the plan, its cost and its reasons; compute nothing."
+)
 @options.mem_limit
 @options.workers
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, camera, output, explain, workers, overwrite, as_json, **settings):
-    """Compute the system matrix A of CAMERA (a .toml file): for every object point over one lenslet's field the share of
-    its light that lands on each pixel, by the cheapest model that meets --accuracy. Reports rank, condition, energy and symmetry.
+    """Compute the system matrix A of CAMERA (a .toml file): for every object point over one
+    lenslet's field the share of its light that lands on each pixel, by the cheapest model that
+    meets --accuracy. Reports rank, condition, energy and symmetry.
 
     \b
     Examples:
       plenocli simulate-pif camera.toml -o pif.h5
-      plenocli simulate-pif camera.toml --wavelength 450nm --wavelength 650nm --accuracy 1e-3 --explain
+      plenocli simulate-pif camera.toml --wavelength 450nm --wavelength 650nm \\
+          --accuracy 1e-3 --explain
       plenocli simulate-pif camera.toml --scene scene.toml -o pif.h5
-      plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 --coherent-ring 0 -o isolated.h5
+      plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 \\
+          --coherent-ring 0 -o isolated.h5
     """
     from plenocli.stages.forward.simulate_pif import Settings, line, run_simulate_pif
 
-    report = run_simulate_pif(camera, output, Settings(**settings), explain=explain, overwrite=overwrite, workers=workers, command=options.command_line(ctx))
+    report = run_simulate_pif(
+        camera,
+        output,
+        Settings(**settings),
+        explain=explain,
+        overwrite=overwrite,
+        workers=workers,
+        command=options.command_line(ctx),
+    )
     options.summary(report, as_json, line(report))

@@ -5,25 +5,82 @@ import click
 from plenocli.cli import options
 
 
-@click.command("simulate-response", short_help="Predict the response F of a camera, as a calibration that demux takes.")
+@click.command(
+    "simulate-response",
+    short_help="Predict the response F of a camera, as a calibration that demux takes.",
+)
 @options.input_path("camera")
-@click.option("-o", "--output", required=True, type=options.FILE, metavar="OUT", help="Calibration to write, .h5.")
-@click.option("--wavelength", "wavelengths", type=options.WAVELENGTH, multiple=True, help="Band centre such as 450nm; repeatable; default [light] wavelengths.")
-@click.option("--bandwidth", type=options.LENGTH, default=None, help="Full width at half maximum of each band, such as 10nm; default one exact wavelength.")
-@click.option("--model", type=click.Choice(["auto", "ray", "fresnel", "exact"]), default="auto", show_default=True, help="Rays (exact areas of the pupil), paraxial waves, or exact waves; auto is waves.")
-@click.option("--own-field", is_flag=True, help="Only light of the lenslet's own object points; default an even object, whose light neighbours exchange where the lens is out of focus.")
-@click.option("--grid", type=options.FILE, metavar="CALIBRATION", help="Put F where the lenslets of a real camera are: a calibration made from white and dark images alone.")
-@click.option("--exposure", type=options.DURATION, help="Exposure to which F refers, such as 2.5ms; default the camera's white_exposure.")
-@click.option("--spectral-step", type=options.LENGTH, default=None, help="Spacing of wavelengths for the white reference; default half of the narrowest filter.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=options.FILE,
+    metavar="OUT",
+    help="Calibration to write, .h5.",
+)
+@click.option(
+    "--wavelength",
+    "wavelengths",
+    type=options.WAVELENGTH,
+    multiple=True,
+    help="Band centre such as 450nm; repeatable; default [light] wavelengths.",
+)
+@click.option(
+    "--bandwidth",
+    type=options.LENGTH,
+    default=None,
+    help="Full width at half maximum of each band, such as 10nm; default one exact wavelength.",
+)
+@click.option(
+    "--model",
+    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
+    default="auto",
+    show_default=True,
+    help="Rays (exact areas of the pupil), paraxial waves, or exact waves; auto is waves.",
+)
+@click.option(
+    "--own-field",
+    is_flag=True,
+    help=(
+        "Only light of the lenslet's own object points; default an even object, whose light "
+        "neighbours exchange where the lens is out of focus."
+    ),
+)
+@click.option(
+    "--grid",
+    type=options.FILE,
+    metavar="CALIBRATION",
+    help=(
+        "Put F where the lenslets of a real camera are: a calibration made from white "
+        "and dark images alone."
+    ),
+)
+@click.option(
+    "--exposure",
+    type=options.DURATION,
+    help="Exposure to which F refers, such as 2.5ms; default the camera's white_exposure.",
+)
+@click.option(
+    "--spectral-step",
+    type=options.LENGTH,
+    default=None,
+    help="Spacing of wavelengths for the white reference; default half of the narrowest filter.",
+)
 @options.superpixels("Superpixels summed over, where F is the sum of a system matrix")
 @options.coherent_ring
-@click.option("--accuracy", type=options.POSITIVE, default=None, help="Relative error of that system matrix; default: what the sensor's noise lets be seen.")
+@click.option(
+    "--accuracy",
+    type=options.POSITIVE,
+    default=None,
+    help="Relative error of that system matrix; default: what the sensor's noise lets be seen.",
+)
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, camera, output, grid, overwrite, as_json, **settings):
-    """Predict the response matrix F of CAMERA (a .toml file): pixel by band behind every lenslet, from filters, glasses,
-    diffraction, colour filters and quantum efficiency. OUT is a calibration as calibrate measures it.
+    """Predict the response matrix F of CAMERA (a .toml file): pixel by band behind every lenslet,
+    from filters, glasses, diffraction, colour filters and quantum efficiency. OUT is a calibration
+    as calibrate measures it.
 
     \b
     Examples:
@@ -35,12 +92,26 @@ def command(ctx, camera, output, grid, overwrite, as_json, **settings):
     from plenocli.stages.forward.simulate_response import Settings, run_simulate_response
 
     settings["bandwidth"] = settings["bandwidth"] or 0.0
-    report = run_simulate_response(camera, output, Settings(**settings), grid=grid, overwrite=overwrite, command=options.command_line(ctx))
-    line = f"{output}: F of {len(report['bands_nm'])} bands, {report['lenslets']} lenslets, {report['model']}, condition {report['condition']:.3g}"
+    report = run_simulate_response(
+        camera,
+        output,
+        Settings(**settings),
+        grid=grid,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+    )
+    line = (
+        f"{output}: F of {len(report['bands_nm'])} bands, {report['lenslets']} lenslets, "
+        f"{report['model']}, condition {report['condition']:.3g}"
+    )
     if report["smallest_angle_deg"] is not None:
         line += f", smallest angle between two columns {report['smallest_angle_deg']:.2f} deg"
-    line += "; light from a lenslet's own field " + ", ".join(f"{share:.0%}" for share in report["own_light"])
+    line += "; light from a lenslet's own field " + ", ".join(
+        f"{share:.0%}" for share in report["own_light"]
+    )
     line += f"; taken to be known to {max(report['error']):.0%}"
     if "rays_against_waves" in report:
-        line += "; rays differ from waves by " + ", ".join(f"{share:.1%}" for share in report["rays_against_waves"])
+        line += "; rays differ from waves by " + ", ".join(
+            f"{share:.1%}" for share in report["rays_against_waves"]
+        )
     options.summary(report, as_json, line)

@@ -7,42 +7,125 @@ import click
 from plenocli.cli import options
 
 
-@click.command("calibrate", short_help="Find the lenslet grid and measure the response F from white, dark and narrow-band captures.")
-@click.option("--white", "whites", multiple=True, required=True, type=options.FILE, help="White image: even light through the main lens. Repeatable: frames are averaged.")
-@click.option("--dark", "darks", multiple=True, type=options.FILE, help="Dark frame. Repeatable; without one the file's black level is used.")
-@click.option("--band", "bands", multiple=True, type=options.Pair("FILE", Path), help="White target under narrow-band light, such as 450nm=band450.dng. Repeatable, also within a band.")
-@click.option("--band-radiance", "radiances", multiple=True, type=options.Pair("NUMBER", options.positive), help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.")
-@click.option("--camera", type=options.FILE, help="Camera description (.toml) for the sensor's gain and read noise.")
-@click.option("--response", type=click.Choice(["auto", "shared", "own", "low-rank"]), default="auto", show_default=True, help="One F shared by all lenslets, an F of its own for each, or own ones without the noise that stands out of what they have in common (with a hundred lenslets one capture a band then does what four do). auto: shared where the data cannot tell lenslets apart, else own.")
-@click.option("--lattice", type=click.Choice(["auto", "square", "hexagonal"]), default="auto", show_default=True, help="Lattice of the lenslet array; auto lets the image decide.")
-@click.option("--centre", "near", type=(options.NON_NEGATIVE, options.NON_NEGATIVE), default=None, metavar="ROW COLUMN", help="A pixel near the centre of any superpixel; needed only where filters in the pupil draw lines as dark as the superpixels' borders.")
-@click.option("--cfa", type=click.Choice(["mono", "RGGB", "BGGR", "GRBG", "GBRG"]), help="Colour filter array of PNG and TIFF mosaics, which cannot say it; default the camera's, else mono.")
+@click.command(
+    "calibrate",
+    short_help=(
+        "Find the lenslet grid and measure the response F from white, dark and "
+        "narrow-band captures."
+    ),
+)
+@click.option(
+    "--white",
+    "whites",
+    multiple=True,
+    required=True,
+    type=options.FILE,
+    help="White image: even light through the main lens. Repeatable: frames are averaged.",
+)
+@click.option(
+    "--dark",
+    "darks",
+    multiple=True,
+    type=options.FILE,
+    help="Dark frame. Repeatable; without one the file's black level is used.",
+)
+@click.option(
+    "--band",
+    "bands",
+    multiple=True,
+    type=options.Pair("FILE", Path),
+    help=(
+        "White target under narrow-band light, such as 450nm=band450.dng. "
+        "Repeatable, also within a band."
+    ),
+)
+@click.option(
+    "--band-radiance",
+    "radiances",
+    multiple=True,
+    type=options.Pair("NUMBER", options.positive),
+    help="Relative radiance of a narrow-band source, such as 450nm=0.8; default 1.",
+)
+@click.option(
+    "--camera",
+    type=options.FILE,
+    help="Camera description (.toml) for the sensor's gain and read noise.",
+)
+@click.option(
+    "--response",
+    type=click.Choice(["auto", "shared", "own", "low-rank"]),
+    default="auto",
+    show_default=True,
+    help=(
+        "One F shared by all lenslets, an F of its own for each, or own ones without the noise "
+        "that stands out of what they have in common (with a hundred lenslets one capture a band "
+        "then does what four do). auto: shared where the data cannot tell lenslets apart, else own."
+    ),
+)
+@click.option(
+    "--lattice",
+    type=click.Choice(["auto", "square", "hexagonal"]),
+    default="auto",
+    show_default=True,
+    help="Lattice of the lenslet array; auto lets the image decide.",
+)
+@click.option(
+    "--centre",
+    "near",
+    type=(options.NON_NEGATIVE, options.NON_NEGATIVE),
+    default=None,
+    metavar="ROW COLUMN",
+    help=(
+        "A pixel near the centre of any superpixel; needed only where filters in the pupil draw "
+        "lines as dark as the superpixels' borders."
+    ),
+)
+@click.option(
+    "--cfa",
+    type=click.Choice(["mono", "RGGB", "BGGR", "GRBG", "GBRG"]),
+    help=(
+        "Colour filter array of PNG and TIFF mosaics, which cannot say it; default the "
+        "camera's, else mono."
+    ),
+)
 @options.output
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, output, as_json, radiances, **settings):
-    """Calibrate a plenoptic camera: lenslet grid, white and dark levels, and the response F of every superpixel.
+    """Calibrate a plenoptic camera: lenslet grid, white and dark levels, and the response F
+    of every superpixel.
 
-    Files are camera RAW, DNG, PNG or TIFF mosaics (never demosaiced) or captures of capture-sim. The grid may be square
-    or hexagonal, turned, of any pitch from 5 to 300 pixels. F needs --band captures; without them the calibration
-    holds grid, white and dark.
+    Files are camera RAW, DNG, PNG or TIFF mosaics (never demosaiced) or captures of capture-sim.
+    The grid may be square or hexagonal, turned, of any pitch from 5 to 300 pixels. F needs --band
+    captures; without them the calibration holds grid, white and dark.
 
     \b
     Examples:
       plenocli calibrate --white white.png --dark dark.png -o grid.h5
-      plenocli calibrate --white w1.NEF --white w2.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF -o cal.h5
-      plenocli calibrate --white white.dng --band 450nm=450.dng --band-radiance 450nm=0.8 --camera camera.toml -o cal.h5
-      plenocli calibrate --white w.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF --response low-rank -o cal.h5
+      plenocli calibrate --white w1.NEF --white w2.NEF --dark d.NEF --band 450nm=b450.NEF \\
+          --band 540nm=b540.NEF -o cal.h5
+      plenocli calibrate --white white.dng --band 450nm=450.dng --band-radiance 450nm=0.8 \\
+          --camera camera.toml -o cal.h5
+      plenocli calibrate --white w.NEF --dark d.NEF --band 450nm=b450.NEF --band 540nm=b540.NEF \\
+          --response low-rank -o cal.h5
     """
     from plenocli.stages.inverse.calibrate import run_calibrate
 
-    report = run_calibrate(output, radiances=radiances, command=options.command_line(ctx), **settings)
+    report = run_calibrate(
+        output, radiances=radiances, command=options.command_line(ctx), **settings
+    )
     down, right = report["pitch_px"]
-    line = (f"{output}: {report['lattice']} grid, pitch {down:.4f} x {right:.4f} px, angle {report['angle_deg']:.3f} deg, "
-            f"{report['lenslets']} lenslets, residual {report['rms_px']:.3f} px rms ({report['model']})")
+    line = (
+        f"{output}: {report['lattice']} grid, pitch {down:.4f} x {right:.4f} px, angle "
+        f"{report['angle_deg']:.3f} deg, {report['lenslets']} lenslets, residual "
+        f"{report['rms_px']:.3f} px rms ({report['model']})"
+    )
     if "condition" in report:
-        line += f"; F: {len(report['bands_nm'])} bands, condition {report['condition']:.3g}, {report['columns']}"
+        line += (
+            f"; F: {len(report['bands_nm'])} bands, condition {report['condition']:.3g}, "
+            f"{report['columns']}"
+        )
         if report["bias"]:
             line += f", bias by its noise up to {max(map(abs, report['bias'])):.1g}"
     options.summary(report, as_json, line)

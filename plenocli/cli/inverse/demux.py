@@ -6,15 +6,45 @@ from plenocli.cli import options
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 
 
-@click.command("demux", short_help="Recover band radiances or reflectances per lenslet from captures.")
+@click.command(
+    "demux", short_help="Recover band radiances or reflectances per lenslet from captures."
+)
 @options.input_path("captures", nargs=-1, required=True)
-@click.option("--calibration", required=True, type=options.FILE, help="Calibration with a response F (from calibrate).")
-@click.option("--method", type=click.Choice(["auto", "pinv", "single-pixel", "wls", "lmmse", "nnls"]), default="auto", show_default=True,
-              help="auto takes the one with the least predicted error and says so.")
-@click.option("--reference", type=options.FILE, help="Capture of a white reference: the result is reflectance instead of radiance.")
-@click.option("--reference-reflectance", type=options.FRACTION, default=REFERENCE_REFLECTANCE, show_default=True, help="Reflectance of that white reference.")
-@click.option("--register", type=click.Choice(["auto", "on", "off"]), default="auto", show_default=True,
-              help="Bring captures into line with the calibration (moved lenslets, offset, stray light); auto: where they show it by more than chance.")
+@click.option(
+    "--calibration",
+    required=True,
+    type=options.FILE,
+    help="Calibration with a response F (from calibrate).",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "pinv", "single-pixel", "wls", "lmmse", "nnls"]),
+    default="auto",
+    show_default=True,
+    help="auto takes the one with the least predicted error and says so.",
+)
+@click.option(
+    "--reference",
+    type=options.FILE,
+    help="Capture of a white reference: the result is reflectance instead of radiance.",
+)
+@click.option(
+    "--reference-reflectance",
+    type=options.FRACTION,
+    default=REFERENCE_REFLECTANCE,
+    show_default=True,
+    help="Reflectance of that white reference.",
+)
+@click.option(
+    "--register",
+    type=click.Choice(["auto", "on", "off"]),
+    default="auto",
+    show_default=True,
+    help=(
+        "Bring captures into line with the calibration (moved lenslets, offset, stray light); "
+        "auto: where they show it by more than chance."
+    ),
+)
 @options.file_type("exr", "h5")
 @options.output
 @options.workers
@@ -22,11 +52,15 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, captures, output, calibration, suffix, workers, scheduler, overwrite, as_json, **settings):
-    """Demultiplex CAPTURE...: x = F b + noise is solved for the band radiances b of every lenslet, with standard deviations.
+def command(
+    ctx, captures, output, calibration, suffix, workers, scheduler, overwrite, as_json, **settings
+):
+    """Demultiplex CAPTURE...: x = F b + noise is solved for the band radiances b of every lenslet,
+    with standard deviations.
 
-    OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each. Finished ones are skipped on
-    a rerun, a bad one is reported and does not stop the others. Lenslets partly off the sensor are NaN.
+    OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each.
+    Finished ones are skipped on a rerun, a bad one is reported and does not stop the others.
+    Lenslets partly off the sensor are NaN.
 
     \b
     Examples:
@@ -37,13 +71,28 @@ def command(ctx, captures, output, calibration, suffix, workers, scheduler, over
     """
     from plenocli.stages.inverse.demux import Settings, run_demux
 
-    report = run_demux(captures, output, calibration=calibration, settings=Settings(**settings), suffix=f".{suffix}", workers=workers, scheduler=scheduler,
-                       overwrite=overwrite, command=options.command_line(ctx))
+    report = run_demux(
+        captures,
+        output,
+        calibration=calibration,
+        settings=Settings(**settings),
+        suffix=f".{suffix}",
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+    )
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
-        line = f"{one['output']}: {one['quantity']} in {len(one['bands_nm'])} bands behind {one['lenslets']} lenslets, {one['method']} ({one['reason']})"
+        line = (
+            f"{one['output']}: {one['quantity']} in {len(one['bands_nm'])} bands behind "
+            f"{one['lenslets']} lenslets, {one['method']} ({one['reason']})"
+        )
         if (one["registration"] or {}).get("corrected"):
-            line += f"; corrected: {', '.join(one['registration']['corrected'])} (lenslets moved by up to {one['registration']['largest_px']:.3g} px)"
+            line += (
+                f"; corrected: {', '.join(one['registration']['corrected'])} (lenslets moved by up "
+                f"to {one['registration']['largest_px']:.3g} px)"
+            )
     else:
         line = f"{output}: {report['done']} demultiplexed, {report['skipped']} were finished before"
     options.summary(report, as_json, line)

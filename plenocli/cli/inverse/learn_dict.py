@@ -17,42 +17,126 @@ class Lambda(click.ParamType):
 
 @click.command("learn-dict", short_help="Learn a dictionary of object patches for a system matrix.")
 @click.argument("images", nargs=-1, metavar="[IMAGE]...")
-@click.option("--pif", required=True, type=options.FILE, help="System matrix A (from simulate-pif).")
+@click.option(
+    "--pif", required=True, type=options.FILE, help="System matrix A (from simulate-pif)."
+)
 @options.output
 @click.option("--atoms", type=options.Whole(2), help="Atoms L; default one for each object point.")
-@click.option("--batch", type=options.Whole(1), help="Patches an iteration; default 4 an atom, as in the paper.")
-@click.option("--iterations", type=options.Whole(0, 100000), default=10, show_default=True, help="Iterations in all, those of --resume included.")
-@click.option("--snr", "snr_db", type=options.DECIBEL, default="60dB", show_default=True, help="Noise of the measurements: sigma^2 = mean(y^2) 10^(-SNR/10).")
-@click.option("--lambda", "lam", type=Lambda(), help="Weight of |c|_1 with A scaled to unit spectral norm, or `noise`: what codes noise as zero; default chosen on held-out patches.")
-@click.option("--delta", type=options.NON_NEGATIVE, default="0.001", show_default=True, help="Weight of |A Phi|^2, which keeps A and the atoms incoherent.")
-@click.option("--init", "initial", type=click.Choice(["patches", "pca", "random"]), default="patches", show_default=True, help="Starting atoms; random is the paper's.")
-@click.option("--gradient-steps", type=options.Whole(0), default=0, show_default=True, help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.")
-@click.option("--synthesis", is_flag=True, help="Also regress atoms that paint what the learnt ones code; reconstruct uses them.")
-@click.option("--resume", type=options.FILE, help="Go on from this dictionary; the result equals that of one long run.")
-@click.option("--checkpoint", type=options.FILE, help="Keep the state here after every iteration, and go on from it if there is one: the same command, given again after an interruption, loses no more than an iteration. Removed at the end.")
+@click.option(
+    "--batch",
+    type=options.Whole(1),
+    help="Patches an iteration; default 4 an atom, as in the paper.",
+)
+@click.option(
+    "--iterations",
+    type=options.Whole(0, 100000),
+    default=10,
+    show_default=True,
+    help="Iterations in all, those of --resume included.",
+)
+@click.option(
+    "--snr",
+    "snr_db",
+    type=options.DECIBEL,
+    default="60dB",
+    show_default=True,
+    help="Noise of the measurements: sigma^2 = mean(y^2) 10^(-SNR/10).",
+)
+@click.option(
+    "--lambda",
+    "lam",
+    type=Lambda(),
+    help=(
+        "Weight of |c|_1 with A scaled to unit spectral norm, or `noise`: what codes noise as "
+        "zero; default chosen on held-out patches."
+    ),
+)
+@click.option(
+    "--delta",
+    type=options.NON_NEGATIVE,
+    default="0.001",
+    show_default=True,
+    help="Weight of |A Phi|^2, which keeps A and the atoms incoherent.",
+)
+@click.option(
+    "--init",
+    "initial",
+    type=click.Choice(["patches", "pca", "random"]),
+    default="patches",
+    show_default=True,
+    help="Starting atoms; random is the paper's.",
+)
+@click.option(
+    "--gradient-steps",
+    type=options.Whole(0),
+    default=0,
+    show_default=True,
+    help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.",
+)
+@click.option(
+    "--synthesis",
+    is_flag=True,
+    help="Also regress atoms that paint what the learnt ones code; reconstruct uses them.",
+)
+@click.option(
+    "--resume",
+    type=options.FILE,
+    help="Go on from this dictionary; the result equals that of one long run.",
+)
+@click.option(
+    "--checkpoint",
+    type=options.FILE,
+    help=(
+        "Keep the state here after every iteration, and go on from it if there is one: the same "
+        "command, given again after an interruption, loses no more than an "
+        "iteration. Removed at the end."
+    ),
+)
 @options.seed
-@click.option("--workers", type=options.Whole(1, 1024), default=None, help="Threads of the compiled solver; default all cores. The result does not depend on it.")
+@click.option(
+    "--workers",
+    type=options.Whole(1, 1024),
+    default=None,
+    help="Threads of the compiled solver; default all cores. The result does not depend on it.",
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **settings):
-    """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship with scikit-image, without the astronaut).
+    """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship
+    with scikit-image, without the astronaut).
 
-    Every fifth picture is held out; the result is compared there with the LMMSE that reconstruct takes of a lenslet by itself
-    (a covariance, and a contrast for every patch), and says so if it does not win. The dictionary holds its history and what --resume needs.
+    Every fifth picture is held out; the result is compared there with the LMMSE that reconstruct
+    takes of a lenslet by itself (a covariance, and a contrast for every patch), and says so if it
+    does not win. The dictionary holds its history and what --resume needs.
 
     \b
     Examples:
       plenocli learn-dict --pif pif.h5 --iterations 20 -o dictionary.h5
-      plenocli learn-dict photos/*.png --pif pif.h5 --atoms 400 --batch 1600 --snr 40dB -o dictionary.h5
+      plenocli learn-dict photos/*.png --pif pif.h5 --atoms 400 --batch 1600 \\
+          --snr 40dB -o dictionary.h5
       plenocli learn-dict --pif pif.h5 --resume dictionary.h5 --iterations 40 -o longer.h5
     """
     from plenocli.stages.inverse.learn_dict import Settings, run_learn_dict
 
-    report = run_learn_dict(images, output, Settings(**settings), pif=pif, resume=resume, checkpoint=checkpoint, overwrite=overwrite, command=options.command_line(ctx))
+    report = run_learn_dict(
+        images,
+        output,
+        Settings(**settings),
+        pif=pif,
+        resume=resume,
+        checkpoint=checkpoint,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+    )
     verdict = "above" if report["beats_lmmse"] else "NOT above"
-    line = (f"{output}: {report['atoms']} atoms, {report['iterations']} iterations, lambda {report['lambda']:.2e}, held out {report['validation_psnr_db']:.2f} dB, "
-            f"averaged over mirror images {report['averaged_psnr_db']:.2f} dB, {verdict} LMMSE {report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest {report['coherence']['coherence_effective']:.3f}, "
-            f"mean {report['coherence']['coherence_effective_mean']:.3f}")
+    line = (
+        f"{output}: {report['atoms']} atoms, {report['iterations']} iterations, lambda "
+        f"{report['lambda']:.2e}, held out {report['validation_psnr_db']:.2f} dB, averaged over "
+        f"mirror images {report['averaged_psnr_db']:.2f} dB, {verdict} LMMSE "
+        f"{report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest "
+        f"{report['coherence']['coherence_effective']:.3f}, mean "
+        f"{report['coherence']['coherence_effective_mean']:.3f}"
+    )
     options.summary(report, as_json, line)

@@ -10,18 +10,80 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @click.command("reconstruct", short_help="Recover the picture behind each lenslet from captures.")
 @options.input_path("captures", nargs=-1, required=True)
 @click.option("--pif", type=options.FILE, help="System matrix A (from simulate-pif).")
-@click.option("--calibration", type=options.FILE, help="Lenslet grid and white reference of a real camera (from calibrate).")
-@click.option("--method", type=click.Choice(METHODS), default="auto", show_default=True, help="auto: the best of lmmse, pnp and (where one is given) dictionary on pieces of training photographs at the capture's noise.")
-@click.option("--dictionary", type=options.FILE, help="Dictionary (from learn-dict) for --method dictionary; auto tries it too.")
-@click.option("--overlap", type=click.Choice(["1", "3"]), help="Superpixels looked at for each block: its own, or 3x3; default 3x3 where the pif holds neighbours. tv and pnp see the whole sensor.")
-@click.option("--training", multiple=True, metavar="IMAGE", help="Photograph or skimage:NAME for the statistics of lmmse and the trial of auto. Repeatable; default those of scikit-image, without the astronaut.")
-@click.option("--truth", type=options.FILE, help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.")
-@click.option("--noise-sigma", type=options.POSITIVE, help="Standard deviation of the noise, relative like A x; default what the capture says, else estimated.")
-@click.option("--alpha", type=options.NON_NEGATIVE, help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.")
-@click.option("--rank", type=options.Whole(1), help="Directions kept by tsvd; default by the least estimated error.")
-@click.option("--lambda", "lam", type=options.POSITIVE, help="Weight of |c|_1 for dictionary; default as learnt.")
-@click.option("--nnls-iterations", type=options.Whole(1), help="Stop nnls after so many gradient steps; default converged.")
-@click.option("--clip", is_flag=True, help="Set negative values to zero; their share is reported either way.")
+@click.option(
+    "--calibration",
+    type=options.FILE,
+    help="Lenslet grid and white reference of a real camera (from calibrate).",
+)
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="auto",
+    show_default=True,
+    help=(
+        "auto: the best of lmmse, pnp and (where one is given) dictionary on pieces of training "
+        "photographs at the capture's noise."
+    ),
+)
+@click.option(
+    "--dictionary",
+    type=options.FILE,
+    help="Dictionary (from learn-dict) for --method dictionary; auto tries it too.",
+)
+@click.option(
+    "--overlap",
+    type=click.Choice(["1", "3"]),
+    help=(
+        "Superpixels looked at for each block: its own, or 3x3; default 3x3 where the pif holds "
+        "neighbours. tv and pnp see the whole sensor."
+    ),
+)
+@click.option(
+    "--training",
+    multiple=True,
+    metavar="IMAGE",
+    help=(
+        "Photograph or skimage:NAME for the statistics of lmmse and the trial of auto. Repeatable; "
+        "default those of scikit-image, without the astronaut."
+    ),
+)
+@click.option(
+    "--truth",
+    type=options.FILE,
+    help="Choose the weight of tikhonov or tsvd with hindsight: an upper bound, not a method.",
+)
+@click.option(
+    "--noise-sigma",
+    type=options.POSITIVE,
+    help=(
+        "Standard deviation of the noise, relative like A x; default what the capture "
+        "says, else estimated."
+    ),
+)
+@click.option(
+    "--alpha",
+    type=options.NON_NEGATIVE,
+    help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.",
+)
+@click.option(
+    "--rank",
+    type=options.Whole(1),
+    help="Directions kept by tsvd; default by the least estimated error.",
+)
+@click.option(
+    "--lambda",
+    "lam",
+    type=options.POSITIVE,
+    help="Weight of |c|_1 for dictionary; default as learnt.",
+)
+@click.option(
+    "--nnls-iterations",
+    type=options.Whole(1),
+    help="Stop nnls after so many gradient steps; default converged.",
+)
+@click.option(
+    "--clip", is_flag=True, help="Set negative values to zero; their share is reported either way."
+)
 @options.file_type("h5", "exr")
 @options.output
 @options.seed
@@ -31,39 +93,79 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, captures, output, pif, calibration, suffix, overlap, scheduler, overwrite, as_json, **settings):
-    """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet, relative to white.
+def command(
+    ctx,
+    captures,
+    output,
+    pif,
+    calibration,
+    suffix,
+    overlap,
+    scheduler,
+    overwrite,
+    as_json,
+    **settings,
+):
+    """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet,
+    relative to white.
 
-    pnp takes turns between the data of every lenslet and a denoiser that sees the whole picture; tv prefers flat areas.
-    auto captures pieces of training photographs with this matrix and this noise, and takes what does best on them.
+    pnp takes turns between the data of every lenslet and a denoiser that sees the whole picture; tv
+    prefers flat areas. auto captures pieces of training photographs with this matrix and this
+    noise, and takes what does best on them.
 
-    A pif of a camera with filters in its pupil gives a picture for each band, from one linear model of all bands: with
-    simulate-pif --spectral-step auto for the whole width of the filters, else one wavelength stands for each.
+    A pif of a camera with filters in its pupil gives a picture for each band, from one linear model
+    of all bands: with simulate-pif --spectral-step auto for the whole width of the filters, else
+    one wavelength stands for each.
 
-    OUT is an image .h5 (with the predicted standard deviation for lmmse, tv and pnp, and what of a lenslet's object the
-    sensor can see at all) or .exr; with several captures a folder with one file each. Finished ones are skipped on a rerun,
-    a bad one is reported and does not stop the others. --workers and --scheduler share captures out, or batches of the
-    lenslets of a single one (nnls, dictionary). With --calibration and no --pif the picture has one value a lenslet.
+    OUT is an image .h5 (with the predicted standard deviation for lmmse, tv and pnp, and what of a
+    lenslet's object the sensor can see at all) or .exr; with several captures a folder with one
+    file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the
+    others. --workers and --scheduler share captures out, or batches of the lenslets of a single one
+    (nnls, dictionary). With --calibration and no --pif the picture has one value a lenslet.
 
     \b
     Examples:
       plenocli reconstruct capture.h5 --pif pif.h5 -o picture.h5
       plenocli reconstruct capture.h5 --pif pif-3x3.h5 --method lmmse -o picture.h5
-      plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary d.h5 -o picture.exr
+      plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary \\
+          --dictionary d.h5 -o picture.exr
       plenocli reconstruct shots/*.h5 --pif pif.h5 --workers 2 -o pictures/
       plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
     """
     from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
 
-    report = run_reconstruct(captures, output, Settings(overlap=overlap and int(overlap), **settings), pif=pif, calibration=calibration, suffix=f".{suffix}",
-                             scheduler=scheduler, overwrite=overwrite, command=options.command_line(ctx))
+    report = run_reconstruct(
+        captures,
+        output,
+        Settings(overlap=overlap and int(overlap), **settings),
+        pif=pif,
+        calibration=calibration,
+        suffix=f".{suffix}",
+        scheduler=scheduler,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+    )
     if len(captures) == 1 and report["done"] == 1:
         one = report["captures"][0]
         rule = f" ({one['reason']})" if settings["method"] == "auto" else ""
         rule += f", {one['rule']}" if "rule" in one else ""
-        seen = f", {one['seen']['directions']} of {one['seen']['points']} directions of the object above the noise" if "seen" in one else ""
-        bands = " in bands of " + ", ".join(f"{b:.4g}" for b in one["bands_nm"]) + " nm" if len(one["bands_nm"]) > 1 else ""
-        line = f"{one['output']}: {one['rows']} x {one['columns']} points{bands}, {one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
+        seen = (
+            (
+                f", {one['seen']['directions']} of {one['seen']['points']} directions of the "
+                "object above the noise"
+            )
+            if "seen" in one
+            else ""
+        )
+        bands = (
+            " in bands of " + ", ".join(f"{b:.4g}" for b in one["bands_nm"]) + " nm"
+            if len(one["bands_nm"]) > 1
+            else ""
+        )
+        line = (
+            f"{one['output']}: {one['rows']} x {one['columns']} points{bands}, "
+            f"{one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
+        )
     else:
         line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"
     options.summary(report, as_json, line)

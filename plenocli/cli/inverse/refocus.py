@@ -21,31 +21,84 @@ class _Slope(click.ParamType):
         return number
 
 
-@click.command("refocus", short_help="Focus a capture at other distances, map its depth, look through parts of the pupil.")
+@click.command(
+    "refocus",
+    short_help=(
+        "Focus a capture at other distances, map its depth, look through parts of the pupil."
+    ),
+)
 @options.input_path("capture")
-@click.option("--calibration", type=options.FILE, help="Lenslet grid and white image (from calibrate); captures of capture-sim need none.")
-@click.option("--camera", type=options.FILE, help="Camera description (.toml): turns slopes into distances.")
-@click.option("--distance", "distances", multiple=True, type=options.DISTANCE, help="Plane to focus on, in front of the main lens, such as 500mm. Repeatable; needs --camera.")
-@click.option("--slope", "slopes", multiple=True, type=_Slope(), help="Plane by its parallax: 0 is the plane focused on the lenslets, 1 has one lenslet of parallax across the pupil, nearer ones are above 0. Repeatable.")
-@click.option("--planes", type=options.Whole(1, 1000), default=13, show_default=True, help="Planes from slope -3 to 3 where neither --distance nor --slope is given.")
-@click.option("--views", type=options.Whole(0, 15), default=3, show_default=True, help="Parts of the pupil along each side whose views are kept.")
+@click.option(
+    "--calibration",
+    type=options.FILE,
+    help="Lenslet grid and white image (from calibrate); captures of capture-sim need none.",
+)
+@click.option(
+    "--camera", type=options.FILE, help="Camera description (.toml): turns slopes into distances."
+)
+@click.option(
+    "--distance",
+    "distances",
+    multiple=True,
+    type=options.DISTANCE,
+    help="Plane to focus on, in front of the main lens, such as 500mm. Repeatable; needs --camera.",
+)
+@click.option(
+    "--slope",
+    "slopes",
+    multiple=True,
+    type=_Slope(),
+    help=(
+        "Plane by its parallax: 0 is the plane focused on the lenslets, 1 has one lenslet of "
+        "parallax across the pupil, nearer ones are above 0. Repeatable."
+    ),
+)
+@click.option(
+    "--planes",
+    type=options.Whole(1, 1000),
+    default=13,
+    show_default=True,
+    help="Planes from slope -3 to 3 where neither --distance nor --slope is given.",
+)
+@click.option(
+    "--views",
+    type=options.Whole(0, 15),
+    default=3,
+    show_default=True,
+    help="Parts of the pupil along each side whose views are kept.",
+)
 @options.output
 @options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context
 def command(ctx, capture, output, overwrite, as_json, **settings):
-    """Refocus CAPTURE: every pixel's ray is followed to the planes asked for. With three planes or more OUT (.h5) holds a
-    map of depth with its confidence.
+    """Refocus CAPTURE: every pixel's ray is followed to the planes asked for. With three planes or
+    more OUT (.h5) holds a map of depth with its confidence.
 
     \b
     Examples:
       plenocli refocus capture.png --calibration grid.h5 -o planes.h5
-      plenocli refocus capture.h5 --camera camera.toml --distance 400mm --distance 550mm --distance 900mm -o planes.h5
+      plenocli refocus capture.h5 --camera camera.toml --distance 400mm --distance 550mm \\
+          --distance 900mm -o planes.h5
       plenocli show planes.h5
     """
     from plenocli.stages.inverse.refocus import run_refocus
 
-    report = run_refocus(capture, output, overwrite=overwrite, command=options.command_line(ctx), **settings)
-    where = "" if report["sharpest_distance_m"] is None else f", {report['sharpest_distance_m']:.4g} m away"
-    options.summary(report, as_json, f"{report['output']}: {report['planes']} planes of {report['lenslets'][0]} x {report['lenslets'][1]} lenslets; sharpest at slope {report['sharpest_slope']:.3g}{where}")
+    report = run_refocus(
+        capture, output, overwrite=overwrite, command=options.command_line(ctx), **settings
+    )
+    where = (
+        ""
+        if report["sharpest_distance_m"] is None
+        else f", {report['sharpest_distance_m']:.4g} m away"
+    )
+    options.summary(
+        report,
+        as_json,
+        (
+            f"{report['output']}: {report['planes']} planes of {report['lenslets'][0]} x "
+            f"{report['lenslets'][1]} lenslets; sharpest at slope "
+            f"{report['sharpest_slope']:.3g}{where}"
+        ),
+    )

@@ -5,7 +5,12 @@ import click
 from plenocli.cli import options
 
 
-@click.command("sweep", short_help="Carry a design space through the stages: a table, and the designs that no other beats.")
+@click.command(
+    "sweep",
+    short_help=(
+        "Carry a design space through the stages: a table, and the designs that no other beats."
+    ),
+)
 @options.input_path("description", metavar="SWEEP.toml")
 @options.table_output
 @options.front_plot
@@ -17,13 +22,15 @@ from plenocli.cli import options
 @options.as_json
 @click.pass_context
 def command(ctx, description, output, as_json, **settings):
-    """Carry every point of a design space through simulate-pif, capture-sim, reconstruct (or simulate-response or calibrate, and
-    demux) and score. SWEEP.toml names a camera, the keys of it and of the stages' options that vary (a grid, a Latin
-    hypercube or a list), and what counts as better.
+    """Carry every point of a design space through simulate-pif, capture-sim, reconstruct (or
+    simulate-response or calibrate, and demux) and score. SWEEP.toml names a camera, the keys of it
+    and of the stages' options that vary (a grid, a Latin hypercube or a list), and
+    what counts as better.
 
-    OUT is a table (.h5), with the same as .csv beside it and the points that no other beats marked. Finished points are kept in
-    OUT's folder .parts: a run that was stopped goes on where it was, and one with more values computes only those. A camera
-    that a stage refuses is a row with the reason.
+    OUT is a table (.h5), with the same as .csv beside it and the points that no other beats marked.
+    Finished points are kept in OUT's folder .parts: a run that was stopped goes on where it was,
+    and one with more values computes only those. A camera that a stage refuses is a
+    row with the reason.
 
     \b
     Examples:
@@ -35,5 +42,11 @@ def command(ctx, description, output, as_json, **settings):
     from plenocli.stages.sweep.sweep import run_sweep
     from plenocli.stages.sweep.table import lines
 
-    report = run_sweep(description, output, read_options=read_options, command=options.command_line(ctx), **settings)
+    report = run_sweep(
+        description,
+        output,
+        read_options=read_options,
+        command=options.command_line(ctx),
+        **settings,
+    )
     options.summary(report, as_json, lines(report))

@@ -1,7 +1,8 @@
-"""Coherence of a dictionary Phi with the system matrix A: what sparse recovery from y = A Phi c can hope for.
+"""Coherence of a dictionary Phi with the system matrix A: what sparse recovery from y = A
+Phi c can hope for.
 
-Three quantities go by the name; all are reported. D = A Phi is the effective dictionary, what the sensor sees of each
-atom. See docs/model.md, "Spatial reconstruction".
+Three quantities go by the name; all are reported. D = A Phi is the effective dictionary, what the
+sensor sees of each atom. See docs/model.md, "Spatial reconstruction".
 """
 
 import math
@@ -11,24 +12,42 @@ import numpy as np
 from plenocli.inverse.sparse.coherence import column_coherence
 
 DEFINITIONS = {
-    "coherence_raw": "max |<a_i, phi_j>| over rows of A and atoms, nothing normalised (Berkner et al. 2013); depends on the "
-    "scale of A",
-    "coherence_candes_romberg": "sqrt(n) max |<a_i, phi_j>| / (|a_i| |phi_j|), n = object points: 1 (incoherent) to sqrt(n) "
-    "(Candes and Romberg 2007)",
-    "coherence_effective": "mu(D) = max |<d_i, d_j>| / (|d_i| |d_j|) over pairs of different columns of D = A Phi: 0 to 1",
+    "coherence_raw": (
+        "max |<a_i, phi_j>| over rows of A and atoms, nothing normalised (Berkner et al. 2013); "
+        "depends on the scale of A"
+    ),
+    "coherence_candes_romberg": (
+        "sqrt(n) max |<a_i, phi_j>| / (|a_i| |phi_j|), n = object points: 1 (incoherent) to "
+        "sqrt(n) (Candes and Romberg 2007)"
+    ),
+    "coherence_effective": (
+        "mu(D) = max |<d_i, d_j>| / (|d_i| |d_j|) over pairs of different columns "
+        "of D = A Phi: 0 to 1"
+    ),
     "coherence_effective_mean": "mean of the same over all pairs",
-    "welch_bound": "sqrt((L - M) / (M (L - 1))) for L atoms and M pixels: the least mu(D) can be; 0 when L <= M",
-    "exact_recovery_sparsity": "largest k < (1 + 1/mu(D)) / 2: any k atoms are recovered exactly without noise (Donoho and Elad 2003)",
+    "welch_bound": (
+        "sqrt((L - M) / (M (L - 1))) for L atoms and M pixels: the least mu(D) "
+        "can be; 0 when L <= M"
+    ),
+    "exact_recovery_sparsity": (
+        "largest k < (1 + 1/mu(D)) / 2: any k atoms are recovered exactly without noise "
+        "(Donoho and Elad 2003)"
+    ),
     "dead_atoms": "atoms of zero norm",
-    "invisible_atoms": "atoms with |A phi| < 1e-6 of the largest: the sensor cannot tell them from nothing; left out of mu(D)",
+    "invisible_atoms": (
+        "atoms with |A phi| < 1e-6 of the largest: the sensor cannot tell them from "
+        "nothing; left out of mu(D)"
+    ),
 }
 
 
 def coherence(system, atoms, block=512):
-    """Measures of DEFINITIONS for A `system` (pixel, point) and Phi `atoms` (point, atom): dict of numbers.
+    """Measures of DEFINITIONS for A `system` (pixel, point) and Phi `atoms` (point,
+    atom): dict of numbers.
 
-    Beside the inputs and D (pixel, atom) only blocks of `block` columns of products are held. Computed in the precision of
-    the inputs. Measures that need two visible atoms are None without them.
+    Beside the inputs and D (pixel, atom) only blocks of `block` columns of products are held.
+    Computed in the precision of the inputs. Measures that need two visible atoms are
+    None without them.
     """
     system, atoms = np.asarray(system), np.asarray(atoms)
     pixels, points = system.shape
@@ -65,7 +84,9 @@ def coherence(system, atoms, block=512):
 
 
 def welch_bound(atoms, pixels):
-    """Least possible mutual coherence of `atoms` unit vectors in `pixels` dimensions (Welch 1974)."""
+    """Least possible mutual coherence of `atoms` unit vectors in `pixels`
+    dimensions (Welch 1974).
+    """
     return math.sqrt((atoms - pixels) / (pixels * (atoms - 1))) if atoms > pixels else 0.0
 
 

@@ -6,8 +6,9 @@ import numpy as np
 def front(values, signs):
     """Whether each row of `values` (point, figure) is beaten by none, (point,) bool.
 
-    signs: (figure,) +1 where more is better, -1 where less is. A point is beaten by one that is at least as good in every figure
-    and better in one; equals beat none of each other. Points with NaN are not on the front, and beat nobody.
+    signs: (figure,) +1 where more is better, -1 where less is. A point is beaten by one that is at
+        least as good in every figure and better in one; equals beat none of each other. Points with
+        NaN are not on the front, and beat nobody.
     """
     merit = np.asarray(values, dtype=np.float64) * np.asarray(signs, dtype=np.float64)
     if merit.ndim != 2 or merit.shape[1] == 0:

@@ -1,19 +1,31 @@
-"""Three signal-to-noise ratios, kept apart by name because they differ by many decibels. All in dB (docs/model.md, "Measures")."""
+"""Three signal-to-noise ratios, kept apart by name because they differ by many decibels.
+
+All in dB (docs/model.md, "Measures").
+"""
 
 import numpy as np
 
 DEFINITIONS = {
-    "snr_capture_db": "20 log10(mean / standard deviation) of the estimate over a uniform white target, band by band: over "
-    "repeated frames where there are several (temporal), else over the lenslets of one frame (spatial, so that "
-    "what flat-fielding leaves counts as noise)",
-    "snr_predicted_db": "20 log10(estimate / predicted standard deviation), band by band: what the noise model promises "
-    "before any repetition, taken at the root mean square of the prediction; the noise of calibration and white reference counts, "
-    "which frames over time share: it may lie some dB below their capture SNR",
+    "snr_capture_db": (
+        "20 log10(mean / standard deviation) of the estimate over a uniform white target, band by "
+        "band: over repeated frames where there are several (temporal), else over the lenslets of "
+        "one frame (spatial, so that what flat-fielding leaves counts as noise)"
+    ),
+    "snr_predicted_db": (
+        "20 log10(estimate / predicted standard deviation), band by band: what the noise model "
+        "promises before any repetition, taken at the root mean square of the prediction; the "
+        "noise of calibration and white reference counts, which frames over time share: it may lie "
+        "some dB below their capture SNR"
+    ),
     "snr_capture_mean_db": "mean of snr_capture_db over the bands",
     "snr_predicted_mean_db": "mean of snr_predicted_db over the bands",
-    "snr_over_single_pixel_db": "snr_capture_mean_db less that of the result of single pixel extraction",
-    "snr_sensor_db": "10 log10(mean(y^2) / sigma^2) of the capture: the noise level of a simulation (60 dB in Berkner et al. "
-    "2013); the mean square of y, not its variance, is the signal",
+    "snr_over_single_pixel_db": (
+        "snr_capture_mean_db less that of the result of single pixel extraction"
+    ),
+    "snr_sensor_db": (
+        "10 log10(mean(y^2) / sigma^2) of the capture: the noise level of a simulation (60 dB in "
+        "Berkner et al. 2013); the mean square of y, not its variance, is the signal"
+    ),
 }
 
 
@@ -23,11 +35,13 @@ def _decibel(ratio):
 
 
 def snr_capture(frames):
-    """Capture SNR (band,) of estimates of one uniform white target, frames (frame, band, lenslet...).
+    """Capture SNR (band,) of estimates of one uniform white target, frames (frame,
+    band, lenslet...).
 
-    Two or more frames: standard deviation over time at each lenslet, with which frame-to-frame change of the mean level
-    counts as noise; for two frames it equals std(f1 - f2)/sqrt 2 at equal means. One frame: over its lenslets.
-    Lenslets with NaN are left out. NaN where fewer than two samples are left; infinite without noise.
+    Two or more frames: standard deviation over time at each lenslet, with which frame-to-frame
+    change of the mean level counts as noise; for two frames it equals std(f1 - f2)/sqrt 2 at equal
+    means. One frame: over its lenslets. Lenslets with NaN are left out. NaN where fewer than two
+    samples are left; infinite without noise.
     """
     frames = np.asarray(frames, dtype=np.float64)
     frames = frames.reshape(*frames.shape[:2], -1)
@@ -36,13 +50,19 @@ def snr_capture(frames):
     if lenslets == 0 or (count == 1 and lenslets == 1):
         return np.full(bands, np.nan)
     mean = frames.mean(axis=(0, 2))
-    variance = frames.var(axis=0, ddof=1).mean(axis=1) if count > 1 else frames[0].var(axis=1, ddof=1)
+    variance = (
+        frames.var(axis=0, ddof=1).mean(axis=1) if count > 1 else frames[0].var(axis=1, ddof=1)
+    )
     return _ratio(mean, np.sqrt(variance))
 
 
 def snr_predicted(value, sigma):
-    """Predicted SNR (band,) of estimates `value` (band, lenslet...) with predicted standard deviations `sigma`."""
-    value, sigma = (np.asarray(v, dtype=np.float64).reshape(np.shape(v)[0], -1) for v in (value, sigma))
+    """Predicted SNR (band,) of estimates `value` (band, lenslet...) with predicted standard
+    deviations `sigma`.
+    """
+    value, sigma = (
+        np.asarray(v, dtype=np.float64).reshape(np.shape(v)[0], -1) for v in (value, sigma)
+    )
     valid = np.isfinite(value).all(0) & np.isfinite(sigma).all(0)
     if not valid.any():
         return np.full(len(value), np.nan)
@@ -50,9 +70,11 @@ def snr_predicted(value, sigma):
 
 
 def snr_sensor(signal, sigma, noisy=False):
-    """Sensor-model SNR of a capture `signal` (any shape) with white noise of standard deviation `sigma`: 10 log10(mean(y^2)/sigma^2).
+    """Sensor-model SNR of a capture `signal` (any shape) with white noise of standard deviation
+    `sigma`: 10 log10(mean(y^2)/sigma^2).
 
-    noisy: the signal carries the noise already, whose power is taken off; -inf where nothing is left.
+    noisy: the signal carries the noise already, whose power is taken off; -inf
+        where nothing is left.
     """
     power = np.mean(np.asarray(signal, dtype=np.float64) ** 2) - (sigma**2 if noisy else 0.0)
     return float(_ratio(np.sqrt(max(power, 0.0)), float(sigma)))
@@ -61,4 +83,6 @@ def snr_sensor(signal, sigma, noisy=False):
 def _ratio(mean, deviation):
     mean, deviation = np.maximum(mean, 0.0), np.asarray(deviation)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(deviation > 0, _decibel(mean / deviation), np.where(mean > 0, np.inf, np.nan))
+        return np.where(
+            deviation > 0, _decibel(mean / deviation), np.where(mean > 0, np.inf, np.nan)
+        )

@@ -1,7 +1,7 @@
 """Accuracy of spectra against their truth: error per band, spectral angle, colour difference.
 
-Spectra are (..., band); cubes are (band, row, column); labels (row, column) are 0 for "nothing" and 1.. for patches.
-See docs/model.md, "Measures".
+Spectra are (..., band); cubes are (band, row, column); labels (row, column) are 0 for "nothing" and
+1.. for patches. See docs/model.md, "Measures".
 """
 
 import numpy as np
@@ -11,32 +11,53 @@ from plenocli.forward.scene import colour
 DEFINITIONS = {
     "rmse_per_band": "square root of the mean squared error over all valid lenslets, band by band",
     "rmse": "mean of rmse_per_band over the bands",
-    "patch_rmse_per_band": "for each band the root mean square over the patches of (mean over a patch's lenslets - truth)",
-    "six_patch_rmse_per_band": "for each band the mean over the patches white, black, red, orange, green and blue of the RMSE "
-    "over a patch's lenslets (Berkner et al. 2013)",
+    "patch_rmse_per_band": (
+        "for each band the root mean square over the patches of (mean over a "
+        "patch's lenslets - truth)"
+    ),
+    "six_patch_rmse_per_band": (
+        "for each band the mean over the patches white, black, red, orange, green and blue of the "
+        "RMSE over a patch's lenslets (Berkner et al. 2013)"
+    ),
     "six_patch_rmse": "mean of six_patch_rmse_per_band over the bands",
-    "spectral_angle_deg": "mean angle between spectrum and truth as vectors, degrees; blind to brightness",
+    "spectral_angle_deg": (
+        "mean angle between spectrum and truth as vectors, degrees; blind to brightness"
+    ),
     "rmse_over_single_pixel": "rmse divided by that of the result of single pixel extraction",
-    "six_patch_rmse_over_single_pixel": "six_patch_rmse divided by that of the result of single pixel extraction",
-    "delta_e_over_single_pixel": "delta_e_2000 divided by that of the result of single pixel extraction",
-    "delta_e_2000": "mean CIEDE2000 colour difference under the light named, spectra taken as piecewise linear between bands",
+    "six_patch_rmse_over_single_pixel": (
+        "six_patch_rmse divided by that of the result of single pixel extraction"
+    ),
+    "delta_e_over_single_pixel": (
+        "delta_e_2000 divided by that of the result of single pixel extraction"
+    ),
+    "delta_e_2000": (
+        "mean CIEDE2000 colour difference under the light named, spectra taken as piecewise "
+        "linear between bands"
+    ),
 }
 
 
 def rmse_per_band(estimate, truth):
-    """Root mean squared error (band,) over all leading axes of two arrays of spectra (..., band)."""
+    """Root mean squared error (band,) over all leading axes of two arrays of
+    spectra (..., band).
+    """
     difference = np.asarray(estimate, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
     return np.sqrt(np.mean(difference**2, axis=tuple(range(difference.ndim - 1))))
 
 
 def spectral_angle(first, second):
-    """Angle (...) in radians between spectra (..., band); pi/2 between a zero spectrum and any other, 0 between two.
+    """Angle (...) in radians between spectra (..., band); pi/2 between a zero spectrum and any
+    other, 0 between two.
 
-    Computed as 2 atan2(|u - v|, |u + v|) of the unit vectors (Kahan), accurate for small angles too.
+    Computed as 2 atan2(|u - v|, |u + v|) of the unit vectors (Kahan), accurate
+    for small angles too.
     """
     first, second = (np.asarray(v, dtype=np.float64) for v in (first, second))
     norms = [np.linalg.norm(v, axis=-1, keepdims=True) for v in (first, second)]
-    u, v = (vector / np.where(norm > 0, norm, 1) for vector, norm in zip((first, second), norms, strict=True))
+    u, v = (
+        vector / np.where(norm > 0, norm, 1)
+        for vector, norm in zip((first, second), norms, strict=True)
+    )
     angle = 2 * np.arctan2(np.linalg.norm(u - v, axis=-1), np.linalg.norm(u + v, axis=-1))
     zero = [norm[..., 0] == 0 for norm in norms]
     return np.where(zero[0] & zero[1], 0.0, np.where(zero[0] | zero[1], np.pi / 2, angle))
@@ -45,11 +66,14 @@ def spectral_angle(first, second):
 def colour_difference(wavelengths, estimate, truth, light="D65"):
     """CIEDE2000 (...) between reflectances (..., band) at `wavelengths` (band,) m under `light`."""
     white = colour.white_point(light)
-    return colour.delta_e_2000(*(colour.lab(colour.xyz(wavelengths, v, light), white) for v in (estimate, truth)))
+    return colour.delta_e_2000(
+        *(colour.lab(colour.xyz(wavelengths, v, light), white) for v in (estimate, truth))
+    )
 
 
 def patch_statistics(cube, labels):
-    """What each patch shows: dict label -> {"mean": (band,), "std": (band,), "count": n}; lenslets with NaN are left out.
+    """What each patch shows: dict label -> {"mean": (band,), "std": (band,), "count": n}; lenslets
+    with NaN are left out.
 
     std: sample standard deviation over the patch's lenslets, 0 where there is only one.
     """
@@ -64,8 +88,13 @@ def patch_statistics(cube, labels):
 
 
 def score_cube(estimate, truth, wavelengths, light="D65"):
-    """Measures over all lenslets of two reflectance cubes (band, row, column); lenslets with NaN in either are left out."""
-    pair = [np.moveaxis(np.asarray(v, dtype=np.float64), 0, -1).reshape(-1, len(wavelengths)) for v in (estimate, truth)]
+    """Measures over all lenslets of two reflectance cubes (band, row, column); lenslets with NaN
+    in either are left out.
+    """
+    pair = [
+        np.moveaxis(np.asarray(v, dtype=np.float64), 0, -1).reshape(-1, len(wavelengths))
+        for v in (estimate, truth)
+    ]
     valid = np.isfinite(pair[0]).all(1) & np.isfinite(pair[1]).all(1)
     if not valid.any():
         return {"lenslets": 0}
@@ -81,9 +110,12 @@ def score_cube(estimate, truth, wavelengths, light="D65"):
 
 
 def score_patches(estimate, truth, labels, six):
-    """Errors over the patches of a label map, of two cubes (band, row, column); `six`: the six labels of the paper.
+    """Errors over the patches of a label map, of two cubes (band, row, column);
 
-    The truth may differ from lenslet to lenslet. Patches without a valid lenslet are left out and counted.
+    `six`: the six labels of the paper.
+
+    The truth may differ from lenslet to lenslet. Patches without a valid lenslet are
+    left out and counted.
     """
     estimate, truth = (np.asarray(v, dtype=np.float64) for v in (estimate, truth))
     valid = np.isfinite(estimate).all(0) & np.isfinite(truth).all(0)
@@ -95,7 +127,9 @@ def score_patches(estimate, truth, labels, six):
         within[int(label)] = np.sqrt(((e - t) ** 2).mean(1))
     scores = {"patches": len(of_mean)}
     if of_mean:
-        scores["patch_rmse_per_band"] = np.sqrt(np.mean(np.square(list(of_mean.values())), axis=0)).tolist()
+        scores["patch_rmse_per_band"] = np.sqrt(
+            np.mean(np.square(list(of_mean.values())), axis=0)
+        ).tolist()
     present = [within[label] for label in six if label in within]
     scores["six_patches_seen"] = len(present)
     if present:

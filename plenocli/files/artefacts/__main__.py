@@ -1,4 +1,6 @@
-"""`python -m plenocli.files.artefacts`: every dataset of every kind of artefact, as one Markdown page."""
+"""`python -m plenocli.files.artefacts`: every dataset of every kind of artefact, as
+one Markdown page.
+"""
 
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.schema import markdown

@@ -1,9 +1,10 @@
 """The one writer and the one verified reader of artefacts.
 
-A file is a 512-byte user block (magic, SHA-256 and length of the rest), then an ordinary HDF5 file that any viewer opens.
-HDF5 never touches the disk, because it may crash the process when one is full: its frame is built in memory, with room for
-the large datasets, and frame and values are written by us (`stream` writes them as they come).
-Reading goes the other way: all bytes once, digest, structure, declared sizes, and only then values, parsed from those bytes.
+A file is a 512-byte user block (magic, SHA-256 and length of the rest), then an ordinary HDF5 file
+that any viewer opens. HDF5 never touches the disk, because it may crash the process when one is
+full: its frame is built in memory, with room for the large datasets, and frame and values are
+written by us (`stream` writes them as they come). Reading goes the other way: all bytes once,
+digest, structure, declared sizes, and only then values, parsed from those bytes.
 """
 
 import errno
@@ -19,15 +20,15 @@ import h5py
 import numpy as np
 
 from plenocli import __version__
-from plenocli.files.artefacts import schema as tables
-from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.base.budget import default_mem_limit
-from plenocli.files.artefacts.provenance import Provenance, require_file
-from plenocli.files.atomic import replacement, reserve, write_at
-from plenocli.files.artefacts.sparse import SparseFile
-from plenocli.files.artefacts.structure import attribute_names, read_attribute, survey
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.memory import can_have, is_lack_of_memory, size_text
+from plenocli.files.artefacts import schema as tables
+from plenocli.files.artefacts.kinds import SCHEMAS
+from plenocli.files.artefacts.provenance import Provenance, require_file
+from plenocli.files.artefacts.sparse import SparseFile
+from plenocli.files.artefacts.structure import attribute_names, read_attribute, survey
+from plenocli.files.atomic import replacement, reserve, write_at
 
 MAGIC = b"plenocli artefact 1\n"
 HEADER_BYTES = 512
@@ -41,9 +42,11 @@ _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 @dataclass
 class Artefact:
-    """data: dataset path ("pif/A") -> array; attrs: group or dataset path -> name -> number, list, text, bool or JSON-able value.
+    """data: dataset path ("pif/A") -> array;
+    attrs: group or dataset path -> name -> number, list, text, bool or JSON-able value.
 
-    A colour filter array may be given as text ("mono", "RGGB"); it comes back as an array: see `cfa_text`.
+    A colour filter array may be given as text ("mono", "RGGB"); it comes back as an
+    array: see `cfa_text`.
     """
 
     kind: str
@@ -53,15 +56,21 @@ class Artefact:
 
 
 def cfa_text(value):
-    """"mono" or four letters from the dataset capture/cfa (0-d or 2x2 array of bytes or str, or already text)."""
+    """ "mono" or four letters from the dataset capture/cfa (0-d or 2x2 array of bytes or
+    str, or already text).
+    """
     values = np.asarray(value)
-    return "".join(v.decode("ascii") if isinstance(v, bytes) else str(v) for v in values.ravel().tolist())
+    return "".join(
+        v.decode("ascii") if isinstance(v, bytes) else str(v) for v in values.ravel().tolist()
+    )
 
 
 def write_artefact(path, artefact, *, overwrite=False):
-    """Check `artefact` against the table of its kind and put it at `path`, whole or not at all; same input, same bytes.
+    """Check `artefact` against the table of its kind and put it at `path`, whole or not at all;
+    same input, same bytes.
 
-    Raises ValueError listing every broken rule of the table (a bug of the caller), UsageError, OutputError.
+    Raises ValueError listing every broken rule of the table (a bug of the caller),
+    UsageError, OutputError.
     """
     frame = Frame(artefact)
     with replacement(path, overwrite=overwrite) as (_, descriptor):
@@ -74,30 +83,39 @@ def write_artefact(path, artefact, *, overwrite=False):
 def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
     """Read and verify the artefact at `path`.
 
-    kind: the kind due, or a tuple of kinds, or None for any. mem_limit: bytes, default half of the machine's memory. skip:
-    datasets that are not wanted; their bytes are verified, their values are not looked at.
-    Raises InputError for a file that is missing, not an artefact, damaged, too large, of another kind, or breaks its table.
+    kind: the kind due, or a tuple of kinds, or None for any.
+    mem_limit: bytes, default half of the machine's memory.
+    skip: datasets that are not wanted; their bytes are verified, their values are not looked at.
+    Raises InputError for a file that is missing, not an artefact, damaged, too large, of another
+    kind, or breaks its table.
     """
     path = Path(path)
     limit = default_mem_limit() if mem_limit is None else int(mem_limit)
     try:
-        with h5py.File(_open_image(_verified_bytes(path, limit)), "r") as file:  # which keeps a copy: ours goes
+        # which keeps a copy: ours goes
+        with h5py.File(_open_image(_verified_bytes(path, limit)), "r") as file:
             return _parse(path, file, kind, limit, skip)
     except (PlenoError, MemoryError):
         raise
     except Exception as error:  # h5py raises half a dozen types for a malformed file
         if is_lack_of_memory(error) and not can_have(READING * path.stat().st_size + (1 << 20)):
             raise MemoryError(str(error)) from error
-        raise InputError(f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again") from error
+        raise InputError(
+            f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again"
+        ) from error
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
+
 
 class Frame:
-    """The HDF5 file of an artefact without the values of its raw datasets (those that the table does not compress).
+    """The HDF5 file of an artefact without the values of its raw datasets (those that the table
+    does not compress).
 
-    raw: dataset path -> values to write; size: bytes of the HDF5 file. `streamed`: dataset path -> (shape, dtype) of raw datasets
-    that come by themselves. ValueError listing every broken rule of the table.
+    raw: dataset path -> values to write;
+    size: bytes of the HDF5 file.
+    `streamed`: dataset path -> (shape, dtype) of raw datasets that come by themselves.
+    ValueError listing every broken rule of the table.
     """
 
     def __init__(self, artefact, streamed=None):
@@ -105,8 +123,13 @@ class Frame:
         stored = _stored_attributes(schema, artefact, declared, attrs)
         apart = [path for path, (shape, dtype) in declared.items() if is_raw(schema, path, shape)]
         self.raw = {path: data.pop(path) for path in apart if path in data}
-        self._file, self._offsets = _frame(schema, data, {path: declared[path] for path in sorted(apart)}, stored)
-        self._taken = {path: (start, int(np.prod(declared[path][0])) * np.dtype(declared[path][1]).itemsize) for path, start in self._offsets.items()}
+        self._file, self._offsets = _frame(
+            schema, data, {path: declared[path] for path in sorted(apart)}, stored
+        )
+        self._taken = {
+            path: (start, int(np.prod(declared[path][0])) * np.dtype(declared[path][1]).itemsize)
+            for path, start in self._offsets.items()
+        }
         self.size = self._file.size
 
     def offset(self, name):
@@ -114,11 +137,13 @@ class Frame:
         return HEADER_BYTES + self._offsets[name]
 
     def write(self, descriptor):
-        """Put the frame into an open file, around the values of the raw datasets, which may be there already."""
+        """Put the frame into an open file, around the values of the raw datasets, which
+        may be there already.
+        """
         reserve(descriptor, HEADER_BYTES + self.size)
         for offset, content in self._file.extents():
             for first, last in self._around(offset, offset + len(content)):
-                write_at(descriptor, HEADER_BYTES + first, content[first - offset:last - offset])
+                write_at(descriptor, HEADER_BYTES + first, content[first - offset : last - offset])
 
     def _around(self, first, last):
         """The parts of a range that no raw dataset takes."""
@@ -136,15 +161,17 @@ def build_image(artefact):
     frame = Frame(artefact)
     image = bytearray(frame.size)
     for offset, content in frame._file.extents():
-        image[offset:offset + len(content)] = content
+        image[offset : offset + len(content)] = content
     for name, values in frame.raw.items():
         start = frame.offset(name) - HEADER_BYTES
-        image[start:start + values.nbytes] = values.tobytes()
+        image[start : start + values.nbytes] = values.tobytes()
     return bytes(image)
 
 
 def is_raw(schema, path, shape):
-    """Whether a dataset is stored as one run of numbers: what the table does not compress, and is not empty."""
+    """Whether a dataset is stored as one run of numbers: what the table does not
+    compress, and is not empty.
+    """
     entry = schema.field_for(path)
     return entry is not None and not entry.compress and len(shape) > 0 and 0 not in shape
 
@@ -165,17 +192,34 @@ def seal(descriptor, size):
 
 
 def _checked(artefact, streamed):
-    """(schema, arrays, declared shapes, attributes) of an artefact; ValueError listing every broken rule of its table."""
+    """(schema, arrays, declared shapes, attributes) of an artefact; ValueError listing every
+    broken rule of its table.
+    """
     if artefact.kind not in SCHEMAS:
         raise ValueError(f"no artefact kind '{artefact.kind}' (kinds: {', '.join(SCHEMAS)})")
     schema = SCHEMAS[artefact.kind]
-    data = {path: _plain_array(path, value) for path, value in artefact.data.items() if value is not None}
-    attrs = {where: {n: v for n, v in named.items() if v is not None} for where, named in artefact.attrs.items()}
-    declared = {path: (values.shape, values.dtype) for path, values in data.items()} | dict(streamed)
+    data = {
+        path: _plain_array(path, value)
+        for path, value in artefact.data.items()
+        if value is not None
+    }
+    attrs = {
+        where: {n: v for n, v in named.items() if v is not None}
+        for where, named in artefact.attrs.items()
+    }
+    declared = {path: (values.shape, values.dtype) for path, values in data.items()} | dict(
+        streamed
+    )
     problems = tables.declared_problems(schema, declared) + tables.attribute_problems(schema, attrs)
     problems += tables.value_problems(schema, data)
-    groups = {path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)}
-    problems += [f"attributes for '{where}', which has no dataset" for where in attrs if attrs[where] and where not in groups | set(declared)]
+    groups = {
+        path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)
+    }
+    problems += [
+        f"attributes for '{where}', which has no dataset"
+        for where in attrs
+        if attrs[where] and where not in groups | set(declared)
+    ]
     if problems:
         raise ValueError(f"{artefact.kind} artefact breaks its table: " + "; ".join(problems))
     return schema, data, declared, attrs
@@ -196,13 +240,24 @@ def _stored_attributes(schema, artefact, declared, attrs):
     origin = artefact.provenance
     stored = {path: dict(named) for path, named in tables.plot_attributes(schema, declared).items()}
     stored[""] |= {
-        "plenocli_kind": schema.kind, "schema_version": schema.version, "plenocli_version": __version__,
-        "command": origin.command, "config": origin.config, "inputs": _json(origin.inputs),
-        "seed": "none" if origin.seed is None else str(int(origin.seed)), "accuracy": _json(origin.accuracy)}
+        "plenocli_kind": schema.kind,
+        "schema_version": schema.version,
+        "plenocli_version": __version__,
+        "command": origin.command,
+        "config": origin.config,
+        "inputs": _json(origin.inputs),
+        "seed": "none" if origin.seed is None else str(int(origin.seed)),
+        "accuracy": _json(origin.accuracy),
+    }
     for where, named in attrs.items():
         for name, value in named.items():
-            stored[where][name] = _json(value) if schema.attr_for(where, name).type == "json" else value
-    return {path: {name: _storable(value) for name, value in named.items()} for path, named in stored.items()}
+            stored[where][name] = (
+                _json(value) if schema.attr_for(where, name).type == "json" else value
+            )
+    return {
+        path: {name: _storable(value) for name, value in named.items()}
+        for path, named in stored.items()
+    }
 
 
 def _json(value):
@@ -219,8 +274,14 @@ def _storable(value):
 
 
 def _frame(schema, data, apart, stored):
-    """(SparseFile, raw dataset path -> offset in it). Raw datasets come first, so that their place depends on their sizes only."""
-    longest = max((len(v) for named in stored.values() for v in named.values() if isinstance(v, bytes)), default=0)
+    """(SparseFile, raw dataset path -> offset in it).
+
+    Raw datasets come first, so that their place depends on their sizes only.
+    """
+    longest = max(
+        (len(v) for named in stored.values() for v in named.values() if isinstance(v, bytes)),
+        default=0,
+    )
     layout = "v108" if apart or longest >= _LONG_TEXT else "earliest"
     memory, offsets = SparseFile(), {}
     with h5py.File(memory, "w", libver=(layout, "v110"), track_times=False) as file:
@@ -244,13 +305,20 @@ def _reserve_dataset(file, path, shape, dtype):
     options.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     options.set_obj_track_times(False)
     parent = file.require_group(group) if group else file
-    made = h5py.h5d.create(parent.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype), logical=True), h5py.h5s.create_simple(tuple(shape)), options)
+    made = h5py.h5d.create(
+        parent.id,
+        name.encode(),
+        h5py.h5t.py_create(np.dtype(dtype), logical=True),
+        h5py.h5s.create_simple(tuple(shape)),
+        options,
+    )
     return made.get_offset()
 
 
 def _put_attribute(target, name, value):
     if isinstance(value, bytes):
-        # h5py would store a null-terminated ASCII type; utf-8 of exactly this length keeps every character of a config
+        # h5py would store a null-terminated ASCII type; utf-8 of exactly this length keeps every
+        # character of a config
         kind = h5py.string_dtype("utf-8", max(len(value), 1))
         target.attrs.create(name, np.array(value, dtype=kind), dtype=kind)
     else:
@@ -265,66 +333,115 @@ def _storage(values):
     for size in reversed(values.shape):
         chunks.insert(0, max(min(size, budget), 1))
         budget //= chunks[0]
-    return {"chunks": tuple(chunks), "fletcher32": True, "track_times": False, "compression": "gzip", "compression_opts": 1, "shuffle": True}
+    return {
+        "chunks": tuple(chunks),
+        "fletcher32": True,
+        "track_times": False,
+        "compression": "gzip",
+        "compression_opts": 1,
+        "shuffle": True,
+    }
 
 
 READING = 3
-"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies of them while it opens, then the values."""
+"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies
+of them while it opens, then the values.
+"""
 
 
-# --- reading -----------------------------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------------
+
 
 def _verified_bytes(path, limit):
     """The HDF5 part of the file at `path`, read once, its digest and length verified."""
     size = require_file(path)
     if READING * size > limit:
-        raise InputError(f"is {size_text(size)}, and reading takes {READING} times that, above the memory limit of {size_text(limit)}", path, f"raise --mem-limit to {size_text(READING * size)}")
+        raise InputError(
+            (
+                f"is {size_text(size)}, and reading takes {READING} times that, above the memory "
+                f"limit of {size_text(limit)}"
+            ),
+            path,
+            f"raise --mem-limit to {size_text(READING * size)}",
+        )
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+        raise InputError(
+            f"cannot be read ({error.strerror})", path, "check the file and its permissions"
+        ) from error
     if not content.startswith(MAGIC):
         if content.startswith(HDF5_SIGNATURE) or HDF5_SIGNATURE in content[:4096]:
-            raise InputError("is an HDF5 file, but not one that plenocli wrote (no digest block)", path,
-                             "give the result of a plenocli stage")
+            raise InputError(
+                "is an HDF5 file, but not one that plenocli wrote (no digest block)",
+                path,
+                "give the result of a plenocli stage",
+            )
         raise InputError("is not a plenocli artefact", path, "give the result of a plenocli stage")
     header = _HEADER.fullmatch(content[:HEADER_BYTES])
     if header is None or len(content) < HEADER_BYTES:
         raise InputError("has a damaged digest block", path, "make it again")
     image = memoryview(content)[HEADER_BYTES:]
     if len(image) != int(header[2]):
-        raise InputError(f"is truncated or has grown: {len(image)} bytes where {int(header[2])} were written", path, "make it again")
+        raise InputError(
+            f"is truncated or has grown: {len(image)} bytes where {int(header[2])} were written",
+            path,
+            "make it again",
+        )
     if hashlib.sha256(image).hexdigest() != header[1].decode():
-        raise InputError("is damaged: its SHA-256 is not the one it was written with", path, "make it again")
+        raise InputError(
+            "is damaged: its SHA-256 is not the one it was written with", path, "make it again"
+        )
     return image
 
 
 def _open_image(image):
-    """Open the bytes of an HDF5 file; the block size saves the reallocations that the default causes."""
+    """Open the bytes of an HDF5 file; the block size saves the reallocations that
+    the default causes.
+    """
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fapl_core(max(len(image), 1), False)
     access.set_file_image(image)
-    # HDF5 takes two images of one name, open at once in two threads, for one file and answers with the first
+    # HDF5 takes two images of one name, open at once in two threads, for one file and
+    # answers with the first
     return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
 def _parse(path, file, kind, limit, skip):
     declared = survey(path, file, limit)
-    root = {name: read_attribute(path, file, name) for name in tables.ROOT_ATTRIBUTES if name in attribute_names(file)}
+    root = {
+        name: read_attribute(path, file, name)
+        for name in tables.ROOT_ATTRIBUTES
+        if name in attribute_names(file)
+    }
     missing = [name for name in tables.ROOT_ATTRIBUTES if name not in root]
     if missing:
-        raise InputError(f"root attributes are missing: {', '.join(missing)}", path, "make it again")
+        raise InputError(
+            f"root attributes are missing: {', '.join(missing)}", path, "make it again"
+        )
     schema = _schema_of(path, root, kind)
     problems = tables.declared_problems(schema, declared)
     attrs = _read_attributes(path, file, schema, declared, problems)
     if not problems:
         data = {name: file[name][()] for name in declared if name not in skip}
-        data = {name: values if isinstance(values, np.ndarray) else np.asarray(values) for name, values in data.items()}
+        data = {
+            name: values if isinstance(values, np.ndarray) else np.asarray(values)
+            for name, values in data.items()
+        }
         problems = tables.value_problems(schema, data)
     if problems:
-        raise InputError("breaks the table of its kind: " + "; ".join(problems), path, f"make it again ({root['command']})")
-    provenance = Provenance(root["command"], json.loads(root["inputs"]), None if root["seed"] == "none" else int(root["seed"]),
-                            root["config"], json.loads(root["accuracy"]))
+        raise InputError(
+            "breaks the table of its kind: " + "; ".join(problems),
+            path,
+            f"make it again ({root['command']})",
+        )
+    provenance = Provenance(
+        root["command"],
+        json.loads(root["inputs"]),
+        None if root["seed"] == "none" else int(root["seed"]),
+        root["config"],
+        json.loads(root["accuracy"]),
+    )
     return Artefact(schema.kind, data, attrs, provenance)
 
 
@@ -332,18 +449,30 @@ def _schema_of(path, root, kind):
     found, version = root["plenocli_kind"], root["schema_version"]
     wanted = (kind,) if isinstance(kind, str) else kind
     if found not in SCHEMAS:
-        raise InputError(f"is of the unknown kind '{found}'", path, f"known kinds: {', '.join(SCHEMAS)}")
+        raise InputError(
+            f"is of the unknown kind '{found}'", path, f"known kinds: {', '.join(SCHEMAS)}"
+        )
     if wanted is not None and found not in wanted:
-        raise InputError(f"is an artefact of kind '{found}' where '{' or '.join(wanted)}' is due", path, "swap or rename the inputs")
+        raise InputError(
+            f"is an artefact of kind '{found}' where '{' or '.join(wanted)}' is due",
+            path,
+            "swap or rename the inputs",
+        )
     if version != SCHEMAS[found].version:
         older = isinstance(version, (int, float)) and version < SCHEMAS[found].version
         fix = f"make it again ({root['command']})" if older else "update plenocli"
-        raise InputError(f"has version {version} of kind '{found}', this program reads {SCHEMAS[found].version}", path, fix)
+        raise InputError(
+            f"has version {version} of kind '{found}', this program reads {SCHEMAS[found].version}",
+            path,
+            fix,
+        )
     return SCHEMAS[found]
 
 
 def _read_attributes(path, file, schema, declared, problems):
-    """Attributes of the table found in the file; unknown ones are added to `problems`, plotting attributes are left out."""
+    """Attributes of the table found in the file; unknown ones are added to `problems`, plotting
+    attributes are left out.
+    """
     generated = tables.plot_attributes(schema, declared)
     attrs = {}
     for where in generated:

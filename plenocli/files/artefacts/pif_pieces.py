@@ -1,26 +1,34 @@
-"""How a system matrix reaches its file: held whole, written superpixel by superpixel, or split into shards."""
+"""How a system matrix reaches its file: held whole, written superpixel by superpixel, or
+split into shards.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.files.artefacts.container import READING
 from plenocli.base.memory import require_memory
+from plenocli.files.artefacts.container import READING
 
 WHOLE_BYTES = 1 << 27
-"""A matrix up to this size is held in memory while it is computed; larger ones go to the disk in pieces."""
+"""A matrix up to this size is held in memory while it is computed; larger ones go to
+the disk in pieces.
+"""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """streamed: written in pieces; groups: the superpixels of each shard, or None for one file."""
+    """streamed: written in pieces;
+    groups: the superpixels of each shard, or None for one file.
+    """
 
     streamed: bool
     groups: tuple | None = None
 
 
 def cost(plan, mem_limit):
-    """(whether it is written in pieces, bytes of memory) of a PifPlan's matrix under a memory limit."""
+    """(whether it is written in pieces, bytes of memory) of a PifPlan's matrix
+    under a memory limit.
+    """
     bands, superpixels = plan.shape[:2]
     slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
     streamed = plan.bytes > min(WHOLE_BYTES, mem_limit // 4)
@@ -28,19 +36,29 @@ def cost(plan, mem_limit):
 
 
 def layout(plan, mem_limit, where):
-    """The Layout of a PifPlan's matrix under a memory limit (bytes). NumericsError where not even one superpixel's part fits.
+    """The Layout of a PifPlan's matrix under a memory limit (bytes).
 
-    Held whole up to WHOLE_BYTES and a quarter of the limit; one file where another stage can read it under
-    the same limit; else shards of an eighth of it.
+    NumericsError where not even one superpixel's part fits.
+
+    Held whole up to WHOLE_BYTES and a quarter of the limit; one file where another stage can read
+    it under the same limit; else shards of an eighth of it.
     """
     bands, superpixels = plan.shape[:2]
     slab = plan.bytes // (bands * superpixels)
     streamed, needed = cost(plan, mem_limit)
-    require_memory(needed, mem_limit, "the matrix", where, "take fewer superpixels, points or wavelengths")
+    require_memory(
+        needed, mem_limit, "the matrix", where, "take fewer superpixels, points or wavelengths"
+    )
     if READING * plan.bytes <= mem_limit or superpixels == 1:
         return Layout(streamed)
     size = max(1, mem_limit // 8 // (bands * slab))
-    return Layout(True, tuple(tuple(range(start, min(start + size, superpixels))) for start in range(0, superpixels, size)))
+    return Layout(
+        True,
+        tuple(
+            tuple(range(start, min(start + size, superpixels)))
+            for start in range(0, superpixels, size)
+        ),
+    )
 
 
 def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progress=None, workers=1):
@@ -53,9 +71,19 @@ def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progres
     from plenocli.forward.propagation.system_matrix import Pif, described, pif_pieces
 
     diagnosis, tails, last = None, {}, None
-    with writing_pif(output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite) as writer:
-        for builder, band, superpixel, slab in pif_pieces(camera, plan, progress=progress, workers=workers):
-            diagnosis = diagnosis or Diagnosis(len(plan.bands), builder.offsets, builder.pixel_shape, builder.object_shape, builder.symmetry)
+    with writing_pif(
+        output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite
+    ) as writer:
+        for builder, band, superpixel, slab in pif_pieces(
+            camera, plan, progress=progress, workers=workers
+        ):
+            diagnosis = diagnosis or Diagnosis(
+                len(plan.bands),
+                builder.offsets,
+                builder.pixel_shape,
+                builder.object_shape,
+                builder.symmetry,
+            )
             diagnosis.add(band, superpixel, slab)
             writer.put(band, superpixel, slab)
             tails[band], last = builder.notes["field_tail"], builder

@@ -1,4 +1,7 @@
-"""Where a result came from: the command, its inputs by name and digest, the seed. No clock, host, folder or user."""
+"""Where a result came from: the command, its inputs by name and digest, the seed.
+
+No clock, host, folder or user.
+"""
 
 import hashlib
 import json
@@ -11,7 +14,10 @@ from plenocli.base.errors import InputError
 
 @dataclass
 class Provenance:
-    """`inputs`: role -> {"name": file name without folder, "sha256": hex}; `config`: resolved TOML text; `accuracy`: JSON-able dict."""
+    """`inputs`: role -> {"name": file name without folder, "sha256": hex};
+    `config`: resolved TOML text;
+    `accuracy`: JSON-able dict.
+    """
 
     command: str
     inputs: dict = field(default_factory=dict)
@@ -23,7 +29,8 @@ class Provenance:
 def describe_inputs(roles):
     """Name and SHA-256 of each input file, for Provenance.inputs.
 
-    roles: role -> path, or role -> sequence of paths (they become "role 1", "role 2", ...); a None path is left out.
+    roles: role -> path, or role -> sequence of paths (they become "role 1", "role 2", ...); a
+        None path is left out.
     Raises InputError for a file that cannot be read.
     """
     described = {}
@@ -32,7 +39,10 @@ def describe_inputs(roles):
             continue
         several = not isinstance(paths, (str, os.PathLike))
         for number, path in enumerate(paths if several else [paths], start=1):
-            described[f"{role} {number}" if several else role] = {"name": Path(path).name, "sha256": file_digest(path)}
+            described[f"{role} {number}" if several else role] = {
+                "name": Path(path).name,
+                "sha256": file_digest(path),
+            }
     return described
 
 
@@ -41,14 +51,27 @@ _TEXT = "plenocli:{}"
 
 def provenance_texts(provenance):
     """The Provenance as text attributes of an EXR, name -> text; what is empty is left out."""
-    texts = {"command": provenance.command, "config": provenance.config, "seed": "" if provenance.seed is None else str(provenance.seed)}
-    texts |= {name: json.dumps(value, sort_keys=True) for name, value in (("inputs", provenance.inputs), ("accuracy", provenance.accuracy)) if value}
+    texts = {
+        "command": provenance.command,
+        "config": provenance.config,
+        "seed": "" if provenance.seed is None else str(provenance.seed),
+    }
+    texts |= {
+        name: json.dumps(value, sort_keys=True)
+        for name, value in (("inputs", provenance.inputs), ("accuracy", provenance.accuracy))
+        if value
+    }
     return {_TEXT.format(name): text for name, text in texts.items() if text}
 
 
 def read_provenance_texts(attrs):
-    """The Provenance that `provenance_texts` put into the text attributes of an EXR; empty where they lack it or it is broken."""
-    found = {name: attrs.get(_TEXT.format(name), "") for name in ("command", "config", "seed", "inputs", "accuracy")}
+    """The Provenance that `provenance_texts` put into the text attributes of an EXR; empty where
+    they lack it or it is broken.
+    """
+    found = {
+        name: attrs.get(_TEXT.format(name), "")
+        for name in ("command", "config", "seed", "inputs", "accuracy")
+    }
     try:
         inputs, accuracy = (json.loads(found[name] or "{}") for name in ("inputs", "accuracy"))
         seed = int(found["seed"]) if found["seed"] else None
@@ -65,7 +88,9 @@ def file_digest(path):
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+        raise InputError(
+            f"cannot be read ({error.strerror})", path, "check the file and its permissions"
+        ) from error
 
 
 def first_bytes(path, count):
@@ -75,22 +100,31 @@ def first_bytes(path, count):
         with open(path, "rb") as stream:
             return stream.read(count)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "check the file and its permissions") from error
+        raise InputError(
+            f"cannot be read ({error.strerror})", path, "check the file and its permissions"
+        ) from error
 
 
 def require_file(path):
-    """Raise InputError, saying which, unless `path` is an existing, non-empty, ordinary file. Returns its size in bytes."""
+    """Raise InputError, saying which, unless `path` is an existing, non-empty, ordinary file.
+
+    Returns its size in bytes.
+    """
     path = Path(path)
     try:
         if path.is_dir():
             raise InputError("is a folder, not a file", path, "name a file in it")
         if not path.exists():
-            raise InputError("does not exist", path, "check the name, or run the stage that makes it")
+            raise InputError(
+                "does not exist", path, "check the name, or run the stage that makes it"
+            )
         if not path.is_file():
             raise InputError("is not an ordinary file", path, "copy it to a file first")
         size = path.stat().st_size
     except OSError as error:
-        raise InputError(f"cannot be reached ({error.strerror})", path, "check the name and the permissions") from error
+        raise InputError(
+            f"cannot be reached ({error.strerror})", path, "check the name and the permissions"
+        ) from error
     if size == 0:
         raise InputError("is empty (0 bytes)", path, "make or copy it again")
     return size

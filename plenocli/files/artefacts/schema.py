@@ -1,5 +1,6 @@
-"""What a schema is: a table of datasets and attributes from which the writer's checks, the reader's checks, the plotting
-attributes, `plenocli inspect` and the documentation all come. The tables themselves stand in `kinds`.
+"""What a schema is: a table of datasets and attributes from which the writer's checks, the reader's
+checks, the plotting attributes, `plenocli inspect` and the documentation all come. The tables
+themselves stand in `kinds`.
 
 `python -m plenocli.files.artefacts` prints them as a Markdown page.
 """
@@ -24,9 +25,11 @@ ROOT_ATTRIBUTES = {
 
 @dataclass(frozen=True)
 class Field:
-    """One dataset. `dims` names the axes ("band row column"; a number is a fixed length; alternatives are separated by "|";
-    None takes any shape), `dtype` lists what it may hold: f (f4 or f8), i (integers), b (true/false), S (short ASCII text).
-    A path that ends in /* stands for any number of datasets below that group."""
+    """One dataset. `dims` names the axes ("band row column"; a number is a fixed length;
+    alternatives are separated by "|"; None takes any shape), `dtype` lists what it may hold: f (f4
+    or f8), i (integers), b (true/false), S (short ASCII text). A path that ends in /* stands for
+    any number of datasets below that group.
+    """
 
     path: str
     dims: str | None
@@ -46,7 +49,10 @@ class Field:
 
 @dataclass(frozen=True)
 class Attr:
-    """One attribute of a group or dataset. `type`: number (one, or a short list), text, json or flag."""
+    """One attribute of a group or dataset.
+
+    `type`: number (one, or a short list), text, json or flag.
+    """
 
     name: str
     type: str
@@ -57,8 +63,11 @@ class Attr:
 
 @dataclass(frozen=True)
 class Schema:
-    """All that an artefact of one kind may hold. `attrs` maps a group or dataset path to its Attrs (all may be left out);
-    `plots` maps a group to (signal dataset, names of its companions); `default` lists the groups to draw first."""
+    """All that an artefact of one kind may hold.
+
+    `attrs` maps a group or dataset path to its Attrs (all may be left out); `plots` maps a group to
+    (signal dataset, names of its companions); `default` lists the groups to draw first.
+    """
 
     kind: str
     version: int
@@ -71,7 +80,9 @@ class Schema:
     def field_for(self, path):
         """The Field that describes dataset `path`, or None."""
         for entry in self.fields:
-            if entry.path == path or (entry.path.endswith("/*") and path.startswith(entry.path[:-1])):
+            if entry.path == path or (
+                entry.path.endswith("/*") and path.startswith(entry.path[:-1])
+            ):
                 return entry
         return None
 
@@ -95,7 +106,9 @@ def _dtype_fits(dtype, spec):
 
 
 def _shape_problem(entry, shape, lengths):
-    """Why `shape` does not fit the axes of `entry`, or None; `lengths` collects the length of each named axis."""
+    """Why `shape` does not fit the axes of `entry`, or None; `lengths` collects the length
+    of each named axis.
+    """
     alternatives = entry.alternatives()
     if alternatives is None:
         return None
@@ -116,7 +129,9 @@ def _shape_problem(entry, shape, lengths):
 
 
 def declared_problems(schema, declared):
-    """Every way in which `declared` (path -> (shape, dtype)) breaks the table, as a list of sentences."""
+    """Every way in which `declared` (path -> (shape, dtype)) breaks the table, as a
+    list of sentences.
+    """
     problems, lengths = [], {}
     for entry in schema.fields:
         if not entry.path.endswith("/*") and not entry.optional and entry.path not in declared:
@@ -127,7 +142,9 @@ def declared_problems(schema, declared):
         shape, dtype = declared[path]
         entry = schema.field_for(path)
         if entry is None:
-            problems.append(f"dataset '{path}' is unknown in kind '{schema.kind}' (known: {_known(schema)})")
+            problems.append(
+                f"dataset '{path}' is unknown in kind '{schema.kind}' (known: {_known(schema)})"
+            )
             continue
         if not _dtype_fits(dtype, entry.dtype):
             problems.append(f"dataset '{path}' holds {dtype} where {entry.dtype} is due")
@@ -142,14 +159,17 @@ def _known(schema):
 
 
 def value_problems(schema, data):
-    """Every way in which the values of `data` (path -> array) break the table: NaN, infinities, below minimum, order."""
+    """Every way in which the values of `data` (path -> array) break the table: NaN, infinities,
+    below minimum, order.
+    """
     problems = []
     for path, values in data.items():
         entry = schema.field_for(path)
         if entry is None or values.size == 0 or values.dtype.kind not in "fiu":
             continue
         with np.errstate(invalid="ignore"):
-            low, high = values.min(), values.max()  # NaN and infinities show in the extremes: no array-sized copy needed
+            # NaN and infinities show in the extremes: no array-sized copy needed
+            low, high = values.min(), values.max()
             if values.dtype.kind == "f" and not (np.isfinite(low) and np.isfinite(high)):
                 if np.isinf(values).any():
                     problems.append(f"dataset '{path}' holds infinities")
@@ -171,9 +191,14 @@ def attribute_problems(schema, attrs):
             attr = schema.attr_for(where, name)
             if attr is None:
                 known = ", ".join(a.name for a in schema.attrs.get(where, ())) or "none"
-                problems.append(f"attribute '{name}' of '{where}' is unknown in kind '{schema.kind}' (known: {known})")
+                problems.append(
+                    f"attribute '{name}' of '{where}' is unknown in kind "
+                    f"'{schema.kind}' (known: {known})"
+                )
             elif not _attribute_fits(attr, value):
-                problems.append(f"attribute '{name}' of '{where}' is {value!r:.80} where a {attr.type} is due")
+                problems.append(
+                    f"attribute '{name}' of '{where}' is {value!r:.80} where a {attr.type} is due"
+                )
     return problems
 
 
@@ -195,19 +220,25 @@ def _attribute_fits(attr, value):
 
 
 def plot_attributes(schema, declared):
-    """NXdata attributes for a file that holds `declared` (path -> (shape, dtype)): path -> name -> text, list or int.
+    """NXdata attributes for a file that holds `declared` (path -> (shape, dtype)): path -> name ->
+    text, list or int.
 
-    Groups get NX_class, signal, axes and <axis>_indices; datasets get units and long_name; the root gets `default`
-    (NeXus NXdata; silx, h5web and HDFView draw such a group at once).
+    Groups get NX_class, signal, axes and <axis>_indices; datasets get units and long_name; the root
+    gets `default` (NeXus NXdata; silx, h5web and HDFView draw such a group at once).
     """
     found = {"": {"NX_class": "NXroot"}}
-    for group in sorted({path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)}):
+    for group in sorted(
+        {path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)}
+    ):
         found[group] = {"NX_class": "NXcollection"}
     for group, (signal, companions) in schema.plots.items():
         if f"{group}/{signal}" not in declared:
             continue
         found[group] = _plot_group(schema, group, signal, companions, declared)
-    default = next((group for group in schema.default if found.get(group, {}).get("NX_class") == "NXdata"), None)
+    default = next(
+        (group for group in schema.default if found.get(group, {}).get("NX_class") == "NXdata"),
+        None,
+    )
     if default is not None:
         found[""]["default"] = default
     for path in declared:
@@ -218,17 +249,26 @@ def plot_attributes(schema, declared):
 
 
 def _plot_group(schema, group, signal, companions, declared):
-    """NXdata attributes of one group: axes are the datasets of the group whose single dimension names an axis of the signal."""
+    """NXdata attributes of one group: axes are the datasets of the group whose single dimension
+    names an axis of the signal.
+    """
     path = f"{group}/{signal}"
     shape = declared[path][0]
     entry = schema.field_for(path)
-    dims = next((d for d in entry.alternatives() or [] if len(d) == len(shape)), tuple("." for _ in shape))
-    scales = {e.dims: e.path.rsplit("/", 1)[1] for e in schema.fields
-              if e.ascending and e.path in declared and e.path.rsplit("/", 1)[0] == group}
+    dims = next(
+        (d for d in entry.alternatives() or [] if len(d) == len(shape)), tuple("." for _ in shape)
+    )
+    scales = {
+        e.dims: e.path.rsplit("/", 1)[1]
+        for e in schema.fields
+        if e.ascending and e.path in declared and e.path.rsplit("/", 1)[0] == group
+    }
     attrs = {"NX_class": "NXdata", "signal": signal}
     if shape:
         attrs["axes"] = [scales.get(dim, ".") for dim in dims]
-    attrs |= {f"{scales[dim]}_indices": position for position, dim in enumerate(dims) if dim in scales}
+    attrs |= {
+        f"{scales[dim]}_indices": position for position, dim in enumerate(dims) if dim in scales
+    }
     beside = [name for name in companions if f"{group}/{name}" in declared]
     if beside:
         attrs["auxiliary_signals"] = beside
@@ -242,18 +282,48 @@ def _long_name(path, entry):
 
 def markdown(schemas):
     """The tables of `schemas` (kind -> Schema) as one Markdown page."""
-    lines = ["# Artefacts", "", "Every result is one HDF5 file. Generated by `python -m plenocli.files.artefacts`.", "",
-             "Root attributes of every kind:", "", "| attribute | meaning |", "|---|---|"]
+    lines = [
+        "# Artefacts",
+        "",
+        "Every result is one HDF5 file. Generated by `python -m plenocli.files.artefacts`.",
+        "",
+        "Root attributes of every kind:",
+        "",
+        "| attribute | meaning |",
+        "|---|---|",
+    ]
     lines += [f"| `{name}` | {doc} |" for name, doc in ROOT_ATTRIBUTES.items()]
     for schema in schemas.values():
-        lines += ["", f"## {schema.kind} (version {schema.version})", "", schema.doc, "",
-                  "| dataset | axes | holds | unit | meaning |", "|---|---|---|---|---|"]
+        lines += [
+            "",
+            f"## {schema.kind} (version {schema.version})",
+            "",
+            schema.doc,
+            "",
+            "| dataset | axes | holds | unit | meaning |",
+            "|---|---|---|---|---|",
+        ]
         for e in schema.fields:
-            axes = "any" if e.dims is None else " or ".join(f"({', '.join(a)})" for a in e.alternatives())
-            notes = [n for n, on in (("optional", e.optional), ("NaN = not measured", e.maskable)) if on]
+            axes = (
+                "any"
+                if e.dims is None
+                else " or ".join(f"({', '.join(a)})" for a in e.alternatives())
+            )
+            notes = [
+                n for n, on in (("optional", e.optional), ("NaN = not measured", e.maskable)) if on
+            ]
             meaning = e.doc + (f" ({'; '.join(notes)})" if notes else "")
             lines.append(f"| `/{e.path}` | {axes} | {e.dtype} | {e.unit} | {meaning} |")
-        rows = [f"| `/{where}` | `{a.name}` | {a.type} | {a.unit} | {a.doc} |" for where, named in schema.attrs.items() for a in named]
+        rows = [
+            f"| `/{where}` | `{a.name}` | {a.type} | {a.unit} | {a.doc} |"
+            for where, named in schema.attrs.items()
+            for a in named
+        ]
         if rows:
-            lines += ["", "| on | attribute | type | unit | meaning |", "|---|---|---|---|---|", *rows]
+            lines += [
+                "",
+                "| on | attribute | type | unit | meaning |",
+                "|---|---|---|---|---|",
+                *rows,
+            ]
     return "\n".join(lines) + "\n"

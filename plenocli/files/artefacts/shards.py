@@ -1,4 +1,6 @@
-"""A system matrix in one file or in several: numbered artefacts of kind pif, each some superpixels, and an index of kind pif-index."""
+"""A system matrix in one file or in several: numbered artefacts of kind pif, each some
+superpixels, and an index of kind pif-index.
+"""
 
 import contextlib
 import re
@@ -6,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.files.atomic import check_output
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.base.budget import default_mem_limit
-from plenocli.files.artefacts.provenance import file_digest
-from plenocli.files.artefacts.stream import streamed_artefact
 from plenocli.base.errors import InputError
 from plenocli.base.memory import size_text
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.provenance import file_digest
+from plenocli.files.artefacts.stream import streamed_artefact
+from plenocli.files.atomic import check_output
 
 
 def shard_path(index, number):
@@ -24,17 +26,35 @@ def shard_path(index, number):
 class PifWriter:
     """A pif that is written superpixel by superpixel, into one file or into shards.
 
-    shape: (band, lenslet, pixel, point); groups: the lenslets of each shard, or None for one file. Use `writing_pif`.
+    shape: (band, lenslet, pixel, point);
+    groups: the lenslets of each shard, or None for one file. Use `writing_pif`.
     """
 
     def __init__(self, path, shape, dtype, groups, stack, overwrite):
         self.path, self._groups, self._overwrite = Path(path), groups, overwrite
-        self.files = [self.path] if groups is None else [shard_path(path, n) for n in range(len(groups))]
-        self._home = {lenslet: (n, i) for n, group in enumerate(groups or [range(shape[1])]) for i, lenslet in enumerate(group)}
+        self.files = (
+            [self.path] if groups is None else [shard_path(path, n) for n in range(len(groups))]
+        )
+        self._home = {
+            lenslet: (n, i)
+            for n, group in enumerate(groups or [range(shape[1])])
+            for i, lenslet in enumerate(group)
+        }
         self._streams = []
         for n, file in enumerate(self.files):
             count = shape[1] if groups is None else len(groups[n])
-            self._streams.append(stack.enter_context(streamed_artefact(file, "pif", "pif/A", (shape[0], count, *shape[2:]), dtype, overwrite=overwrite)))
+            self._streams.append(
+                stack.enter_context(
+                    streamed_artefact(
+                        file,
+                        "pif",
+                        "pif/A",
+                        (shape[0], count, *shape[2:]),
+                        dtype,
+                        overwrite=overwrite,
+                    )
+                )
+            )
         self._energy = np.zeros((len(self.files), shape[0], shape[3]))
 
     def put(self, band, lenslet, slab):
@@ -54,9 +74,20 @@ class PifWriter:
             self._streams[0].close(artefact)
             return
         for stream, group, energy in zip(self._streams, self._groups, self._energy):
-            part = {"pif/lenslet_offset": artefact.data["pif/lenslet_offset"][list(group)], "pif/column_energy": energy}
-            data = {name: values for name, values in artefact.data.items() if name != "pif/singular_values"} | part
-            attrs = {name: value for name, value in artefact.attrs["pif"].items() if name not in ("rank", "condition", "symmetry_defect")}
+            part = {
+                "pif/lenslet_offset": artefact.data["pif/lenslet_offset"][list(group)],
+                "pif/column_energy": energy,
+            }
+            data = {
+                name: values
+                for name, values in artefact.data.items()
+                if name != "pif/singular_values"
+            } | part
+            attrs = {
+                name: value
+                for name, value in artefact.attrs["pif"].items()
+                if name not in ("rank", "condition", "symmetry_defect")
+            }
             stream.close(Artefact("pif", data, {"pif": attrs}, artefact.provenance))
         self._index = artefact
 
@@ -67,13 +98,23 @@ class PifWriter:
         home = np.array([self._home[lenslet][0] for lenslet in sorted(self._home)], np.int32)
         shards = [{"name": file.name, "sha256": file_digest(file)} for file in self.files]
         artefact = self._index
-        write_artefact(self.path, Artefact("pif-index", artefact.data | {"pif/shard": home}, {"pif": artefact.attrs["pif"] | {"shards": shards}},
-                                           artefact.provenance), overwrite=self._overwrite)
+        write_artefact(
+            self.path,
+            Artefact(
+                "pif-index",
+                artefact.data | {"pif/shard": home},
+                {"pif": artefact.attrs["pif"] | {"shards": shards}},
+                artefact.provenance,
+            ),
+            overwrite=self._overwrite,
+        )
 
 
 @contextlib.contextmanager
 def writing_pif(path, shape, dtype, *, groups=None, overwrite=False):
-    """Yield a PifWriter; all files appear when the block ends well, the index last. After a failure no new file is left.
+    """Yield a PifWriter; all files appear when the block ends well, the index last.
+
+    After a failure no new file is left.
 
     Errors as write_artefact.
     """
@@ -93,7 +134,10 @@ def writing_pif(path, shape, dtype, *, groups=None, overwrite=False):
 
 
 def read_pif(path, mem_limit=None):
-    """The Artefact of kind pif at `path`; that of an index with its shards put together. Errors as read_artefact."""
+    """The Artefact of kind pif at `path`; that of an index with its shards put together.
+
+    Errors as read_artefact.
+    """
     artefact = read_artefact(path, ("pif", "pif-index"), mem_limit=mem_limit)
     if artefact.kind == "pif":
         return artefact
@@ -104,7 +148,11 @@ def read_pif(path, mem_limit=None):
             shape = (part.shape[0], len(artefact.data["pif/lenslet_offset"]), *part.shape[2:])
             size = int(np.prod(shape)) * part.itemsize
             if size > limit:
-                raise InputError(f"holds {size_text(size)} in all, above the memory limit of {size_text(limit)}", path, f"raise --mem-limit to {size_text(1.4 * size)}")
+                raise InputError(
+                    f"holds {size_text(size)} in all, above the memory limit of {size_text(limit)}",
+                    path,
+                    f"raise --mem-limit to {size_text(1.4 * size)}",
+                )
             A = np.empty(shape, part.dtype)
         A[:, lenslets] = part
     attrs = {name: value for name, value in artefact.attrs["pif"].items() if name != "shards"}
@@ -113,7 +161,8 @@ def read_pif(path, mem_limit=None):
 
 
 def pif_parts(path, artefact=None, mem_limit=None):
-    """The matrix of a pif or pif-index shard by shard: yields (lenslet numbers, A of these (band, lenslet, pixel, point)).
+    """The matrix of a pif or pif-index shard by shard: yields (lenslet numbers, A of these (band,
+    lenslet, pixel, point)).
 
     One shard is in memory at a time; each is verified against the index. Errors as read_artefact.
     """
@@ -124,14 +173,27 @@ def pif_parts(path, artefact=None, mem_limit=None):
         return
     home, offsets = artefact.data["pif/shard"], artefact.data["pif/lenslet_offset"]
     listed = artefact.attrs.get("pif", {}).get("shards")
-    if not isinstance(listed, list) or not all(isinstance(e, dict) and isinstance(e.get("name"), str) and re.fullmatch(r"[^/\0]{1,255}", e["name"]) for e in listed) or home.max() >= len(listed):
+    if (
+        not isinstance(listed, list)
+        or not all(
+            isinstance(e, dict)
+            and isinstance(e.get("name"), str)
+            and re.fullmatch(r"[^/\0]{1,255}", e["name"])
+            for e in listed
+        )
+        or home.max() >= len(listed)
+    ):
         raise InputError("does not name the files that hold its superpixels", path, "make it again")
     for number, entry in enumerate(listed):
         lenslets = np.flatnonzero(home == number)
         file = path.with_name(Path(entry["name"]).name)
         if file_digest(file) != entry.get("sha256"):
-            raise InputError(f"is not the file that {path.name} was written with", file, "make both again")
+            raise InputError(
+                f"is not the file that {path.name} was written with", file, "make both again"
+            )
         part = read_artefact(file, "pif", mem_limit=mem_limit)
         if not np.array_equal(part.data["pif/lenslet_offset"], offsets[lenslets]):
-            raise InputError(f"holds other superpixels than {path.name} says", file, "make both again")
+            raise InputError(
+                f"holds other superpixels than {path.name} says", file, "make both again"
+            )
         yield lenslets, part.data["pif/A"]

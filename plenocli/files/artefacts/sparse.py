@@ -1,4 +1,6 @@
-"""A file in memory that keeps only what was written: the frame of an HDF5 file whose large datasets go to the disk by themselves."""
+"""A file in memory that keeps only what was written: the frame of an HDF5 file whose large
+datasets go to the disk by themselves.
+"""
 
 import io
 import os
@@ -21,7 +23,9 @@ class SparseFile(io.RawIOBase):
         return self._place
 
     def seek(self, offset, whence=os.SEEK_SET):
-        self._place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
+        self._place = (
+            offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
+        )
         return self._place
 
     def truncate(self, size=None):
@@ -31,17 +35,21 @@ class SparseFile(io.RawIOBase):
     def write(self, data):
         view = memoryview(data).cast("B")
         for page, inside, part in self._parts(len(view)):
-            self.pages.setdefault(page, bytearray(PAGE))[inside:inside + len(view[part])] = view[part]
+            self.pages.setdefault(page, bytearray(PAGE))[inside : inside + len(view[part])] = view[
+                part
+            ]
         self._place += len(view)
         self.size = max(self.size, self._place)
         return len(view)
 
     def readinto(self, buffer):
         view = memoryview(buffer).cast("B")
-        view = view[:max(0, min(len(view), self.size - self._place))]
+        view = view[: max(0, min(len(view), self.size - self._place))]
         for page, inside, part in self._parts(len(view)):
             length = len(view[part])
-            view[part] = self.pages[page][inside:inside + length] if page in self.pages else bytes(length)
+            view[part] = (
+                self.pages[page][inside : inside + length] if page in self.pages else bytes(length)
+            )
         self._place += len(view)
         return len(view)
 
@@ -57,4 +65,4 @@ class SparseFile(io.RawIOBase):
     def extents(self):
         """(offset, bytes) of all that was written, ascending, cut at the size."""
         for page in sorted(self.pages):
-            yield page * PAGE, memoryview(self.pages[page])[:max(0, self.size - page * PAGE)]
+            yield page * PAGE, memoryview(self.pages[page])[: max(0, self.size - page * PAGE)]

@@ -1,45 +1,63 @@
-"""An artefact whose large dataset is written while it is computed: the same bytes as if it had been held in memory."""
+"""An artefact whose large dataset is written while it is computed: the same bytes as if it had
+been held in memory.
+"""
 
 import contextlib
 
 import numpy as np
 
-from plenocli.files.atomic import replacement, write_at
 from plenocli.files.artefacts.container import HEADER_BYTES, Frame, _frame, seal
 from plenocli.files.artefacts.kinds import SCHEMAS
+from plenocli.files.atomic import replacement, write_at
 
 
 class Stream:
-    """An open artefact with one raw dataset, `name`, of `shape` and `dtype`, that comes in pieces."""
+    """An open artefact with one raw dataset, `name`, of `shape` and `dtype`,
+    that comes in pieces.
+    """
 
     def __init__(self, descriptor, kind, name, shape, dtype):
         self.name, self.shape, self.dtype = name, tuple(shape), np.dtype(dtype)
         self._descriptor, self._entry = descriptor, SCHEMAS[kind].field_for(name)
         # the frame is known only at the end, but raw datasets come first in it
-        self._offset = HEADER_BYTES + _frame(SCHEMAS[kind], {}, {name: (self.shape, self.dtype)}, {})[1][name]
+        self._offset = (
+            HEADER_BYTES + _frame(SCHEMAS[kind], {}, {name: (self.shape, self.dtype)}, {})[1][name]
+        )
         self._missing = int(np.prod(self.shape))
         self._closed = False
 
     def put(self, index, values):
-        """Write the part of the dataset at `index`, whole numbers for its leading axes. ValueError where the table forbids the values."""
+        """Write the part of the dataset at `index`, whole numbers for its leading axes.
+
+        ValueError where the table forbids the values.
+        """
         values = np.ascontiguousarray(values, self.dtype)
-        rest = self.shape[len(index):]
+        rest = self.shape[len(index) :]
         if values.shape != rest:
             raise ValueError(f"'{self.name}' at {index} takes {rest}, not {values.shape}")
         low, high = values.min(), values.max()
-        if not np.isfinite(low + high) or (self._entry.minimum is not None and low < self._entry.minimum):
+        if not np.isfinite(low + high) or (
+            self._entry.minimum is not None and low < self._entry.minimum
+        ):
             raise ValueError(f"'{self.name}' at {index} holds values from {low:.6g} to {high:.6g}")
-        start = int(np.ravel_multi_index(index, self.shape[:len(index)])) * values.size if index else 0
+        start = (
+            int(np.ravel_multi_index(index, self.shape[: len(index)])) * values.size if index else 0
+        )
         write_at(self._descriptor, self._offset + start * self.dtype.itemsize, values)
         self._missing -= values.size
 
     def close(self, artefact):
-        """Add everything else, an Artefact without the streamed dataset, and seal the file. ValueError as write_artefact."""
+        """Add everything else, an Artefact without the streamed dataset, and seal the file.
+
+        ValueError as write_artefact.
+        """
         if self._missing:
             raise ValueError(f"'{self.name}' lacks {self._missing} values")
         frame = Frame(artefact, {self.name: (self.shape, self.dtype)})
         if frame.offset(self.name) != self._offset:
-            raise ValueError(f"the place of '{self.name}' in the file depends on more than its size")
+            raise ValueError(
+                f"the place of '{self.name}' in the file depends on more than its size"
+            )
         frame.write(self._descriptor)
         for name, values in frame.raw.items():
             write_at(self._descriptor, frame.offset(name), values)
@@ -49,7 +67,9 @@ class Stream:
 
 @contextlib.contextmanager
 def streamed_artefact(path, kind, name, shape, dtype, *, overwrite=False):
-    """Yield a Stream into an artefact that appears at `path` when the block ends well, after `close`; errors as write_artefact."""
+    """Yield a Stream into an artefact that appears at `path` when the block ends well, after
+    `close`; errors as write_artefact.
+    """
     with replacement(path, overwrite=overwrite) as (_, descriptor):
         stream = Stream(descriptor, kind, name, shape, dtype)
         yield stream

@@ -1,4 +1,6 @@
-"""Look at every object of an HDF5 file before reading a single value: what is refused, and what the rest declares."""
+"""Look at every object of an HDF5 file before reading a single value: what is refused, and what
+the rest declares.
+"""
 
 import h5py
 import numpy as np
@@ -7,7 +9,10 @@ from h5py import h5d, h5l, h5t, h5z
 from plenocli.base.errors import InputError
 from plenocli.base.memory import size_text
 
-_FIX = "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length (numpy.bytes_), only"
+_FIX = (
+    "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length "
+    "(numpy.bytes_), only"
+)
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 _LINKS = {h5l.TYPE_SOFT: "a soft", h5l.TYPE_EXTERNAL: "an external"}
 _ATTRIBUTE_BYTES = 8 << 20
@@ -18,12 +23,15 @@ _MAX_DEPTH = 8
 def survey(path, file, limit):
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
-    Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an object linked twice,
-    external or virtual storage, unknown filters, any type but plain integers, floats, true/false and fixed-length text,
-    and declared data of more than `limit` bytes in all. Reads no dataset.
+    Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
+    object linked twice, external or virtual storage, unknown filters, any type but plain integers,
+    floats, true/false and fixed-length text, and declared data of more than `limit` bytes in
+    all. Reads no dataset.
     """
     declared, seen, total = {}, set(), 0
-    stack = [("", file.id if isinstance(file.id, h5py.h5g.GroupID) else h5py.h5g.open(file.id, b"/"), 0)]
+    stack = [
+        ("", file.id if isinstance(file.id, h5py.h5g.GroupID) else h5py.h5g.open(file.id, b"/"), 0)
+    ]
     while stack:
         name, group, depth = stack.pop()
         _check_attributes(path, group, f"/{name}")
@@ -34,7 +42,9 @@ def survey(path, file, limit):
             _check_link(path, group, link, child)
             info = h5py.h5o.get_info(group, link)
             if info.addr in seen or len(seen) > _MAX_OBJECTS or depth > _MAX_DEPTH:
-                raise InputError(f"'/{child}' is linked twice, or the file nests too deep", path, _FIX)
+                raise InputError(
+                    f"'/{child}' is linked twice, or the file nests too deep", path, _FIX
+                )
             seen.add(info.addr)
             if info.type == h5py.h5o.TYPE_GROUP:
                 stack.append((child, h5py.h5g.open(group, link), depth + 1))
@@ -47,7 +57,14 @@ def survey(path, file, limit):
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
             if total > limit:
-                raise InputError(f"declares {size_text(total)} of data up to '/{child}', above the memory limit of {size_text(limit)}", path, "raise --mem-limit if the file is yours")
+                raise InputError(
+                    (
+                        f"declares {size_text(total)} of data up to '/{child}', above the memory "
+                        f"limit of {size_text(limit)}"
+                    ),
+                    path,
+                    "raise --mem-limit if the file is yours",
+                )
     return dict(sorted(declared.items()))
 
 
@@ -55,7 +72,11 @@ def _text(path, name):
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"holds an object whose name '{name.decode('utf-8', 'replace')}' is not UTF-8", path, _FIX) from error
+        raise InputError(
+            f"holds an object whose name '{name.decode('utf-8', 'replace')}' is not UTF-8",
+            path,
+            _FIX,
+        ) from error
 
 
 def _check_link(path, group, link, child):
@@ -72,7 +93,14 @@ def _declaration(path, dataset, name):
         raise InputError(f"'/{name}' is a virtual dataset, which reads other files", path, _FIX)
     for position in range(properties.get_nfilters()):
         if properties.get_filter(position)[0] not in _FILTERS:
-            raise InputError(f"'/{name}' uses the filter {properties.get_filter(position)[0]}, not gzip, shuffle or fletcher32", path, _FIX)
+            raise InputError(
+                (
+                    f"'/{name}' uses the filter {properties.get_filter(position)[0]}, not gzip, "
+                    "shuffle or fletcher32"
+                ),
+                path,
+                _FIX,
+            )
     _check_type(path, dataset.get_type(), f"/{name}")
     if dataset.get_space().get_simple_extent_type() == h5py.h5s.NULL:
         raise InputError(f"'/{name}' holds no data (null dataspace)", path, _FIX)
@@ -80,11 +108,15 @@ def _declaration(path, dataset, name):
 
 
 def _check_type(path, kind, where):
-    allowed = kind.get_class() in (h5t.INTEGER, h5t.FLOAT) or (
-        kind.get_class() == h5t.STRING and not kind.is_variable_str()) or (
-        kind.get_class() == h5t.ENUM and kind.dtype == np.dtype(bool))
+    allowed = (
+        kind.get_class() in (h5t.INTEGER, h5t.FLOAT)
+        or (kind.get_class() == h5t.STRING and not kind.is_variable_str())
+        or (kind.get_class() == h5t.ENUM and kind.dtype == np.dtype(bool))
+    )
     if not allowed:
-        raise InputError(f"'{where}' holds objects, references, compounds or text of variable length", path, _FIX)
+        raise InputError(
+            f"'{where}' holds objects, references, compounds or text of variable length", path, _FIX
+        )
 
 
 def _check_attributes(path, target, where):

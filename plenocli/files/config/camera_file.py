@@ -7,8 +7,11 @@ from plenocli.base.units import format_duration, format_length
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
 
+
 def load_camera(path):
-    """Read and check a camera description; InputError where the file cannot be read, ConfigError for what it says."""
+    """Read and check a camera description; InputError where the file cannot be read,
+    ConfigError for what it says.
+    """
     return parse_camera(read_text(Path(path), "camera"), path)
 
 
@@ -25,7 +28,15 @@ def camera_schema():
 _UNITS = {"full_well": "e", "read_noise": "e", "gain": "DN/e"}
 
 
-_NUMBERS = {"f_number", "obscuration", "fill_factor", "pixel_fill_factor", "quantum_efficiency", "peak", "blocking"}
+_NUMBERS = {
+    "f_number",
+    "obscuration",
+    "fill_factor",
+    "pixel_fill_factor",
+    "quantum_efficiency",
+    "peak",
+    "blocking",
+}
 
 
 def to_toml(camera):

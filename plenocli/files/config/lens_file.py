@@ -1,4 +1,5 @@
-"""A lens prescription as TOML: surfaces with units, dispersion formulas of its glasses, the stop; checked whole, read into SI.
+"""A lens prescription as TOML: surfaces with units, dispersion formulas of its glasses, the stop;
+checked whole, read into SI.
 
     [lens]
     name = "triplet"
@@ -7,13 +8,13 @@
     stop_diameter = "5.8 mm"
     [[surface]]
     radius = "12.44 mm"                   # or "flat"; positive: centre behind the surface
-    thickness = "5.514 mm"                # to the next surface, of the last one to the image plane (may be left out)
+    thickness = "5.514 mm"                # to the next surface; the last: to the image plane
     glass = "N-SK16"                      # behind the surface; left out: air
     conic = -1.2
     asphere = { r4 = "9.6e-05 mm^-3" }
     semi_diameter = "6 mm"                # rays further out are lost
     [glass.N-SK16]                        # left out: plenocli's own catalogue
-    sellmeier = [[1.34317774, 0.00704687339], ...]    # or polynomial, cauchy, or nd and vd; wavelengths in um
+    sellmeier = [[1.34317774, 0.00704687339], ...]    # um; or polynomial, cauchy, nd and vd
     range = ["310 nm", "2500 nm"]
 """
 
@@ -24,11 +25,11 @@ from typing import Annotated, Any
 
 from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
+from plenocli.base.errors import ConfigError
 from plenocli.base.quantities import Length, Section, Wavelength, quantity
 from plenocli.base.toml import parse_toml
-from plenocli.files.config.toml_file import read_text
 from plenocli.base.units import LENGTHS, UnitError, format_length, parse_length
-from plenocli.base.errors import ConfigError
+from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.glass import AIR, Medium, medium
 from plenocli.forward.camera.prescription import Prescription, Surface
 
@@ -44,12 +45,25 @@ def _radius(value: Any):
     if length is None:
         raise ValueError(f'{value!r} needs its unit as text, such as "50 mm", or "flat"')
     if not 1e-6 <= abs(length) <= 1e6:
-        raise ValueError(f'{value!r} is no radius; write a length from 1 um to 1000 km, negative for a centre before the surface, or "flat"')
+        raise ValueError(
+            f"{value!r} is no radius; write a length from 1 um to 1000 km, negative for a centre "
+            'before the surface, or "flat"'
+        )
     return length
 
 
-Radius = Annotated[float, PlainValidator(_radius),
-                   WithJsonSchema({"type": "string", "description": 'length such as "50 mm", positive where the centre lies behind, or "flat"'})]
+Radius = Annotated[
+    float,
+    PlainValidator(_radius),
+    WithJsonSchema(
+        {
+            "type": "string",
+            "description": (
+                'length such as "50 mm", positive where the centre lies behind, or "flat"'
+            ),
+        }
+    ),
+]
 
 
 def _coefficients(value: Any):
@@ -66,17 +80,34 @@ def _coefficients(value: Any):
 
 
 def _per_length(text, power):
-    match = re.fullmatch(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*([a-zµμ]+)\^-(\d+)\s*", text) if isinstance(text, str) else None
+    match = (
+        re.fullmatch(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*([a-zµμ]+)\^-(\d+)\s*", text)
+        if isinstance(text, str)
+        else None
+    )
     if match is None or match.group(2) not in LENGTHS or int(match.group(3)) != power:
-        raise UnitError(f'{text!r} must be a number per length to the power {power}, such as "1e-5 mm^-{power}"')
+        raise UnitError(
+            f'{text!r} must be a number per length to the power {power}, such as "1e-5 mm^-{power}"'
+        )
     scale = round(-math.log10(LENGTHS[match.group(2)]))
     # one decimal conversion keeps the double nearest to the text
     digits, _, exponent = match.group(1).lower().partition("e")
     return float(f"{digits}e{int(exponent or 0) + scale * power}")
 
 
-Asphere = Annotated[tuple, PlainValidator(_coefficients), WithJsonSchema({"type": "object", "additionalProperties": {"type": "string"},
-                    "description": 'coefficients of even powers of the height, such as { r4 = "9.6e-05 mm^-3" }'})]
+Asphere = Annotated[
+    tuple,
+    PlainValidator(_coefficients),
+    WithJsonSchema(
+        {
+            "type": "object",
+            "additionalProperties": {"type": "string"},
+            "description": (
+                'coefficients of even powers of the height, such as { r4 = "9.6e-05 mm^-3" }'
+            ),
+        }
+    ),
+]
 Pairs = Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=16)]
 
 
@@ -90,7 +121,9 @@ class SurfaceEntry(Section):
 
 
 class GlassEntry(Section):
-    """A dispersion formula (plenocli.forward.camera.glass.Medium), exactly one, and the range it holds on."""
+    """A dispersion formula (plenocli.forward.camera.glass.Medium), exactly one, and the
+    range it holds on.
+    """
 
     sellmeier: Pairs | None = None
     polynomial: Pairs | None = None
@@ -101,7 +134,11 @@ class GlassEntry(Section):
 
     @model_validator(mode="after")
     def _one_formula(self):
-        given = [name for name in ("sellmeier", "polynomial", "cauchy", "nd") if getattr(self, name) is not None]
+        given = [
+            name
+            for name in ("sellmeier", "polynomial", "cauchy", "nd")
+            if getattr(self, name) is not None
+        ]
         if len(given) != 1 or (self.nd is None) != (self.vd is None):
             raise ValueError("give exactly one of sellmeier, polynomial, cauchy, or nd with vd")
         if self.range and self.range[0] >= self.range[1]:
@@ -109,10 +146,14 @@ class GlassEntry(Section):
         return self
 
     def medium(self, name):
-        """The Medium of this entry; without a range it is trusted from 300 nm to 2.5 um, nd and vd from 380 to 780 nm."""
+        """The Medium of this entry; without a range it is trusted from 300 nm to 2.5 um, nd and
+        vd from 380 to 780 nm.
+        """
         if self.nd is not None:
             return Medium(name, "abbe", (self.nd, self.vd), self.range or (380e-9, 780e-9))
-        formula = next(f for f in ("sellmeier", "polynomial", "cauchy") if getattr(self, f) is not None)
+        formula = next(
+            f for f in ("sellmeier", "polynomial", "cauchy") if getattr(self, f) is not None
+        )
         return Medium(name, formula, getattr(self, formula), self.range or (300e-9, 2.5e-6))
 
 
@@ -135,12 +176,17 @@ class LensFile(Section):
     def _consistent(self):
         wrong = []
         if self.lens.stop > len(self.surface):
-            wrong.append(f"lens.stop is {self.lens.stop}, but there are {len(self.surface)} surfaces")
+            wrong.append(
+                f"lens.stop is {self.lens.stop}, but there are {len(self.surface)} surfaces"
+            )
         for i, entry in enumerate(self.surface, 1):
             try:
                 self.medium(entry.glass).index(self.lens.design_wavelength)
             except ConfigError as error:
-                wrong.append(f"surface {i}: {error.what}; write its dispersion as [glass.{_key(entry.glass)}]")
+                wrong.append(
+                    f"surface {i}: {error.what}; write its dispersion as "
+                    f"[glass.{_key(entry.glass)}]"
+                )
         if self.surface[-1].glass.lower() != "air":
             wrong.append("the last surface must end in air")
         if all(math.isinf(e.radius) and not e.asphere for e in self.surface):
@@ -150,21 +196,40 @@ class LensFile(Section):
         return self
 
     def medium(self, name):
-        """The Medium that this file means by `name`: its own entry, else the catalogue's. ConfigError for an unknown one."""
+        """The Medium that this file means by `name`: its own entry, else the catalogue's.
+
+        ConfigError for an unknown one.
+        """
         return self.glass[name].medium(name) if name in self.glass else medium(name)
 
     def prescription(self):
         """The plenocli.forward.camera.prescription.Prescription in SI units."""
         surfaces = tuple(
-            Surface(0.0 if math.isinf(e.radius) else 1 / e.radius, e.thickness, self.medium(e.glass), e.conic, e.asphere,
-                    math.inf if e.semi_diameter is None else e.semi_diameter)
-            for e in self.surface)
+            Surface(
+                0.0 if math.isinf(e.radius) else 1 / e.radius,
+                e.thickness,
+                self.medium(e.glass),
+                e.conic,
+                e.asphere,
+                math.inf if e.semi_diameter is None else e.semi_diameter,
+            )
+            for e in self.surface
+        )
         distance = math.inf if self.lens.object_distance is None else self.lens.object_distance
-        return Prescription(surfaces, self.lens.stop - 1, self.lens.stop_diameter / 2, self.lens.design_wavelength, distance, self.lens.name)
+        return Prescription(
+            surfaces,
+            self.lens.stop - 1,
+            self.lens.stop_diameter / 2,
+            self.lens.design_wavelength,
+            distance,
+            self.lens.name,
+        )
 
 
 def load_lens(path):
-    """The Prescription in the TOML file `path`; InputError where it cannot be read, ConfigError for what it says."""
+    """The Prescription in the TOML file `path`; InputError where it cannot be read,
+    ConfigError for what it says.
+    """
     return parse_lens(read_text(Path(path), "lens"), path)
 
 
@@ -173,14 +238,21 @@ def parse_lens(text, where="lens"):
     return parse_toml(text, where, LensFile).prescription()
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
+
 
 def lens_toml(lens, comments=()):
-    """TOML text of a Prescription that parse_lens reads back to an equal one; its glasses are written out."""
+    """TOML text of a Prescription that parse_lens reads back to an equal one; its
+    glasses are written out.
+    """
     lines = [f"# {text}" for text in comments] + ["[lens]"]
     if lens.name:
         lines.append(f"name = {_text(lens.name)}")
-    lines += [f'design_wavelength = "{format_length(lens.design_wavelength)}"', f"stop = {lens.stop + 1}", f'stop_diameter = "{format_length(2 * lens.stop_radius)}"']
+    lines += [
+        f'design_wavelength = "{format_length(lens.design_wavelength)}"',
+        f"stop = {lens.stop + 1}",
+        f'stop_diameter = "{format_length(2 * lens.stop_radius)}"',
+    ]
     if math.isfinite(lens.object_distance):
         lines.append(f'object_distance = "{format_length(lens.object_distance)}"')
     for surface in lens.surfaces:
@@ -200,7 +272,9 @@ def _surface_lines(surface):
     if surface.conic:
         lines.append(f"conic = {surface.conic!r}")
     if any(surface.asphere):
-        terms = [f'r{2 * i} = "{a!r} m^-{2 * i - 1}"' for i, a in enumerate(surface.asphere, 1) if a]
+        terms = [
+            f'r{2 * i} = "{a!r} m^-{2 * i - 1}"' for i, a in enumerate(surface.asphere, 1) if a
+        ]
         lines.append(f"asphere = {{ {', '.join(terms)} }}")
     if math.isfinite(surface.semi_diameter):
         lines.append(f'semi_diameter = "{format_length(surface.semi_diameter)}"')
@@ -212,7 +286,12 @@ def _shown_radius(curvature):
     if curvature == 0:
         return "flat"
     radius = 1 / curvature
-    near = (*(float(f"{radius:.{digits}g}") for digits in (6, 9, 12, 15)), radius, math.nextafter(radius, math.inf), math.nextafter(radius, -math.inf))
+    near = (
+        *(float(f"{radius:.{digits}g}") for digits in (6, 9, 12, 15)),
+        radius,
+        math.nextafter(radius, math.inf),
+        math.nextafter(radius, -math.inf),
+    )
     return format_length(next((r for r in near if 1 / r == curvature), radius))
 
 
@@ -222,7 +301,10 @@ def _glass_lines(glass):
         return [f"nd = {glass.coefficients[0]!r}", f"vd = {glass.coefficients[1]!r}", *limits]
     pairs = ((glass.coefficients[0], 0.0),) if glass.formula == "constant" else glass.coefficients
     formula = "cauchy" if glass.formula == "constant" else glass.formula
-    return [f"{formula} = [{', '.join(f'[{a!r}, {b!r}]' for a, b in pairs)}]", *(limits if math.isfinite(glass.limits[1]) else [])]
+    return [
+        f"{formula} = [{', '.join(f'[{a!r}, {b!r}]' for a, b in pairs)}]",
+        *(limits if math.isfinite(glass.limits[1]) else []),
+    ]
 
 
 def _key(name):

@@ -7,8 +7,8 @@ from pydantic import Field, model_validator
 
 from plenocli.base.quantities import Length, Section, Wavelength, quantity
 from plenocli.base.toml import parse_toml
-from plenocli.files.config.toml_file import read_text
 from plenocli.base.units import parse_decibel
+from plenocli.files.config.toml_file import read_text
 
 Decibel = quantity(parse_decibel, "40 dB", -100.0, 300.0, lambda value: f"{value:g} dB")
 Count = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, le=4096)]]
@@ -17,9 +17,11 @@ Count = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, l
 class Scene(Section):
     """A scene as the accuracy dial sees it; what is left out is not narrowed.
 
-    picture: photograph or spectral EXR, relative to this file, whose extent and bands count too; depth: nearest and farthest
-    distance to the main lens; spectrum: shortest and longest wavelength with light; lenslets: rows and columns of lenslets
-    around the centre that see light; snr: amplitude ratio of a bright pixel to its noise.
+    picture: photograph or spectral EXR, relative to this file, whose extent and bands count too;
+    depth: nearest and farthest distance to the main lens;
+    spectrum: shortest and longest wavelength with light;
+    lenslets: rows and columns of lenslets around the centre that see light;
+    snr: amplitude ratio of a bright pixel to its noise.
     """
 
     picture: str | None = None
@@ -38,6 +40,8 @@ class Scene(Section):
 
 
 def load_scene(path):
-    """Read and check a scene description; InputError where the file cannot be read, ConfigError for what it says."""
+    """Read and check a scene description; InputError where the file cannot be read,
+    ConfigError for what it says.
+    """
     path = Path(path)
     return parse_toml(read_text(path, "scene"), path, Scene)

@@ -1,7 +1,9 @@
-"""A sweep: which camera, which of its keys and of the stages' options vary, over what, and what counts as better.
+"""A sweep: which camera, which of its keys and of the stages' options vary, over what, and
+what counts as better.
 
-Every point of the design space is a plain dict of dotted keys and values as they would stand in a camera file
-("main_lens.f_number") or on a command line ("reconstruct.method"). Nothing here computes optics or opens another file.
+Every point of the design space is a plain dict of dotted keys and values as they would stand in a
+camera file ("main_lens.f_number") or on a command line ("reconstruct.method"). Nothing here
+computes optics or opens another file.
 """
 
 import difflib
@@ -13,27 +15,50 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from plenocli.base.errors import ConfigError
 from plenocli.base.quantities import FileName, Section
+from plenocli.base.text import shown
 from plenocli.base.toml import known_keys, parse_toml
+from plenocli.base.units import (
+    UnitError,
+    format_duration,
+    format_length,
+    parse_duration,
+    parse_length,
+)
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
-from plenocli.base.units import UnitError, format_duration, format_length, parse_duration, parse_length
-from plenocli.base.errors import ConfigError
-from plenocli.base.text import shown
 
-STAGES = ("simulate-pif", "capture-sim", "reconstruct", "simulate-response", "calibrate", "demux", "score")
+STAGES = (
+    "simulate-pif",
+    "capture-sim",
+    "reconstruct",
+    "simulate-response",
+    "calibrate",
+    "demux",
+    "score",
+)
 """Stages whose options may be set and varied."""
 MAX_POINTS = 100_000
 DIGITS = 9
 """Significant digits of values between the ends of a range, so that a table reads well."""
 
 _UNITLESS = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]\S*)\s*")
-_ALTERNATIVES = (("main_lens", "aperture_diameter", "f_number"), ("lenslet_array", "pitch", "superpixel_pitch"), ("light", "wavelengths", "band"))
+_ALTERNATIVES = (
+    ("main_lens", "aperture_diameter", "f_number"),
+    ("lenslet_array", "pitch", "superpixel_pitch"),
+    ("light", "wavelengths", "band"),
+)
 _RANGE = {"from", "to", "steps", "scale", "whole"}
 
 
 class Range(Section):
-    """Values between two ends, which carry the same unit; steps: how many (a grid needs it); scale: how they are spaced; whole: whole numbers."""
+    """Values between two ends, which carry the same unit;
+
+    steps: how many (a grid needs it);
+    scale: how they are spaced;
+    whole: whole numbers.
+    """
 
     low: Annotated[Any, Field(alias="from")]
     high: Annotated[Any, Field(alias="to")]
@@ -47,7 +72,10 @@ class Range(Section):
         if unit != other:
             raise ValueError(f"{self.low!r} and {self.high!r} are not of one kind")
         if not low < high:
-            raise ValueError(f"a range runs from the smaller to the larger value, not from {self.low!r} to {self.high!r}")
+            raise ValueError(
+                "a range runs from the smaller to the larger value, not from "
+                f"{self.low!r} to {self.high!r}"
+            )
         if self.scale == "log" and low <= 0:
             raise ValueError(f"a range on a logarithmic scale starts above 0, not at {self.low!r}")
         if self.whole and (unit is not None or low != int(low) or high != int(high)):
@@ -90,10 +118,13 @@ class Choice:
 class Sweep(Section):
     """The description as it stands in the file; `vary`, `set` and `follow` flat, by dotted key.
 
-    camera: the file that all points start from, relative to this one. chain: "spatial" (simulate-pif, capture-sim, reconstruct,
-    score) or "spectral" (simulate-pif, capture-sim, simulate-response or calibrate, demux, score); default by whether
-    the camera has a filter array. follow: keys computed from others, products and quotients of keys and numbers. front: what
-    counts as better, metric -> min or max. Sections named like the commands hold their options.
+    camera: the file that all points start from, relative to this one.
+    chain: "spatial" (simulate-pif, capture-sim, reconstruct, score) or "spectral" (simulate-pif,
+        capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
+        has a filter array.
+    follow: keys computed from others, products and quotients of keys and numbers.
+    front: what counts as better, metric -> min or max. Sections named like the commands
+        hold their options.
     """
 
     camera: FileName
@@ -116,7 +147,10 @@ class Sweep(Section):
         for name in data:
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1, 0.5)
-                raise ValueError(f"{name}: unknown key; " + (f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"))
+                raise ValueError(
+                    f"{name}: unknown key; "
+                    + (f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}")
+                )
         wrong = [stage for stage, values in options.items() if not isinstance(values, dict)]
         if wrong:
             raise ValueError(f"{wrong[0]} is a section of options, such as [{wrong[0]}]")
@@ -130,13 +164,15 @@ class Sweep(Section):
     @model_validator(mode="after")
     def _consistent(self):
         if (self.design == "list") != bool(self.point):
-            raise ValueError("[[point]] sections go with design = \"list\", and only with it")
+            raise ValueError('[[point]] sections go with design = "list", and only with it')
         if self.design == "list" and self.vary:
-            raise ValueError("design = \"list\" takes its values from [[point]]; leave [vary] out")
+            raise ValueError('design = "list" takes its values from [[point]]; leave [vary] out')
         if self.design != "list" and not self.vary:
             raise ValueError("[vary] is missing: name at least one key and its values")
         if (self.samples is not None) != (self.design == "latin-hypercube"):
-            raise ValueError("samples (how many points) goes with design = \"latin-hypercube\", and only with it")
+            raise ValueError(
+                'samples (how many points) goes with design = "latin-hypercube", and only with it'
+            )
         overlap = [key for key in self.varied if key in self.follow]
         if overlap:
             raise ValueError(f"{overlap[0]} both varies and follows other keys")
@@ -145,11 +181,17 @@ class Sweep(Section):
     @property
     def varied(self):
         """The keys that differ between points, in the order of the file."""
-        return list(self.vary) if self.vary else list(dict.fromkeys(key for point in self.point for key in point))
+        return (
+            list(self.vary)
+            if self.vary
+            else list(dict.fromkeys(key for point in self.point for key in point))
+        )
 
 
 def load_sweep(path):
-    """(Sweep, axes: key -> Range or Choice) of the TOML file at `path`; InputError where it cannot be read, ConfigError for what it says."""
+    """(Sweep, axes: key -> Range or Choice) of the TOML file at `path`; InputError where it
+    cannot be read, ConfigError for what it says.
+    """
     path = Path(path)
     sweep = parse_toml(read_text(path, "sweep"), path, Sweep)
     problems = [p for key in (*sweep.varied, *sweep.set, *sweep.follow) if (p := unknown_key(key))]
@@ -160,34 +202,57 @@ def load_sweep(path):
         except (ValueError, UnitError) as error:
             problems.append(f"vary.{key}: {_said(error)}")
     if problems:
-        raise ConfigError(f"{len(problems)} violation{'s'[: len(problems) > 1]}\n  " + "\n  ".join(problems), path)
+        raise ConfigError(
+            f"{len(problems)} violation{'s'[: len(problems) > 1]}\n  " + "\n  ".join(problems), path
+        )
     return sweep, axes
 
 
 def points(sweep, axes, seed=0):
-    """The points of the design in order, each a dict key -> value. ConfigError where there are too many.
+    """The points of the design in order, each a dict key -> value.
 
-    A grid lists the last key fastest. A Latin hypercube (McKay et al. 1979) cuts every axis into `samples` equal parts and
-    takes each part once; the seed decides which meet.
+    ConfigError where there are too many.
+
+    A grid lists the last key fastest. A Latin hypercube (McKay et al. 1979) cuts every axis into
+    `samples` equal parts and takes each part once; the seed decides which meet.
     """
     if sweep.design == "list":
         return [dict(point) for point in sweep.point]
     if sweep.design == "latin-hypercube":
         rng = np.random.default_rng([seed, *b"sweep"])
-        shares = np.stack([(rng.permutation(sweep.samples) + rng.random(sweep.samples)) / sweep.samples for _ in axes], axis=1)
-        return [{key: axis.at(float(share)) for (key, axis), share in zip(axes.items(), row)} for row in shares]
+        shares = np.stack(
+            [
+                (rng.permutation(sweep.samples) + rng.random(sweep.samples)) / sweep.samples
+                for _ in axes
+            ],
+            axis=1,
+        )
+        return [
+            {key: axis.at(float(share)) for (key, axis), share in zip(axes.items(), row)}
+            for row in shares
+        ]
     endless = [key for key, axis in axes.items() if isinstance(axis, Range) and axis.steps is None]
     if endless:
-        raise ConfigError("a grid needs steps, how many values to take between from and to", f"vary.{endless[0]}", "give steps, or design = \"latin-hypercube\" and samples")
+        raise ConfigError(
+            "a grid needs steps, how many values to take between from and to",
+            f"vary.{endless[0]}",
+            'give steps, or design = "latin-hypercube" and samples',
+        )
     levels = [axis.levels() for axis in axes.values()]
     count = int(np.prod([len(values) for values in levels], dtype=object))
     if count > MAX_POINTS:
-        raise ConfigError(f"the grid has {count} points, more than {MAX_POINTS}", "vary", "take fewer steps, or design = \"latin-hypercube\"")
+        raise ConfigError(
+            f"the grid has {count} points, more than {MAX_POINTS}",
+            "vary",
+            'take fewer steps, or design = "latin-hypercube"',
+        )
     return [dict(zip(axes, values)) for values in product(*levels)]
 
 
 def unknown_key(key):
-    """Why a dotted key names nothing, in words; None where it is a key of a camera or an option of a stage (whose name is not looked at)."""
+    """Why a dotted key names nothing, in words; None where it is a key of a camera or an option
+    of a stage (whose name is not looked at).
+    """
     head, _, rest = key.partition(".")
     if head in STAGES:
         return None if rest and "." not in rest else f"{key}: name one option, such as {head}.seed"
@@ -200,13 +265,19 @@ def unknown_key(key):
         known = known_keys(path[:depth], Camera) if depth else [*Camera.model_fields, *STAGES]
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.5)
-            return f"{key}: unknown key {name}; " + (f"did you mean {'.'.join([*path[:depth], near[0]])}?" if near else f"known here: {', '.join(known)}")
+            return f"{key}: unknown key {name}; " + (
+                f"did you mean {'.'.join([*path[:depth], near[0]])}?"
+                if near
+                else f"known here: {', '.join(known)}"
+            )
     return None
 
 
 def changed(data, values, follow):
-    """A camera description (nested dict as read from TOML) with dotted keys set and the keys of `follow` computed; the options of
-    stages in `values` are left alone. ConfigError where a key is not there or an expression cannot be computed."""
+    """A camera description (nested dict as read from TOML) with dotted keys set and the keys of
+    `follow` computed; the options of stages in `values` are left alone. ConfigError where a key is
+    not there or an expression cannot be computed.
+    """
     data = _copy(data)
     for key, value in values.items():
         if key.partition(".")[0] not in STAGES:
@@ -227,7 +298,9 @@ def options_of(sweep, point):
 
 
 def number(value):
-    """A value as a number: lengths in m, durations in s, others in their own unit; None for words, lists and switches."""
+    """A value as a number: lengths in m, durations in s, others in their own unit; None for
+    words, lists and switches.
+    """
     try:
         return _measure(value)[0]
     except ValueError:
@@ -242,7 +315,7 @@ def unit(value):
         return ""
 
 
-# --- reading ------------------------------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------------
 
 
 def _axis(values):
@@ -250,10 +323,18 @@ def _axis(values):
         try:
             made = Range.model_validate(values)
         except ValidationError as error:
-            raise ValueError("; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}".lstrip(": ") for e in error.errors())) from None
+            raise ValueError(
+                "; ".join(
+                    f"{'.'.join(map(str, e['loc']))}: {e['msg']}".lstrip(": ")
+                    for e in error.errors()
+                )
+            ) from None
         return made
     if not isinstance(values, list) or not values:
-        raise ValueError(f"{values!r} is no list of values and no range; write for example [6, 8, 11] or {{ from = \"50 um\", to = \"250 um\", steps = 5 }}")
+        raise ValueError(
+            f"{values!r} is no list of values and no range; write for example [6, 8, 11] or {{ "
+            'from = "50 um", to = "250 um", steps = 5 }'
+        )
     for i, value in enumerate(values):
         if value in values[:i] and any(type(value) is type(v) and value == v for v in values[:i]):
             raise ValueError(f"{value!r} stands twice")
@@ -290,18 +371,26 @@ def _measure(value):
             continue
     match = _UNITLESS.fullmatch(value)
     if match is None:
-        raise ValueError(f"{value!r} is no number with a unit, such as \"250 um\"")
+        raise ValueError(f'{value!r} is no number with a unit, such as "250 um"')
     return float(match[1]), match[2]
 
 
 def _written(value, unit):
     if unit is None:
         return value
-    return {"m": format_length, "s": format_duration}.get(unit, lambda v: f"{v:.{DIGITS}g} {unit}")(value)
+    return {"m": format_length, "s": format_duration}.get(unit, lambda v: f"{v:.{DIGITS}g} {unit}")(
+        value
+    )
 
 
 def _copy(data):
-    return {k: _copy(v) for k, v in data.items()} if isinstance(data, dict) else [_copy(v) for v in data] if isinstance(data, list) else data
+    return (
+        {k: _copy(v) for k, v in data.items()}
+        if isinstance(data, dict)
+        else [_copy(v) for v in data]
+        if isinstance(data, list)
+        else data
+    )
 
 
 def _put(data, key, value):
@@ -309,7 +398,11 @@ def _put(data, key, value):
     *path, last = key.split(".")
     targets = [data]
     for depth, name in enumerate(path):
-        targets = [inner for target in targets for inner in _entries(target, name, path[: depth + 1], key, make=True)]
+        targets = [
+            inner
+            for target in targets
+            for inner in _entries(target, name, path[: depth + 1], key, make=True)
+        ]
     for target in targets:
         if isinstance(target, list):
             for i in _indices(target, last, path, key):
@@ -326,10 +419,20 @@ def _put(data, key, value):
 def _entries(target, name, path, key, make=False):
     if isinstance(target, list):
         return [target[i] for i in _indices(target, name, path[:-1], key)]
-    if make and isinstance(target, dict) and name not in target and len(path) == 1 and name != "filter_array":
+    if (
+        make
+        and isinstance(target, dict)
+        and name not in target
+        and len(path) == 1
+        and name != "filter_array"
+    ):
         target[name] = {}
     if not isinstance(target, dict) or name not in target:
-        raise ConfigError(f"{'.'.join(path)} is not given in the camera, so that a part of it cannot be set", key, "give it whole in the camera file")
+        raise ConfigError(
+            f"{'.'.join(path)} is not given in the camera, so that a part of it cannot be set",
+            key,
+            "give it whole in the camera file",
+        )
     return [target[name]]
 
 
@@ -337,7 +440,11 @@ def _indices(target, name, path, key):
     if name == "*":
         return range(len(target))
     if not name.isdigit() or int(name) >= len(target):
-        raise ConfigError(f"{'.'.join(path)} has {len(target)} entries, counted from 0", key, f"write {'.'.join(path)}.0 or {'.'.join(path)}.*")
+        raise ConfigError(
+            f"{'.'.join(path)} has {len(target)} entries, counted from 0",
+            key,
+            f"write {'.'.join(path)}.0 or {'.'.join(path)}.*",
+        )
     return [int(name)]
 
 
@@ -345,21 +452,39 @@ _FACTOR = re.compile(r"\s*([*/]?)\s*([^*/]+)")
 
 
 def _computed(data, key, expression):
-    """The value of a product such as "sensor.pixel_pitch * 13 / 2"; a length where one length is left over, else a number."""
+    """The value of a product such as "sensor.pixel_pitch * 13 / 2"; a length where one length is
+    left over, else a number.
+    """
     if not isinstance(expression, str) or not expression.strip():
-        raise ConfigError(f"{expression!r} is no product of keys and numbers", f"follow.{key}", "write for example \"sensor.pixel_pitch * 13\"")
+        raise ConfigError(
+            f"{expression!r} is no product of keys and numbers",
+            f"follow.{key}",
+            'write for example "sensor.pixel_pitch * 13"',
+        )
     value, power, place = 1.0, 0, 0
     while place < len(expression.rstrip()):
         match = _FACTOR.match(expression, place)
         if match is None or (match[1] == "") != (place == 0):
-            raise ConfigError(f"{expression!r} is no product of keys and numbers", f"follow.{key}", "use * and / only")
+            raise ConfigError(
+                f"{expression!r} is no product of keys and numbers",
+                f"follow.{key}",
+                "use * and / only",
+            )
         term, unit = _term(data, key, match[2].strip())
         if match[1] == "/" and term == 0:
-            raise ConfigError(f"{expression!r} divides by {match[2].strip()}, which is 0", f"follow.{key}", "divide by something else")
+            raise ConfigError(
+                f"{expression!r} divides by {match[2].strip()}, which is 0",
+                f"follow.{key}",
+                "divide by something else",
+            )
         sign = -1 if match[1] == "/" else 1
         value, power, place = value * term**sign, power + sign * (unit == "m"), match.end()
     if power not in (0, 1):
-        raise ConfigError(f"{expression!r} is a length to the power of {power}", f"follow.{key}", "a key takes a length or a number")
+        raise ConfigError(
+            f"{expression!r} is a length to the power of {power}",
+            f"follow.{key}",
+            "a key takes a length or a number",
+        )
     return _written(float(f"{value:.{DIGITS}g}"), "m" if power else None)
 
 
@@ -382,7 +507,11 @@ def _term(data, key, text):
     try:
         value, unit = _measure(found)
     except ValueError as error:
-        raise ConfigError(f"{text}: {error}", f"follow.{key}", "use lengths and plain numbers") from None
+        raise ConfigError(
+            f"{text}: {error}", f"follow.{key}", "use lengths and plain numbers"
+        ) from None
     if unit not in (None, "m"):
-        raise ConfigError(f"{text} is {shown(found)}", f"follow.{key}", "use lengths and plain numbers")
+        raise ConfigError(
+            f"{text} is {shown(found)}", f"follow.{key}", "use lengths and plain numbers"
+        )
     return value, unit

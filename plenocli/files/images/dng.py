@@ -1,7 +1,9 @@
-"""DNG out: the mosaic of a simulated sensor as a file that every RAW reader opens (Adobe DNG specification 1.4).
+"""DNG out: the mosaic of a simulated sensor as a file that every RAW reader opens (Adobe DNG
+specification 1.4).
 
-Uncompressed 16-bit container, one strip, little-endian, nothing but tags that follow from the arguments: same input, same
-bytes. What the tags cannot say (gain, band, seed, digest of the mosaic) travels as JSON in the XMP packet.
+Uncompressed 16-bit container, one strip, little-endian, nothing but tags that follow from the
+arguments: same input, same bytes. What the tags cannot say (gain, band, seed, digest of the mosaic)
+travels as JSON in the XMP packet.
 """
 
 import hashlib
@@ -13,8 +15,8 @@ from xml.sax.saxutils import escape, unescape
 import numpy as np
 
 from plenocli import __version__
-from plenocli.files.atomic import publish
 from plenocli.base.errors import OutputError
+from plenocli.files.atomic import publish
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _FORMAT = {_BYTE: "B", _SHORT: "H", _LONG: "I"}
@@ -26,34 +28,73 @@ _OPEN, _CLOSE = "<plenocli:capture>", "</plenocli:capture>"
 SMALLEST = 22  # LibRaw takes anything smaller for no RAW file
 
 
-def write_dng(path, mosaic, *, cfa, black, white, exposure_s=None, iso=None, xmp_json=None, overwrite=False):
+def write_dng(
+    path, mosaic, *, cfa, black, white, exposure_s=None, iso=None, xmp_json=None, overwrite=False
+):
     """Write a sensor mosaic as DNG; `rawpy` reads the same numbers back.
 
-    mosaic: (row, column) unsigned integers below 65536. cfa: "mono" or four letters, row by row. black: DN, one number or
-    2x2 by position. white: saturation level, DN. exposure_s: s. xmp_json: JSON-able dict or JSON text kept in the XMP packet
-    (attributes of a capture artefact by their names, "provenance"); black, white and the mosaic's SHA-256 are added to it.
+    mosaic: (row, column) unsigned integers below 65536.
+    cfa: "mono" or four letters, row by row.
+    black: DN, one number or 2x2 by position.
+    white: saturation level, DN.
+    exposure_s: s.
+    xmp_json: JSON-able dict or JSON text kept in the XMP packet (attributes of a capture artefact
+        by their names, "provenance"); black, white and the mosaic's SHA-256 are added to it.
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
     values = np.asarray(mosaic)
-    if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 65535:
-        raise ValueError(f"a DNG mosaic is a table of whole numbers 0..65535, not {values.dtype} {values.shape}")
+    if (
+        values.ndim != 2
+        or values.size == 0
+        or values.dtype.kind not in "iu"
+        or values.min() < 0
+        or values.max() > 65535
+    ):
+        raise ValueError(
+            f"a DNG mosaic is a table of whole numbers 0..65535, not {values.dtype} {values.shape}"
+        )
     if min(values.shape) < SMALLEST:
-        raise OutputError(f"{values.shape[0]} x {values.shape[1]} pixels are too few for a DNG: RAW readers refuse less than {SMALLEST} x {SMALLEST}",
-                          path, "write .h5 instead")
+        raise OutputError(
+            (
+                f"{values.shape[0]} x {values.shape[1]} pixels are too few for a DNG: RAW readers "
+                f"refuse less than {SMALLEST} x {SMALLEST}"
+            ),
+            path,
+            "write .h5 instead",
+        )
     if cfa != "mono" and (len(cfa) != 4 or set(cfa) - set("RGB")):
         raise ValueError(f"no colour filter array {cfa!r}")
     if not 0 < white <= 65535:
         raise ValueError(f"white level {white} is not within 1..65535")
     pixels = np.ascontiguousarray(values, dtype="<u2").tobytes()
     notes = json.loads(xmp_json) if isinstance(xmp_json, str) else dict(xmp_json or {})
-    notes |= {"black": np.asarray(black, dtype=float).tolist(), "white": float(white)}  # in full: RAW readers round and merge them
+    # in full: RAW readers round and merge them
+    notes |= {"black": np.asarray(black, dtype=float).tolist(), "white": float(white)}
     notes["mosaic_sha256"] = hashlib.sha256(pixels).hexdigest()
-    publish(path, [_headers(values.shape, cfa, np.asarray(black, dtype=float), int(round(white)), exposure_s, iso, notes, len(pixels)), pixels],
-            overwrite=overwrite)
+    publish(
+        path,
+        [
+            _headers(
+                values.shape,
+                cfa,
+                np.asarray(black, dtype=float),
+                int(round(white)),
+                exposure_s,
+                iso,
+                notes,
+                len(pixels),
+            ),
+            pixels,
+        ],
+        overwrite=overwrite,
+    )
 
 
 def _headers(shape, cfa, black, white, exposure_s, iso, notes, size):
-    """Everything before the pixels. Laid out twice: the first pass finds the lengths, the second fills in the offsets."""
+    """Everything before the pixels.
+
+    Laid out twice: the first pass finds the lengths, the second fills in the offsets.
+    """
     exif = [(36864, _UNDEFINED, 4, b"0230")]
     if exposure_s:
         exif.append((33434, _RATIONAL, 1, _rationals([exposure_s])))
@@ -71,24 +112,55 @@ def _headers(shape, cfa, black, white, exposure_s, iso, notes, size):
 def _tags(shape, cfa, black, white, notes, size, pixels, exif):
     rows, columns = shape
     tags = [
-        (254, _LONG, [0]), (256, _LONG, [columns]), (257, _LONG, [rows]), (258, _SHORT, [16]), (259, _SHORT, [1]),
-        (262, _SHORT, [_LINEAR_RAW if cfa == "mono" else _CFA_PHOTOMETRIC]), (271, _ASCII, b"plenocli\0"),
-        (272, _ASCII, b"simulated plenoptic camera\0"), (273, _LONG, [pixels]), (274, _SHORT, [1]), (277, _SHORT, [1]),
-        (278, _LONG, [rows]), (279, _LONG, [size]), (284, _SHORT, [1]), (305, _ASCII, f"plenocli {__version__}\0".encode()),
-        (700, _BYTE, _packet(notes)), (34665, _LONG, [exif]), (50706, _BYTE, [1, 4, 0, 0]), (50707, _BYTE, [1, 1, 0, 0]),
-        (50708, _ASCII, b"plenocli simulated plenoptic camera\0"), (50717, _LONG, [white]), *_black_tags(black)]
+        (254, _LONG, [0]),
+        (256, _LONG, [columns]),
+        (257, _LONG, [rows]),
+        (258, _SHORT, [16]),
+        (259, _SHORT, [1]),
+        (262, _SHORT, [_LINEAR_RAW if cfa == "mono" else _CFA_PHOTOMETRIC]),
+        (271, _ASCII, b"plenocli\0"),
+        (272, _ASCII, b"simulated plenoptic camera\0"),
+        (273, _LONG, [pixels]),
+        (274, _SHORT, [1]),
+        (277, _SHORT, [1]),
+        (278, _LONG, [rows]),
+        (279, _LONG, [size]),
+        (284, _SHORT, [1]),
+        (305, _ASCII, f"plenocli {__version__}\0".encode()),
+        (700, _BYTE, _packet(notes)),
+        (34665, _LONG, [exif]),
+        (50706, _BYTE, [1, 4, 0, 0]),
+        (50707, _BYTE, [1, 1, 0, 0]),
+        (50708, _ASCII, b"plenocli simulated plenoptic camera\0"),
+        (50717, _LONG, [white]),
+        *_black_tags(black),
+    ]
     if cfa != "mono":
-        tags += [(33421, _SHORT, [2, 2]), (33422, _BYTE, [_COLOUR_CODE[letter] for letter in cfa]), (50710, _BYTE, [0, 1, 2]), (50711, _SHORT, [1]),
-                 (50721, _SRATIONAL, [round(v * 10_000) for v in _COLOUR_MATRIX]), (50728, _RATIONAL, _rationals([1.0] * 3)), (50778, _SHORT, [21])]
+        tags += [
+            (33421, _SHORT, [2, 2]),
+            (33422, _BYTE, [_COLOUR_CODE[letter] for letter in cfa]),
+            (50710, _BYTE, [0, 1, 2]),
+            (50711, _SHORT, [1]),
+            (50721, _SRATIONAL, [round(v * 10_000) for v in _COLOUR_MATRIX]),
+            (50728, _RATIONAL, _rationals([1.0] * 3)),
+            (50778, _SHORT, [21]),
+        ]
     return [_packed(*tag) for tag in sorted(tags, key=lambda tag: tag[0])]
 
 
 def _black_tags(black):
-    """BlackLevelRepeatDim and BlackLevel, row by row; whole numbers as such, others as fractions."""
+    """BlackLevelRepeatDim and BlackLevel, row by row; whole numbers as such,
+    others as fractions.
+    """
     levels = black.ravel() if black.shape == (2, 2) else np.array([float(black)])
     whole = all(float(v).is_integer() and 0 <= v < 65536 for v in levels)
     side = 2 if levels.size == 4 else 1
-    return [(50713, _SHORT, [side, side]), (50714, _SHORT, [int(v) for v in levels]) if whole else (50714, _RATIONAL, _rationals(levels))]
+    return [
+        (50713, _SHORT, [side, side]),
+        (50714, _SHORT, [int(v) for v in levels])
+        if whole
+        else (50714, _RATIONAL, _rationals(levels)),
+    ]
 
 
 def _packed(number, kind, values):
@@ -101,12 +173,19 @@ def _packed(number, kind, values):
 
 
 def _rationals(values):
-    parts = [Fraction(float(v)).limit_denominator(10**6) if v >= 1e-3 else Fraction(round(float(v) * 1e9), 10**9) for v in values]
+    parts = [
+        Fraction(float(v)).limit_denominator(10**6)
+        if v >= 1e-3
+        else Fraction(round(float(v) * 1e9), 10**9)
+        for v in values
+    ]
     return b"".join(struct.pack("<II", min(p.numerator, 2**32 - 1), p.denominator) for p in parts)
 
 
 def _directory(tags, offset):
-    """One image file directory at `offset`, with the values that do not fit into its entries behind it."""
+    """One image file directory at `offset`, with the values that do not fit into its
+    entries behind it.
+    """
     entries, extra = b"", b""
     behind = offset + 2 + 12 * len(tags) + 4
     for number, kind, count, data in sorted(tags):
@@ -121,14 +200,20 @@ def _directory(tags, offset):
 
 def _packet(notes):
     text = json.dumps(notes, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    return ('<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
-            '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
-            f'xmlns:plenocli="https://plenocli.invalid/ns/1/">{_OPEN}{escape(text)}{_CLOSE}'
-            '</rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="r"?>').encode()
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta '
+        'xmlns:x="adobe:ns:meta/"><rdf:RDF '
+        'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
+        f'xmlns:plenocli="https://plenocli.invalid/ns/1/">{_OPEN}{escape(text)}{_CLOSE}</'
+        'rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="r"?>'
+    ).encode()
 
 
 def read_notes(path):
-    """The JSON that `write_dng` left in the XMP packet, as a dict; {} where there is none. Looks at the first 4 MiB only."""
+    """The JSON that `write_dng` left in the XMP packet, as a dict; {} where there is none.
+
+    Looks at the first 4 MiB only.
+    """
     with open(path, "rb") as stream:
         head = stream.read(4 << 20)
     start = head.find(_OPEN.encode())
@@ -136,7 +221,7 @@ def read_notes(path):
     if not head.startswith(b"II*\0") or start < 0 or end < 0:
         return {}
     try:
-        notes = json.loads(unescape(head[start + len(_OPEN):end].decode("utf-8")))
+        notes = json.loads(unescape(head[start + len(_OPEN) : end].decode("utf-8")))
     except ValueError:
         return {"mosaic_sha256": "unreadable"}
     return notes if isinstance(notes, dict) else {}

@@ -1,7 +1,9 @@
-"""OpenEXR in and out through OpenImageIO. Channels are always found by name, because EXR sorts them.
+"""OpenEXR in and out through OpenImageIO. Channels are always found by name,
+because EXR sorts them.
 
-What we write carries a SHA-256 of its channels and attributes, because EXR has no checksum of its own; the reader verifies
-it where it is there. The clock is kept out: the same channels give the same bytes.
+What we write carries a SHA-256 of its channels and attributes, because EXR has no checksum of its
+own; the reader verifies it where it is there. The clock is kept out: the same channels
+give the same bytes.
 """
 
 import contextlib
@@ -12,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from plenocli import __version__
-from plenocli.files.atomic import check_output, replacement
 from plenocli.base.budget import require_room
-from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.base.errors import InputError, OutputError
+from plenocli.files.artefacts.provenance import first_bytes
+from plenocli.files.atomic import check_output, replacement
 
 DIGEST = "plenocli:sha256"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
@@ -23,7 +25,8 @@ _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose
 
 
 def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip"):
-    """Write float32 channels (name -> (row, column) array, all of one shape) and text attributes (name -> str).
+    """Write float32 channels (name -> (row, column) array, all of one shape) and text
+    attributes (name -> str).
 
     Everything is read back and compared before the file takes its place. Same input, same bytes.
     Raises ValueError (a bug of the caller: shapes, names), UsageError, OutputError.
@@ -40,18 +43,27 @@ def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip")
 
         output = oiio.ImageOutput.create("exr")
         if output is None or not output.open(str(partial), spec):
-            raise OutputError(f"OpenEXR cannot write it ({oiio_error(output)})", path, "check the folder and the space left")
+            raise OutputError(
+                f"OpenEXR cannot write it ({oiio_error(output)})",
+                path,
+                "check the folder and the space left",
+            )
         written = output.write_image(pixels)
         closed = output.close()
         if not (written and closed):
-            raise OutputError(f"OpenEXR could not write all of it ({oiio_error(output)})", path, "free some space; nothing was changed")
+            raise OutputError(
+                f"OpenEXR could not write all of it ({oiio_error(output)})",
+                path,
+                "free some space; nothing was changed",
+            )
         _verify(path, partial, pixels, names, attrs, compression)
 
 
 def read_exr(path, *, mem_limit=None):
     """Channels (name -> (row, column) float32) and text attributes (name -> str) of an EXR file.
 
-    Raises InputError for a file that is missing, damaged, too large, deep, in several parts, or holds integer channels.
+    Raises InputError for a file that is missing, damaged, too large, deep, in several parts, or
+    holds integer channels.
     """
     with _opened(path) as source:
         spec = source.spec()
@@ -60,14 +72,27 @@ def read_exr(path, *, mem_limit=None):
         if pixels is None:
             raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
         attrs = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
-        pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
-        "".join([*spec.channelnames, *attrs, *attrs.values()]).encode()  # damaged text may come as lone surrogates
-        channels = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)}
+        pixels = np.asarray(pixels, dtype=np.float32).reshape(
+            spec.height, spec.width, spec.nchannels
+        )
+        # damaged text may come as lone surrogates
+        "".join([*spec.channelnames, *attrs, *attrs.values()]).encode()
+        channels = {
+            name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)
+        }
     if DIGEST in attrs:
-        ours = {name: value for name, value in attrs.items() if name.startswith("plenocli:") or name in _listed(attrs)}
+        ours = {
+            name: value
+            for name, value in attrs.items()
+            if name.startswith("plenocli:") or name in _listed(attrs)
+        }
         ours.pop(DIGEST)
         if _digest(channels, {n: v for n, v in ours.items() if n != _LIST}) != attrs[DIGEST]:
-            raise InputError("is damaged or was edited: its SHA-256 is not the one it was written with", path, "make it again")
+            raise InputError(
+                "is damaged or was edited: its SHA-256 is not the one it was written with",
+                path,
+                "make it again",
+            )
     return channels, {name: value for name, value in attrs.items() if name != _LIST}
 
 
@@ -77,9 +102,10 @@ def channel_names(path):
         return list(source.spec().channelnames)
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
 
-_LIST = "plenocli:attributes"  # the names that the digest covers; OpenImageIO adds attributes of its own
+# the names that the digest covers; OpenImageIO adds attributes of its own
+_LIST = "plenocli:attributes"
 
 
 def _listed(attrs):
@@ -90,15 +116,23 @@ def _listed(attrs):
 
 
 def _checked(channels, attrs, compression):
-    planes = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()}
+    planes = {
+        name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()
+    }
     shapes = {plane.shape for plane in planes.values()}
     if not planes or len(shapes) != 1 or any(len(s) != 2 or 0 in s for s in shapes):
-        raise ValueError(f"EXR channels must be two-dimensional, not empty and of one shape, not {shapes}")
+        raise ValueError(
+            f"EXR channels must be two-dimensional, not empty and of one shape, not {shapes}"
+        )
     # EXR keeps 255 bytes of a name; OpenImageIO renames empty and repeated ones without a word
-    if any(not name or len(name.encode()) > 255 or "\0" in name for name in planes) or len({n.lower() for n in planes}) != len(planes):
+    if any(not name or len(name.encode()) > 255 or "\0" in name for name in planes) or len(
+        {n.lower() for n in planes}
+    ) != len(planes):
         raise ValueError(f"EXR channel names must be distinct and not empty: {list(planes)}")
     if any(not isinstance(v, str) or not n for n, v in attrs.items()):
-        raise ValueError("EXR attributes must be text: OpenImageIO drops other types without a word")
+        raise ValueError(
+            "EXR attributes must be text: OpenImageIO drops other types without a word"
+        )
     if compression not in _COMPRESSIONS:
         raise ValueError(f"EXR compression {compression!r} is none of {_COMPRESSIONS}")
     return planes, attrs
@@ -127,30 +161,55 @@ def _digest(planes, attrs):
 
 
 def _verify(path, partial, pixels, names, attrs, compression):
-    """Compare the file with what went in: OpenImageIO drops what it cannot store, and misses a disk that gets full, without an error."""
+    """Compare the file with what went in: OpenImageIO drops what it cannot store, and misses a
+    disk that gets full, without an error.
+    """
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(str(partial))
     if source is None:
-        raise OutputError(f"cannot be read back ({oiio_error(None)})", path, "free some space; nothing was changed")
+        raise OutputError(
+            f"cannot be read back ({oiio_error(None)})",
+            path,
+            "free some space; nothing was changed",
+        )
     spec = source.spec()
     back, stored = {a.name: a.value for a in spec.extra_attribs}, list(spec.channelnames)
-    wrong = [name for name, value in (attrs | {"compression": compression}).items() if back.get(name) != value]
+    wrong = [
+        name
+        for name, value in (attrs | {"compression": compression}).items()
+        if back.get(name) != value
+    ]
     if sorted(stored) != sorted(names) or wrong or spec.format.basetype != oiio.FLOAT:
-        raise OutputError(f"EXR does not keep {wrong or 'the channel names'}", path, "use other names")
+        raise OutputError(
+            f"EXR does not keep {wrong or 'the channel names'}", path, "use other names"
+        )
     found = source.read_image("float")
     trouble = oiio_error(source)
     source.close()
     order = [stored.index(name) for name in names]
-    if found is None or trouble or not np.array_equal(found.reshape(pixels.shape)[..., order].view(np.uint32), pixels.view(np.uint32)):
-        raise OutputError(f"does not hold what was written ({trouble or 'other values'})", path, "free some space; nothing was changed")
+    if (
+        found is None
+        or trouble
+        or not np.array_equal(
+            found.reshape(pixels.shape)[..., order].view(np.uint32), pixels.view(np.uint32)
+        )
+    ):
+        raise OutputError(
+            f"does not hold what was written ({trouble or 'other values'})",
+            path,
+            "free some space; nothing was changed",
+        )
 
 
-# --- reading -----------------------------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------------
+
 
 @contextlib.contextmanager
 def _opened(path):
-    """An open ImageInput of the EXR at `path`, closed afterwards; the type is taken from the content, not from the name."""
+    """An open ImageInput of the EXR at `path`, closed afterwards; the type is taken from the
+    content, not from the name.
+    """
     import OpenImageIO as oiio
 
     path = Path(path)
@@ -165,7 +224,9 @@ def _opened(path):
     try:
         yield source
     except UnicodeError as error:
-        raise InputError("is damaged: an attribute or channel name is not text", path, "make or copy it again") from error
+        raise InputError(
+            "is damaged: an attribute or channel name is not text", path, "make or copy it again"
+        ) from error
     finally:
         source.close()
         oiio_error(source)  # an error never fetched is printed when the process ends
@@ -179,7 +240,9 @@ def _check_header(path, source, spec, mem_limit):
     require_room(path, spec.width * spec.height * spec.nchannels * 4, mem_limit)
     formats = spec.channelformats or (spec.format,) * spec.nchannels
     if any(f.basetype not in (oiio.FLOAT, oiio.HALF) for f in formats):
-        raise InputError("holds integer channels, which have no unit", path, "keep only half and float channels")
+        raise InputError(
+            "holds integer channels, which have no unit", path, "keep only half and float channels"
+        )
     if source.seek_subimage(1, 0):
         raise InputError("holds several parts", path, "split it into one file a part")
     oiio_error(source)
@@ -187,7 +250,9 @@ def _check_header(path, source, spec, mem_limit):
 
 
 def oiio_error(handle):
-    """The pending message of an OpenImageIO object (or of the library, for None), its first line; fetching clears it."""
+    """The pending message of an OpenImageIO object (or of the library, for None), its first
+    line; fetching clears it.
+    """
     import OpenImageIO as oiio
 
     try:

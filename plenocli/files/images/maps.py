@@ -1,17 +1,19 @@
-"""What a camera description names by file: the transmittance of its pupil and its wavefront error, as square grids."""
+"""What a camera description names by file: the transmittance of its pupil and its wavefront
+error, as square grids.
+"""
 
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from plenocli.files.images.exr import read_exr
 from plenocli.base.budget import require_room
-from plenocli.files.images.pictures import file_type, read_stored
-from plenocli.files.artefacts.provenance import require_file
-from plenocli.files.artefacts.structure import read_attribute, survey
 from plenocli.base.errors import InputError
 from plenocli.base.text import by
+from plenocli.files.artefacts.provenance import require_file
+from plenocli.files.artefacts.structure import read_attribute, survey
+from plenocli.files.images.exr import read_exr
+from plenocli.files.images.pictures import file_type, read_stored
 
 MAX_BYTES = 64 << 20
 """No map of at most 1024 x 1024 values is longer."""
@@ -19,10 +21,11 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_transmittance(path):
-    """Intensity transmittance (rows, columns) float64 from a grey PNG or the one channel of an EXR. Raises InputError.
+    """Intensity transmittance (rows, columns) float64 from a grey PNG or the one channel of an EXR.
+    Raises InputError.
 
-    PNG: stored numbers over the largest (255 or 65535), not decoded as sRGB; EXR: as stored. An RGB picture passes if its
-    three channels are equal; alpha is ignored.
+    PNG: stored numbers over the largest (255 or 65535), not decoded as sRGB; EXR: as stored. An RGB
+    picture passes if its three channels are equal; alpha is ignored.
     """
     _require_small(path)
     kind = file_type(path)
@@ -33,15 +36,18 @@ def read_transmittance(path):
     stored, names, bits = read_stored(path, kind, MAX_BYTES)
     colours = stored[..., [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]]
     if np.any(colours != colours[..., :1]):
-        raise InputError("is a colour picture; a transmittance has one channel", path, "convert it to grey")
+        raise InputError(
+            "is a colour picture; a transmittance has one channel", path, "convert it to grey"
+        )
     return colours[..., 0].astype(float) / (2 ** max(bits, 8) - 1)
 
 
 def read_wavefront(path):
-    """Wavefront error in metres (rows, columns) float64, from the dataset "wavefront" of an HDF5 file or the one channel of an EXR.
+    """Wavefront error in metres (rows, columns) float64, from the dataset "wavefront" of an HDF5
+    file or the one channel of an EXR.
 
-    A dataset may say its unit in the attribute "units", which must be m, as text of fixed length: HDF5 may read a damaged one of
-    variable length for ever. Raises InputError.
+    A dataset may say its unit in the attribute "units", which must be m, as text of fixed length:
+    HDF5 may read a damaged one of variable length for ever. Raises InputError.
     """
     _require_small(path)
     content = Path(path).read_bytes()
@@ -49,19 +55,31 @@ def read_wavefront(path):
         return _from_hdf5(path, content)
     if file_type(path) == "exr":
         return _one_channel(path)
-    raise InputError("is neither HDF5 nor EXR", path, "give the wavefront as .h5 with the dataset wavefront, or as .exr, in metres")
+    raise InputError(
+        "is neither HDF5 nor EXR",
+        path,
+        "give the wavefront as .h5 with the dataset wavefront, or as .exr, in metres",
+    )
 
 
 def _require_small(path):
     size = require_file(path)
     if size > MAX_BYTES:
-        raise InputError(f"is {size / 1e6:.0f} MB, more than {MAX_BYTES >> 20} MiB", path, "give a grid of at most 1024 x 1024 values")
+        raise InputError(
+            f"is {size / 1e6:.0f} MB, more than {MAX_BYTES >> 20} MiB",
+            path,
+            "give a grid of at most 1024 x 1024 values",
+        )
 
 
 def _one_channel(path):
     channels, _ = read_exr(path, mem_limit=MAX_BYTES)
     if len(channels) != 1 and "Y" not in channels:
-        raise InputError(f"has the channels {', '.join(list(channels)[:8])}", path, "give one channel, or one named Y")
+        raise InputError(
+            f"has the channels {', '.join(list(channels)[:8])}",
+            path,
+            "give one channel, or one named Y",
+        )
     return np.asarray(channels.get("Y", next(iter(channels.values()))), float)
 
 
@@ -73,15 +91,25 @@ def _from_hdf5(path, content):
         with h5py.File(h5py.h5f.open(b"wavefront", h5py.h5f.ACC_RDONLY, access)) as file:
             declared = survey(path, file, MAX_BYTES)
             if "wavefront" not in declared:
-                raise InputError(f"has no dataset wavefront, only {', '.join(list(declared)[:8]) or 'none'}", path, "store W in metres as /wavefront")
+                raise InputError(
+                    f"has no dataset wavefront, only {', '.join(list(declared)[:8]) or 'none'}",
+                    path,
+                    "store W in metres as /wavefront",
+                )
             shape, dtype = declared["wavefront"]
             if dtype.kind not in "iuf" or len(shape) != 2:
-                raise InputError(f"holds {by(shape)} values of the type {dtype} in /wavefront", path, "store a square grid of floats")
+                raise InputError(
+                    f"holds {by(shape)} values of the type {dtype} in /wavefront",
+                    path,
+                    "store a square grid of floats",
+                )
             require_room(path, 8 * int(np.prod(shape)), MAX_BYTES)
             dataset = file["wavefront"]
             units = read_attribute(path, dataset, "units") if "units" in dataset.attrs else "m"
             if units != "m":
-                raise InputError(f"gives /wavefront in {units!r}", path, 'store metres, units = "m"')
+                raise InputError(
+                    f"gives /wavefront in {units!r}", path, 'store metres, units = "m"'
+                )
             return dataset[()].astype(float)
     except InputError:
         raise

@@ -5,18 +5,27 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.files.images.exr import oiio_error
 from plenocli.base.budget import require_room
-from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.base.errors import InputError
+from plenocli.files.artefacts.provenance import first_bytes
+from plenocli.files.images.exr import oiio_error
 
-_MAGIC = ((b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8\xff", "jpeg"), (b"II*\0", "tiff"), (b"MM\0*", "tiff"), (b"\x76\x2f\x31\x01", "exr"),
-          (b"II+\0", "tiff"), (b"MM\0+", "tiff"))
+_MAGIC = (
+    (b"\x89PNG\r\n\x1a\n", "png"),
+    (b"\xff\xd8\xff", "jpeg"),
+    (b"II*\0", "tiff"),
+    (b"MM\0*", "tiff"),
+    (b"\x76\x2f\x31\x01", "exr"),
+    (b"II+\0", "tiff"),
+    (b"MM\0+", "tiff"),
+)
 
 
 @dataclass
 class Picture:
-    """values: float32 (row, column, channel), linear; wavelengths: m, one a channel, where `is_spectral`, else None."""
+    """values: float32 (row, column, channel), linear;
+    wavelengths: m, one a channel, where `is_spectral`, else None.
+    """
 
     values: np.ndarray
     is_spectral: bool = False
@@ -24,10 +33,11 @@ class Picture:
 
 
 def read_picture(path, *, mem_limit=None):
-    """Read a photograph (PNG, JPEG, TIFF) or an EXR as linear values with one channel, or R, G, B, or one a band.
+    """Read a photograph (PNG, JPEG, TIFF) or an EXR as linear values with one channel, or R,
+    G, B, or one a band.
 
-    8 and 16 bit values are taken as sRGB (IEC 61966-2-1) and decoded to 0..1; float values are linear already. Alpha is
-    dropped without touching the colours. Raises InputError.
+    8 and 16 bit values are taken as sRGB (IEC 61966-2-1) and decoded to 0..1; float values are
+    linear already. Alpha is dropped without touching the colours. Raises InputError.
     """
     kind = file_type(path)
     if kind == "exr":
@@ -35,17 +45,27 @@ def read_picture(path, *, mem_limit=None):
     if kind is None:
         raise InputError("is no PNG, JPEG, TIFF or EXR", path, "convert it to one of them")
     if kind == "tiff" and Path(path).suffix.lower() not in (".tif", ".tiff"):
-        raise InputError("is a camera's RAW or a DNG, the mosaic of a sensor and no picture", path, "develop it, or name it .tif if it is a picture")
+        raise InputError(
+            "is a camera's RAW or a DNG, the mosaic of a sensor and no picture",
+            path,
+            "develop it, or name it .tif if it is a picture",
+        )
     stored, names, _ = read_stored(path, kind, mem_limit)
     colours = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     if len(colours) not in (1, 3):
-        raise InputError(f"has the channels {', '.join(names)}", path, "give a grey or an RGB picture")
+        raise InputError(
+            f"has the channels {', '.join(names)}", path, "give a grey or an RGB picture"
+        )
     stored = stored[..., colours]
     if stored.dtype.kind == "f":
         return Picture(_finite(path, stored.astype(np.float32)))
     if stored.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"holds values of the type {stored.dtype}", path, "give 8 or 16 bits, or float")
-    table = srgb_to_linear(np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max).astype(np.float32)
+        raise InputError(
+            f"holds values of the type {stored.dtype}", path, "give 8 or 16 bits, or float"
+        )
+    table = srgb_to_linear(
+        np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max
+    ).astype(np.float32)
     return Picture(table[stored])
 
 
@@ -56,13 +76,17 @@ def srgb_to_linear(encoded):
 
 
 def file_type(path):
-    """"png", "jpeg", "tiff", "exr" or None, by the first bytes. Raises InputError for what is no readable file."""
+    """ "png", "jpeg", "tiff", "exr" or None, by the first bytes.
+
+    Raises InputError for what is no readable file.
+    """
     head = first_bytes(path, 8)
     return next((kind for magic, kind in _MAGIC if head.startswith(magic)), None)
 
 
 def read_stored(path, kind, mem_limit=None):
-    """(values (row, column, channel) as stored, channel names, bits) of a PNG, JPEG or TIFF. Raises InputError.
+    """(values (row, column, channel) as stored, channel names, bits) of a PNG, JPEG or TIFF.
+    Raises InputError.
 
     Values of odd bit depths (10, 12, 14) come back unscaled in uint16.
     """
@@ -72,12 +96,20 @@ def read_stored(path, kind, mem_limit=None):
     settings.attribute("oiio:UnassociatedAlpha", 1)  # else colours come multiplied with alpha
     source = oiio.ImageInput.open(str(Path(path)), settings)
     if source is None or source.format_name() != kind:
-        raise InputError(f"is no readable {kind.upper()}: {oiio_error(source)}", path, "make or copy it again")
+        raise InputError(
+            f"is no readable {kind.upper()}: {oiio_error(source)}", path, "make or copy it again"
+        )
     try:
         spec = source.spec()
         if spec.depth > 1 or spec.nchannels > 8:
-            raise InputError(f"has {spec.depth} layers and {spec.nchannels} channels", path, "give a flat picture")
-        require_room(path, spec.width * spec.height * spec.nchannels * (spec.format.size() + 4), mem_limit)
+            raise InputError(
+                f"has {spec.depth} layers and {spec.nchannels} channels",
+                path,
+                "give a flat picture",
+            )
+        require_room(
+            path, spec.width * spec.height * spec.nchannels * (spec.format.size() + 4), mem_limit
+        )
         values = source.read_image(spec.format)
         trouble = oiio_error(source)
         if values is None or trouble:
@@ -86,7 +118,8 @@ def read_stored(path, kind, mem_limit=None):
         container = 8 * values.itemsize
         bits = spec.get_int_attribute("oiio:BitsPerSample", container)
         if values.dtype.kind == "u" and 8 < bits < container:
-            values = values >> (container - bits)  # OpenImageIO fills the upper bits; this undoes it exactly
+            # OpenImageIO fills the upper bits; this undoes it exactly
+            values = values >> (container - bits)
         return values, list(spec.channelnames), bits if values.dtype.kind == "u" else container
     finally:
         source.close()
@@ -99,15 +132,27 @@ def _from_exr(path, mem_limit):
 
     if is_spectral(path):
         spectral = read_spectral_exr(path, mem_limit=mem_limit)
-        return Picture(_finite(path, np.ascontiguousarray(np.moveaxis(spectral.values, 0, -1))), True, spectral.wavelengths)
+        return Picture(
+            _finite(path, np.ascontiguousarray(np.moveaxis(spectral.values, 0, -1))),
+            True,
+            spectral.wavelengths,
+        )
     channels, _ = read_exr(path, mem_limit=mem_limit)
     for names in (("R", "G", "B"), ("Y",), tuple(channels) if len(channels) == 1 else ("Y",)):
         if set(names) <= set(channels):
             return Picture(_finite(path, np.stack([channels[name] for name in names], axis=-1)))
-    raise InputError(f"has the channels {', '.join(list(channels)[:8])}, neither Y nor R, G, B nor wavelengths", path, "rename its channels")
+    raise InputError(
+        f"has the channels {', '.join(list(channels)[:8])}, neither Y nor R, G, B nor wavelengths",
+        path,
+        "rename its channels",
+    )
 
 
 def _finite(path, values):
     if not np.isfinite(values).all():
-        raise InputError(f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite", path, "mend or crop it")
+        raise InputError(
+            f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite",
+            path,
+            "mend or crop it",
+        )
     return values

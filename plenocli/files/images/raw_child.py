@@ -1,7 +1,8 @@
-"""Reads one RAW file in a process of its own, with limits, because LibRaw has to survive files that nobody can vouch for.
+"""Reads one RAW file in a process of its own, with limits, because LibRaw has to survive files that
+nobody can vouch for.
 
-Run by `raw.py` as a script: python -P raw_child.py FILE ADDRESS_SPACE_BYTES CPU_SECONDS
-stdout: one line of JSON, then the mosaic as little-endian uint16, row by row. Nothing is written to disk.
+Run by `raw.py` as a script: python -P raw_child.py FILE ADDRESS_SPACE_BYTES CPU_SECONDS stdout: one
+line of JSON, then the mosaic as little-endian uint16, row by row. Nothing is written to disk.
 """
 
 import json
@@ -13,31 +14,53 @@ import sys
 
 def limit(address_space, cpu_seconds):
     """Bound this process before any foreign byte is parsed."""
-    for kind, value in ((resource.RLIMIT_AS, address_space), (resource.RLIMIT_CPU, cpu_seconds),
-                        (resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_CORE, 0)):
+    for kind, value in (
+        (resource.RLIMIT_AS, address_space),
+        (resource.RLIMIT_CPU, cpu_seconds),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
         hard = resource.getrlimit(kind)[1]
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)
         resource.setrlimit(kind, (value, value))
 
 
 def read(path):
-    """(description, mosaic bytes) of a RAW file; the description has "refused" with the reason where it holds no mosaic."""
+    """(description, mosaic bytes) of a RAW file; the description has "refused" with the reason
+    where it holds no mosaic.
+    """
     import rawpy
 
     with rawpy.imread(path) as raw:
         if raw.raw_type != rawpy.RawType.Flat:
-            return {"refused": f"holds {raw.raw_image.shape[-1]} values a pixel, not a colour filter mosaic: it is demosaiced, a scan or a stack"}, b""
+            return {
+                "refused": (
+                    f"holds {raw.raw_image.shape[-1]} values a pixel, not a colour filter mosaic: "
+                    "it is demosaiced, a scan or a stack"
+                )
+            }, b""
         visible = raw.raw_image_visible
         colours = raw.raw_colors_visible
         found = {
-            "shape": list(visible.shape), "full_shape": list(raw.raw_image.shape), "description": raw.color_desc.decode("latin-1"),
-            "colour_count": int(raw.num_colors), "black": [float(v) for v in raw.black_level_per_channel], "white": float(raw.white_level),
-            "camera_white": None if raw.camera_white_level_per_channel is None else [float(v) for v in raw.camera_white_level_per_channel],
-            "exposure_s": float(raw.other.shutter_speed), "iso": float(raw.other.iso_speed), "f_number": float(raw.other.aperture),
-            "focal_length_m": float(raw.other.focal_length) / 1000}
+            "shape": list(visible.shape),
+            "full_shape": list(raw.raw_image.shape),
+            "description": raw.color_desc.decode("latin-1"),
+            "colour_count": int(raw.num_colors),
+            "black": [float(v) for v in raw.black_level_per_channel],
+            "white": float(raw.white_level),
+            "camera_white": None
+            if raw.camera_white_level_per_channel is None
+            else [float(v) for v in raw.camera_white_level_per_channel],
+            "exposure_s": float(raw.other.shutter_speed),
+            "iso": float(raw.other.iso_speed),
+            "f_number": float(raw.other.aperture),
+            "focal_length_m": float(raw.other.focal_length) / 1000,
+        }
         indices = colours[:2, :2].astype(int)
         if colours.shape[0] >= 2 and colours.shape[1] >= 2:
-            repeats = all((colours[i::2, j::2] == indices[i, j]).all() for i in (0, 1) for j in (0, 1))
+            repeats = all(
+                (colours[i::2, j::2] == indices[i, j]).all() for i in (0, 1) for j in (0, 1)
+            )
             found |= {"indices": indices.tolist(), "repeats": repeats}
         # a copy: LibRaw frees the mosaic when it is closed
         return found, visible.astype("<u2").tobytes()
@@ -66,7 +89,9 @@ def exif(path):
 
 
 def main():
-    """Read sys.argv and answer on stdout, as said above; every failure becomes an answer with "refused"."""
+    """Read sys.argv and answer on stdout, as said above; every failure becomes an
+    answer with "refused".
+    """
     path, address_space, cpu_seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     channel = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not mix with the answer

@@ -1,6 +1,7 @@
-"""Spectral pictures as EXR in the layout of Fichet, Pacanowski & Wilkie, "An OpenEXR Layout for Spectral Images",
-Journal of Computer Graphics Techniques 10(3), 2021: one channel a band, named by its wavelength with a decimal comma
-("T.450,000000nm" reflectance, "S0.450,000000nm" radiance), and R, G, B for viewers.
+"""Spectral pictures as EXR in the layout of Fichet, Pacanowski & Wilkie, "An OpenEXR Layout for
+Spectral Images", Journal of Computer Graphics Techniques 10(3), 2021: one channel a band, named by
+its wavelength with a decimal comma ("T.450,000000nm" reflectance, "S0.450,000000nm" radiance), and
+R, G, B for viewers.
 """
 
 import re
@@ -8,19 +9,46 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from plenocli.files.images.exr import channel_names, read_exr, write_exr
 from plenocli.base.errors import InputError
+from plenocli.files.images.exr import channel_names, read_exr, write_exr
 
 LIGHT = 299_792_458.0
 _PREFIX = {"reflectance": "T", "radiance": "S0"}
-_MULTIPLIER = {"": 1.0, "Y": 1e24, "Z": 1e21, "E": 1e18, "P": 1e15, "T": 1e12, "G": 1e9, "M": 1e6, "k": 1e3, "h": 1e2, "da": 1e1,
-               "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15, "a": 1e-18, "z": 1e-21, "y": 1e-24}
-_CHANNEL = re.compile(r"(S[0-3]|T|sigma)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p|f|a|z|y)?(m|Hz)")
+_MULTIPLIER = {
+    "": 1.0,
+    "Y": 1e24,
+    "Z": 1e21,
+    "E": 1e18,
+    "P": 1e15,
+    "T": 1e12,
+    "G": 1e9,
+    "M": 1e6,
+    "k": 1e3,
+    "h": 1e2,
+    "da": 1e1,
+    "d": 1e-1,
+    "c": 1e-2,
+    "m": 1e-3,
+    "u": 1e-6,
+    "n": 1e-9,
+    "p": 1e-12,
+    "f": 1e-15,
+    "a": 1e-18,
+    "z": 1e-21,
+    "y": 1e-24,
+}
+_CHANNEL = re.compile(
+    r"(S[0-3]|T|sigma)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|"
+    r"n|p|f|a|z|y)?(m|Hz)"
+)
 
 
 @dataclass
 class Spectral:
-    """values and sigma (or None): (band, row, column) float32; wavelengths: m, ascending; quantity: "reflectance" or "radiance"."""
+    """values and sigma (or None): (band, row, column) float32;
+    wavelengths: m, ascending;
+    quantity: "reflectance" or "radiance".
+    """
 
     wavelengths: np.ndarray
     values: np.ndarray
@@ -29,23 +57,48 @@ class Spectral:
     attrs: dict = field(default_factory=dict)
 
 
-def write_spectral_exr(path, wavelengths, cube, quantity="reflectance", rgb=None, sigma=None, attrs=None, *, overwrite=False, compression="zip"):
+def write_spectral_exr(
+    path,
+    wavelengths,
+    cube,
+    quantity="reflectance",
+    rgb=None,
+    sigma=None,
+    attrs=None,
+    *,
+    overwrite=False,
+    compression="zip",
+):
     """Write a spectral picture.
 
-    wavelengths: (band,) m, ascending. cube, sigma: (band, row, column). quantity: "reflectance" (channels T) or "radiance"
-    (channels S0, unit W m^-2 sr^-1 in each band, or relative where attrs says so with "emissiveUnits"). rgb: (3, row, column)
-    linear preview; computed where None. attrs: text. sigma goes into channels "sigma.<wavelength>" that other readers skip.
+    wavelengths: (band,) m, ascending.
+    cube, sigma: (band, row, column).
+    quantity: "reflectance" (channels T) or "radiance" (channels S0, unit W m^-2 sr^-1 in each band,
+        or relative where attrs says so with "emissiveUnits").
+    rgb: (3, row, column) linear preview; computed where None.
+    attrs: text.
+    sigma goes into channels "sigma.<wavelength>" that other readers skip.
     Raises ValueError, UsageError, OutputError.
     """
-    wavelengths, cube = np.asarray(wavelengths, dtype=np.float64), np.asarray(cube, dtype=np.float32)
+    wavelengths, cube = (
+        np.asarray(wavelengths, dtype=np.float64),
+        np.asarray(cube, dtype=np.float32),
+    )
     if cube.ndim != 3 or wavelengths.shape != cube.shape[:1] or (np.diff(wavelengths) <= 0).any():
-        raise ValueError(f"{wavelengths.shape} wavelengths, which must ascend, do not fit a cube of shape {cube.shape}")
+        raise ValueError(
+            f"{wavelengths.shape} wavelengths, which must ascend, do not fit a cube "
+            f"of shape {cube.shape}"
+        )
     labels = [f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(labels)) != len(labels):
         raise ValueError("wavelengths are closer than 1e-6 nm")
-    channels = {f"{_PREFIX[quantity]}.{label}": plane for label, plane in zip(labels, cube, strict=True)}
+    channels = {
+        f"{_PREFIX[quantity]}.{label}": plane for label, plane in zip(labels, cube, strict=True)
+    }
     if sigma is not None:
-        channels |= {f"sigma.{label}": plane for label, plane in zip(labels, np.asarray(sigma), strict=True)}
+        channels |= {
+            f"sigma.{label}": plane for label, plane in zip(labels, np.asarray(sigma), strict=True)
+        }
     channels |= dict(zip("RGB", preview(wavelengths, cube) if rgb is None else rgb, strict=True))
     layout = {"spectralLayoutVersion": "1.0"}
     if quantity == "radiance":
@@ -70,25 +123,42 @@ def read_spectral_exr(path, quantity=None, *, mem_limit=None):
         if found:
             prefix, wavelength = found
             if wavelength in bands.setdefault(prefix, {}):
-                raise InputError(f"holds two '{prefix}' channels of {wavelength * 1e9:g} nm", path, "make it again")
+                raise InputError(
+                    f"holds two '{prefix}' channels of {wavelength * 1e9:g} nm",
+                    path,
+                    "make it again",
+                )
             bands[prefix][wavelength] = channels[name]
     there = [name for name, prefix in _PREFIX.items() if prefix in bands]
     if not there:
-        raise InputError("holds no spectral channels such as T.450,000000nm or S0.450,000000nm", path, "give a spectral EXR")
+        raise InputError(
+            "holds no spectral channels such as T.450,000000nm or S0.450,000000nm",
+            path,
+            "give a spectral EXR",
+        )
     if quantity is None and len(there) > 1:
-        raise InputError("holds both radiance and reflectance", path, "keep the channels of one of them")
+        raise InputError(
+            "holds both radiance and reflectance", path, "keep the channels of one of them"
+        )
     quantity = quantity or there[0]
     if quantity not in there:
         raise InputError(f"holds {there[0]}, not {quantity}", path, "give another file")
     planes = bands[_PREFIX[quantity]]
     wavelengths = np.array(sorted(planes))
     sigma = bands.get("sigma", {})
-    return Spectral(wavelengths, np.stack([planes[w] for w in wavelengths]), quantity,
-                    np.stack([sigma[w] for w in wavelengths]) if set(sigma) == set(planes) else None, attrs)
+    return Spectral(
+        wavelengths,
+        np.stack([planes[w] for w in wavelengths]),
+        quantity,
+        np.stack([sigma[w] for w in wavelengths]) if set(sigma) == set(planes) else None,
+        attrs,
+    )
 
 
 def _band(name):
-    """("T", "S0".. or "sigma", wavelength in m) of a channel name, or None; frequencies are turned into wavelengths."""
+    """("T", "S0".. or "sigma", wavelength in m) of a channel name, or None; frequencies are
+    turned into wavelengths.
+    """
     match = _CHANNEL.fullmatch(name)
     if match is None:
         return None
@@ -104,7 +174,9 @@ def _band(name):
 
 
 def preview(wavelengths, cube):
-    """Linear sRGB (3, row, column) of a spectral picture under equal energy, for looking at only; a flat unit spectrum gives white."""
+    """Linear sRGB (3, row, column) of a spectral picture under equal energy, for looking at
+    only; a flat unit spectrum gives white.
+    """
     from plenocli.forward.scene.colour import preview_rgb
 
     return np.maximum(preview_rgb(wavelengths, cube, "E"), 0.0)

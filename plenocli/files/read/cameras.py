@@ -4,17 +4,23 @@ from pathlib import Path
 
 from plenocli.base.errors import ConfigError, InputError
 
-_READERS = {"aperture_image": "read_transmittance", "wavefront": "read_wavefront", "prescription": "load_lens"}
+_READERS = {
+    "aperture_image": "read_transmittance",
+    "wavefront": "read_wavefront",
+    "prescription": "load_lens",
+}
 
 
 def read_camera(path):
-    """The Camera described at `path`, with its aperture image, wavefront and lens file read and attached; names are relative to `path`'s folder.
+    """The Camera described at `path`, with its aperture image, wavefront and lens file read and
+    attached; names are relative to `path`'s folder.
 
-    InputError for a file that cannot be read or whose values cannot be, ConfigError for the description.
+    InputError for a file that cannot be read or whose values cannot be, ConfigError
+    for the description.
     """
-    from plenocli.files.images import maps
     from plenocli.files.config import lens_file as lens
     from plenocli.files.config.camera_file import load_camera
+    from plenocli.files.images import maps
 
     camera = load_camera(path)
     for key, file in _named(path, camera).items():
@@ -22,25 +28,39 @@ def read_camera(path):
         try:
             camera = camera.attach(**{key: values})
         except ConfigError as error:
-            raise InputError(error.what, file, f"mend it, or [main_lens] {key} in {Path(path).name}") from None
+            raise InputError(
+                error.what, file, f"mend it, or [main_lens] {key} in {Path(path).name}"
+            ) from None
     return camera
 
 
 def camera_files(path, camera):
     """Role -> path of the description and of every file that it names, for describe_inputs."""
-    return {"camera": path} | {key.replace("_", " "): file for key, file in _named(path, camera).items()}
+    return {"camera": path} | {
+        key.replace("_", " "): file for key, file in _named(path, camera).items()
+    }
 
 
 def require_same_files(camera_path, camera, artefact, where):
-    """InputError unless the files that `camera` names are, byte for byte, those that `artefact` was made with."""
+    """InputError unless the files that `camera` names are, byte for byte, those that
+    `artefact` was made with.
+    """
     from plenocli.files.artefacts.provenance import file_digest
 
     for role, file in camera_files(camera_path, camera).items():
         known = artefact.provenance.inputs.get(role, {}).get("sha256")
         if role != "camera" and known != file_digest(file):
-            raise InputError(f"was made with another {role} than {Path(file).name}", where, "run simulate-pif on this camera")
+            raise InputError(
+                f"was made with another {role} than {Path(file).name}",
+                where,
+                "run simulate-pif on this camera",
+            )
 
 
 def _named(path, camera):
     lens = camera.main_lens
-    return {key: Path(path).parent / getattr(lens, key) for key in _READERS if getattr(lens, key) is not None}
+    return {
+        key: Path(path).parent / getattr(lens, key)
+        for key in _READERS
+        if getattr(lens, key) is not None
+    }

@@ -1,8 +1,9 @@
 """A folder of captures of a ColorChecker under narrow-band light, as colorchecker reads it.
 
-Anywhere below the folder: captures whose names hold their band and exposure time as in chart_550nm_25ms.tif, dark frames as
-dark_25ms.tif, a label map with "label" in its name (a picture with 0 for nothing, 1 to 24 for the patches row by row), and
-the spectrometer's table (.csv): wavelengths in nm in the first column, one column a patch by its name on the chart, one a
+Anywhere below the folder: captures whose names hold their band and exposure time as in
+chart_550nm_25ms.tif, dark frames as dark_25ms.tif, a label map with "label" in its name (a picture
+with 0 for nothing, 1 to 24 for the patches row by row), and the spectrometer's table (.csv):
+wavelengths in nm in the first column, one column a patch by its name on the chart, one a
 filter such as "550 nm".
 """
 
@@ -17,16 +18,23 @@ from plenocli.base.errors import InputError
 
 PICTURES = (".tif", ".tiff", ".png")
 MOST_FILES = 10_000
-_BAND, _TIME = re.compile(r"(?<![\d.])(\d{3,4})nm(?![a-z])", re.I), re.compile(r"(?<![\d.])(\d+(?:\.\d+)?)(us|ms|s)(?![a-z])", re.I)
+_BAND, _TIME = (
+    re.compile(r"(?<![\d.])(\d{3,4})nm(?![a-z])", re.I),
+    re.compile(r"(?<![\d.])(\d+(?:\.\d+)?)(us|ms|s)(?![a-z])", re.I),
+)
 _UNIT = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 _FILTER = re.compile(r"\s*(\d{3,4})\s*nm\s*")
 
 
 @dataclass(frozen=True)
 class ChartFolder:
-    """captures: band (m) -> list of (seconds, values (rows, columns)); darks: list of (seconds, values); white: level, DN;
-    cfa; labels (rows, columns) int; wavelengths (n,) m, patches (24, n) reflectance, filters: label (m) -> (n,) transmission;
-    files: every file used, by role."""
+    """captures: band (m) -> list of (seconds, values (rows, columns));
+    darks: list of (seconds, values);
+    white: level, DN; cfa;
+    labels (rows, columns) int;
+    wavelengths (n,) m, patches (24, n) reflectance, filters: label (m) -> (n,) transmission;
+    files: every file used, by role.
+    """
 
     captures: dict
     darks: list
@@ -40,21 +48,39 @@ class ChartFolder:
 
 
 def read_chart_folder(folder, *, cfa, labels=None, spectra=None):
-    """The ChartFolder in `folder`; labels, spectra: files instead of the ones in it. InputError, saying what is missing."""
+    """The ChartFolder in `folder`;
+
+    labels, spectra: files instead of the ones in it.
+    InputError, saying what is missing.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError("is no folder", folder, "name the folder with the captures of the chart")
-    found = [path for path, _ in zip(sorted(folder.rglob("*")), range(MOST_FILES)) if path.is_file()]
-    pictures = [path for path in found if path.suffix.lower() in PICTURES and "label" not in path.name.lower() and _TIME.search(path.name)]
+    found = [
+        path for path, _ in zip(sorted(folder.rglob("*")), range(MOST_FILES)) if path.is_file()
+    ]
+    pictures = [
+        path
+        for path in found
+        if path.suffix.lower() in PICTURES
+        and "label" not in path.name.lower()
+        and _TIME.search(path.name)
+    ]
     dark_paths = [path for path in pictures if "dark" in path.name.lower()]
     shots = [path for path in pictures if _BAND.search(path.name) and path not in dark_paths]
     if not shots:
-        raise InputError("holds no capture whose name says band and exposure time, such as chart_550nm_25ms.tif", folder, "name the captures so")
+        raise InputError(
+            "holds no capture whose name says band and exposure time, such as chart_550nm_25ms.tif",
+            folder,
+            "name the captures so",
+        )
     captures, white, shape = {}, None, None
     for path in shots:
         mosaic, shape = _read(path, cfa, shape)
         white = mosaic.white
-        captures.setdefault(int(_BAND.search(path.name)[1]) * 1e-9, []).append((_seconds(path), mosaic.values))
+        captures.setdefault(int(_BAND.search(path.name)[1]) * 1e-9, []).append(
+            (_seconds(path), mosaic.values)
+        )
     kept, darks = [], []
     for path in dark_paths:
         mosaic, _ = _read(path, cfa, None)
@@ -77,18 +103,40 @@ def _read(path, cfa, shape):
 
     mosaic = read_mosaic(path, cfa=cfa)
     if shape is not None and mosaic.values.shape != shape:
-        raise InputError(f"is {mosaic.values.shape[0]} x {mosaic.values.shape[1]} px, other captures {shape[0]} x {shape[1]}", path, "give captures of one camera")
+        raise InputError(
+            (
+                f"is {mosaic.values.shape[0]} x {mosaic.values.shape[1]} px, other captures "
+                f"{shape[0]} x {shape[1]}"
+            ),
+            path,
+            "give captures of one camera",
+        )
     return mosaic, mosaic.values.shape
 
 
 def _labels(path, found, shape, folder):
-    """(path, map): the one asked for, or the map of this size whose patches are each in one piece."""
-    likely = [p for p in found if "label" in p.name.lower() and p.suffix.lower() in (".png", ".tif", ".tiff")]
-    return _first(path, likely, lambda one: _label_map(one, shape), "label map of the chart", folder, "give one with --labels: 0 nothing, 1 to 24 the patches row by row")
+    """(path, map): the one asked for, or the map of this size whose patches are
+    each in one piece.
+    """
+    likely = [
+        p
+        for p in found
+        if "label" in p.name.lower() and p.suffix.lower() in (".png", ".tif", ".tiff")
+    ]
+    return _first(
+        path,
+        likely,
+        lambda one: _label_map(one, shape),
+        "label map of the chart",
+        folder,
+        "give one with --labels: 0 nothing, 1 to 24 the patches row by row",
+    )
 
 
 def _first(path, likely, read, what, folder, fix):
-    """(path, read(path)) of the file asked for, or of the first of the `likely` ones that can be read; InputError where there is none."""
+    """(path, read(path)) of the file asked for, or of the first of the `likely` ones that can be
+    read; InputError where there is none.
+    """
     faults = []
     for one in [Path(path)] if path else likely:
         try:
@@ -108,21 +156,36 @@ def _label_map(path, shape):
 
     values = np.asarray(read_mosaic(path).values)
     if values.shape != shape:
-        raise InputError(f"is {values.shape[0]} x {values.shape[1]} px, the captures {shape[0]} x {shape[1]}", path, "draw it on a capture")
+        raise InputError(
+            f"is {values.shape[0]} x {values.shape[1]} px, the captures {shape[0]} x {shape[1]}",
+            path,
+            "draw it on a capture",
+        )
     labels = np.rint(values).astype(int)
     if set(np.unique(labels)) != set(range(25)):
-        raise InputError("does not hold the labels 0 to 24", path, "label every patch, and nothing else")
+        raise InputError(
+            "does not hold the labels 0 to 24", path, "label every patch, and nothing else"
+        )
     for k in range(1, 25):
         pieces = np.bincount(label(labels == k)[0].ravel())[1:]
         if pieces.max() < 0.99 * pieces.sum():
-            raise InputError(f"shows patch {k} in several pieces", path, "draw every patch in one piece")
+            raise InputError(
+                f"shows patch {k} in several pieces", path, "draw every patch in one piece"
+            )
     return labels
 
 
 def _spectra(path, found, folder):
     """(path, (wavelengths m, patches (24, n), filters)) from the first table that has them all."""
     likely = [p for p in found if p.suffix.lower() == ".csv"]
-    return _first(path, likely, _table, "table of the patches' spectra", folder, "give one with --spectra: wavelength in nm, then a column a patch")
+    return _first(
+        path,
+        likely,
+        _table,
+        "table of the patches' spectra",
+        folder,
+        "give one with --spectra: wavelength in nm, then a column a patch",
+    )
 
 
 def _table(path):
@@ -133,15 +196,39 @@ def _table(path):
             header, *rows = list(csv.reader(file))
         values = np.array([[float(cell) for cell in row] for row in rows if row])
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"is no table of numbers ({error})", path, "give a .csv with a header line") from error
+        raise InputError(
+            f"is no table of numbers ({error})", path, "give a .csv with a header line"
+        ) from error
     header = [name.strip() for name in header]
     names = colorchecker()[0]
     missing = [name for name in names if name not in header]
-    if missing or values.ndim != 2 or values.shape[1] != len(header) or not np.isfinite(values).all():
-        raise InputError(f"has no column {missing[0]!r}" if missing else "has rows of different length, or values that are not finite", path, "name the columns after the patches: dark skin, light skin, ...")
+    if (
+        missing
+        or values.ndim != 2
+        or values.shape[1] != len(header)
+        or not np.isfinite(values).all()
+    ):
+        raise InputError(
+            f"has no column {missing[0]!r}"
+            if missing
+            else "has rows of different length, or values that are not finite",
+            path,
+            "name the columns after the patches: dark skin, light skin, ...",
+        )
     wavelengths = values[:, 0] * 1e-9
-    if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100e-9 or wavelengths[-1] > 20e-6:
-        raise InputError("does not begin with ascending wavelengths in nm", path, "put them in the first column")
+    if (
+        len(wavelengths) < 2
+        or not (np.diff(wavelengths) > 0).all()
+        or wavelengths[0] < 100e-9
+        or wavelengths[-1] > 20e-6
+    ):
+        raise InputError(
+            "does not begin with ascending wavelengths in nm", path, "put them in the first column"
+        )
     columns = {name: values[:, i] for i, name in enumerate(header)}
-    filters = {int(_FILTER.fullmatch(name)[1]) * 1e-9: columns[name] for name in header[1:] if _FILTER.fullmatch(name)}
+    filters = {
+        int(_FILTER.fullmatch(name)[1]) * 1e-9: columns[name]
+        for name in header[1:]
+        if _FILTER.fullmatch(name)
+    }
     return wavelengths, np.array([columns[name] for name in names]), filters

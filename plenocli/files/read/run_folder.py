@@ -1,4 +1,6 @@
-"""What lies in a run folder: artefacts, EXR and DNG files and score documents, and which was made from which."""
+"""What lies in a run folder: artefacts, EXR and DNG files and score documents, and which
+was made from which.
+"""
 
 import json
 from dataclasses import dataclass, field
@@ -13,7 +15,11 @@ _KEPT_BYTES = 32 << 20  # larger artefacts are read again when they are drawn
 
 @dataclass
 class RunFile:
-    """One readable file. kind: that of the artefact, "capture" for a mosaic, or "score"; sources: SHA-256 of its inputs."""
+    """One readable file.
+
+    kind: that of the artefact, "capture" for a mosaic, or "score";
+    sources: SHA-256 of its inputs.
+    """
 
     path: Path
     name: str
@@ -43,7 +49,9 @@ class RunFolder:
         if not root.is_dir():
             raise InputError("is no folder", root, "name the folder of a run, such as runs/demo")
         self.root, self.files, self.unreadable = root, [], []
-        for path in sorted({p for pattern in _PATTERNS for p in root.rglob(pattern) if p.is_file()}):
+        for path in sorted(
+            {p for pattern in _PATTERNS for p in root.rglob(pattern) if p.is_file()}
+        ):
             name = path.relative_to(root).as_posix()
             if path.name.startswith("."):
                 continue
@@ -54,7 +62,9 @@ class RunFolder:
             else:
                 self.files += [found] if found else []
         if not self.files:
-            raise InputError("holds no result of plenocli", root, "run a pipeline first, such as make demo")
+            raise InputError(
+                "holds no result of plenocli", root, "run a pipeline first, such as make demo"
+            )
 
     def of_kind(self, kind):
         return [file for file in self.files if file.kind == kind]
@@ -87,7 +97,15 @@ def _survey(path, name):
         document = _score_document(path)
         if document is None:
             return None
-        return RunFile(path, name, "score", file_digest(path), document["command"], sources=_digests_of(document["inputs"]), content=document)
+        return RunFile(
+            path,
+            name,
+            "score",
+            file_digest(path),
+            document["command"],
+            sources=_digests_of(document["inputs"]),
+            content=document,
+        )
     if path.suffix == ".h5":
         return _survey_artefact(path, name)
     if path.suffix == ".exr":
@@ -96,7 +114,11 @@ def _survey(path, name):
 
 
 def _digests_of(inputs):
-    return {role: about["sha256"] for role, about in inputs.items() if isinstance(about, dict) and "sha256" in about}
+    return {
+        role: about["sha256"]
+        for role, about in inputs.items()
+        if isinstance(about, dict) and "sha256" in about
+    }
 
 
 def _survey_artefact(path, name):
@@ -106,7 +128,16 @@ def _survey_artefact(path, name):
     artefact = read_artefact(path)
     origin = artefact.provenance
     size = sum(values.nbytes for values in artefact.data.values())
-    return RunFile(path, name, artefact.kind, file_digest(path), origin.command, origin.config, _digests_of(origin.inputs), artefact if size <= _KEPT_BYTES else None)
+    return RunFile(
+        path,
+        name,
+        artefact.kind,
+        file_digest(path),
+        origin.command,
+        origin.config,
+        _digests_of(origin.inputs),
+        artefact if size <= _KEPT_BYTES else None,
+    )
 
 
 def _survey_exr(path, name):
@@ -118,7 +149,15 @@ def _survey_exr(path, name):
     attrs = read_exr(path)[1]
     kind = "spectra" if is_spectral(path) else "capture" if CAPTURE in attrs else "image"
     origin = read_provenance_texts(attrs)
-    return RunFile(path, name, kind, file_digest(path), origin.command, origin.config, _digests_of(origin.inputs))
+    return RunFile(
+        path,
+        name,
+        kind,
+        file_digest(path),
+        origin.command,
+        origin.config,
+        _digests_of(origin.inputs),
+    )
 
 
 def _score_document(path):
@@ -130,8 +169,16 @@ def _score_document(path):
     if not isinstance(document, dict) or not isinstance(document.get("results"), list):
         return None
     for entry in document["results"]:
-        if not isinstance(entry, dict) or not isinstance(entry.get("metrics"), dict) or not isinstance(entry.get("name"), str):
-            raise InputError("is not a score document: a result lacks its name or metrics", path, "run score again")
+        if (
+            not isinstance(entry, dict)
+            or not isinstance(entry.get("metrics"), dict)
+            or not isinstance(entry.get("name"), str)
+        ):
+            raise InputError(
+                "is not a score document: a result lacks its name or metrics",
+                path,
+                "run score again",
+            )
         entry.setdefault("label", Path(entry["name"]).stem)
     for key in ("definitions", "inputs"):
         if not isinstance(document.setdefault(key, {}), dict):

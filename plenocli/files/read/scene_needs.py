@@ -4,15 +4,16 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.forward.accuracy.needs import Needs
 from plenocli.files.read.scenes import Cube, read_scene
+from plenocli.forward.accuracy.needs import Needs
 
 DARK = 1e-6
 """Lenslets whose part of the picture is below this share of its peak see no light."""
 
 
 def read_needs(name, camera):
-    """Needs of the scene called `name`: a scene .toml, or whatever read_scene takes, whose bands and extent then count.
+    """Needs of the scene called `name`: a scene .toml, or whatever read_scene takes, whose bands
+    and extent then count.
 
     InputError, ConfigError or UsageError where it cannot be read.
     """
@@ -22,7 +23,11 @@ def read_needs(name, camera):
 
     scene = load_scene(name)
     found = _from_picture(Path(name).parent / scene.picture, camera) if scene.picture else {}
-    found |= {key: value for key in ("depth", "spectrum", "lenslets") if (value := getattr(scene, key)) is not None}
+    found |= {
+        key: value
+        for key in ("depth", "spectrum", "lenslets")
+        if (value := getattr(scene, key)) is not None
+    }
     noise = None if scene.snr is None else 10 ** (-scene.snr / 20)
     return Needs(noise=noise, source=Path(name).name, **found)
 
@@ -33,7 +38,14 @@ def _from_picture(name, camera):
     count = camera.lenslet_array.count
     wavelengths = scene.wavelengths if isinstance(scene, Cube) else camera.light.wavelengths
     # eight points a lenslet see every lit one
-    planes = np.stack([scene.at(float(w), count[0] * 8, count[1] * 8).reshape(count[0], 8, count[1], 8).max(axis=(1, 3)) for w in wavelengths])
+    planes = np.stack(
+        [
+            scene.at(float(w), count[0] * 8, count[1] * 8)
+            .reshape(count[0], 8, count[1], 8)
+            .max(axis=(1, 3))
+            for w in wavelengths
+        ]
+    )
     peak = planes.max()
     if peak <= 0:
         return {"lenslets": (1, 1)}

@@ -1,6 +1,8 @@
-"""Where scenes come from: photographs, spectral EXR files, image artefacts, the ColorChecker, uniform targets.
+"""Where scenes come from: photographs, spectral EXR files, image artefacts, the
+ColorChecker, uniform targets.
 
-A scene answers one question: its reflectance at a wavelength on a grid of object points, in image orientation.
+A scene answers one question: its reflectance at a wavelength on a grid of object points, in
+image orientation.
 """
 
 from functools import lru_cache
@@ -12,7 +14,9 @@ from plenocli.base.errors import UsageError
 
 EMBEDDED = "skimage:"
 _RGB_CENTRES = np.array([450e-9, 545e-9, 630e-9])
-"""Where the blue, green and red channels of a photograph stand in the spectrum; linear in between, constant outside."""
+"""Where the blue, green and red channels of a photograph stand in the spectrum; linear in
+between, constant outside.
+"""
 
 
 class Uniform:
@@ -29,12 +33,18 @@ class Uniform:
 
 
 class Photograph:
-    """A linear picture (row, column, channel); in colour its reflectance is interpolated between B, G and R."""
+    """A linear picture (row, column, channel); in colour its reflectance is interpolated
+    between B, G and R.
+    """
 
     uniform = False
 
     def __init__(self, values, sampling, spectral):
-        self.values, self.sampling, self.spectral = values, sampling, spectral and values.shape[2] >= 3
+        self.values, self.sampling, self.spectral = (
+            values,
+            sampling,
+            spectral and values.shape[2] >= 3,
+        )
 
     def at(self, wavelength, rows, columns):
         from plenocli.forward.scene.sample import luminance, sample_picture
@@ -62,7 +72,9 @@ class Cube:
         low = min(int(position), len(self.wavelengths) - 1)
         high = min(low + 1, len(self.wavelengths) - 1)
         part = position - low
-        return sample_picture((1 - part) * self.values[low] + part * self.values[high], rows, columns, self.sampling)
+        return sample_picture(
+            (1 - part) * self.values[low] + part * self.values[high], rows, columns, self.sampling
+        )
 
 
 class Chart:
@@ -78,9 +90,11 @@ class Chart:
 
 
 def read_scene(name, *, sampling="fit", spectral=False):
-    """The scene called `name`: "colorchecker", "skimage:astronaut", a photograph, a spectral EXR or an image artefact.
+    """The scene called `name`: "colorchecker", "skimage:astronaut", a photograph, a spectral EXR or
+    an image artefact.
 
-    spectral: whether the camera tells wavelengths apart; if not, a colour photograph counts by its luminance.
+    spectral: whether the camera tells wavelengths apart; if not, a colour photograph
+        counts by its luminance.
     InputError or UsageError where it cannot be had.
     """
     if str(name) == "colorchecker":
@@ -105,7 +119,10 @@ def read_scene(name, *, sampling="fit", spectral=False):
 
 @lru_cache(maxsize=16)
 def embedded_photograph(name):
-    """A photograph that ships inside scikit-image, linear float32 (row, column, channel). UsageError for unknown names."""
+    """A photograph that ships inside scikit-image, linear float32 (row, column, channel).
+
+    UsageError for unknown names.
+    """
     from importlib.util import find_spec
 
     from plenocli.files.images.pictures import read_picture
@@ -115,4 +132,6 @@ def embedded_photograph(name):
         if (folder / f"{name}{suffix}").is_file():
             return read_picture(folder / f"{name}{suffix}").values
     known = ", ".join(sorted(p.stem for p in folder.iterdir() if p.suffix in (".png", ".jpg")))
-    raise UsageError(f"scikit-image ships no photograph {name!r}", EMBEDDED + name, f"choose one of {known}")
+    raise UsageError(
+        f"scikit-image ships no photograph {name!r}", EMBEDDED + name, f"choose one of {known}"
+    )

@@ -8,8 +8,18 @@ from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.files.read.scenes import EMBEDDED, embedded_photograph
 
-DEFAULT = ("skimage:camera", "skimage:coffee", "skimage:chelsea", "skimage:rocket", "skimage:coins", "skimage:moon", "skimage:brick",
-           "skimage:grass", "skimage:gravel", "skimage:motorcycle_left")
+DEFAULT = (
+    "skimage:camera",
+    "skimage:coffee",
+    "skimage:chelsea",
+    "skimage:rocket",
+    "skimage:coins",
+    "skimage:moon",
+    "skimage:brick",
+    "skimage:grass",
+    "skimage:gravel",
+    "skimage:motorcycle_left",
+)
 """Photographs that ship with scikit-image, but for the astronaut, which is the test picture."""
 
 SCALES = (1, 2, 4)
@@ -18,11 +28,15 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".ppm", ".
 """What is taken for a picture in a folder."""
 
 IN_MEMORY = 1 << 30
-"""Bytes of pictures that are held in memory; more go to a temporary file that is mapped, so that thousands of pictures stream."""
+"""Bytes of pictures that are held in memory; more go to a temporary file that is mapped, so that
+thousands of pictures stream.
+"""
 
 
 class Shelf:
-    """Keeps float32 pictures: in memory up to `limit` bytes, the rest in a nameless temporary file."""
+    """Keeps float32 pictures: in memory up to `limit` bytes, the rest in a
+    nameless temporary file.
+    """
 
     def __init__(self, limit=None):
         self.limit, self.held, self.file = IN_MEMORY if limit is None else limit, 0, None
@@ -46,13 +60,16 @@ class Shelf:
 
 
 def read_training(names, shape, *, not_scene=None, limit=None):
-    """Linear luminance pictures [(name, (row, column) float32)] of at least `shape`, from files, folders or skimage:NAME; () means DEFAULT.
+    """Linear luminance pictures [(name, (row, column) float32)] of at least `shape`, from files,
+    folders or skimage:NAME; () means DEFAULT.
 
-    A folder stands for the pictures in it and below; what cannot be read there is left out with a note. One picture is decoded
-    at a time; beyond `limit` bytes (IN_MEMORY) they lie in a temporary file.
+    A folder stands for the pictures in it and below; what cannot be read there is left out with a
+    note. One picture is decoded at a time; beyond `limit` bytes (IN_MEMORY) they lie
+    in a temporary file.
 
-    not_scene: name of a test scene; a default picture of that name is left out with a note, one asked for is an error
-    (statistics from the test picture would flatter every result). InputError where nothing is left.
+    not_scene: name of a test scene; a default picture of that name is left out with a note, one
+        asked for is an error (statistics from the test picture would flatter every result).
+    InputError where nothing is left.
     """
     from plenocli.forward.scene.sample import luminance
 
@@ -63,7 +80,11 @@ def read_training(names, shape, *, not_scene=None, limit=None):
         asked = asked and bool(names)
         if stem and Path(str(name).removeprefix(EMBEDDED)).stem == stem:
             if asked:
-                raise InputError("is the captured scene itself; results trained on it would flatter", name, "train on other pictures")
+                raise InputError(
+                    "is the captured scene itself; results trained on it would flatter",
+                    name,
+                    "train on other pictures",
+                )
             note(f"training leaves out {name}, which is the captured scene")
             continue
         try:
@@ -74,31 +95,46 @@ def read_training(names, shape, *, not_scene=None, limit=None):
             note(f"training leaves out a picture: {error}")
             continue
         if min(picture.shape[0] - shape[0], picture.shape[1] - shape[1]) < 0:
-            note(f"training leaves out {name}: {picture.shape[0]} x {picture.shape[1]} pixels are less than a block of {shape[0]} x {shape[1]}")
+            note(
+                f"training leaves out {name}: {picture.shape[0]} x {picture.shape[1]} pixels are "
+                f"less than a block of {shape[0]} x {shape[1]}"
+            )
             continue
         if not (picture.min() >= 0 and np.ptp(picture) > 0):
             if not asked:
                 note(f"training leaves out {name}: no structure, or values below 0")
                 continue
-            raise InputError("has no structure to learn from, or values below 0", name, "train on photographs")
+            raise InputError(
+                "has no structure to learn from, or values below 0", name, "train on photographs"
+            )
         top = float(picture.max(initial=0))
         pictures.append((str(name), shelf.keep(picture / top if top > 1 else picture)))
     if not pictures:
-        raise InputError("no training picture is left", fix=f"give pictures of at least {shape[0]} x {shape[1]} pixels")
+        raise InputError(
+            "no training picture is left",
+            fix=f"give pictures of at least {shape[0]} x {shape[1]} pixels",
+        )
     return pictures
 
 
 def split_by_scene(pictures):
-    """(training, held out): every fifth picture, from the third on, judges; one picture alone has to do both."""
+    """(training, held out): every fifth picture, from the third on, judges; one picture
+    alone has to do both.
+    """
     if len(pictures) == 1:
-        note("one training picture only: the validation patches come from it too, so the figures flatter")
+        note(
+            "one training picture only: the validation patches come from it too, "
+            "so the figures flatter"
+        )
         return pictures, pictures
     held = set(range(2, len(pictures), 5)) or {len(pictures) - 1}
     return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
 
 
 def at_scales(pictures, shape, *, limit=None):
-    """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of `shape` fit: scenes come in all sizes."""
+    """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of
+    `shape` fit: scenes come in all sizes.
+    """
     from plenocli.forward.scene.sample import block_mean
 
     out, shelf = [], Shelf(limit)
@@ -106,7 +142,14 @@ def at_scales(pictures, shape, *, limit=None):
         for k in SCALES:
             rows, columns = (n // k * k for n in picture.shape)
             if k == 1 or min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
-                out.append((name, shelf.keep(block_mean(np.asarray(picture[:rows, :columns], float), (k, k))) if k > 1 else picture))
+                out.append(
+                    (
+                        name,
+                        shelf.keep(block_mean(np.asarray(picture[:rows, :columns], float), (k, k)))
+                        if k > 1
+                        else picture,
+                    )
+                )
     return out
 
 

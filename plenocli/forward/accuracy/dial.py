@@ -1,18 +1,26 @@
-"""The dial: which computation of a system matrix meets the accuracy asked for at the least cost (docs/model.md)."""
+"""The dial: which computation of a system matrix meets the accuracy asked for at the least
+cost (docs/model.md).
+"""
 
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
+from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.needs import seen_wavelengths, sensor_noise, visible_accuracy
 from plenocli.forward.accuracy.rates import NOMINAL, product_rate
-from plenocli.forward.propagation.models import RUNGS
-from plenocli.base.errors import NumericsError, UsageError
-from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
 from plenocli.forward.camera.geometry import geometry, lenslet_shift
-from plenocli.forward.propagation.sampling import PifPlan, blur_ring, coherent_window, predicted_outside, window_error
+from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
+from plenocli.forward.propagation.models import RUNGS
+from plenocli.forward.propagation.sampling import (
+    PifPlan,
+    blur_ring,
+    coherent_window,
+    predicted_outside,
+    window_error,
+)
+from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
 
 BEST_ACCURACY = 1e-8
 """Finest sampling on offer: double precision."""
@@ -26,19 +34,31 @@ ROUNDING = {False: 3e-7, True: 3e-10}
 BAND_SHARE = 0.5
 """Share of the accuracy that the wavelengths of a band may use up."""
 STEPS = 6
-"""Halvings, on a logarithmic scale, of the range in which the finest accuracy that can be reached is sought."""
+"""Halvings, on a logarithmic scale, of the range in which the finest accuracy that can be
+reached is sought.
+"""
 STEEPEST = 1.75
-"""Tangent of the angle from a lenslet's axis up to which the exact model takes coherent neighbours in by itself."""
+"""Tangent of the angle from a lenslet's axis up to which the exact model takes coherent
+neighbours in by itself.
+"""
 COARSEST = 0.5
-"""A default accuracy beyond this is refused: such columns are not the camera's. Who can use them asks for them."""
+"""A default accuracy beyond this is refused: such columns are not the camera's. Who can use
+them asks for them.
+"""
 SHARE = 0.2
-"""Least share of the accuracy that must be left for sampling; below it the other errors count as the accuracy's whole."""
+"""Least share of the accuracy that must be left for sampling; below it the other errors count as
+the accuracy's whole.
+"""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rung as it was considered. `why`: why it was not chosen (None: it was); split: error by its source; rings and bands as
-    PifPlan; seconds: of one core at nominal rates; bytes: result and work."""
+    """One rung as it was considered.
+
+    `why`: why it was not chosen (None: it was);
+    split: error by its source; rings and bands as PifPlan; seconds: of one core at nominal rates;
+    bytes: result and work.
+    """
 
     name: str
     model: str
@@ -56,20 +76,51 @@ class Candidate:
 
     def seconds(self, rate=None):
         """Seconds of one core, at the nominal rate or at `rate` (a function of `double`)."""
-        return self.operations / (rate(self.double) if rate else NOMINAL[self.double]) + self.fixed_seconds
+        return (
+            self.operations / (rate(self.double) if rate else NOMINAL[self.double])
+            + self.fixed_seconds
+        )
 
 
-def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="auto", accuracy=None, model="auto", dtype="auto", points=None,
-             needs=None, lenslet=None):
+def plan_pif(
+    camera,
+    *,
+    wavelengths=None,
+    superpixels="auto",
+    coherent_ring="auto",
+    accuracy=None,
+    model="auto",
+    dtype="auto",
+    points=None,
+    needs=None,
+    lenslet=None,
+):
     """Choose how to compute the system matrix of `camera`; no optics is computed.
 
-    wavelengths: metres (default: the camera's); superpixels: "auto" or odd (rows, columns); coherent_ring: "auto" or a number of
-    rings (0: isolated lenslets); accuracy: relative L2 error of the worst column, against the finest model for model "auto" and
-    within the model where one is named; None takes what the noise of the sensor or of the scene lets be seen, or the best
-    there is; dtype: "auto", float32 or float64 of the stored matrix; points: slice of flat point indices; needs: a Needs that
-    narrows the request; lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster. Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
+    wavelengths: metres (default: the camera's);
+    superpixels: "auto" or odd (rows, columns);
+    coherent_ring: "auto" or a number of rings (0: isolated lenslets);
+    accuracy: relative L2 error of the worst column, against the finest model for model "auto" and
+        within the model where one is named; None takes what the noise of the sensor or of the scene
+        lets be seen, or the best there is;
+    dtype: "auto", float32 or float64 of the stored matrix;
+    points: slice of flat point indices;
+    needs: a Needs that narrows the request;
+    lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster.
+    Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
     """
-    request = _Request(camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs, lenslet)
+    request = _Request(
+        camera,
+        wavelengths,
+        superpixels,
+        coherent_ring,
+        accuracy,
+        model,
+        dtype,
+        points,
+        needs,
+        lenslet,
+    )
     found = [_consider(request, rung) for rung in RUNGS if model in ("auto", rung.model)]
     best = _cheapest(found)
     if best is None:
@@ -80,50 +131,98 @@ def plan_pif(camera, *, wavelengths=None, superpixels="auto", coherent_ring="aut
 class _Request:
     """What was asked, narrowed to what the scene needs, with the geometry at each wavelength."""
 
-    def __init__(self, camera, wavelengths, superpixels, coherent_ring, accuracy, model, dtype, points, needs, lenslet):
+    def __init__(
+        self,
+        camera,
+        wavelengths,
+        superpixels,
+        coherent_ring,
+        accuracy,
+        model,
+        dtype,
+        points,
+        needs,
+        lenslet,
+    ):
         if model not in MODELS:
             raise UsageError(f"model {model!r} is not one of {', '.join(MODELS)}", "model")
-        if coherent_ring != "auto" and not (isinstance(coherent_ring, int) and 0 <= coherent_ring <= 20):
-            raise UsageError(f"coherent ring {coherent_ring!r} is not auto or a whole number from 0 to 20", "coherent_ring")
+        if coherent_ring != "auto" and not (
+            isinstance(coherent_ring, int) and 0 <= coherent_ring <= 20
+        ):
+            raise UsageError(
+                f"coherent ring {coherent_ring!r} is not auto or a whole number from 0 to 20",
+                "coherent_ring",
+            )
         if accuracy is not None and not BEST_ACCURACY <= accuracy < 1:
-            raise NumericsError(f"accuracy {accuracy:g} cannot be reached", "accuracy", f"ask for {BEST_ACCURACY:g} to below 1")
+            raise NumericsError(
+                f"accuracy {accuracy:g} cannot be reached",
+                "accuracy",
+                f"ask for {BEST_ACCURACY:g} to below 1",
+            )
         self.camera, self.model, self.needs, self.points = camera, model, needs, points
         self.reasons, self.left_out, self.warnings = [], [], []
         kept, dropped = seen_wavelengths(wavelengths or camera.light.wavelengths, needs)
         if dropped:
-            self.left_out.append(f"{len(dropped)} wavelength(s) without light in the scene: no error")
+            self.left_out.append(
+                f"{len(dropped)} wavelength(s) without light in the scene: no error"
+            )
         self.pixel_shift, self.off_axis = _place(camera, lenslet)
         self.views = [geometry(camera, w, self.pixel_shift) for w in kept]
         # a band goes by its centre
-        self.band = camera.light.band if camera.light.band is not None and kept == (camera.light.band.center,) else None
+        self.band = (
+            camera.light.band
+            if camera.light.band is not None and kept == (camera.light.band.center,)
+            else None
+        )
         self.explicit = accuracy is not None
         self.accuracy, self.asked_by = self._accuracy(accuracy)
-        self.dtype = np.dtype((np.float32 if self.accuracy >= 1e-6 else np.float64) if isinstance(dtype, str) and dtype == "auto" else dtype)
+        self.dtype = np.dtype(
+            (np.float32 if self.accuracy >= 1e-6 else np.float64)
+            if isinstance(dtype, str) and dtype == "auto"
+            else dtype
+        )
         self.depths = self._depths()
         self.grid = _superpixels(superpixels, self.depths, self.accuracy, self.reasons)
         self.rings = self._rings(coherent_ring)
         if needs is not None and needs.lenslets is not None:
             total, lit = int(np.prod(camera.lenslet_array.count)), int(np.prod(needs.lenslets))
             if lit < total:
-                self.left_out.append(f"{total - lit} of {total} lenslets see no light of the scene: no error")
+                self.left_out.append(
+                    f"{total - lit} of {total} lenslets see no light of the scene: no error"
+                )
 
     def _accuracy(self, asked):
-        noise, who = (sensor_noise(self.camera), "sensor noise") if self.needs is None or self.needs.noise is None else (self.needs.noise, f"noise of the {self.needs.source}")
+        noise, who = (
+            (sensor_noise(self.camera), "sensor noise")
+            if self.needs is None or self.needs.noise is None
+            else (self.needs.noise, f"noise of the {self.needs.source}")
+        )
         seen = visible_accuracy(noise)
         if asked is None:
-            self.reasons.append(f"accuracy {seen:.2g}: {who} is {noise:.2g} of the signal, and a third of that cannot be seen beside it")
+            self.reasons.append(
+                f"accuracy {seen:.2g}: {who} is {noise:.2g} of the signal, and a third of that "
+                "cannot be seen beside it"
+            )
             return seen, who
         if self.needs is not None and self.needs.noise is not None and seen > asked:
-            self.left_out.append(f"accuracy beyond {seen:.2g} ({asked:g} asked): the {who} is {noise:.2g} of the signal and hides it")
+            self.left_out.append(
+                f"accuracy beyond {seen:.2g} ({asked:g} asked): the {who} is {noise:.2g} of "
+                "the signal and hides it"
+            )
             return seen, who
         return asked, "request"
 
     def _depths(self):
-        """The geometries that size the neighbourhood: those of the camera, or at both ends of the scene's depth."""
+        """The geometries that size the neighbourhood: those of the camera, or at both ends of
+        the scene's depth.
+        """
         if self.needs is None or self.needs.depth is None:
             return self.views
         ends = [replace(view, z1=z) for view in self.views for z in self.needs.depth]
-        self.reasons.append(f"depth {self.needs.depth[0]:.4g} to {self.needs.depth[1]:.4g} m: neighbourhood sized for the blur at both ends")
+        self.reasons.append(
+            f"depth {self.needs.depth[0]:.4g} to {self.needs.depth[1]:.4g} m: neighbourhood sized "
+            "for the blur at both ends"
+        )
         return ends
 
     def _rings(self, asked):
@@ -138,34 +237,62 @@ class _Request:
         """(band, lenslet, pixel, point) of the matrix."""
         count = int(np.prod(self.views[0].object_shape))
         count = count if self.points is None else len(range(*self.points.indices(count)))
-        return len(self.views), self.grid[0] * self.grid[1], int(np.prod(self.views[0].pixel_shape)), count
+        return (
+            len(self.views),
+            self.grid[0] * self.grid[1],
+            int(np.prod(self.views[0].pixel_shape)),
+            count,
+        )
 
 
 def _place(camera, lenslet):
-    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; (None, False) for the one on the axis."""
+    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; (None,
+    False) for the one on the axis.
+    """
     if lenslet is None:
         return None, False
     count = camera.lenslet_array.count
     if not all(0 <= n < m for n, m in zip(lenslet, count)):
-        raise UsageError(f"lenslet {lenslet[0]},{lenslet[1]} is not on the array of {count[0]} x {count[1]}", "lenslet", "count rows and columns from 0")
+        raise UsageError(
+            f"lenslet {lenslet[0]},{lenslet[1]} is not on the array of {count[0]} x {count[1]}",
+            "lenslet",
+            "count rows and columns from 0",
+        )
     return lenslet_shift(camera, *lenslet)[2], any(2 * n != m - 1 for n, m in zip(lenslet, count))
 
 
 def _consider(request, rung):
-    """The Candidate of one rung: its error by source, and the rings, precision and node counts that it would take."""
-    reason = next((r for r in (rung.valid_for(request.camera, v) for v in request.views) if r), None)
+    """The Candidate of one rung: its error by source, and the rings, precision and node counts
+    that it would take.
+    """
+    reason = next(
+        (r for r in (rung.valid_for(request.camera, v) for v in request.views) if r), None
+    )
     if request.off_axis and rung.model == "exact":
-        reason = reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
+        reason = (
+            reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
+        )
     if reason:
         return Candidate(rung.name, rung.model, reason)
-    fixed = {"model": 0.0 if request.model != "auto" else max(rung.error_bound(request.camera, v) for v in request.views),
-             "storage": 3e-8 if request.dtype == np.float32 else 0.0}
+    fixed = {
+        "model": 0.0
+        if request.model != "auto"
+        else max(rung.error_bound(request.camera, v) for v in request.views),
+        "storage": 3e-8 if request.dtype == np.float32 else 0.0,
+    }
     tried = []
     for ring in _rings_of(request, rung):
-        outside = 0.0 if rung.model == "ray" else max(window_error(v, request.grid, ring) for v in request.depths)
+        outside = (
+            0.0
+            if rung.model == "ray"
+            else max(window_error(v, request.grid, ring) for v in request.depths)
+        )
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, rung, ring)
-        split = fixed | {"spectrum": spectrum, "neighbourhood": outside if len(request.rings) > 1 else 0.0}
+        split = fixed | {
+            "spectrum": spectrum,
+            "neighbourhood": outside if len(request.rings) > 1 else 0.0,
+        }
         tried.append(_sized(request, rung, ring, split, nodes))
         if tried[-1].why is None:
             return tried[-1]
@@ -177,17 +304,28 @@ def _consider(request, rung):
 
 
 def _rings_of(request, rung):
-    """The rings of coherent neighbours to choose from: of the least number only for rays, which end where the blur ends."""
+    """The rings of coherent neighbours to choose from: of the least number only for rays, which
+    end where the blur ends.
+    """
     if rung.model == "ray" or len(request.rings) == 1:
         return request.rings[:1]
     if rung.model != "exact":
         return request.rings
-    # what lies outside is known from the paraxial model, which says less than a third of it 64 degrees aside
-    return [ring for ring in request.rings if ring == 1 or max(coherent_window(v, request.grid, ring) * v.D2 / v.z3 for v in request.views) <= STEEPEST]
+    # what lies outside is known from the paraxial model, which says less than a third of
+    # it 64 degrees aside
+    return [
+        ring
+        for ring in request.rings
+        if ring == 1
+        or max(coherent_window(v, request.grid, ring) * v.D2 / v.z3 for v in request.views)
+        <= STEEPEST
+    ]
 
 
 def _band_nodes(request, rung, ring):
-    """(wavelengths that stand for the camera's band of light, error that leaves); (0, 0.0) for lines."""
+    """(wavelengths that stand for the camera's band of light, error that leaves);
+    (0, 0.0) for lines.
+    """
     if request.band is None:
         return 0, 0.0
     view = request.views[0]
@@ -211,24 +349,46 @@ def _sized(request, rung, ring, split, nodes):
     sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
     double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
-        bands = tuple(rung.size(v, request.grid, ring, sampling, sampling / 2) for v in _finest(request, nodes))
-        costs = [rung.cost(request.camera, v, b, request.shape, double) for v, b in zip(request.views, bands)]
+        bands = tuple(
+            rung.size(v, request.grid, ring, sampling, sampling / 2)
+            for v in _finest(request, nodes)
+        )
+        costs = [
+            rung.cost(request.camera, v, b, request.shape, double)
+            for v, b in zip(request.views, bands)
+        ]
     except NumericsError as error:
         return Candidate(rung.name, rung.model, error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     if nodes:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
-    return Candidate(rung.name, rung.model, why, math.hypot(*split.values()), split, ring, sampling, double, bands,
-                     max(nodes, 1) * sum(c["operations"] for c in costs), max(nodes, 1) * sum(c["seconds"] for c in costs),
-                     size + max(nodes, 1) * max(c["bytes"] for c in costs), nodes)
+    return Candidate(
+        rung.name,
+        rung.model,
+        why,
+        math.hypot(*split.values()),
+        split,
+        ring,
+        sampling,
+        double,
+        bands,
+        max(nodes, 1) * sum(c["operations"] for c in costs),
+        max(nodes, 1) * sum(c["seconds"] for c in costs),
+        size + max(nodes, 1) * max(c["bytes"] for c in costs),
+        nodes,
+    )
 
 
 def _finest(request, nodes):
     """The geometries that node counts must serve: of a band, that of its shortest wavelength."""
     if not nodes:
         return request.views
-    return [geometry(request.camera, float(spectral_nodes(request.band, nodes)[0].min()), request.pixel_shift)]
+    return [
+        geometry(
+            request.camera, float(spectral_nodes(request.band, nodes)[0].min()), request.pixel_shift
+        )
+    ]
 
 
 def _cheapest(found):
@@ -237,23 +397,54 @@ def _cheapest(found):
 
 
 def _fall_back(request, found):
-    """Where nothing serves: the best there is for a default accuracy, unless that is beyond COARSEST; exit 5 for one that was asked for."""
+    """Where nothing serves: the best there is for a default accuracy, unless that is beyond
+    COARSEST; exit 5 for one that was asked for.
+    """
     asked, possible = request.accuracy, [c for c in found if math.isfinite(c.error)]
-    least = min((math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible), default=math.inf)
-    reached, again, best = _finest_served(request, found, max(asked, min(1.3 * least + 1.1 * BEST_ACCURACY, 0.99)))
+    least = min(
+        (math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible),
+        default=math.inf,
+    )
+    reached, again, best = _finest_served(
+        request, found, max(asked, min(1.3 * least + 1.1 * BEST_ACCURACY, 0.99))
+    )
     if best is None:
-        raise NumericsError(f"model {request.model!r} does not serve this camera ({_reasons(found)})", "model",
-                            "change the camera, or " + ("name a model, such as --model ray, to be exact within it only" if request.model == "auto" else "leave --model at auto"))
+        raise NumericsError(
+            f"model {request.model!r} does not serve this camera ({_reasons(found)})",
+            "model",
+            "change the camera, or "
+            + (
+                "name a model, such as --model ray, to be exact within it only"
+                if request.model == "auto"
+                else "leave --model at auto"
+            ),
+        )
     why = next(c.why for c in found if c.name == best.name)
     if request.explicit:
         advice = f"ask for {reached:.2g} or coarser"
         if request.model == "auto" and best.split["model"] > 0.5 * best.error:
-            advice += f", or name a model (--model {best.model}) to ask for accuracy within that model only"
-        raise NumericsError(f"accuracy {asked:g} cannot be reached: the best is about {reached:.2g} ({best.name}: {why})", "accuracy", advice)
+            advice += (
+                f", or name a model (--model {best.model}) to ask for accuracy "
+                "within that model only"
+            )
+        raise NumericsError(
+            (
+                f"accuracy {asked:g} cannot be reached: the best is about {reached:.2g} "
+                f"({best.name}: {why})"
+            ),
+            "accuracy",
+            advice,
+        )
     if reached > COARSEST:
-        raise NumericsError(f"no model comes nearer to this camera than {reached:.2g} ({_reasons(found)})", "accuracy", f"change the camera, or ask for {reached:.2g}")
-    request.warnings.append(f"the {request.asked_by} calls for accuracy {asked:.1g}; the best there is for this camera is "
-                            f"about {reached:.1g} ({best.name}: {why})")
+        raise NumericsError(
+            f"no model comes nearer to this camera than {reached:.2g} ({_reasons(found)})",
+            "accuracy",
+            f"change the camera, or ask for {reached:.2g}",
+        )
+    request.warnings.append(
+        f"the {request.asked_by} calls for accuracy {asked:.1g}; the best there is for this "
+        f"camera is about {reached:.1g} ({best.name}: {why})"
+    )
     request.accuracy = reached
     return request, again, best
 
@@ -261,12 +452,16 @@ def _fall_back(request, found):
 def _reasons(found):
     """Why each rung does not serve, rungs with the same reason together."""
     reasons = dict.fromkeys(c.why for c in found)
-    return "; ".join(f"{' and '.join(c.name for c in found if c.why == why)}: {why}" for why in reasons)
+    return "; ".join(
+        f"{' and '.join(c.name for c in found if c.why == why)}: {why}" for why in reasons
+    )
 
 
 def _finest_served(request, found, limit):
-    """(accuracy, candidates, the chosen one) of about the finest accuracy that something serves between the request's, which nothing
-    does, and `limit`; the chosen one is None where nothing serves any."""
+    """(accuracy, candidates, the chosen one) of about the finest accuracy that something serves
+    between the request's, which nothing does, and `limit`; the chosen one is None where
+    nothing serves any.
+    """
     asked, low, served = request.accuracy, request.accuracy, (limit, found, None)
     # what limits a rung that could be sized is known; others may serve what is coarser
     trials = [limit] if any(math.isfinite(c.error) for c in found) else []
@@ -300,17 +495,52 @@ def _rounded_up(value):
 
 def _plan(request, found, best):
     """The PifPlan of the chosen Candidate, with what was considered and left out."""
-    table = tuple(replace(c, why=c.why or f"serves, at {c.seconds() / max(best.seconds(), 1e-9):.2g} times the cost") if c is not best else c for c in found)
+    table = tuple(
+        replace(
+            c,
+            why=c.why or f"serves, at {c.seconds() / max(best.seconds(), 1e-9):.2g} times the cost",
+        )
+        if c is not best
+        else c
+        for c in found
+    )
     warnings = [*request.warnings, *_warnings(request, best)]
     view_error = max(window_error(v, request.grid, best.ring) for v in request.depths)
     if best.ring and best.model != "ray":
-        request.left_out.append(f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {view_error:.1g}")
+        request.left_out.append(
+            f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error "
+            f"about {view_error:.1g}"
+        )
         if len(request.rings) == 1 and view_error > request.accuracy:
-            warnings.append(f"lenslets beyond the coherent window change columns by about {view_error:.1g}, more than the accuracy {request.accuracy:g}")
+            warnings.append(
+                f"lenslets beyond the coherent window change columns by about {view_error:.1g}, "
+                f"more than the accuracy {request.accuracy:g}"
+            )
     size = int(np.prod(request.shape)) * request.dtype.itemsize
-    return PifPlan(best.model, best.name, request.grid, best.ring, request.accuracy, request.asked_by, best.sampling / 2, best.double, best.bands,
-                   request.shape, size, best.bytes, best.error, best.split, _model_error(request, best), request.dtype.name, tuple(request.reasons), tuple(request.left_out),
-                   tuple(warnings), table, request.pixel_shift, best.band_nodes)
+    return PifPlan(
+        best.model,
+        best.name,
+        request.grid,
+        best.ring,
+        request.accuracy,
+        request.asked_by,
+        best.sampling / 2,
+        best.double,
+        best.bands,
+        request.shape,
+        size,
+        best.bytes,
+        best.error,
+        best.split,
+        _model_error(request, best),
+        request.dtype.name,
+        tuple(request.reasons),
+        tuple(request.left_out),
+        tuple(warnings),
+        table,
+        request.pixel_shift,
+        best.band_nodes,
+    )
 
 
 def _model_error(request, best):
@@ -327,19 +557,28 @@ def _superpixels(asked, views, accuracy, reasons):
     if asked != "auto":
         rows, columns = (int(n) for n in asked)
         if rows < 1 or columns < 1 or rows % 2 == 0 or columns % 2 == 0:
-            raise UsageError(f"superpixels {rows}x{columns} are not centred on the object's lenslet", "superpixels", "give odd numbers such as 1x1 or 3x3")
+            raise UsageError(
+                f"superpixels {rows}x{columns} are not centred on the object's lenslet",
+                "superpixels",
+                "give odd numbers such as 1x1 or 3x3",
+            )
         reasons.append(f"superpixels {rows}x{columns} as asked")
         return rows, columns
     ring = max(blur_ring(view) for view in views)
-    reasons.append(f"geometric blur {max(v.blur / v.D2 for v in views):.2f} lenslets: superpixels under it kept, ring {ring}")
+    reasons.append(
+        f"geometric blur {max(v.blur / v.D2 for v in views):.2f} lenslets: superpixels under "
+        f"it kept, ring {ring}"
+    )
     if accuracy < 0.05:
         wanted = ring
         while max(predicted_outside(v, wanted) for v in views) > 0.05 and wanted < ring + 4:
             wanted += 1
         if wanted > ring:
             reasons.append(
-                f"ring {wanted} kept for diffraction: it leaves about {max(predicted_outside(v, wanted) for v in views):.3f} "
-                "of a corner point's light outside (limit 0.05)")
+                f"ring {wanted} kept for diffraction: it leaves about "
+                f"{max(predicted_outside(v, wanted) for v in views):.3f} of a corner point's "
+                "light outside (limit 0.05)"
+            )
         ring = wanted
     return 2 * ring + 1, 2 * ring + 1
 
@@ -351,22 +590,37 @@ def _warnings(request, best):
         spacing = view.superpixel_pitch * (1.0 if axis else view.row_spacing)
         if request.pixel_shift is None and abs(size / spacing - 1) > 1e-4:
             found.append(
-                f"superpixels are {spacing / view.pixel_pitch:.3f} pixels apart, not {view.pixel_shape[axis]} ({name}): A is for the "
-                "grid centred on each superpixel, not for one sensor raster (--lenslet)")
+                f"superpixels are {spacing / view.pixel_pitch:.3f} pixels apart, not "
+                f"{view.pixel_shape[axis]} ({name}): A is for the grid centred on each "
+                "superpixel, not for one sensor raster (--lenslet)"
+            )
     if request.model != "auto" and best.model != "exact":
         error = _model_error(request, best)
         if error > request.accuracy:
-            found.append(f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; that model is off by about {error:.1g} itself")
+            found.append(
+                f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; "
+                f"that model is off by about {error:.1g} itself"
+            )
     if max(v.blur / (2 * v.D2) for v in request.depths) > (min(grid) - 1) // 2 + 1e-9:
-        found.append("the geometric blur reaches beyond the superpixels kept: their light is missing from the columns")
+        found.append(
+            "the geometric blur reaches beyond the superpixels kept: their light is "
+            "missing from the columns"
+        )
     return found
 
 
 def system_matrix(camera, *, progress=None, **request):
     """Plan and compute the system matrix of `camera`, a Pif; `request` as for plan_pif."""
-    return build_pif(camera, plan_pif(camera, **request), points=request.get("points"), progress=progress)
+    return build_pif(
+        camera, plan_pif(camera, **request), points=request.get("points"), progress=progress
+    )
 
 
 def pif_builder(camera, wavelength, **request):
     """A PifBuilder of `camera` at `wavelength` (m), planned by plan_pif with `request`."""
-    return PifBuilder(camera, wavelength, plan_pif(camera, wavelengths=(wavelength,), **request), dtype=request.get("dtype", "float32"))
+    return PifBuilder(
+        camera,
+        wavelength,
+        plan_pif(camera, wavelengths=(wavelength,), **request),
+        dtype=request.get("dtype", "float32"),
+    )

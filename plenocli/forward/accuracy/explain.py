@@ -1,4 +1,8 @@
-"""A plan in words and as a table: which models were considered, which serve and why not, and what each would cost."""
+"""A plan in words and as a table: which models were considered, which serve and why not, and
+what each would cost.
+"""
+
+import math
 
 from plenocli.forward.accuracy.dial import seconds_here
 
@@ -7,71 +11,137 @@ LONG = 20.0
 
 
 def explain(plan, memory=None):
-    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was left out, warnings. memory: bytes that
-    the chosen one takes as it is written, where known."""
+    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was
+    left out, warnings.
+
+    memory: bytes that the chosen one takes as it is written, where known.
+    """
     rows, columns = plan.superpixels
     head = [
         f"asked: accuracy {plan.accuracy:.2g} ({plan.asked_by})",
-        f"matrix: {plan.shape[0]} band(s) x {plan.shape[1]} superpixels ({rows}x{columns}) x {plan.shape[2]} pixels x {plan.shape[3]} points, "
-        f"{_size(plan.bytes)} as {plan.dtype}; {'double' if plan.double else 'single'} precision, coherent ring {plan.coherent_ring}",
+        (
+            f"matrix: {plan.shape[0]} band(s) x {plan.shape[1]} superpixels ({rows}x{columns}) x "
+            f"{plan.shape[2]} pixels x {plan.shape[3]} points, {_size(plan.bytes)} as "
+            f"{plan.dtype}; {'double' if plan.double else 'single'} precision, coherent ring "
+            f"{plan.coherent_ring}"
+        ),
         "",
         *_table(candidates(plan)),
         "",
-        *([] if memory is None else [f"memory: about {_size(memory)}" + (", written in pieces" if memory < plan.bytes else "")]),
-        "error by source: " + ", ".join(f"{name} {value:.1g}" for name, value in plan.split.items()) + f"; together {plan.estimated:.1g}",
+        *(
+            []
+            if memory is None
+            else [
+                f"memory: about {_size(memory)}"
+                + (", written in pieces" if memory < plan.bytes else "")
+            ]
+        ),
+        "error by source: "
+        + ", ".join(f"{name} {value:.1g}" for name, value in plan.split.items())
+        + f"; together {plan.estimated:.1g}",
     ]
     nodes = [
-        f"{b.wavelength * 1e9:.1f} nm: {b.lenslet_nodes} nodes across a lenslet, {b.pixel_nodes} across a pixel, "
-        f"{b.psf_nodes} across the spread function, about {b.terms} terms"
+        (
+            f"{b.wavelength * 1e9:.1f} nm: {b.lenslet_nodes} nodes across a lenslet, "
+            f"{b.pixel_nodes} across a pixel, {b.psf_nodes} across the spread function, "
+            f"about {b.terms} terms"
+        )
         for b in plan.bands
     ]
     if plan.band_nodes:
         nodes.append(f"the band is the sum of {plan.band_nodes} wavelength(s)")
-    return "\n".join([*head, *(f"- {r}" for r in plan.reasons), *(f"- left out: {t}" for t in plan.left_out), *(f"- {n}" for n in nodes),
-                      *(f"! {w}" for w in plan.warnings)])
+    return "\n".join(
+        [
+            *head,
+            *(f"- {r}" for r in plan.reasons),
+            *(f"- left out: {t}" for t in plan.left_out),
+            *(f"- {n}" for n in nodes),
+            *(f"! {w}" for w in plan.warnings),
+        ]
+    )
 
 
 def candidates(plan):
-    """The rungs considered, as JSON-able dicts: rung, model, chosen, serves, reason, error, split, seconds (of one core here), bytes."""
+    """The rungs considered, as JSON-able dicts: rung, model, chosen, serves, reason, error,
+    split, seconds (of one core here), bytes.
+    """
     found = []
     for c in plan.candidates:
         known = c.split is not None
-        found.append({"rung": c.name, "model": c.model, "chosen": c.why is None, "reason": c.why, "error": c.error if known else None, "split": c.split,
-                      "coherent_ring": c.ring if known else None, "seconds": seconds_here(c) if known else None, "bytes": c.bytes if known else None})
+        found.append(
+            {
+                "rung": c.name,
+                "model": c.model,
+                "chosen": c.why is None,
+                "reason": c.why,
+                "error": c.error if known else None,
+                "split": c.split,
+                "coherent_ring": c.ring if known else None,
+                "seconds": seconds_here(c) if known else None,
+                "bytes": c.bytes if known else None,
+            }
+        )
     return found
 
 
 def expectation(plan, memory=None, times=1):
-    """One line about work that takes long, and the rung that would take much less; None where it does not. memory: bytes, where known;
-    times: how often such a plan is carried out."""
+    """One line about work that takes long, and the rung that would take much less; None
+    where it does not.
+
+    memory: bytes, where known;
+    times: how often such a plan is carried out.
+    """
     chosen = plan.chosen
     if times * chosen.seconds() < LONG:
         return None
-    text = f"about {_duration(times * seconds_here(chosen))} on one core" + ("" if memory is None else f" and {_size(memory)} of memory") + f" ({chosen.name}, error {chosen.error:.1g})"
-    quicker = [c for c in plan.candidates if c.model != chosen.model and c.split is not None and c.error < 0.5 and c.seconds() < chosen.seconds() / 4]
+    text = (
+        f"about {_duration(times * seconds_here(chosen))} on one core"
+        + ("" if memory is None else f" and {_size(memory)} of memory")
+        + f" ({chosen.name}, error {chosen.error:.1g})"
+    )
+    quicker = [
+        c
+        for c in plan.candidates
+        if c.model != chosen.model
+        and c.split is not None
+        and c.error < 0.5
+        and c.seconds() < chosen.seconds() / 4
+    ]
     if not quicker:
         return text
     other = min(quicker, key=lambda c: (c.error, c.seconds()))
-    return f"{text}; --model {other.model} takes {_duration(times * seconds_here(other))} at an error of {other.error:.1g}"
+    return (
+        f"{text}; --model {other.model} takes {_duration(times * seconds_here(other))} at an error "
+        f"of {other.error:.1g}"
+    )
 
 
 def _table(rows):
     cells = [("rung", "error", "time", "memory", "")]
     for r in rows:
         known = r["error"] is not None
-        cells.append((r["rung"], f"{r['error']:.1g}" if known else "-", _duration(r["seconds"]) if known else "-", _size(r["bytes"]) if known else "-",
-                      "chosen" if r["chosen"] else r["reason"]))
+        cells.append(
+            (
+                r["rung"],
+                f"{r['error']:.1g}" if known else "-",
+                _duration(r["seconds"]) if known else "-",
+                _size(r["bytes"]) if known else "-",
+                "chosen" if r["chosen"] else r["reason"],
+            )
+        )
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
-    return ["  ".join((row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in (1, 2, 3)), row[4])).rstrip() for row in cells]
+    return [
+        "  ".join(
+            (row[0].ljust(widths[0]), *(row[i].rjust(widths[i]) for i in (1, 2, 3)), row[4])
+        ).rstrip()
+        for row in cells
+    ]
 
 
 def _duration(seconds):
     """Seconds in a unit that a person would take."""
-    for unit, size, most in (("s", 1, 100), ("min", 60, 100), ("h", 3600, 72)):
-        if seconds < (most - 0.5) * size:
-            break
-    else:
-        unit, size = "days", 86400
+    units = (("s", 1, 100), ("min", 60, 100), ("h", 3600, 72), ("days", 86400, math.inf))
+    unit, size, _ = next(known for known in units if seconds < (known[2] - 0.5) * known[1])
     return f"{seconds / size:.2g} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
 
 

@@ -1,18 +1,25 @@
-"""What a scene requires of the model: how far, which colours, which lenslets, and how fine noise lets anyone see."""
+"""What a scene requires of the model: how far, which colours, which lenslets, and how fine
+noise lets anyone see.
+"""
 
 import math
 from dataclasses import dataclass
 
 HIDDEN = 0.3
-"""A model error of this share of the noise, both relative to the signal, adds under 5 % to the total: it cannot be seen."""
+"""A model error of this share of the noise, both relative to the signal, adds under 5 % to the
+total: it cannot be seen.
+"""
 
 
 @dataclass(frozen=True)
 class Needs:
     """What is known of a scene; None where it is not.
 
-    depth: nearest and farthest distance (m) to the main lens; spectrum: lowest and highest wavelength (m) with light;
-    lenslets: (rows, columns) that see light; noise: relative noise of a pixel at the brightest; source: who says so.
+    depth: nearest and farthest distance (m) to the main lens;
+    spectrum: lowest and highest wavelength (m) with light;
+    lenslets: (rows, columns) that see light;
+    noise: relative noise of a pixel at the brightest;
+    source: who says so.
     """
 
     depth: tuple | None = None
@@ -23,20 +30,28 @@ class Needs:
 
 
 def sensor_noise(camera):
-    """Relative noise of a pixel of `camera` at full well: shot and read noise over the signal (EMVA 1288)."""
+    """Relative noise of a pixel of `camera` at full well: shot and read noise over the
+    signal (EMVA 1288).
+    """
     sensor = camera.sensor
     return math.sqrt(sensor.full_well + sensor.read_noise**2) / sensor.full_well
 
 
 def visible_accuracy(noise):
-    """The finest model error worth computing beside a relative `noise`, within what the dial offers."""
+    """The finest model error worth computing beside a relative `noise`, within
+    what the dial offers.
+    """
     return min(0.3, max(1e-8, HIDDEN * noise))
 
 
 def seen_wavelengths(wavelengths, needs):
-    """(those of `wavelengths` that the scene has light at, those left out); all of them where that would leave none."""
+    """(those of `wavelengths` that the scene has light at, those left out); all of them where
+    that would leave none.
+    """
     if needs is None or needs.spectrum is None:
         return tuple(wavelengths), ()
     low, high = needs.spectrum
     kept = tuple(w for w in wavelengths if low * (1 - 1e-9) <= w <= high * (1 + 1e-9))
-    return (kept, tuple(w for w in wavelengths if w not in kept)) if kept else (tuple(wavelengths), ())
+    return (
+        (kept, tuple(w for w in wavelengths if w not in kept)) if kept else (tuple(wavelengths), ())
+    )

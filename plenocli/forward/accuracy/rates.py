@@ -1,7 +1,9 @@
-"""How fast this machine multiplies complex matrices: the unit in which plans are turned into seconds.
+"""How fast this machine multiplies complex matrices: the unit in which plans are
+turned into seconds.
 
-Plans are chosen by counting operations at nominal rates, so that a file does not depend on the machine that made it;
-the rates measured here only turn the choice into the seconds that a user is told.
+Plans are chosen by counting operations at nominal rates, so that a file does not depend on the
+machine that made it; the rates measured here only turn the choice into the seconds
+that a user is told.
 """
 
 import time
@@ -10,12 +12,16 @@ from functools import lru_cache
 import numpy as np
 
 NOMINAL = {False: 60e9, True: 30e9}
-"""Real operations a second of one core in complex matrix products, single and double precision, for choosing."""
+"""Real operations a second of one core in complex matrix products, single and double
+precision, for choosing.
+"""
 
 
 @lru_cache(maxsize=2)
 def product_rate(double):
-    """Real operations (8 for a complex multiply-add) a second of one core in products of the shape that the field needs."""
+    """Real operations (8 for a complex multiply-add) a second of one core in products of the
+    shape that the field needs.
+    """
     from threadpoolctl import threadpool_limits
 
     dtype = np.complex128 if double else np.complex64

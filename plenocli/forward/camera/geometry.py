@@ -1,32 +1,38 @@
 """First-order geometry of a plenoptic camera at one wavelength.
 
-Planes: object --z1--> main lens (f1, diameter D1) --z2--> lenslet array (pitch D2, f2) --z3--> sensor.
-Transverse coordinates are (row, column) = (y down, x right), in metres, the same sense in every plane.
+Planes: object --z1--> main lens (f1, diameter D1) --z2--> lenslet array (pitch D2, f2) --z3-->
+sensor. Transverse coordinates are (row, column) = (y down, x right), in metres, the same
+sense in every plane.
 
-Lenslets are numbered (r, c). On a square lattice lenslet (r, c) stands at y = r p, x = c p (p the pitch). On a hexagonal one
-(close-packed rows along x, two flat sides of each cell facing +-x, corners up and down) these are axial coordinates:
-y = r p sqrt(3)/2, x = (c + r/2) p. The object's field of one lenslet is the rectangle (row spacing) x p around its centre,
-which tiles either lattice; on the hexagonal one its corners stick out of the hexagon into the next cells.
+Lenslets are numbered (r, c). On a square lattice lenslet (r, c) stands at y = r p, x = c p (p the
+pitch). On a hexagonal one (close-packed rows along x, two flat sides of each cell facing +-x,
+corners up and down) these are axial coordinates: y = r p sqrt(3)/2, x = (c + r/2) p. The object's
+field of one lenslet is the rectangle (row spacing) x p around its centre, which tiles either
+lattice; on the hexagonal one its corners stick out of the hexagon into the next cells.
 """
 
 import math
 from dataclasses import dataclass
 
-from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.glass import focal_length
 from plenocli.forward.camera.lens import at_wavelength
+from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.pupil import ray_reach
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Distances (m) and derived constants of a camera at `wavelength` (m); Berkner et al. 2013, section 2-3-1.
+    """Distances (m) and derived constants of a camera at `wavelength` (m); Berkner et al.
+    2013, section 2-3-1.
 
-    lattice: "square" or "hexagonal"; lenslet_shape: "square", "circle" or "hexagon", lenslet_width across its flat sides;
-    pixel_shift: None where the pixels of every superpixel are centred on its chief ray, else where the sensor's raster lies:
-    (rows, columns) in pixels from a superpixel's centre to the middle of its window; ray_reach (m): farthest that a ray of an
-    aberrated pupil lands on the array from the image point along either axis, None without wavefront error.
+    lattice: "square" or "hexagonal";
+    lenslet_shape: "square", "circle" or "hexagon", lenslet_width across its flat sides;
+    pixel_shift: None where the pixels of every superpixel are centred on its chief ray, else where
+        the sensor's raster lies: (rows, columns) in pixels from a superpixel's centre to the
+        middle of its window;
+    ray_reach (m): farthest that a ray of an aberrated pupil lands on the array from the image point
+        along either axis, None without wavefront error.
     """
 
     wavelength: float
@@ -54,12 +60,16 @@ class Geometry:
 
     @property
     def eps(self):
-        """Defocus of the main lens at the array, 1/m: 1/z1 + 1/z2 - 1/f1; 0 when the object is imaged onto the array."""
+        """Defocus of the main lens at the array, 1/m: 1/z1 + 1/z2 - 1/f1; 0 when the object is
+        imaged onto the array.
+        """
         return 1 / self.z1 + 1 / self.z2 - 1 / self.f1
 
     @property
     def kappa(self):
-        """Curvature left on a lenslet, 1/m: 1/z2 + 1/z3 - 1/f2; 0 when the lenslets image the pupil onto the sensor."""
+        """Curvature left on a lenslet, 1/m: 1/z2 + 1/z3 - 1/f2; 0 when the lenslets image the
+        pupil onto the sensor.
+        """
         return 1 / self.z2 + 1 / self.z3 - 1 / self.f2
 
     @property
@@ -69,13 +79,16 @@ class Geometry:
 
     @property
     def superpixel_pitch(self):
-        """Spacing of superpixel centres on the sensor, m: D2 (1 + z3/z2), because chief rays come from the pupil's centre."""
+        """Spacing of superpixel centres on the sensor, m: D2 (1 + z3/z2), because chief rays
+        come from the pupil's centre.
+        """
         return self.D2 * (1 + self.z3 / self.z2)
 
     @property
     def blur(self):
-        """Width of the geometric blur of an object point on the array, m: D1 z2 |eps|; with wavefront error twice the reach of
-        its rays z2 (eps r + grad W)."""
+        """Width of the geometric blur of an object point on the array, m: D1 z2 |eps|; with
+        wavefront error twice the reach of its rays z2 (eps r + grad W).
+        """
         return self.D1 * self.z2 * abs(self.eps) if self.ray_reach is None else 2 * self.ray_reach
 
     @property
@@ -91,17 +104,23 @@ class Geometry:
 
     @property
     def diffraction_cells(self):
-        """Lenslet pitch in units of wavelength times image-side F-number: the space-bandwidth number per axis."""
+        """Lenslet pitch in units of wavelength times image-side F-number: the
+        space-bandwidth number per axis.
+        """
         return self.D2 * self.D1 / (self.wavelength * self.z2)
 
     @property
     def quartic_phase(self):
-        """Phase (rad) that the paraxial model drops between a lenslet's edge and its axis on the sensor: k (D2/2)^4/(8 z3^3).
-        Above about 0.1 rad the difference from exact propagation shows in the fringes."""
-        return self.k * (self.D2 / 2)**4 / (8 * self.z3**3)
+        """Phase (rad) that the paraxial model drops between a lenslet's edge and its axis on the
+        sensor: k (D2/2)^4/(8 z3^3). Above about 0.1 rad the difference from exact propagation
+        shows in the fringes.
+        """
+        return self.k * (self.D2 / 2) ** 4 / (8 * self.z3**3)
 
     def points(self, axis):
-        """Centres (m, on the array) of the images of the object points along `axis` (0 rows, 1 columns)."""
+        """Centres (m, on the array) of the images of the object points along `axis`
+        (0 rows, 1 columns).
+        """
         n = self.object_shape[axis]
         return _steps(n) * self.D2 * (1.0 if axis else self.row_spacing) / n
 
@@ -110,13 +129,17 @@ class Geometry:
         return _steps(self.pixel_shape[axis]) * self.pixel_pitch
 
     def centre(self, r, c):
-        """Where lenslet (r, c) stands, in pitches: (row, column); on the sensor its superpixel does, in superpixel pitches."""
+        """Where lenslet (r, c) stands, in pitches: (row, column); on the sensor its superpixel
+        does, in superpixel pitches.
+        """
         return (r * ROW_SPACING, c + r / 2) if self.lattice == "hexagonal" else (float(r), float(c))
 
     def neighbourhood(self, window):
-        """Lenslets up to `window` pitches away in rows and columns, as products [(row positions, column positions)], in pitches.
+        """Lenslets up to `window` pitches away in rows and columns, as products [(row positions,
+        column positions)], in pitches.
 
-        Square: one product, |r|, |c| <= window. Hexagonal: even rows and, half a pitch aside, odd rows. Both mirror-symmetric.
+        Square: one product, |r|, |c| <= window. Hexagonal: even rows and, half a pitch aside, odd
+        rows. Both mirror-symmetric.
         """
         import numpy as np
 
@@ -125,12 +148,21 @@ class Geometry:
             return [(far, far)]
         rows = np.arange(-hexagonal_rows(window), hexagonal_rows(window) + 1)
         odd = np.arange(-window - 0.5, window + 1)
-        return [(rows[rows % 2 == 0] * ROW_SPACING, np.arange(-window, window + 1.0)), (rows[rows % 2 == 1] * ROW_SPACING, odd)]
+        return [
+            (rows[rows % 2 == 0] * ROW_SPACING, np.arange(-window, window + 1.0)),
+            (rows[rows % 2 == 1] * ROW_SPACING, odd),
+        ]
 
     def places(self, grid):
-        """Where the superpixels of `grid` (rows, columns of axial numbers, both odd) stand, in pitches: {place: (row, column) in the grid}."""
+        """Where the superpixels of `grid` (rows, columns of axial numbers, both odd) stand, in
+        pitches: {place: (row, column) in the grid}.
+        """
         rows, columns = ((n - 1) // 2 for n in grid)
-        return {self.centre(r, c): (r + rows, c + columns) for r in range(-rows, rows + 1) for c in range(-columns, columns + 1)}
+        return {
+            self.centre(r, c): (r + rows, c + columns)
+            for r in range(-rows, rows + 1)
+            for c in range(-columns, columns + 1)
+        }
 
     def lines(self, grid, axis):
         """How many different rows (axis 0) or columns (1) the superpixels of `grid` stand in."""
@@ -138,20 +170,35 @@ class Geometry:
         return 2 * grid[1] + grid[0] - 2 if aside else grid[axis]
 
     def reach(self, grid, window=None):
-        """Farthest that a lenslet whose light counts stands from the object's own, (rows, columns) in pitches: those of the
-        neighbourhood, or where window is None those of the superpixels kept."""
+        """Farthest that a lenslet whose light counts stands from the object's own, (rows, columns)
+        in pitches: those of the neighbourhood, or where window is None those of
+        the superpixels kept.
+        """
         if window is None:
             rows, columns = ((n - 1) // 2 for n in grid)
             return tuple(float(n) for n in self.centre(rows, columns))
-        return tuple(max(float(product[axis].max()) for product in self.neighbourhood(window) if product[axis].size) for axis in (0, 1))
+        return tuple(
+            max(
+                float(product[axis].max())
+                for product in self.neighbourhood(window)
+                if product[axis].size
+            )
+            for axis in (0, 1)
+        )
 
     def field_half(self, grid, window=None):
-        """Half width (m) on which the main lens's spread function is needed: from an object point to a lenslet's far edge."""
+        """Half width (m) on which the main lens's spread function is needed: from an object
+        point to a lenslet's far edge.
+        """
         cell = self.row_spacing / 2, 0.5
-        return max((far + c) * self.D2 + e for far, c, e in zip(self.reach(grid, window), cell, self.lenslet_extent))
+        return max(
+            (far + c) * self.D2 + e
+            for far, c, e in zip(self.reach(grid, window), cell, self.lenslet_extent)
+        )
 
     def window_shift(self, axis, n=0.0):
-        """From the centre of the superpixel n superpixel pitches away along `axis` to the middle of its window, m.
+        """From the centre of the superpixel n superpixel pitches away along `axis` to the
+        middle of its window, m.
 
         Zero where windows are centred on chief rays; on a sensor's raster at most half a pixel.
         """
@@ -161,7 +208,9 @@ class Geometry:
         return (round(ideal) - ideal) * self.pixel_pitch
 
     def mirrors(self, grid):
-        """(flip rows, flip columns, transpose) that map lattice, lenslets and pixels of `grid` superpixels onto themselves."""
+        """(flip rows, flip columns, transpose) that map lattice, lenslets and pixels of `grid`
+        superpixels onto themselves.
+        """
         shift = self.pixel_shift or (0.0, 0.0)
         # a rhombus of axial coordinates is no mirror image of itself
         flips = self.lattice == "square" or tuple(grid) == (1, 1)
@@ -181,14 +230,20 @@ def hexagonal_rows(window):
 
 
 def geometry(camera, wavelength, pixel_shift=None):
-    """The Geometry of `camera` (plenocli.forward.camera.model.Camera) at `wavelength` (m), with the focal lengths of its glasses there.
+    """The Geometry of `camera` (plenocli.forward.camera.model.Camera) at `wavelength` (m), with the
+    focal lengths of its glasses there.
 
-    pixel_shift: (rows, columns) as lenslet_shift gives it, for pixels on the sensor's own raster; None: centred on chief rays.
+    pixel_shift: (rows, columns) as lenslet_shift gives it, for pixels on the sensor's own raster;
+        None: centred on chief rays.
     """
     camera = at_wavelength(camera, wavelength)
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     design = camera.light.design_wavelength or wavelength
-    f1, z1, z2 = focal_length(lens.focal_length, lens.glass, design, wavelength), camera.object.distance, array.distance
+    f1, z1, z2 = (
+        focal_length(lens.focal_length, lens.glass, design, wavelength),
+        camera.object.distance,
+        array.distance,
+    )
     return Geometry(
         wavelength=wavelength,
         z1=z1,
@@ -211,14 +266,20 @@ def geometry(camera, wavelength, pixel_shift=None):
 
 
 def array_position(camera, row, column):
-    """Where lenslet (row, column) of the array, counted from its first, stands from the optical axis: (y, x) in pitches.
+    """Where lenslet (row, column) of the array, counted from its first, stands from the optical
+    axis: (y, x) in pitches.
 
-    The axis meets the middle of a square array. Rows of a hexagonal one are upright, every odd one half a pitch to the right;
-    the axis meets lenslet (rows // 2, columns // 2). ConfigError outside of the array.
+    The axis meets the middle of a square array. Rows of a hexagonal one are upright, every odd one
+    half a pitch to the right; the axis meets lenslet (rows // 2, columns // 2). ConfigError
+    outside of the array.
     """
     array = camera.lenslet_array
     if not all(0 <= n < count for n, count in zip((row, column), array.count)):
-        raise ConfigError(f"there is no lenslet ({row}, {column})", "lenslet_array.count", f"it has {array.count[0]} x {array.count[1]}, counted from 0")
+        raise ConfigError(
+            f"there is no lenslet ({row}, {column})",
+            "lenslet_array.count",
+            f"it has {array.count[0]} x {array.count[1]}, counted from 0",
+        )
     if array.lattice == "square":
         return row - (array.count[0] - 1) / 2, column - (array.count[1] - 1) / 2
     middle = array.count[0] // 2
@@ -226,15 +287,19 @@ def array_position(camera, row, column):
 
 
 def lenslet_shift(camera, row, column):
-    """The window of lenslet (row, column) of the array on the sensor's raster: (first pixel row, first pixel column, pixel_shift).
+    """The window of lenslet (row, column) of the array on the sensor's raster: (first pixel row,
+    first pixel column, pixel_shift).
 
-    The raster is centred on the optical axis and holds pixels_per_lenslet times count pixels; the window, as many pixels as a
-    superpixel, may reach beyond it. pixel_shift (rows, columns), at most half a pixel: from the superpixel's centre, where the
-    chief ray lands, to the middle of the window. In the paraxial model an off-axis lenslet differs from the central one by
-    this shift alone: where it is zero, A serves unchanged.
+    The raster is centred on the optical axis and holds pixels_per_lenslet times count pixels; the
+    window, as many pixels as a superpixel, may reach beyond it. pixel_shift (rows, columns), at
+    most half a pixel: from the superpixel's centre, where the chief ray lands, to the middle of the
+    window. In the paraxial model an off-axis lenslet differs from the central one by this shift
+    alone: where it is zero, A serves unchanged.
     """
     sensor, first, shift = camera.sensor, [], []
-    for n, count, size in zip(array_position(camera, row, column), camera.lenslet_array.count, sensor.pixels_per_lenslet):
+    for n, count, size in zip(
+        array_position(camera, row, column), camera.lenslet_array.count, sensor.pixels_per_lenslet
+    ):
         ideal = n * camera.superpixel_pitch / sensor.pixel_pitch + (count * size - size) / 2
         nearest = math.floor(ideal + 0.5)
         first.append(nearest)

@@ -1,7 +1,9 @@
-"""What a camera needs to know of a traced lens: first-order data, focal shift, lateral colour, distortion, vignetting, W.
+"""What a camera needs to know of a traced lens: first-order data, focal shift, lateral colour,
+distortion, vignetting, W.
 
-Lenses and rays as in plenocli.forward.camera.prescription and plenocli.forward.camera.raytrace; fields are angles (rad) of the paraxial chief
-ray in object space, towards +y; image planes are distances (m) from the last vertex. docs/model.md, "Real lenses".
+Lenses and rays as in plenocli.forward.camera.prescription and plenocli.forward.camera.raytrace;
+fields are angles (rad) of the paraxial chief ray in object space, towards +y; image planes are
+distances (m) from the last vertex. docs/model.md, "Real lenses".
 """
 
 import functools
@@ -12,15 +14,25 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError
 from plenocli.forward.camera.pupil import unit_radius, zernike
-from plenocli.forward.camera.raytrace import Pupil, aim, entrance_pupil, exit_pupil, paraxial_matrix, to_plane, trace
+from plenocli.forward.camera.raytrace import (
+    Pupil,
+    aim,
+    entrance_pupil,
+    exit_pupil,
+    paraxial_matrix,
+    to_plane,
+    trace,
+)
 
+# --- first order ----------------------------------------------------------------------------------
 
-# --- first order -----------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """Paraxial data at one wavelength, m: effective focal length, back focus (last vertex to rear focus), principal points
-    (from the first and from the last vertex), pupils, and the F-number f/(2 entrance pupil radius), NaN where that pupil lies at infinity."""
+    """Paraxial data at one wavelength, m: effective focal length, back focus (last vertex to rear
+    focus), principal points (from the first and from the last vertex), pupils, and the F-number
+    f/(2 entrance pupil radius), NaN where that pupil lies at infinity.
+    """
 
     focal_length: float
     back_focus: float
@@ -35,29 +47,47 @@ def first_order(lens, wavelength):
     """The FirstOrder of `lens` at `wavelength` (m). NumericsError for a lens without power."""
     (a, _), (c, d) = paraxial_matrix(lens.surfaces, wavelength)
     if abs(c) < 1e-9:
-        raise NumericsError("the lens has no power", "lens", "afocal systems form no image; check radii and glasses")
+        raise NumericsError(
+            "the lens has no power", "lens", "afocal systems form no image; check radii and glasses"
+        )
     n = _last_index(lens, wavelength)
     entrance = entrance_pupil(lens, wavelength)
-    return FirstOrder(float(-n / c), float(-n * a / c), float((d - 1) / c), float(n * (1 - a) / c), entrance, exit_pupil(lens, wavelength),
-                      float(abs(n / c) / (2 * entrance.radius)) if math.isfinite(entrance.radius) else math.nan)
+    return FirstOrder(
+        float(-n / c),
+        float(-n * a / c),
+        float((d - 1) / c),
+        float(n * (1 - a) / c),
+        entrance,
+        exit_pupil(lens, wavelength),
+        float(abs(n / c) / (2 * entrance.radius)) if math.isfinite(entrance.radius) else math.nan,
+    )
 
 
 def paraxial_image(lens, wavelength, object_distance=math.inf):
-    """Distance (m) from the last vertex to the paraxial image of an axial point `object_distance` (m) before the first."""
+    """Distance (m) from the last vertex to the paraxial image of an axial point
+    `object_distance` (m) before the first.
+    """
     (a, b), (c, d) = paraxial_matrix(lens.surfaces, wavelength)
-    top, bottom = (a, c) if math.isinf(object_distance) else (a * object_distance + b, c * object_distance + d)
+    top, bottom = (
+        (a, c)
+        if math.isinf(object_distance)
+        else (a * object_distance + b, c * object_distance + d)
+    )
     return float(-_last_index(lens, wavelength) * top / bottom) if bottom else math.inf
 
 
 def focal_shift(lens, wavelengths, object_distance=math.inf):
-    """Paraxial image distances at `wavelengths` minus that at the design wavelength, (wavelength,) m."""
+    """Paraxial image distances at `wavelengths` minus that at the design
+    wavelength, (wavelength,) m.
+    """
     at_design = paraxial_image(lens, lens.design_wavelength, object_distance)
     return np.array([paraxial_image(lens, w, object_distance) - at_design for w in wavelengths])
 
 
 def image_plane(lens, object_distance=math.inf):
-    """Where the sensor stands: the image distance the description gives for its own object distance, or else the paraxial
-    image at the design wavelength."""
+    """Where the sensor stands: the image distance the description gives for its own object
+    distance, or else the paraxial image at the design wavelength.
+    """
     if lens.image_distance and object_distance == lens.object_distance:
         return lens.image_distance
     return paraxial_image(lens, lens.design_wavelength, object_distance)
@@ -67,7 +97,7 @@ def _last_index(lens, wavelength):
     return lens.surfaces[-1].medium.index(wavelength)
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
+# --- fields ---------------------------------------------------------------------------------------
 
 _CENTRE = np.zeros((2, 1))
 
@@ -75,37 +105,58 @@ _CENTRE = np.zeros((2, 1))
 def chief_height(lens, wavelength, angle, object_distance=math.inf, image_distance=None):
     """Height y (m) at which the ray through the stop's centre meets the image plane."""
     distance = image_plane(lens, object_distance) if image_distance is None else image_distance
-    rays = trace(lens.surfaces, aim(lens, wavelength, _CENTRE, angle=angle, object_distance=object_distance), wavelength)
+    rays = trace(
+        lens.surfaces,
+        aim(lens, wavelength, _CENTRE, angle=angle, object_distance=object_distance),
+        wavelength,
+    )
     return float(to_plane(rays, distance).position[1, 0])
 
 
 def lateral_colour(lens, wavelengths, angle, object_distance=math.inf, image_distance=None):
-    """Chief-ray heights at `wavelengths` minus that at the design wavelength, on one image plane, (wavelength,) m.
+    """Chief-ray heights at `wavelengths` minus that at the design wavelength, on one image
+    plane, (wavelength,) m.
 
-    The object point is the same for all: its angle is that of the paraxial chief ray at the design wavelength.
+    The object point is the same for all: its angle is that of the paraxial chief ray at the
+    design wavelength.
     """
     heights = []
     for w in (lens.design_wavelength, *wavelengths):
-        heights.append(chief_height(lens, w, _same_point(lens, w, angle, object_distance), object_distance, image_distance))
+        heights.append(
+            chief_height(
+                lens,
+                w,
+                _same_point(lens, w, angle, object_distance),
+                object_distance,
+                image_distance,
+            )
+        )
     return np.array(heights[1:]) - heights[0]
 
 
 def _same_point(lens, wavelength, angle, object_distance):
-    """The field angle at `wavelength` of the object point that has `angle` at the design wavelength: for a near object it
-    changes with the entrance pupil's place."""
+    """The field angle at `wavelength` of the object point that has `angle` at the design
+    wavelength: for a near object it changes with the entrance pupil's place.
+    """
     if math.isinf(object_distance) or angle == 0:
         return angle
-    here, there = (object_distance + entrance_pupil(lens, w).position for w in (lens.design_wavelength, wavelength))
+    here, there = (
+        object_distance + entrance_pupil(lens, w).position
+        for w in (lens.design_wavelength, wavelength)
+    )
     return math.atan(math.tan(angle) * here / there)
 
 
 def distortion(lens, wavelength, angle, object_distance=math.inf, image_distance=None):
-    """Relative excess of the chief ray's height over the paraxial one, (h - h_p)/h_p; h_p = f tan(angle) in the rear focal plane.
-    Positive: pincushion."""
+    """Relative excess of the chief ray's height over the paraxial one, (h - h_p)/h_p; h_p = f
+    tan(angle) in the rear focal plane. Positive: pincushion.
+    """
     pupil = exit_pupil(lens, wavelength)
     entrance = entrance_pupil(lens, wavelength)
     distance = image_plane(lens, object_distance) if image_distance is None else image_distance
-    ray = paraxial_matrix(lens.surfaces, wavelength) @ np.array([-entrance.position * math.tan(angle), math.tan(angle)])
+    ray = paraxial_matrix(lens.surfaces, wavelength) @ np.array(
+        [-entrance.position * math.tan(angle), math.tan(angle)]
+    )
     ideal = ray[0] + distance * ray[1] / _last_index(lens, wavelength)
     if ideal == 0 or not math.isfinite(pupil.magnification):
         raise NumericsError("distortion is defined off axis", "lens", "ask for a field above 0")
@@ -113,31 +164,43 @@ def distortion(lens, wavelength, angle, object_distance=math.inf, image_distance
 
 
 def transmitted(lens, wavelength, angle, object_distance=math.inf, rings=32):
-    """Share (0 to 1) of the stop's area through which light from `angle` gets past every clear aperture; cos^4 is not in it."""
+    """Share (0 to 1) of the stop's area through which light from `angle` gets past every clear
+    aperture; cos^4 is not in it.
+    """
     points, weights = disc_points(rings, 4 * rings)
-    rays = trace(lens.surfaces, aim(lens, wavelength, points, angle=angle, object_distance=object_distance), wavelength, clip=True)
+    rays = trace(
+        lens.surfaces,
+        aim(lens, wavelength, points, angle=angle, object_distance=object_distance),
+        wavelength,
+        clip=True,
+    )
     return float(weights[rays.alive].sum() / weights.sum())
 
 
 def disc_points(rings, spokes):
-    """Points (2, n) of the unit disc and weights (n,) that integrate polynomials over it: Gauss-Legendre in rho^2 times equal angles."""
+    """Points (2, n) of the unit disc and weights (n,) that integrate polynomials over it:
+    Gauss-Legendre in rho^2 times equal angles.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     rho, theta = np.sqrt((nodes + 1) / 2), (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
     points = np.stack([np.outer(rho, np.cos(theta)).ravel(), np.outer(rho, np.sin(theta)).ravel()])
     return points, np.repeat(weights / 2 * math.pi / spokes, spokes)
 
 
-# --- wavefront -------------------------------------------------------------------------------------------------------
+# --- wavefront ------------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True)
 class Wavefront:
     """The wavefront error of one field and wavelength on a sphere through the exit pupil's centre.
 
-    points: (2, ray) x, y over the stop's radius.  error: (ray,) W in m, optical path from the object to the sphere minus that of
-    the chief ray; W > 0 is a later wave, a phase exp(+jkW); NaN where no light comes through.  cosines: (2, ray) x, y of
-    the unit vectors from the rays' places on the sphere to its centre; minus these, times the image distance, are pupil
-    coordinates.  centre: (3,) m, the chief ray's image, from the last vertex.  radius: m, signed, positive where the exit
-    pupil lies before the image.
+    points: (2, ray) x, y over the stop's radius.
+    error: (ray,) W in m, optical path from the object to the sphere minus that of the chief ray;
+        W > 0 is a later wave, a phase exp(+jkW); NaN where no light comes through.
+    cosines: (2, ray) x, y of the unit vectors from the rays' places on the sphere to its centre;
+        minus these, times the image distance, are pupil coordinates.
+    centre: (3,) m, the chief ray's image, from the last vertex.
+    radius: m, signed, positive where the exit pupil lies before the image.
     """
 
     points: np.ndarray
@@ -147,20 +210,26 @@ class Wavefront:
     radius: float
 
     def rms(self, weights=None):
-        """Root mean square (m) of W about its mean over the points that light reaches; `weights` (ray,) as of disc_points."""
+        """Root mean square (m) of W about its mean over the points that light reaches; `weights`
+        (ray,) as of disc_points.
+        """
         lit = np.isfinite(self.error)
         weights = None if weights is None else weights[lit]
         mean = np.average(self.error[lit], weights=weights)
         return float(np.sqrt(np.average((self.error[lit] - mean) ** 2, weights=weights)))
 
 
-def wavefront(lens, wavelength, points, angle=0.0, object_distance=math.inf, image_distance=None, clip=True):
-    """The Wavefront of `lens` at `points` (2, ray) of the stop, about the chief ray's own image on the image plane.
+def wavefront(
+    lens, wavelength, points, angle=0.0, object_distance=math.inf, image_distance=None, clip=True
+):
+    """The Wavefront of `lens` at `points` (2, ray) of the stop, about the chief ray's own image
+    on the image plane.
 
-    Each wavelength has its own centre, so lateral colour is no part of W (see `lateral_colour`); the exit pupil is that of
-    the design wavelength. Sphere and path in a form that does not cancel, valid for telecentric pupils too: with D the ray's
-    direction, d its distance from the centre on the image plane and q = d^2 - (d.D)^2, the way back to the sphere is
-    R + d.D - q/(R + sqrt(R^2 - q)).
+    Each wavelength has its own centre, so lateral colour is no part of W (see `lateral_colour`);
+    the exit pupil is that of the design wavelength. Sphere and path in a form that does not cancel,
+    valid for telecentric pupils too: with D the ray's direction, d its distance from the centre on
+    the image plane and q = d^2 - (d.D)^2, the way back to the sphere is R + d.D -
+    q/(R + sqrt(R^2 - q)).
     """
     distance = image_plane(lens, object_distance) if image_distance is None else image_distance
     both = np.concatenate([_CENTRE, np.asarray(points, dtype=float)], axis=1)
@@ -168,27 +237,50 @@ def wavefront(lens, wavelength, points, angle=0.0, object_distance=math.inf, ima
     n = _last_index(lens, wavelength)
     rays = to_plane(trace(lens.surfaces, start, wavelength), distance, n)
     if not rays.alive[0]:
-        raise NumericsError(f"the chief ray at {math.degrees(angle):.4g} degrees does not get through", "lens", "use a smaller field")
+        raise NumericsError(
+            f"the chief ray at {math.degrees(angle):.4g} degrees does not get through",
+            "lens",
+            "use a smaller field",
+        )
     centre = rays.position[:, :1]
     pupil = exit_pupil(lens, lens.design_wavelength).position
     gap = distance - pupil
-    radius = math.copysign(math.hypot(gap, float(centre[1, 0])), gap) if math.isfinite(pupil) else math.inf
+    radius = (
+        math.copysign(math.hypot(gap, float(centre[1, 0])), gap)
+        if math.isfinite(pupil)
+        else math.inf
+    )
     offset = rays.position - centre
     along = (offset * rays.direction).sum(axis=0)
     square = (offset * offset).sum(axis=0) - along * along
-    bent = square / (radius + math.copysign(1.0, radius) * np.sqrt(radius * radius - square)) if math.isfinite(radius) else 0.0
+    bent = (
+        square / (radius + math.copysign(1.0, radius) * np.sqrt(radius * radius - square))
+        if math.isfinite(radius)
+        else 0.0
+    )
     back = along - bent  # way back to the sphere, less its radius
     error = rays.path - n * back
-    cosines = rays.direction[:2] if math.isinf(radius) else ((radius + back) * rays.direction - offset)[:2] / radius
+    cosines = (
+        rays.direction[:2]
+        if math.isinf(radius)
+        else ((radius + back) * rays.direction - offset)[:2] / radius
+    )
     error = error - error[0]
     if clip:
         error = np.where(trace(lens.surfaces, start, wavelength, clip=True).alive, error, np.nan)
-    return Wavefront(both[:, 1:], error[1:], cosines[:, 1:] - cosines[:, :1], np.array([*centre[:2, 0], distance]), radius)
+    return Wavefront(
+        both[:, 1:],
+        error[1:],
+        cosines[:, 1:] - cosines[:, :1],
+        np.array([*centre[:2, 0], distance]),
+        radius,
+    )
 
 
 def wavefront_grid(lens, wavelength, samples=64, **field):
-    """(samples, samples) W in m on a square grid of pixel centres over the stop's diameter, rows along y; NaN outside.
-    `field` as `wavefront`."""
+    """(samples, samples) W in m on a square grid of pixel centres over the stop's diameter, rows
+    along y; NaN outside. `field` as `wavefront`.
+    """
     axis = (np.arange(samples) + 0.5) * (2 / samples) - 1
     x, y = np.meshgrid(axis, axis)
     inside = x * x + y * y <= 1
@@ -198,10 +290,12 @@ def wavefront_grid(lens, wavelength, samples=64, **field):
 
 
 def noll_coefficients(lens, wavelength, terms=37, pupil="stop", rings=16, **field):
-    """(terms,) coefficients (m rms) of Noll's Zernike polynomials 1 ... `terms` in W, and the rms (m) of what they leave.
+    """(terms,) coefficients (m rms) of Noll's Zernike polynomials 1 ... `terms` in W, and the rms
+    (m) of what they leave.
 
-    `pupil` = "stop" expands over the stop's coordinates, "exit" over direction cosines in image space, relative to the chief
-    ray and in units of the largest; where the lens obeys the sine condition these are the same on axis. `field` as `wavefront`.
+    `pupil` = "stop" expands over the stop's coordinates, "exit" over direction cosines in image
+    space, relative to the chief ray and in units of the largest; where the lens obeys the sine
+    condition these are the same on axis. `field` as `wavefront`.
     """
     points, weights = disc_points(rings, 4 * rings)
     if pupil == "exit":  # one more ring, the rim itself, to know the unit
@@ -214,22 +308,31 @@ def noll_coefficients(lens, wavelength, terms=37, pupil="stop", rings=16, **fiel
     count = weights.size
     good = np.isfinite(wave.error[:count])
     if good.sum() < 2 * terms:
-        raise NumericsError(f"{int(good.sum())} rays get through, too few for {terms} Zernike terms", "lens", "ask for fewer terms or a smaller field")
+        raise NumericsError(
+            f"{int(good.sum())} rays get through, too few for {terms} Zernike terms",
+            "lens",
+            "ask for fewer terms or a smaller field",
+        )
     root = np.sqrt(weights[good] / weights[good].sum())
-    basis = np.stack([zernike(j, at[1, :count][good], at[0, :count][good]) for j in range(1, terms + 1)], axis=1)
+    basis = np.stack(
+        [zernike(j, at[1, :count][good], at[0, :count][good]) for j in range(1, terms + 1)], axis=1
+    )
     values = wave.error[:count][good]
     found = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
     return found, float(np.sqrt(np.sum((root * (values - basis @ found)) ** 2)))
 
 
-# --- in a camera -----------------------------------------------------------------------------------------------------
+# --- in a camera ----------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True)
 class CameraLens:
-    """A traced lens in the place of a camera's thin main lens, for one object distance and aperture, on axis.
+    """A traced lens in the place of a camera's thin main lens, for one object distance and
+    aperture, on axis.
 
-    Its principal planes stand for the thin lens: `z1` (m) from the object to the front one, `z2` (m) from the rear one to
-    the image at the design wavelength; the beam is aperture_diameter wide there, so that its paraxial half angle is D1/(2 z2).
+    Its principal planes stand for the thin lens: `z1` (m) from the object to the front one, `z2`
+    (m) from the rear one to the image at the design wavelength; the beam is aperture_diameter wide
+    there, so that its paraxial half angle is D1/(2 z2).
     """
 
     lens: object
@@ -238,70 +341,125 @@ class CameraLens:
     z2: float
 
     def focal_length(self, wavelength):
-        """f1 (m) of the thin lens that focuses where this one does: 1/f1 = 1/z1 + 1/(z2 + focal shift)."""
+        """f1 (m) of the thin lens that focuses where this one does: 1/f1 = 1/z1 +
+        1/(z2 + focal shift).
+        """
         shift = focal_shift(self.lens, [wavelength], self.object_distance)[0]
         return 1 / (1 / self.z1 + 1 / (self.z2 + shift))
 
     def aberrations(self, wavelength, order=10):
-        """((Noll index, coefficient in m), ...) of W about this wavelength's own paraxial image, defocus and spherical terms
-        up to radial `order`; the focal shift is in `focal_length`."""
+        """((Noll index, coefficient in m), ...) of W about this wavelength's own paraxial image,
+        defocus and spherical terms up to radial `order`; the focal shift is in `focal_length`.
+        """
         radial = [n * (n + 1) // 2 + 1 for n in range(2, order + 1, 2)]
         points, weights = disc_points(32, 1)
-        points = np.concatenate([np.stack([np.zeros(32), np.hypot(*points)]), [[0.0], [1.0]]], axis=1)
+        points = np.concatenate(
+            [np.stack([np.zeros(32), np.hypot(*points)]), [[0.0], [1.0]]], axis=1
+        )
         image = paraxial_image(self.lens, wavelength, self.object_distance)
-        wave = wavefront(self.lens, wavelength, points, object_distance=self.object_distance, image_distance=image, clip=False)
+        wave = wavefront(
+            self.lens,
+            wavelength,
+            points,
+            object_distance=self.object_distance,
+            image_distance=image,
+            clip=False,
+        )
         if not np.isfinite(wave.error).all():
-            raise NumericsError("rays at the rim of the aperture do not get through the lens", "main_lens.prescription", "use a smaller aperture")
+            raise NumericsError(
+                "rays at the rim of the aperture do not get through the lens",
+                "main_lens.prescription",
+                "use a smaller aperture",
+            )
         rho = np.hypot(*wave.cosines) / np.hypot(*wave.cosines[:, -1])
-        basis = np.stack([np.ones(32), *(zernike(j, rho[:32], np.zeros(32)) for j in radial)], axis=1)
+        basis = np.stack(
+            [np.ones(32), *(zernike(j, rho[:32], np.zeros(32)) for j in radial)], axis=1
+        )
         root = np.sqrt(weights)
         found = np.linalg.lstsq(basis * root[:, None], wave.error[:32] * root, rcond=None)[0]
         return tuple((j, float(c)) for j, c in zip(radial, found[1:]))
 
 
 def camera_lens(lens, object_distance, aperture_diameter, design_wavelength):
-    """The CameraLens of `lens` for an object `object_distance` (m) before its front principal point, stopped down to
-    `aperture_diameter` (m). ConfigError where the lens cannot be opened that far or forms no real image."""
+    """The CameraLens of `lens` for an object `object_distance` (m) before its front principal
+    point, stopped down to `aperture_diameter` (m). ConfigError where the lens cannot be opened that
+    far or forms no real image.
+    """
     lens = replace(lens, design_wavelength=design_wavelength)
     data = first_order(lens, design_wavelength)
     from_vertex = object_distance - data.front_principal
     image = paraxial_image(lens, design_wavelength, from_vertex)
     z2 = image - data.rear_principal
     if not (from_vertex > 0 and 0 < z2 < math.inf):
-        raise ConfigError(f"a lens of {data.focal_length * 1e3:.4g} mm forms no real image of an object {object_distance * 1e3:.4g} mm away", "main_lens.prescription",
-                          "move the object away")
+        raise ConfigError(
+            (
+                f"a lens of {data.focal_length * 1e3:.4g} mm forms no real image of an object "
+                f"{object_distance * 1e3:.4g} mm away"
+            ),
+            "main_lens.prescription",
+            "move the object away",
+        )
     slope = data.entrance_pupil.radius / (from_vertex + data.entrance_pupil.position)
     widest = abs(slope) * object_distance * 2  # of the axial beam in the principal planes
     if aperture_diameter > widest * 1.0001:
-        raise ConfigError(f"the lens opens to {widest * 1e3:.5g} mm at most, not to {aperture_diameter * 1e3:.5g} mm", "main_lens.aperture_diameter", "stop it down")
+        raise ConfigError(
+            (
+                f"the lens opens to {widest * 1e3:.5g} mm at most, not to "
+                f"{aperture_diameter * 1e3:.5g} mm"
+            ),
+            "main_lens.aperture_diameter",
+            "stop it down",
+        )
     stopped = replace(lens, stop_radius=lens.stop_radius * aperture_diameter / widest)
     return CameraLens(stopped, from_vertex, object_distance, z2)
 
 
 def at_wavelength(camera, wavelength):
-    """`camera` (plenocli.forward.camera.model.Camera) with its lens prescription, if it names one, resolved for `wavelength` (m): a thin main lens
-    of the traced focal length, whose aberrations are those of the description and the traced ones together.
+    """`camera` (plenocli.forward.camera.model.Camera) with its lens prescription, if it names one,
+    resolved for `wavelength` (m): a thin main lens of the traced focal length, whose aberrations
+    are those of the description and the traced ones together.
 
-    ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be used so (see camera_lens).
+    ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be used
+    so (see camera_lens).
     """
     thin = camera.main_lens
     if thin.prescription is None:
         return camera
     from plenocli.forward.camera.model import Aberration
 
-    focal_length, terms = _resolved(thin.samples("prescription"), camera.object.distance, 2 * unit_radius(thin), camera.light.design_wavelength, wavelength,
-                                    thin.focal_length)
+    focal_length, terms = _resolved(
+        thin.samples("prescription"),
+        camera.object.distance,
+        2 * unit_radius(thin),
+        camera.light.design_wavelength,
+        wavelength,
+        thin.focal_length,
+    )
     traced = tuple(Aberration.model_construct(noll=j, coefficient=c) for j, c in terms)
-    changed = thin.model_copy(update={"focal_length": focal_length, "aberrations": (*thin.aberrations, *traced), "prescription": None})
+    changed = thin.model_copy(
+        update={
+            "focal_length": focal_length,
+            "aberrations": (*thin.aberrations, *traced),
+            "prescription": None,
+        }
+    )
     return camera.model_copy(update={"main_lens": changed})
 
 
 @functools.lru_cache(maxsize=512)
 def _resolved(lens, object_distance, aperture_diameter, design_wavelength, wavelength, nominal):
-    """(focal length (m), Noll terms) of a prescription in a camera whose description says `nominal` (m)."""
+    """(focal length (m), Noll terms) of a prescription in a camera whose description
+    says `nominal` (m).
+    """
     inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
     own = first_order(lens, design_wavelength).focal_length
     if abs(own / nominal - 1) > 0.02:
-        raise ConfigError(f"the lens file has a focal length of {own * 1e3:.5g} mm at {design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm",
-                          "main_lens.focal_length", "write the lens's own, or scale the lens: plenocli lens import --focal-length")
+        raise ConfigError(
+            (
+                f"the lens file has a focal length of {own * 1e3:.5g} mm at "
+                f"{design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm"
+            ),
+            "main_lens.focal_length",
+            "write the lens's own, or scale the lens: plenocli lens import --focal-length",
+        )
     return inside.focal_length(wavelength), inside.aberrations(wavelength)

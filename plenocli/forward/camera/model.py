@@ -1,7 +1,8 @@
 """The camera: one description of source, optics and detector, checked whole, kept in SI units.
 
-Planes along the axis: object --object.distance--> main lens --lenslet_array.distance--> lenslet array
---sensor.distance--> sensor. All violations of a file are reported together, each with its path.
+Planes along the axis: object --object.distance--> main lens --lenslet_array.distance--> lenslet
+array --sensor.distance--> sensor. All violations of a file are reported together,
+each with its path.
 """
 
 import math
@@ -11,18 +12,31 @@ import numpy as np
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from plenocli.base.errors import ConfigError
-from plenocli.base.quantities import (Duration, Electrons, FileName, Gain, Gap, Length, Pair, Section, SignedLength, Unit, Wavelength)
+from plenocli.base.quantities import (
+    Duration,
+    Electrons,
+    FileName,
+    Gain,
+    Gap,
+    Length,
+    Pair,
+    Section,
+    SignedLength,
+    Unit,
+    Wavelength,
+)
 from plenocli.base.text import by
 from plenocli.base.toml import violations
 from plenocli.base.units import format_length
-
 
 ROW_SPACING = math.sqrt(3) / 2
 """Spacing of the rows of a hexagonal lattice, in units of its pitch."""
 
 
 class Samples:
-    """Values on a square grid that a camera carries beside its description: float64, read-only; equal where the values are."""
+    """Values on a square grid that a camera carries beside its description: float64, read-only;
+    equal where the values are.
+    """
 
     def __init__(self, values):
         self.values = np.array(values, float)
@@ -36,7 +50,9 @@ class Samples:
 
 
 class Aberration(Section):
-    """One Zernike term of the wavefront error W in the main-lens pupil, Noll index, in metres of optical path."""
+    """One Zernike term of the wavefront error W in the main-lens pupil, Noll index, in
+    metres of optical path.
+    """
 
     noll: Annotated[int, Field(ge=1, le=231)]
     coefficient: SignedLength
@@ -57,15 +73,17 @@ Glass = Annotated[str, AfterValidator(_known_glass)]
 
 
 class MainLens(Section):
-    """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files with values on a square
-    grid of cells over the square of side aperture_diameter: rows in the sense of the sensor's rows, downwards, looking
-    along the light. `prescription` names a lens file (plenocli.files.config.lens_file): its focal shift and wavefront error at the object
-    and aperture of this camera take the place of `glass`; focal_length must be the lens's own. What files hold is attached
-    by Camera.attach; nothing here opens a file.
+    """The main lens. `aperture_image` (intensity transmittance) and `wavefront` (metres) name files
+    with values on a square grid of cells over the square of side aperture_diameter: rows in the
+    sense of the sensor's rows, downwards, looking along the light. `prescription` names a lens file
+    (plenocli.files.config.lens_file): its focal shift and wavefront error at the object and
+    aperture of this camera take the place of `glass`; focal_length must be the lens's own. What
+    files hold is attached by Camera.attach; nothing here opens a file.
 
-    apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps Abbe's sine condition, as
-    lenses corrected over a field do), "uniform-pupil" (an evenly lit plane aperture) or "uniform-sine" (even in direction
-    cosines, which gives Airy's pattern)."""
+    apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps
+        Abbe's sine condition, as lenses corrected over a field do), "uniform-pupil" (an evenly lit
+        plane aperture) or "uniform-sine" (even in direction cosines, which gives Airy's pattern).
+    """
 
     focal_length: Length
     aperture_diameter: Length | None = None
@@ -87,23 +105,34 @@ class MainLens(Section):
         if self.aperture_shape is None:
             self.__dict__["aperture_shape"] = "circle" if self.aperture_image is None else "image"
         if (self.aperture_shape == "image") != (self.aperture_image is not None):
-            raise ValueError("aperture_image is the whole aperture: it goes with aperture_shape = \"image\" (or none), and only with it")
+            raise ValueError(
+                'aperture_image is the whole aperture: it goes with aperture_shape = "image" (or '
+                "none), and only with it"
+            )
         if (self.aperture_shape == "annulus") != (self.obscuration > 0):
-            raise ValueError("obscuration (above 0) goes with aperture_shape = \"annulus\", and only with it")
+            raise ValueError(
+                'obscuration (above 0) goes with aperture_shape = "annulus", and only with it'
+            )
         if self.prescription is not None and self.glass.lower() != "none":
-            raise ValueError("glass and prescription exclude each other: a lens file names its own glasses")
+            raise ValueError(
+                "glass and prescription exclude each other: a lens file names its own glasses"
+            )
         return self
 
     def samples(self, name):
-        """What the file that key `name` names holds: the values (rows, columns) of "aperture_image" and "wavefront", the Prescription
-        of "prescription"; None where it names none.
+        """What the file that key `name` names holds: the values (rows, columns) of "aperture_image"
+        and "wavefront", the Prescription of "prescription"; None where it names none.
 
         ConfigError where they have not been attached.
         """
         if getattr(self, name) is None:
             return None
         if name not in self._samples:
-            raise ConfigError(f"the values of {getattr(self, name)!r} are missing", f"main_lens.{name}", "read the camera from its file")
+            raise ConfigError(
+                f"the values of {getattr(self, name)!r} are missing",
+                f"main_lens.{name}",
+                "read the camera from its file",
+            )
         return getattr(self._samples[name], "values", self._samples[name])
 
 
@@ -113,8 +142,11 @@ class Object(Section):
 
 
 class LensletArray(Section):
-    """The lenslets. profile: their phase in the exact model, "hyperbolic" (a plane wave comes to a point at the focal length)
-    or "parabolic" (the paraxial phase, which leaves spherical aberration)."""
+    """The lenslets.
+
+    profile: their phase in the exact model, "hyperbolic" (a plane wave comes to a point at the
+        focal length) or "parabolic" (the paraxial phase, which leaves spherical aberration).
+    """
 
     distance: Length
     pitch: Length | None = None
@@ -130,17 +162,24 @@ class LensletArray(Section):
     @model_validator(mode="after")
     def _one_pitch(self):
         if (self.pitch is None) == (self.superpixel_pitch is None):
-            raise ValueError("give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)")
+            raise ValueError(
+                "give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)"
+            )
         if self.aperture_shape is None:
             self.__dict__["aperture_shape"] = "square" if self.lattice == "square" else "hexagon"
         other = {"square": "hexagon", "hexagonal": "square"}[self.lattice]
         if self.aperture_shape == other and self.fill_factor > ROW_SPACING:
-            raise ValueError(f"lenslets of aperture_shape = \"{other}\" overlap on a {self.lattice} lattice where fill_factor is above {ROW_SPACING:.4f}")
+            raise ValueError(
+                f'lenslets of aperture_shape = "{other}" overlap on a {self.lattice} lattice '
+                f"where fill_factor is above {ROW_SPACING:.4f}"
+            )
         return self
 
     @property
     def row_spacing(self):
-        """Distance of neighbouring rows of lenslets over the pitch: 1, or sqrt(3)/2 on a hexagonal lattice."""
+        """Distance of neighbouring rows of lenslets over the pitch: 1, or sqrt(3)/2 on a
+        hexagonal lattice.
+        """
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0
 
 
@@ -163,15 +202,19 @@ class Sensor(Section):
         if self.black_level >= 2**self.bits - 1:
             raise ValueError(f"black_level {self.black_level} leaves no range in {self.bits} bits")
         if self.cfa != "mono" and self.camera is None:
-            raise ValueError(f"cfa = \"{self.cfa}\" needs camera, the name of measured sensitivities, such as \"Nikon 5100 (NPL)\"")
+            raise ValueError(
+                f'cfa = "{self.cfa}" needs camera, the name of measured sensitivities, such '
+                'as "Nikon 5100 (NPL)"'
+            )
         if self.full_well <= 0:
             raise ValueError("full_well must be above 0 e")
         return self
 
 
 class Band(Section):
-    """A band of light around `center`, `fwhm` wide: photons per wavelength fall off as a Gaussian, cut
-    off at 1.5 fwhm on either side, or are constant (box)."""
+    """A band of light around `center`, `fwhm` wide: photons per wavelength fall off as a Gaussian,
+    cut off at 1.5 fwhm on either side, or are constant (box).
+    """
 
     center: Wavelength
     fwhm: Length
@@ -180,17 +223,24 @@ class Band(Section):
     @model_validator(mode="after")
     def _narrow(self):
         if self.fwhm > self.center / 3:
-            raise ValueError(f"fwhm {format_length(self.fwhm)} is more than a third of the centre, {format_length(self.center)}: give several bands' wavelengths instead")
+            raise ValueError(
+                f"fwhm {format_length(self.fwhm)} is more than a third of the centre, "
+                f"{format_length(self.center)}: give several bands' wavelengths instead"
+            )
         return self
 
 
 class Light(Section):
-    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full well in `white_exposure`.
+    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full
+    well in `white_exposure`.
 
-    Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths` resolves to its centre.
+    Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths`
+    resolves to its centre.
     """
 
-    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)] | None = None
+    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)] | None = (
+        None
+    )
     band: Band | None = None
     design_wavelength: Wavelength | None = None
     illuminant: str = "D65"
@@ -200,7 +250,9 @@ class Light(Section):
     def _ascending(self):
         if self.band is not None and self.wavelengths is None:
             self.__dict__["wavelengths"] = (self.band.center,)
-        if self.wavelengths is None or (self.band is not None and self.wavelengths != (self.band.center,)):
+        if self.wavelengths is None or (
+            self.band is not None and self.wavelengths != (self.band.center,)
+        ):
             raise ValueError("give exactly one of wavelengths and band")
         if any(b <= a for a, b in zip(self.wavelengths, self.wavelengths[1:])):
             raise ValueError("wavelengths must ascend without repetition")
@@ -208,7 +260,9 @@ class Light(Section):
 
 
 class Filter(Section):
-    """A Gaussian band of intensity transmittance: peak exp(-4 ln2 ((l - center)/fwhm)^2) on a floor of `blocking`."""
+    """A Gaussian band of intensity transmittance: peak exp(-4 ln2 ((l - center)/fwhm)^2) on a
+    floor of `blocking`.
+    """
 
     center: Wavelength
     fwhm: Length
@@ -226,7 +280,10 @@ class FilterArray(Section):
     def _one_filter_a_cell(self):
         rows, columns = self.layout
         if len(self.filters) != rows * columns:
-            raise ValueError(f"layout {rows} x {columns} needs {rows * columns} filters, row by row; there are {len(self.filters)}")
+            raise ValueError(
+                f"layout {rows} x {columns} needs {rows * columns} filters, row by row; there are "
+                f"{len(self.filters)}"
+            )
         return self
 
 
@@ -256,41 +313,66 @@ class Camera(Section):
 
     @model_validator(mode="after")
     def _resolve(self):
-        lens, array, sensor, light, cells = self.main_lens, self.lenslet_array, self.sensor, self.light, self.filter_array
+        lens, array, sensor, light, cells = (
+            self.main_lens,
+            self.lenslet_array,
+            self.sensor,
+            self.light,
+            self.filter_array,
+        )
         if lens.aperture_diameter is None:
-            self.__dict__["main_lens"] = lens = lens.model_copy(update={"aperture_diameter": array.distance / lens.f_number, "f_number": None})
+            self.__dict__["main_lens"] = lens = lens.model_copy(
+                update={"aperture_diameter": array.distance / lens.f_number, "f_number": None}
+            )
         if array.pitch is None:
             pitch = array.superpixel_pitch / (1 + sensor.distance / array.distance)
-            self.__dict__["lenslet_array"] = array.model_copy(update={"pitch": pitch, "superpixel_pitch": None})
+            self.__dict__["lenslet_array"] = array.model_copy(
+                update={"pitch": pitch, "superpixel_pitch": None}
+            )
         if light.design_wavelength is None:
             middle = light.wavelengths[len(light.wavelengths) // 2]
             self.__dict__["light"] = light.model_copy(update={"design_wavelength": middle})
         for section in ("main_lens", "lenslet_array"):
-            _check_range(section, getattr(self, section).glass, (self.light.design_wavelength, *light.wavelengths))
+            _check_range(
+                section,
+                getattr(self, section).glass,
+                (self.light.design_wavelength, *light.wavelengths),
+            )
         if cells is not None:
-            side = lens.aperture_diameter * (1 if lens.aperture_shape == "square" else math.sqrt(0.5))
+            side = lens.aperture_diameter * (
+                1 if lens.aperture_shape == "square" else math.sqrt(0.5)
+            )
             if cells.size is None:
                 self.__dict__["filter_array"] = cells = cells.model_copy(update={"size": side})
             elif cells.size > lens.aperture_diameter * (1 + 1e-9):
-                raise ValueError(f"filter_array.size {format_length(cells.size)} is wider than the pupil, {format_length(lens.aperture_diameter)}")
+                raise ValueError(
+                    f"filter_array.size {format_length(cells.size)} is wider than the pupil, "
+                    f"{format_length(lens.aperture_diameter)}"
+                )
             if cells.gap * max(cells.layout) >= cells.size:
                 raise ValueError("filter_array.gap leaves no room for the filters")
         return self
 
     @property
     def superpixel_pitch(self):
-        """Spacing of superpixel centres on the sensor, m: pitch (1 + z3/z2), by similar triangles from the pupil's centre."""
+        """Spacing of superpixel centres on the sensor, m: pitch (1 + z3/z2), by similar
+        triangles from the pupil's centre.
+        """
         return self.lenslet_array.pitch * (1 + self.sensor.distance / self.lenslet_array.distance)
 
     @property
     def pixel_mismatch(self):
-        """(rows, columns): spacing of superpixels in pixels minus pixels_per_lenslet; zero when they tile whole pixels."""
+        """(rows, columns): spacing of superpixels in pixels minus pixels_per_lenslet; zero when
+        they tile whole pixels.
+        """
         pitch = self.superpixel_pitch / self.sensor.pixel_pitch
         rows, columns = self.sensor.pixels_per_lenslet
         return pitch * self.lenslet_array.row_spacing - rows, pitch - columns
 
     def replace(self, **changes):
-        """A camera with dotted keys changed to SI values, checked again: replace(**{"object.distance": 0.6})."""
+        """A camera with dotted keys changed to SI values, checked again:
+        replace(**{"object.distance": 0.6}).
+        """
         data = self.model_dump()
         for path, value in changes.items():
             section, key = path.split(".")
@@ -299,21 +381,30 @@ class Camera(Section):
             changed = Camera.model_validate(data, context={"si": True})
         except ValidationError as error:
             raise violations(error, "camera", Camera) from None
-        kept = {name: old for name, old in self.main_lens._samples.items() if getattr(changed.main_lens, name) == getattr(self.main_lens, name)}
+        kept = {
+            name: old
+            for name, old in self.main_lens._samples.items()
+            if getattr(changed.main_lens, name) == getattr(self.main_lens, name)
+        }
         return changed.attach(**{name: getattr(old, "values", old) for name, old in kept.items()})
 
     def attach(self, **samples):
-        """A camera that carries what its files hold: attach(aperture_image=..., wavefront=..., prescription=...).
+        """A camera that carries what its files hold: attach(aperture_image=...,
+        wavefront=..., prescription=...).
 
-        aperture_image: square array, intensity transmittance 0..1; wavefront: square array, m, positive for phase advance, at least
-        4 x 4; prescription: a plenocli.forward.camera.prescription.Prescription. ConfigError for
-        keys that the description does not have and for values that cannot be.
+        aperture_image: square array, intensity transmittance 0..1; wavefront: square array, m,
+        positive for phase advance, at least 4 x 4; prescription: a
+        plenocli.forward.camera.prescription.Prescription. ConfigError for keys that the description
+        does not have and for values that cannot be.
         """
         lens = self.main_lens.model_copy()
         lens._samples = dict(lens._samples)
         for name, values in samples.items():
             where = f"main_lens.{name}"
-            if name not in ("aperture_image", "wavefront", "prescription") or getattr(lens, name) is None:
+            if (
+                name not in ("aperture_image", "wavefront", "prescription")
+                or getattr(lens, name) is None
+            ):
                 raise ConfigError("names no file, so that values cannot belong to it", where)
             if name == "prescription":
                 lens._samples[name] = values
@@ -342,9 +433,13 @@ def _trouble(name, values):
         return f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite"
     low, high = float(values.min()), float(values.max())
     if name == "wavefront":
-        return None if max(-low, high) <= MAX_WAVEFRONT else f"holds {max(-low, high):g} m; a wavefront error is at most {MAX_WAVEFRONT:g} m"
+        return (
+            None
+            if max(-low, high) <= MAX_WAVEFRONT
+            else f"holds {max(-low, high):g} m; a wavefront error is at most {MAX_WAVEFRONT:g} m"
+        )
     if low < 0 or high > 1:
-        return f"holds values from {low:g} to {high:g}; an intensity transmittance lies within 0 ... 1"
+        return (
+            f"holds values from {low:g} to {high:g}; an intensity transmittance lies within 0 ... 1"
+        )
     return None if high > 0 else "lets no light through: all values are 0"
-
-

@@ -1,7 +1,8 @@
 """Quadrature over lens apertures, sized by the phase the integrand runs through.
 
-An integrand exp(j phi(t)) on [-1, 1] with |dphi/dt| <= K is integrated by n-point Gauss-Legendre to about 1e-9 once
-n >= K/2 + 3 K^(1/3); below K/2 nodes the result is meaningless (measured cliffs, see docs/model.md).
+An integrand exp(j phi(t)) on [-1, 1] with |dphi/dt| <= K is integrated by n-point Gauss-Legendre to
+about 1e-9 once n >= K/2 + 3 K^(1/3); below K/2 nodes the result is meaningless (measured cliffs,
+see docs/model.md).
 """
 
 import math
@@ -10,14 +11,15 @@ from functools import lru_cache
 
 import numpy as np
 
-
 RULE_STEP = 0.1
 """Cycles over [-1, 1] for each node by which the bands of band_rule grow."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Nodes of a region scanned row by row: `y` (rows,), `x` and `weight` (rows, nodes), all in metres and square metres."""
+    """Nodes of a region scanned row by row: `y` (rows,), `x` and `weight` (rows, nodes), all in
+    metres and square metres.
+    """
 
     y: np.ndarray
     x: np.ndarray
@@ -26,7 +28,9 @@ class Rows:
 
 @lru_cache(maxsize=64)
 def gauss(n):
-    """Nodes and weights (read-only) of n-point Gauss-Legendre on [-1, 1]: Newton's method from Tricomi's first guess."""
+    """Nodes and weights (read-only) of n-point Gauss-Legendre on [-1, 1]: Newton's method from
+    Tricomi's first guess.
+    """
     count = (n + 1) // 2
     t = np.cos(np.pi * (np.arange(count) + 0.75) / (n + 0.5)) * (1 - (n - 1) / (8 * n**3))
     if n % 2:
@@ -41,26 +45,30 @@ def gauss(n):
             break
         t = t - change
     half = 2 / ((1 - t * t) * slope * slope)
-    nodes, weights = np.concatenate([-t, t[n // 2 - 1::-1][: n // 2]]), np.concatenate([half, half[n // 2 - 1::-1][: n // 2]])
+    nodes, weights = (
+        np.concatenate([-t, t[n // 2 - 1 :: -1][: n // 2]]),
+        np.concatenate([half, half[n // 2 - 1 :: -1][: n // 2]]),
+    )
     nodes.flags.writeable = weights.flags.writeable = False
     return nodes, weights
 
 
 @lru_cache(maxsize=512)
 def band_rule(n, step=0):
-    """Nodes and weights (read-only) of an n-point rule on [-1, 1] made for frequencies: cos(pi c t), c up to RULE_STEP step n.
+    """Nodes and weights (read-only) of an n-point rule on [-1, 1] made for frequencies: cos(pi c
+    t), c up to RULE_STEP step n.
 
-    Least squares over the band by Gauss and Newton, from the rule of the next narrower band; step 0 is Gauss and Legendre's,
-    which spends its nodes on polynomials. Constants are integrated exactly. Such rules exist for every band (Xiao, Rokhlin
-    and Yarvin, Inverse Problems 17, 2001).
+    Least squares over the band by Gauss and Newton, from the rule of the next narrower band; step 0
+    is Gauss and Legendre's, which spends its nodes on polynomials. Constants are integrated
+    exactly. Such rules exist for every band (Xiao, Rokhlin and Yarvin, Inverse Problems 17, 2001).
     """
     if step == 0:
         return gauss(n)
     nodes, weights = band_rule(n, step - 1)
     half, odd = n // 2, n % 2
-    t, w = nodes[n - half:].copy(), weights[n - half:].copy()
+    t, w = nodes[n - half :].copy(), weights[n - half :].copy()
     cycles, _ = gauss(2 * n + 8)
-    cycles = RULE_STEP * step * n * cycles[n + 4:]
+    cycles = RULE_STEP * step * n * cycles[n + 4 :]
     for _ in range(8):
         error = np.cos(np.pi * np.outer(cycles, nodes)) @ weights / 2 - np.sinc(cycles)
         phase = np.pi * np.outer(cycles, t)
@@ -77,7 +85,10 @@ def band_rule(n, step=0):
             w[1:] += change[half:]
             w[0] = 1 - w[1:].sum()
         middle = ([0.0], [2 - 2 * w.sum()]) if odd else ([], [])
-        nodes, weights = np.concatenate([-t[::-1], middle[0], t]), np.concatenate([w[::-1], middle[1], w])
+        nodes, weights = (
+            np.concatenate([-t[::-1], middle[0], t]),
+            np.concatenate([w[::-1], middle[1], w]),
+        )
         if np.abs(change).max() < 1e-13:
             break
     if not (np.diff(nodes) > 0).all() or nodes[-1] >= 1 or weights.min() <= 0:
@@ -92,34 +103,47 @@ def nodes_for(phase):
 
 
 def smooth_nodes(phase, error=1e-10):
-    """Fewest Gauss-Legendre nodes that integrate exp(j phase t) on [-1, 1] to `error`, for panels of little phase each.
+    """Fewest Gauss-Legendre nodes that integrate exp(j phase t) on [-1, 1] to `error`, for panels
+    of little phase each.
 
-    Where the remainder 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) phase^(2n) of the rule falls below it; never more than nodes_for.
+    Where the remainder 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) phase^(2n) of the rule falls below it;
+    never more than nodes_for.
     """
     for count in range(1, nodes_for(phase)):
-        log = (2 * count + 1) * math.log(2) + 4 * math.lgamma(count + 1) - math.log(2 * count + 1) - 3 * math.lgamma(2 * count + 1)
+        log = (
+            (2 * count + 1) * math.log(2)
+            + 4 * math.lgamma(count + 1)
+            - math.log(2 * count + 1)
+            - 3 * math.lgamma(2 * count + 1)
+        )
         if log + 2 * count * math.log(max(phase, 1e-300)) < math.log(error):
             return count
     return nodes_for(phase)
 
 
 def disc_rows(radius, slope):
-    """Rows over a disc for integrands whose phase changes by at most `slope` rad/m in any direction.
+    """Rows over a disc for integrands whose phase changes by at most `slope`
+    rad/m in any direction.
 
-    y = radius sin(theta) with equidistant theta, which converges spectrally because the integrand is periodic in theta.
+    y = radius sin(theta) with equidistant theta, which converges spectrally because the integrand
+    is periodic in theta.
     """
     phase = slope * radius
     count = int(np.ceil(phase / 2 + 3 * np.cbrt(phase) + 5))
     theta = (np.arange(count) + 0.5) * np.pi / count - np.pi / 2
     half = radius * np.cos(theta)
     t, w = gauss(nodes_for(phase))
-    return Rows(radius * np.sin(theta), half[:, None] * t, (np.pi / count * half * half)[:, None] * w)
+    return Rows(
+        radius * np.sin(theta), half[:, None] * t, (np.pi / count * half * half)[:, None] * w
+    )
 
 
 def cell_rows(cell, radius, slope):
-    """Rows over the part of the rectangle `cell` = (y0, y1, x0, x1) inside a centred disc, as a list (maybe empty).
+    """Rows over the part of the rectangle `cell` = (y0, y1, x0, x1) inside a centred disc, as a
+    list (maybe empty).
 
-    `radius` None means no disc. Panels end where the circle meets the rectangle's sides, so every integrand is smooth.
+    `radius` None means no disc. Panels end where the circle meets the rectangle's sides, so every
+    integrand is smooth.
     """
     panels = []
     for y, weight, left, right in cell_chords(cell, radius, slope):
@@ -130,7 +154,9 @@ def cell_rows(cell, radius, slope):
 
 
 def cell_chords(cell, radius, slope):
-    """The same region as chords: panels (y, weight, left, right), (rows,) each; weights integrate over y alone, m."""
+    """The same region as chords: panels (y, weight, left, right), (rows,) each; weights
+    integrate over y alone, m.
+    """
     y0, y1, x0, x1 = cell
     if radius is None:
         return [_panel(y0, y1, lambda y: (np.full_like(y, x0), np.full_like(y, x1)), None, slope)]
@@ -153,7 +179,9 @@ def cell_chords(cell, radius, slope):
 
 
 def _panel(low, high, ends, radius, slope):
-    """Chords between y = low and high at Gauss-Legendre nodes; on a disc in theta = asin(y/radius), where its rim is smooth."""
+    """Chords between y = low and high at Gauss-Legendre nodes; on a disc in theta =
+    asin(y/radius), where its rim is smooth.
+    """
     if radius is None:
         t, w = gauss(nodes_for(slope * (high - low) / 2))
         y, wy = (low + high) / 2 + (high - low) / 2 * t, (high - low) / 2 * w

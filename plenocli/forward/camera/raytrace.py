@@ -1,8 +1,10 @@
-"""Sequential ray tracing through a lens: exact refraction in three dimensions, ray aiming at the stop, paraxial optics.
+"""Sequential ray tracing through a lens: exact refraction in three dimensions, ray aiming at the
+stop, paraxial optics.
 
-Coordinates (x, y, z) as in plenocli.forward.camera.prescription, x along columns, y along rows. A bundle of rays holds positions
-and unit directions as arrays (3, ray) and optical path lengths (ray,), all in metres. Rays that miss a surface, are totally
-reflected or (where asked for) fall outside a clear aperture carry NaN.
+Coordinates (x, y, z) as in plenocli.forward.camera.prescription, x along columns, y along rows. A
+bundle of rays holds positions and unit directions as arrays (3, ray) and optical path lengths
+(ray,), all in metres. Rays that miss a surface, are totally reflected or (where asked for) fall
+outside a clear aperture carry NaN.
 """
 
 import math
@@ -17,7 +19,9 @@ _NEWTON_STEPS, _AIM_STEPS, _BLOCK = 50, 40, 8192
 
 @dataclass(frozen=True)
 class Rays:
-    """A bundle: position (3, ray) m, direction (3, ray) unit vectors, path (ray,) m of index times distance."""
+    """A bundle: position (3, ray) m, direction (3, ray) unit vectors, path (ray,) m of
+    index times distance.
+    """
 
     position: np.ndarray
     direction: np.ndarray
@@ -29,10 +33,13 @@ class Rays:
         return np.isfinite(self.path)
 
 
-# --- exact rays ------------------------------------------------------------------------------------------------------
+# --- exact rays -----------------------------------------------------------------------------------
+
 
 def sag(surface, square):
-    """Height z (m) of `surface` above its vertex plane at squared distance r^2 (m^2) from the axis; NaN beyond its rim."""
+    """Height z (m) of `surface` above its vertex plane at squared distance r^2 (m^2) from the
+    axis; NaN beyond its rim.
+    """
     c, conic = surface.curvature, 1 + surface.conic
     with np.errstate(invalid="ignore"):
         z = c * square / (1 + np.sqrt(1 - conic * c * c * square))
@@ -55,10 +62,11 @@ def _polynomial(coefficients, square):
 
 
 def intersect(surface, position, direction):
-    """Signed distance (ray,) along each ray to `surface`, whose vertex is the origin of `position` (3, ray).
+    """Signed distance (ray,) along each ray to `surface`, whose vertex is the origin of
+    `position` (3, ray).
 
-    Conics in closed form on the branch through the vertex, in the form that does not cancel; even aspheres by Newton's
-    method from there. NaN where a ray misses.
+    Conics in closed form on the branch through the vertex, in the form that does not cancel; even
+    aspheres by Newton's method from there. NaN where a ray misses.
     """
     x, y, z = position
     l, m, n = direction
@@ -75,7 +83,9 @@ def intersect(surface, position, direction):
 
 
 def _newton(surface, position, direction, t):
-    """Distances to an even asphere from first guesses `t`; where there is none, from the vertex plane."""
+    """Distances to an even asphere from first guesses `t`; where there is none,
+    from the vertex plane.
+    """
     x, y, z = position
     l, m, n = direction
     t = np.where(np.isfinite(t), t, -z / n)
@@ -93,9 +103,11 @@ def _newton(surface, position, direction, t):
 
 
 def refract(surface, position, direction, ratio):
-    """Directions (3, ray) behind `surface` of rays that meet it at `position` (3, ray); `ratio` is n before over n behind.
+    """Directions (3, ray) behind `surface` of rays that meet it at `position` (3, ray); `ratio` is
+    n before over n behind.
 
-    Snell's law as vectors, D' = r D + (cos t - r cos i) N with N the normal towards +z; NaN for total reflection.
+    Snell's law as vectors, D' = r D + (cos t - r cos i) N with N the normal towards +z; NaN
+    for total reflection.
     """
     x, y, _ = position
     slope = 2 * sag_slope(surface, x * x + y * y)
@@ -111,8 +123,8 @@ def refract(surface, position, direction, ratio):
 def trace(surfaces, rays, wavelength, *, clip=False, upto=None):
     """Carry `rays`, given in the frame of the first vertex, in air, through `surfaces`.
 
-    Returns Rays on the last surface, refracted, in the frame of ITS vertex; with `upto` = i the rays on surface i, refracted
-    too. With `clip` rays outside a surface's semi_diameter are lost.
+    Returns Rays on the last surface, refracted, in the frame of ITS vertex; with `upto` = i the
+    rays on surface i, refracted too. With `clip` rays outside a surface's semi_diameter are lost.
     """
     chosen = surfaces if upto is None else surfaces[: upto + 1]
     indices = [1.0] + [s.medium.index(wavelength) for s in chosen]
@@ -153,12 +165,15 @@ def to_plane(rays, distance, index=1.0):
     return Rays(position, rays.direction, rays.path + index * t)
 
 
-# --- paraxial optics ---------------------------------------------------------------------------------------------------
+# --- paraxial optics ------------------------------------------------------------------------------
+
 
 def paraxial_matrix(surfaces, wavelength, index_before=1.0):
-    """System matrix [[A, B], [C, D]] from just before the first vertex to just behind the last: (y, n u) -> (y', n' u').
+    """System matrix [[A, B], [C, D]] from just before the first vertex to just behind the last: (y,
+    n u) -> (y', n' u').
 
-    Refraction [[1, 0], [-(n' - n) c, 1]] and transfer [[1, d/n], [0, 1]]; the determinant is 1 (Lagrange's invariant).
+    Refraction [[1, 0], [-(n' - n) c, 1]] and transfer [[1, d/n], [0, 1]]; the determinant is 1
+    (Lagrange's invariant).
     """
     matrix, n = np.eye(2), index_before
     for i, surface in enumerate(surfaces):
@@ -172,8 +187,10 @@ def paraxial_matrix(surfaces, wavelength, index_before=1.0):
 
 @dataclass(frozen=True)
 class Pupil:
-    """Paraxial image of the stop: position (m, from the first vertex for the entrance, from the last for the exit pupil)
-    and radius (m) for the lens's stop radius; `magnification` is radius over stop radius, signed. Infinite if telecentric."""
+    """Paraxial image of the stop: position (m, from the first vertex for the entrance, from the
+    last for the exit pupil) and radius (m) for the lens's stop radius; `magnification` is radius
+    over stop radius, signed. Infinite if telecentric.
+    """
 
     position: float
     radius: float
@@ -188,7 +205,8 @@ def entrance_pupil(lens, wavelength):
     front = paraxial_matrix(lens.surfaces[: lens.stop], wavelength) if lens.stop else np.eye(2)
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
     gap = lens.surfaces[lens.stop - 1].thickness / n if lens.stop else 0.0
-    (a, b), _ = np.array([[1.0, gap], [0.0, 1.0]]) @ front  # height at the stop = a y + b u of the ray at the first vertex
+    # height at the stop = a y + b u of the ray at the first vertex
+    (a, b), _ = np.array([[1.0, gap], [0.0, 1.0]]) @ front
     return _TELECENTRIC if abs(a) < 1e-12 else _pupil(b / a, 1 / a, lens.stop_radius)
 
 
@@ -205,15 +223,18 @@ def _pupil(position, magnification, stop_radius):
     return Pupil(float(position), abs(float(magnification)) * stop_radius, float(magnification))
 
 
-# --- aiming --------------------------------------------------------------------------------------------------------------
+# --- aiming ---------------------------------------------------------------------------------------
+
 
 def aim(lens, wavelength, points, *, angle=0.0, object_distance=math.inf, real=True):
-    """Rays from one object point that meet the stop at `points` (2, ray), given as (x, y) over the stop's radius.
+    """Rays from one object point that meet the stop at `points` (2, ray), given as (x, y) over
+    the stop's radius.
 
-    The object lies at infinity in the direction whose rays climb towards +y by `angle` (rad), or at `object_distance` (m)
-    before the first vertex, that far off axis that its paraxial chief ray has this angle. Paths are counted from the
-    object point, from infinity from the wavefront through the entrance pupil's centre. `real` = False aims at the paraxial
-    entrance pupil instead of the stop. Rays that reach no such point carry NaN. NumericsError where the chief ray fails.
+    The object lies at infinity in the direction whose rays climb towards +y by `angle` (rad), or at
+    `object_distance` (m) before the first vertex, that far off axis that its paraxial chief ray has
+    this angle. Paths are counted from the object point, from infinity from the wavefront through
+    the entrance pupil's centre. `real` = False aims at the paraxial entrance pupil instead of the
+    stop. Rays that reach no such point carry NaN. NumericsError where the chief ray fails.
     """
     source = _Source(lens, wavelength, angle, object_distance)
     target = np.asarray(points, dtype=float) * lens.stop_radius
@@ -245,14 +266,22 @@ class _Source:
     def __init__(self, lens, wavelength, angle, object_distance):
         self.pupil = entrance_pupil(lens, wavelength)
         if not math.isfinite(self.pupil.position):
-            raise NumericsError("the stop's image lies at infinity on the object's side", "lens", "telecentric entrance pupils cannot be aimed at")
+            raise NumericsError(
+                "the stop's image lies at infinity on the object's side",
+                "lens",
+                "telecentric entrance pupils cannot be aimed at",
+            )
         self.direction = np.array([0.0, math.sin(angle), math.cos(angle)])
         self.point = None
         if math.isfinite(object_distance):
-            self.point = np.array([0.0, -math.tan(angle) * (object_distance + self.pupil.position), -object_distance])
+            self.point = np.array(
+                [0.0, -math.tan(angle) * (object_distance + self.pupil.position), -object_distance]
+            )
 
     def rays(self, crossing):
-        """Rays through `crossing` (2, ray) (m) of the entrance pupil's plane, placed on the first vertex plane."""
+        """Rays through `crossing` (2, ray) (m) of the entrance pupil's plane, placed on the
+        first vertex plane.
+        """
         at = np.stack([crossing[0], crossing[1], np.full(crossing.shape[1], self.pupil.position)])
         if self.point is None:
             direction = np.broadcast_to(self.direction[:, None], at.shape).copy()
@@ -260,29 +289,42 @@ class _Source:
             t = -at[2] / direction[2]
             return Rays(at + t * direction, direction, path + t)
         way = at - self.point[:, None]
-        direction = way / np.sqrt((way * way).sum(axis=0)) * math.copysign(1.0, self.pupil.position - self.point[2])
+        direction = (
+            way
+            / np.sqrt((way * way).sum(axis=0))
+            * math.copysign(1.0, self.pupil.position - self.point[2])
+        )
         t = -self.point[2] / direction[2]
         return Rays(self.point[:, None] + t * direction, direction, t)
 
 
 def _chief(lens, wavelength, angle, object_distance):
-    """Where the ray to the stop's centre crosses the entrance pupil's plane, (2, 1) m; wide fields are reached in steps."""
+    """Where the ray to the stop's centre crosses the entrance pupil's plane, (2, 1) m; wide
+    fields are reached in steps.
+    """
     zero = np.zeros((2, 1))
     for steps in (1, 4, 16):
         at = zero
         for i in range(1, steps + 1):
-            source = _Source(lens, wavelength, math.atan(math.tan(angle) * i / steps), object_distance)
+            source = _Source(
+                lens, wavelength, math.atan(math.tan(angle) * i / steps), object_distance
+            )
             at, ok = _solve(lens, wavelength, source, at, zero)
             if not ok.all():
                 break
         else:
             return at
-    raise NumericsError(f"no ray from {math.degrees(angle):.4g} degrees reaches the centre of the stop", "lens", "use a smaller field")
+    raise NumericsError(
+        f"no ray from {math.degrees(angle):.4g} degrees reaches the centre of the stop",
+        "lens",
+        "use a smaller field",
+    )
 
 
 def _solve(lens, wavelength, source, start, target):
-    """Newton's method on the two pupil coordinates of every ray, with differences over 1e-4 of the pupil's radius and steps
-    halved where they fail. Returns (crossings (2, ray), converged (ray,))."""
+    """Newton's method on the two pupil coordinates of every ray, with differences over 1e-4 of the
+    pupil's radius and steps halved where they fail. Returns (crossings (2, ray), converged (ray,)).
+    """
     ahead = lens.surfaces[: lens.stop + 1]
     tolerance = 1e-12 * lens.stop_radius
     h = 1e-4 * source.pupil.radius
@@ -299,14 +341,25 @@ def _solve(lens, wavelength, source, start, target):
         for _ in range(_AIM_STEPS):
             if not (best > tolerance).any():
                 break
-            jx, jy = ((miss(at + e[:, None] * h) - miss(at - e[:, None] * h)) / (2 * h) for e in np.eye(2))
+            jx, jy = (
+                (miss(at + e[:, None] * h) - miss(at - e[:, None] * h)) / (2 * h) for e in np.eye(2)
+            )
             det = jx[0] * jy[1] - jx[1] * jy[0]
-            step = -np.stack([jy[1] * error[0] - jy[0] * error[1], jx[0] * error[1] - jx[1] * error[0]]) / det
+            step = (
+                -np.stack(
+                    [jy[1] * error[0] - jy[0] * error[1], jx[0] * error[1] - jx[1] * error[0]]
+                )
+                / det
+            )
             tried = at + damping * np.where(np.isfinite(step), step, 0.0)
             new = miss(tried)
             size = np.hypot(*new)
             better = size < best
-            at, error, best = np.where(better, tried, at), np.where(better, new, error), np.where(better, size, best)
+            at, error, best = (
+                np.where(better, tried, at),
+                np.where(better, new, error),
+                np.where(better, size, best),
+            )
             damping = np.where(better, 1.0, damping / 2)
             if not (better | ~(best > tolerance)).any() and (damping < 1e-3).all():
                 break

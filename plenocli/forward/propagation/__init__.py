@@ -1,4 +1,5 @@
-"""From an object point to pixels: the models of propagation and the system matrix that they compute.
+"""From an object point to pixels: the models of propagation and the system matrix
+that they compute.
 
 Which model serves is chosen in accuracy; no files, no inversion.
 """

@@ -1,17 +1,22 @@
 """What a system matrix can and cannot tell apart: rank, condition, symmetry, energy.
 
-If the pupil is point-symmetric, the object in focus and the pupil imaged onto the sensor (eps = kappa = W = 0), object
-points at +x and -x give the same superpixel of an isolated lenslet: half of the object is invisible (docs/model.md).
+If the pupil is point-symmetric, the object in focus and the pupil imaged onto the sensor (eps =
+kappa = W = 0), object points at +x and -x give the same superpixel of an isolated lenslet: half of
+the object is invisible (docs/model.md).
 """
 
 import numpy as np
 
 RANK_THRESHOLD = 1e-6
-"""Singular values below this share of the largest do not count towards the rank: the rounding of a single-precision A."""
+"""Singular values below this share of the largest do not count towards the rank: the rounding of
+a single-precision A.
+"""
 NOISE_THRESHOLD = 1e-3
 """Singular values above this share stand out of noise at 60 dB."""
 SYMMETRY_WARNING = 1e-3
-"""Symmetry defects below this are worth a warning: the antisymmetric half of the object is all but lost."""
+"""Symmetry defects below this are worth a warning: the antisymmetric half of the
+object is all but lost.
+"""
 LARGEST = 4000
 """Above this many object points singular values are left out: they would take minutes."""
 _DIRECT = 400
@@ -22,21 +27,28 @@ _RESOLUTION = 3e-8
 class Spectrum:
     """Singular values of a matrix that comes in pieces of rows, through A^T A in double precision.
 
-    object_shape: (rows, columns) of points; flips: (rows, columns) whether turning the object over changes the whole matrix by a
-    permutation of its rows only: A^T A then falls into blocks for points even and odd in that direction.
+    object_shape: (rows, columns) of points;
+    flips: (rows, columns) whether turning the object over changes the whole matrix by a permutation
+        of its rows only: A^T A then falls into blocks for points even and odd in that direction.
     """
 
     def __init__(self, object_shape, flips=(False, False)):
         self._shape, self._flips, self._grams = tuple(object_shape), flips, None
 
     def add(self, part, times=1, turned=0):
-        """Add rows (..., point), `times` times, and `turned` times with rows and columns of points exchanged."""
+        """Add rows (..., point), `times` times, and `turned` times with rows and columns
+        of points exchanged.
+        """
         part = part.reshape(-1, *self._shape)
         grams = None
         for start in range(0, len(part), _ROWS):
-            blocks = [part[start:start + _ROWS].astype(float)]
+            blocks = [part[start : start + _ROWS].astype(float)]
             for axis, flip in enumerate(self._flips, 1):
-                blocks = [half for block in blocks for half in _parities(block, axis)] if flip else blocks
+                blocks = (
+                    [half for block in blocks for half in _parities(block, axis)]
+                    if flip
+                    else blocks
+                )
             shapes = [block.shape[1:] for block in blocks]
             blocks = [block.reshape(len(block), -1) for block in blocks]
             grams = [0.0] * len(blocks) if grams is None else grams
@@ -45,10 +57,14 @@ class Spectrum:
         pairs = [0, 2, 1, 3] if len(grams) == 4 else range(len(grams))
         other = [_exchanged(grams[k], shapes[k]) for k in pairs] if turned else [0.0] * len(grams)
         total = [times * gram + turned * swapped for gram, swapped in zip(grams, other)]
-        self._grams = total if self._grams is None else [old + new for old, new in zip(self._grams, total)]
+        self._grams = (
+            total if self._grams is None else [old + new for old, new in zip(self._grams, total)]
+        )
 
     def values(self):
-        """Singular values, descending; those under 3e-8 of the largest are reported as that bound."""
+        """Singular values, descending; those under 3e-8 of the largest are
+        reported as that bound.
+        """
         values = np.sort(np.concatenate([np.linalg.eigvalsh(gram) for gram in self._grams]))[::-1]
         return np.sqrt(np.maximum(values, _RESOLUTION**2 * max(values[0], 0)))
 
@@ -65,13 +81,17 @@ def _parities(values, axis):
     count = high.shape[axis]
     first, middle = np.array_split(low, [count], axis)
     mirrored = np.flip(high, axis)
-    return np.concatenate([(first + mirrored) * np.sqrt(0.5), middle], axis), (first - mirrored) * np.sqrt(0.5)
+    return np.concatenate([(first + mirrored) * np.sqrt(0.5), middle], axis), (
+        first - mirrored
+    ) * np.sqrt(0.5)
 
 
 def singular_values(matrix):
-    """Singular values (descending, float64) of one band, (..., point): rows may have any leading shape.
+    """Singular values (descending, float64) of one band, (..., point): rows may have
+    any leading shape.
 
-    Small matrices by LAPACK; larger ones as Spectrum does it, which resolves values down to 3e-8 of the largest.
+    Small matrices by LAPACK; larger ones as Spectrum does it, which resolves values down to
+    3e-8 of the largest.
     """
     matrix = matrix.reshape(-1, matrix.shape[-1])
     if matrix.shape[1] <= _DIRECT or len(matrix) < matrix.shape[1]:
@@ -82,7 +102,9 @@ def singular_values(matrix):
 
 
 def symmetry_defect(own):
-    """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point); A' is A for the object turned by 180 degrees."""
+    """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point); A' is A for the
+    object turned by 180 degrees.
+    """
     peak = np.abs(own).max()
     half = (own.shape[1] + 1) // 2
     return float(np.abs(own[:, :half] - own[:, ::-1][:, :half]).max() / peak) if peak > 0 else 0.0
@@ -91,19 +113,28 @@ def symmetry_defect(own):
 class Diagnosis:
     """What `describe` finds, gathered from a matrix that comes superpixel by superpixel.
 
-    bands: how many; offsets: (superpixel, 2); pixel_shape, object_shape: (rows, columns); symmetry: of A, as PifBuilder has it. Only the
-    first superpixel of each orbit is looked at (optics.pif.superpixel_orbits), and only half of one that mirrors itself: the others
-    hold the same light.
+    bands: how many;
+    offsets: (superpixel, 2);
+    pixel_shape, object_shape: (rows, columns);
+    symmetry: of A, as PifBuilder has it. Only the first superpixel of each orbit is looked at
+        (optics.pif.superpixel_orbits), and only half of one that mirrors itself: the others
+        hold the same light.
     """
 
     def __init__(self, bands, offsets, pixel_shape, object_shape, symmetry):
         from plenocli.forward.propagation.system_matrix import superpixel_orbits
 
         self._pixel_shape = tuple(pixel_shape)
-        self._mirrors = (np.asarray(offsets) == 0) & np.array(symmetry[:2]) & (np.array(self._pixel_shape) % 2 == 0)
+        self._mirrors = (
+            (np.asarray(offsets) == 0)
+            & np.array(symmetry[:2])
+            & (np.array(self._pixel_shape) % 2 == 0)
+        )
         self._own = int(np.flatnonzero((np.asarray(offsets) == 0).all(axis=1))[0])
-        self._times = {first: (sum(not how[0] for _, how in members), sum(how[0] for _, how in members))
-                       for first, members in superpixel_orbits(offsets, symmetry)}
+        self._times = {
+            first: (sum(not how[0] for _, how in members), sum(how[0] for _, how in members))
+            for first, members in superpixel_orbits(offsets, symmetry)
+        }
         self._spectra = [Spectrum(object_shape, symmetry[:2]) for _ in range(bands)]
         self._defects = [0.0] * bands
         self._few = int(np.prod(object_shape)) <= LARGEST
@@ -113,9 +144,15 @@ class Diagnosis:
         if superpixel == self._own:
             self._defects[band] = symmetry_defect(slab)
         if self._few and superpixel in self._times:
-            rows, columns = (n // 2 if mirrors else n for n, mirrors in zip(self._pixel_shape, self._mirrors[superpixel]))
+            rows, columns = (
+                n // 2 if mirrors else n
+                for n, mirrors in zip(self._pixel_shape, self._mirrors[superpixel])
+            )
             part = slab.reshape(*self._pixel_shape, -1)[:rows, :columns]
-            self._spectra[band].add(part, *(n * 2 ** int(self._mirrors[superpixel].sum()) for n in self._times[superpixel]))
+            self._spectra[band].add(
+                part,
+                *(n * 2 ** int(self._mirrors[superpixel].sum()) for n in self._times[superpixel]),
+            )
 
     def result(self, energy):
         """As `describe`, for column energies (band, point)."""
@@ -126,31 +163,52 @@ class Diagnosis:
 def describe(pif):
     """Diagnose a Pif: dict of per-band lists and arrays.
 
-    rank (threshold 1e-6 of the largest singular value), rank_60db (1e-3), condition (largest over smallest; a lower bound
-    where the smallest is under 3e-8 of it), singular_values (band, value), or absent above 4000 points, symmetry_defect of the object's
-    own superpixel, energy_min, energy_max, and warnings (sentences).
+    rank (threshold 1e-6 of the largest singular value), rank_60db (1e-3), condition (largest over
+    smallest; a lower bound where the smallest is under 3e-8 of it), singular_values (band, value),
+    or absent above 4000 points, symmetry_defect of the object's own superpixel, energy_min,
+    energy_max, and warnings (sentences).
     """
     points = pif.A.shape[-1]
     if points == int(np.prod(pif.object_shape)) and points > _DIRECT:
-        diagnosis = Diagnosis(len(pif.A), pif.lenslet_offset, pif.pixel_shape, pif.object_shape, pif.notes.get("symmetry", (False, False, False)))
+        diagnosis = Diagnosis(
+            len(pif.A),
+            pif.lenslet_offset,
+            pif.pixel_shape,
+            pif.object_shape,
+            pif.notes.get("symmetry", (False, False, False)),
+        )
         for band, matrix in enumerate(pif.A):
             for superpixel, slab in enumerate(matrix):
                 diagnosis.add(band, superpixel, slab)
         return diagnosis.result(pif.column_energy)
     own = int(np.flatnonzero((np.asarray(pif.lenslet_offset) == 0).all(axis=1))[0])
-    defects = [symmetry_defect(band[own]) for band in pif.A] if points == int(np.prod(pif.object_shape)) else None
-    return _found(pif.column_energy, defects, np.array([singular_values(band) for band in pif.A]) if points <= LARGEST else None)
+    defects = (
+        [symmetry_defect(band[own]) for band in pif.A]
+        if points == int(np.prod(pif.object_shape))
+        else None
+    )
+    return _found(
+        pif.column_energy,
+        defects,
+        np.array([singular_values(band) for band in pif.A]) if points <= LARGEST else None,
+    )
 
 
 def _found(energy, defects, values):
-    found = {"energy_min": energy.min(axis=1).tolist(), "energy_max": energy.max(axis=1).tolist(), "warnings": []}
+    found = {
+        "energy_min": energy.min(axis=1).tolist(),
+        "energy_max": energy.max(axis=1).tolist(),
+        "warnings": [],
+    }
     if defects is not None:
         found["symmetry_defect"] = defects
         if energy.shape[1] > 1 and min(defects) < SYMMETRY_WARNING:
             found["warnings"].append(
-                f"half of the object is invisible to an isolated lenslet: points at +x and -x give the same superpixel (symmetry defect "
-                f"{min(defects):.1e}); move the sensor off the pupil's image, as to sensor.distance = "
-                "lenslet_array.focal_length, or defocus a little")
+                "half of the object is invisible to an isolated lenslet: points at +x and -x give "
+                f"the same superpixel (symmetry defect {min(defects):.1e}); move the sensor off "
+                "the pupil's image, as to sensor.distance = "
+                "lenslet_array.focal_length, or defocus a little"
+            )
     if values is None:
         return found
     top = np.maximum(values[:, :1], np.finfo(float).tiny)

@@ -1,14 +1,18 @@
-"""The geometric rung: shares of the pupil that rays carry into each pixel, as exact areas. Nothing is sampled.
+"""The geometric rung: shares of the pupil that rays carry into each pixel, as exact areas.
 
-Per axis a ray from the pupil at x towards the image point u0 meets the array at u = u0 + x z2 eps. Through the lenslet at
-m D2 it lands on the sensor at
+Nothing is sampled.
+
+Per axis a ray from the pupil at x towards the image point u0 meets the array at u = u0 + x z2 eps.
+Through the lenslet at m D2 it lands on the sensor at
 
     t = a x + b_m,   a = z3 (kappa z2 eps - 1/z2),   b_m = z3 kappa u0 + m D2 z3/f2
 
-(section 6 of docs/model.md), an affine map. So what a pixel sees of the pupil through a square lenslet is a rectangle: its own
-image in the pupil cut by that of the lenslet, and its light is the transmittance integrated over that rectangle. Defocus
-and tilt in the wavefront error (Noll 1 to 4) keep the map affine: W = a2 r^2 is eps + 2 a2, W = g x moves u0 by z2 g.
-Where a vanishes, all rays of a lenslet meet in one point, which belongs to one pixel; pixels and lenslets own their lower edges.
+(section 6 of docs/model.md), an affine map. So what a pixel sees of the pupil through a square
+lenslet is a rectangle: its own image in the pupil cut by that of the lenslet, and its light is the
+transmittance integrated over that rectangle. Defocus and tilt in the wavefront error (Noll 1 to 4)
+keep the map affine: W = a2 r^2 is eps + 2 a2, W = g x moves u0 by z2 g. Where a vanishes, all rays
+of a lenslet meet in one point, which belongs to one pixel; pixels and lenslets own
+their lower edges.
 """
 
 import math
@@ -16,8 +20,8 @@ import math
 import numpy as np
 
 from plenocli.forward.camera.lens import at_wavelength
-from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
+from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
 
 SLAB = 1 << 17
 """Corners of rectangles in a work array: about what a second-level cache holds."""
@@ -29,14 +33,25 @@ def valid_for(camera, view):
     """None, or one sentence why rays cannot serve this camera at the Geometry `view`."""
     lens = at_wavelength(camera, view.wavelength).main_lens
     if lens.wavefront is not None or any(_noll(term) > 4 for term in lens.aberrations or ()):
-        return "wavefront errors beyond tilt and defocus bend the pupil's image, which rays here take as affine"
-    if view.lenslet_shape != "square" and abs(_affine(lens, view)[0]) * view.z2 * view.D1 > FOCUSED * view.D2:
-        return f"out of focus the rays of a {view.lenslet_shape} lenslet fill no rectangle of the pupil"
+        return (
+            "wavefront errors beyond tilt and defocus bend the pupil's image, which "
+            "rays here take as affine"
+        )
+    if (
+        view.lenslet_shape != "square"
+        and abs(_affine(lens, view)[0]) * view.z2 * view.D1 > FOCUSED * view.D2
+    ):
+        return (
+            f"out of focus the rays of a {view.lenslet_shape} lenslet fill no "
+            "rectangle of the pupil"
+        )
     return None
 
 
 def size_band(view, grid, ring, accuracy, tolerance):
-    """The BandPlan of this rung: no quadrature, every lenslet under the blur of every superpixel kept (ring 0: its own only)."""
+    """The BandPlan of this rung: no quadrature, every lenslet under the blur of every superpixel
+    kept (ring 0: its own only).
+    """
     window = None if ring == 0 else math.ceil(max(view.reach(grid))) + blur_ring(view) + 1
     return BandPlan(view.wavelength, window, 0, 0, 0, 0, 0.0)
 
@@ -44,10 +59,11 @@ def size_band(view, grid, ring, accuracy, tolerance):
 def error_bound(camera, view):
     """Estimated relative L2 error of the worst column against the Fresnel model.
 
-    Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2 pixel/(lambda z3) cells fit
-    into a pixel. In focus only the rim is an edge, of N = D2 D1/(lambda z2) cells; but a point d cells from the border between
-    two lenslets sends its light through both. Out of focus that border cuts every image. Fitted to 132 cases of N from 3 to
-    47, c from 0.06 to 16, blur from 0 to 3 lenslets: within 2.5 of the measured error (docs/model.md).
+    Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2
+    pixel/(lambda z3) cells fit into a pixel. In focus only the rim is an edge, of N = D2 D1/(lambda
+    z2) cells; but a point d cells from the border between two lenslets sends its light through
+    both. Out of focus that border cuts every image. Fitted to 132 cases of N from 3 to 47, c from
+    0.06 to 16, blur from 0 to 3 lenslets: within 2.5 of the measured error (docs/model.md).
     """
     cells, fit = view.diffraction_cells, view.D2 * view.pixel_active / (view.wavelength * view.z3)
     border = cells / (2 * max(view.object_shape))
@@ -57,13 +73,20 @@ def error_bound(camera, view):
 
 
 def cost(camera, view, band, shape, double):
-    """Seconds of one core and bytes of work for a matrix of `shape`: 130 ns a pixel and lenslet that lights it, measured."""
+    """Seconds of one core and bytes of work for a matrix of `shape`: 130 ns a pixel and lenslet
+    that lights it, measured.
+    """
     cells = 1 if camera.filter_array is None else len(camera.filter_array.filters)
-    # in focus one lenslet lights a superpixel; out of focus so do slivers of its neighbours, the fewer the wider the blur
+    # in focus one lenslet lights a superpixel; out of focus so do slivers of its neighbours, the
+    # fewer the wider the blur
     lighting = 1.0 if view.blur == 0 else 13 / (1 + 0.8 * view.blur / view.D2)
     across = (1 if band.window is None else 2 * band.window + 1) * sum(view.pixel_shape)
     each = view.pixel_shape[0] * view.pixel_shape[1] * cells * 1.3e-7 * lighting + across * 4e-8
-    return {"operations": 0.0, "seconds": distinct(camera, view, shape)[1] * each + 0.003, "bytes": 8 * SLAB * 8}
+    return {
+        "operations": 0.0,
+        "seconds": distinct(camera, view, shape)[1] * each + 0.003,
+        "bytes": 8 * SLAB * 8,
+    }
 
 
 class RayLenslets:
@@ -74,17 +97,25 @@ class RayLenslets:
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
         self.eps, *self._tilt = _affine(lens, geometry)
         self.slope = geometry.z3 * (geometry.kappa * geometry.z2 * self.eps - 1 / geometry.z2)
-        self._below, self._joined = pupil_measure(lens), geometry.pixel_active == geometry.pixel_pitch
+        self._below, self._joined = (
+            pupil_measure(lens),
+            geometry.pixel_active == geometry.pixel_pitch,
+        )
         cells = filter_cells(camera, geometry.wavelength)
         half = lens.aperture_diameter / 2
         self._cells = [((-half, half, -half, half), 1.0)] if cells is None else cells
         plain = cells is None and lens.aperture_shape != "image" and not any(self._tilt)
         self.symmetry, self.notes = (plain, plain, plain), {"separable_terms": 0, "field_tail": 0.0}
-        self._passed = sum(t * float(self._rectangles(np.array([[y0, y1]]), np.array([[x0, x1]]))[0, 0, 0]) for (y0, y1, x0, x1), t in self._cells)
+        self._passed = sum(
+            t * float(self._rectangles(np.array([[y0, y1]]), np.array([[x0, x1]]))[0, 0, 0])
+            for (y0, y1, x0, x1), t in self._cells
+        )
         self._places = {where: place for place, where in geometry.places(plan.superpixels).items()}
 
     def incident(self, rows, columns):
-        """An upper bound of the share of light entering the lenslets: all that the filters pass, (points,)."""
+        """An upper bound of the share of light entering the lenslets: all that the
+        filters pass, (points,).
+        """
         return np.full(len(rows), self._passed)
 
     def columns(self, rows, columns, out):
@@ -94,11 +125,15 @@ class RayLenslets:
                 self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
 
     def superpixel(self, sy, sx, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) in superpixel (sy, sx) of the grid, counted from its corner: out (points, pixel rows, pixel columns)."""
+        """Pixel energies of points (rows[i], columns[i]) in superpixel (sy, sx) of the grid,
+        counted from its corner: out (points, pixel rows, pixel columns).
+        """
         place = self._places[sy, sx]
         g = self.geometry
         step = max(1, SLAB // (4 * g.pixel_shape[0] * g.pixel_shape[1]))
-        products = [([place[0]], [place[1]])] if self.window is None else g.neighbourhood(self.window)
+        products = (
+            [([place[0]], [place[1]])] if self.window is None else g.neighbourhood(self.window)
+        )
         for start in range(0, len(rows), step):
             part = slice(start, start + step)
             out[part] = 0
@@ -108,50 +143,78 @@ class RayLenslets:
                 for m, y in high:
                     for n, x in wide:
                         if _lit(y) and _lit(x):
-                            out[part] += self._light(y, x) * self._enters(rows[part], columns[part], m, n)
+                            out[part] += self._light(y, x) * self._enters(
+                                rows[part], columns[part], m, n
+                            )
 
     def _edges(self, axis, points, place, m):
-        """Edges in the pupil of what the pixels of the superpixel at `place` see through the lenslet at m (both in pitches):
-        (points, pixels + 1) where pixels touch, else pairs (points, 2 x pixels)."""
+        """Edges in the pupil of what the pixels of the superpixel at `place` see through the
+        lenslet at m (both in pitches): (points, pixels + 1) where pixels touch, else pairs
+        (points, 2 x pixels).
+        """
         g = self.geometry
         points, where = np.unique(points, return_inverse=True)
         u0 = g.points(axis)[points] + g.z2 * self._tilt[axis]
         pixel = place * g.superpixel_pitch + g.window_shift(axis, place) + g.pixels(axis)
         half = g.pixel_active / 2
-        edges = np.r_[pixel[0] - half, pixel + half] if self._joined else np.stack([pixel - half, pixel + half], -1).ravel()
+        edges = (
+            np.r_[pixel[0] - half, pixel + half]
+            if self._joined
+            else np.stack([pixel - half, pixel + half], -1).ravel()
+        )
         t = edges - (g.z3 * g.kappa * u0 + m * g.D2 * g.z3 / g.f2)[:, None]
         opening = np.array([-1, 1]) * g.lenslet_extent[axis] + m * g.D2 - u0[:, None]
-        low, high = np.sort(self._into_pupil(opening, g.z2 * self.eps, FOCUSED * g.D2), axis=1).T[..., None]
+        low, high = np.sort(self._into_pupil(opening, g.z2 * self.eps, FOCUSED * g.D2), axis=1).T[
+            ..., None
+        ]
         return np.clip(self._into_pupil(t, self.slope, FOCUSED * g.pixel_pitch), low, high)[where]
 
     def _into_pupil(self, position, slope, small):
-        """Pupil coordinates of positions = slope x; where the pupil's image is a point, +-inf for positions on either side of it."""
+        """Pupil coordinates of positions = slope x; where the pupil's image is a point, +-inf
+        for positions on either side of it.
+        """
         if abs(slope) * self.geometry.D1 > small:
             return position / slope
         return np.where(position <= 0, -np.inf, np.inf)
 
     def _enters(self, rows, columns, m, n):
-        """Whether points in focus lie in the opening of lenslet (m, n) where its shape is not square: (points, 1, 1)."""
+        """Whether points in focus lie in the opening of lenslet (m, n) where its shape is not
+        square: (points, 1, 1).
+        """
         g = self.geometry
         if g.lenslet_shape == "square":
             return 1
-        y, x = (np.abs(g.points(axis)[index] + g.z2 * self._tilt[axis] - at * g.D2) for axis, index, at in ((0, rows, m), (1, columns, n)))
-        far = np.hypot(y, x) if g.lenslet_shape == "circle" else np.maximum(x, math.sqrt(0.75) * y + x / 2)
+        y, x = (
+            np.abs(g.points(axis)[index] + g.z2 * self._tilt[axis] - at * g.D2)
+            for axis, index, at in ((0, rows, m), (1, columns, n))
+        )
+        far = (
+            np.hypot(y, x)
+            if g.lenslet_shape == "circle"
+            else np.maximum(x, math.sqrt(0.75) * y + x / 2)
+        )
         return (far <= g.lenslet_width / 2)[:, None, None]
 
     def _light(self, y, x):
-        """Light (points, pixel rows, pixel columns) through rectangles with edges y, x in pairs, filters included."""
+        """Light (points, pixel rows, pixel columns) through rectangles with edges y, x in
+        pairs, filters included.
+        """
         total = 0
         for (y0, y1, x0, x1), transmittance in self._cells:
             total = total + transmittance * self._rectangles(np.clip(y, y0, y1), np.clip(x, x0, x1))
         return total
 
     def _rectangles(self, y, x):
-        """Share of the open pupil in the rectangles between edges y and x (points, edges), neighbours or pairs: (points, rows, columns)."""
+        """Share of the open pupil in the rectangles between edges y and x (points, edges),
+        neighbours or pairs: (points, rows, columns).
+        """
         # both axes run through the pupil the same way, so that their signs cancel
         step = 1 if self._joined else 2
-        areas = np.diff(np.diff(self._below(y[:, :, None], x[:, None, :]), axis=1)[:, ::step], axis=2)
-        return np.maximum(areas[:, :, ::step], 0)  # differences of nearly equal areas round to below 0
+        areas = np.diff(
+            np.diff(self._below(y[:, :, None], x[:, None, :]), axis=1)[:, ::step], axis=2
+        )
+        # differences of nearly equal areas round to below 0
+        return np.maximum(areas[:, :, ::step], 0)
 
 
 def _lit(edges):
@@ -163,21 +226,29 @@ def _noll(term):
 
 
 def _affine(lens, geometry):
-    """Defocus (1/m) and tilt (rows, columns) of the rays: those of the geometry and of the wavefront's Noll terms 2 to 4."""
+    """Defocus (1/m) and tilt (rows, columns) of the rays: those of the geometry and of the
+    wavefront's Noll terms 2 to 4.
+    """
     unit = unit_radius(lens)
     found = {2: 0.0, 3: 0.0, 4: 0.0}
     for term in lens.aberrations or ():
         noll, coefficient = (term.noll, term.coefficient) if hasattr(term, "noll") else term
         if noll in found:
             found[noll] += coefficient
-    return geometry.eps + 8 * math.sqrt(3) * found[4] / unit**2 / 2, 2 * found[3] / unit, 2 * found[2] / unit
+    return (
+        geometry.eps + 8 * math.sqrt(3) * found[4] / unit**2 / 2,
+        2 * found[3] / unit,
+        2 * found[2] / unit,
+    )
 
 
 # the pupil as a measure: its share below and left of a corner
 
 
 def pupil_measure(lens):
-    """A function (y, x) -> share of the open aperture at smaller y and smaller x (m), broadcasting."""
+    """A function (y, x) -> share of the open aperture at smaller y and smaller x
+    (m), broadcasting.
+    """
     half = lens.aperture_diameter / 2
     if lens.aperture_shape == "image":
         return _image_measure(lens.samples("aperture_image"), half)
@@ -187,14 +258,20 @@ def pupil_measure(lens):
         return lambda y, x: disc_below(y / half, x / half) / math.pi
     hole = lens.obscuration * half
     share = math.pi * half**2 / aperture_area(lens)
-    return lambda y, x: share / math.pi * (disc_below(y / half, x / half) - lens.obscuration**2 * disc_below(y / hole, x / hole))
+    return lambda y, x: (
+        share
+        / math.pi
+        * (disc_below(y / half, x / half) - lens.obscuration**2 * disc_below(y / hole, x / hole))
+    )
 
 
 def disc_below(y, x):
-    """Area of the part of the unit disc at smaller y and x than given, in closed form; y and x broadcast.
+    """Area of the part of the unit disc at smaller y and x than given, in closed form;
+    y and x broadcast.
 
-    It is the integral over X up to x of min(y, c) + c, c = sqrt(1 - X^2), where positive; the integral of c is
-    C(X) = (X c + asin X)/2, and beyond |X| = q = sqrt(1 - y^2) the corner's height no longer counts.
+    It is the integral over X up to x of min(y, c) + c, c = sqrt(1 - X^2), where positive; the
+    integral of c is C(X) = (X c + asin X)/2, and beyond |X| = q = sqrt(1 - y^2) the corner's
+    height no longer counts.
     """
     y, x = np.clip(y, -1, 1), np.clip(x, -1, 1)
     q = np.sqrt((1 - y) * (1 + y))
@@ -209,7 +286,9 @@ def _cap(x):
 
 
 def _image_measure(image, half):
-    """The measure of an aperture of constant cells: bilinear between the sums up to the cells' corners."""
+    """The measure of an aperture of constant cells: bilinear between the sums up to
+    the cells' corners.
+    """
     count = len(image)
     total = np.zeros((count + 1, count + 1))
     total[1:, 1:] = np.cumsum(np.cumsum(image, axis=0), axis=1) / image.sum()
@@ -218,6 +297,8 @@ def _image_measure(image, half):
         y, x = ((np.clip(v / half, -1, 1) + 1) * count / 2 for v in (y, x))
         i, j = (np.minimum(v.astype(int), count - 1) for v in (y, x))
         y, x = y - i, x - j
-        return (total[i, j] * (1 - y) + total[i + 1, j] * y) * (1 - x) + (total[i, j + 1] * (1 - y) + total[i + 1, j + 1] * y) * x
+        return (total[i, j] * (1 - y) + total[i + 1, j] * y) * (1 - x) + (
+            total[i, j + 1] * (1 - y) + total[i + 1, j + 1] * y
+        ) * x
 
     return below

@@ -1,14 +1,18 @@
-"""The response of one superpixel to an even object at one wavelength: A summed over object points, without forming A.
+"""The response of one superpixel to an even object at one wavelength: A summed over object points,
+without forming A.
 
-An even, incoherent object that goes on beyond the lenslet's field fills every ray from the pupil to the array with the same
-light, and in waves makes the pupil itself an incoherent source (van Cittert and Zernike). Focus and wavefront error of the main
-lens then only exchange object points with one another. What is left is the pupil, with its filters, imaged by one lenslet:
+An even, incoherent object that goes on beyond the lenslet's field fills every ray from the pupil to
+the array with the same light, and in waves makes the pupil itself an incoherent source (van Cittert
+and Zernike). Focus and wavefront error of the main lens then only exchange object points with one
+another. What is left is the pupil, with its filters, imaged by one lenslet:
 
-    F(pixel) = opening/cell * integral over the pupil of T(x) * integral over the pixel of spot(t - m pitch + (z3/z2) x) dt dx / pupil area,
+    F(pixel) = opening/cell * integral over the pupil of T(x) * integral over the pixel of spot(t -
+        m pitch + (z3/z2) x) dt dx / pupil area,
 
-summed over lenslets m; docs/model.md, "The response predicted". The spot of a lenslet is its opening, z3 kappa wide per
-unit, by rays, and |Fourier transform of its opening with the phase k kappa u^2/2|^2 by waves. The fields of different lenslets
-are added in intensity: over a pupil of many diffraction cells their interference averages out.
+summed over lenslets m; docs/model.md, "The response predicted". The spot of a lenslet is its
+opening, z3 kappa wide per unit, by rays, and |Fourier transform of its opening with the phase k
+kappa u^2/2|^2 by waves. The fields of different lenslets are added in intensity: over a pupil of
+many diffraction cells their interference averages out.
 """
 
 import math
@@ -22,11 +26,17 @@ from plenocli.forward.camera.quadrature import cell_chords, gauss, nodes_for
 from plenocli.forward.propagation.rays import pupil_measure
 
 TAIL = 6
-"""Pitches beyond the pupil's image over which the diffraction of neighbouring lenslets is followed."""
+"""Pitches beyond the pupil's image over which the diffraction of neighbouring
+lenslets is followed.
+"""
 SAMPLES = 6
-"""Samples of a spot's integral per diffraction cell lambda z3/w, for splines of degree 5 (4e-7 of a response)."""
+"""Samples of a spot's integral per diffraction cell lambda z3/w, for splines of degree 5
+(4e-7 of a response).
+"""
 OPENING_STEPS = 8
-"""Nodes across a lenslet for each pixel that its spot is wide, where areas of the pupil are summed over them."""
+"""Nodes across a lenslet for each pixel that its spot is wide, where areas of the pupil
+are summed over them.
+"""
 
 
 def valid_for(camera, model):
@@ -41,36 +51,56 @@ def valid_for(camera, model):
 
 
 def uniform_response(camera, wavelength, model, shifts=((0.0, 0.0),)):
-    """Response (lenslet, pixel) to an even object: mean over object points of what A, all superpixels together, gives a pixel.
+    """Response (lenslet, pixel) to an even object: mean over object points of what A, all
+    superpixels together, gives a pixel.
 
-    A uniform object of one unit of light a point (through the clear pupil) puts this much into each pixel, per point of the
-    object under one lenslet. model: "ray" or "fresnel", see valid_for. shifts (lenslet, 2): rows and columns in pixels from
-    the superpixel's centre to the middle of its window. At `wavelength` (m); both lenses by their glass.
+    A uniform object of one unit of light a point (through the clear pupil) puts this much into each
+    pixel, per point of the object under one lenslet.
+    model: "ray" or "fresnel", see valid_for.
+    shifts (lenslet, 2): rows and columns in pixels from the superpixel's centre to the middle of
+        its window. At `wavelength` (m); both lenses by their glass.
     """
     view, lens = geometry(camera, wavelength), at_wavelength(camera, wavelength).main_lens
     shifts = np.atleast_2d(np.asarray(shifts, float))
     cells = filter_cells(camera, wavelength)
     half = lens.aperture_diameter / 2
     cells = [((-half, half, -half, half), 1.0)] if cells is None else cells
-    separable = view.lenslet_shape == "square" and (model == "fresnel" or lens.aperture_shape == "square")
+    separable = view.lenslet_shape == "square" and (
+        model == "fresnel" or lens.aperture_shape == "square"
+    )
     spot = _spot(view, model) if separable else None
     strips = _strips(view, lens, cells) if separable else None
     reach, scale = _reach(view, model), 1 / (aperture_area(lens) * view.row_spacing * view.D2**2)
     # lenslets of one row are often shifted alike
     lines, which = zip(*(np.unique(shifts[:, axis], return_inverse=True) for axis in (0, 1)))
-    edges = [[view.pixels(axis) + (shift + np.array([[-0.5], [0.5]]) * view.pixel_active / view.pixel_pitch) * view.pixel_pitch for shift in lines[axis]] for axis in (0, 1)]
+    edges = [
+        [
+            view.pixels(axis)
+            + (shift + np.array([[-0.5], [0.5]]) * view.pixel_active / view.pixel_pitch)
+            * view.pixel_pitch
+            for shift in lines[axis]
+        ]
+        for axis in (0, 1)
+    ]
     if separable:
         out = _through_spot(view, spot, strips, edges, which, reach)
     else:
-        out = np.stack([_through_opening(view, lens, cells, (edges[0][i], edges[1][j]), reach) for i, j in zip(*which)])
+        out = np.stack(
+            [
+                _through_opening(view, lens, cells, (edges[0][i], edges[1][j]), reach)
+                for i, j in zip(*which)
+            ]
+        )
     return out.reshape(len(shifts), -1) * scale
 
 
 def field_response(builder):
-    """Response (superpixel, pixel) to the object points of one lenslet's field alone: mean over the columns of A.
+    """Response (superpixel, pixel) to the object points of one lenslet's field alone: mean
+    over the columns of A.
 
-    builder: a plenocli.forward.propagation.system_matrix.PifBuilder. The own superpixel of that field is the one with offset (0, 0); summed over
-    superpixels this is uniform_response, as far as light does not reach beyond those kept.
+    builder: a plenocli.forward.propagation.system_matrix.PifBuilder. The own superpixel of that
+        field is the one with offset (0, 0); summed over superpixels this is uniform_response, as
+        far as light does not reach beyond those kept.
     """
     total = 0.0
     for _, block in builder.blocks():
@@ -79,10 +109,12 @@ def field_response(builder):
 
 
 def own_light(camera, wavelength, count=256):
-    """Share of a lenslet's light that comes from its own object field, by rays; the rest belongs to its neighbours'.
+    """Share of a lenslet's light that comes from its own object field, by rays; the rest belongs
+    to its neighbours'.
 
-    The ray from (y, x) of the pupil that meets the array at u comes from the image point u - z2 (eps x + dW/dx). Summed over
-    count x count points of the pupil, which tells a share to about 1/count.
+    The ray from (y, x) of the pupil that meets the array at u comes from the image point u - z2
+    (eps x + dW/dx). Summed over count x count points of the pupil, which tells a
+    share to about 1/count.
     """
     lens = at_wavelength(camera, wavelength).main_lens
     view = geometry(camera, wavelength)
@@ -90,10 +122,17 @@ def own_light(camera, wavelength, count=256):
     y, x, step = axis[:, None], axis[None, :], lens.aperture_diameter / count / 2
     weight = aperture_picture(lens, y, x)
     if camera.filter_array is not None:
-        weight = weight * sum(t * ((y > y0) & (y < y1) & (x > x0) & (x < x1)) for (y0, y1, x0, x1), t in filter_cells(camera, wavelength))
+        weight = weight * sum(
+            t * ((y > y0) & (y < y1) & (x > x0) & (x < x1))
+            for (y0, y1, x0, x1), t in filter_cells(camera, wavelength)
+        )
     down = view.eps * y + (wavefront(lens, y + step, x) - wavefront(lens, y - step, x)) / (2 * step)
-    across = view.eps * x + (wavefront(lens, y, x + step) - wavefront(lens, y, x - step)) / (2 * step)
-    stay = np.clip(1 - view.z2 * np.abs(down) / (view.D2 * view.row_spacing), 0, None) * np.clip(1 - view.z2 * np.abs(across) / view.D2, 0, None)
+    across = view.eps * x + (wavefront(lens, y, x + step) - wavefront(lens, y, x - step)) / (
+        2 * step
+    )
+    stay = np.clip(1 - view.z2 * np.abs(down) / (view.D2 * view.row_spacing), 0, None) * np.clip(
+        1 - view.z2 * np.abs(across) / view.D2, 0, None
+    )
     return float((weight * stay).sum() / weight.sum())
 
 
@@ -101,7 +140,9 @@ def _reach(view, model):
     """Lenslets, in pitches, whose light may meet the window of a superpixel."""
     image = view.z3 / view.z2 * view.D1 / 2 + abs(view.z3 * view.kappa) * max(view.lenslet_extent)
     windows = max(n * view.pixel_pitch / 2 + view.pixel_pitch for n in view.pixel_shape)
-    far = math.ceil((image + windows) / (view.superpixel_pitch * view.row_spacing) - 1e-9) - (model == "ray")
+    far = math.ceil((image + windows) / (view.superpixel_pitch * view.row_spacing) - 1e-9) - (
+        model == "ray"
+    )
     return far + (TAIL if model == "fresnel" else 0)
 
 
@@ -109,7 +150,9 @@ def _reach(view, model):
 
 
 class RaySpot:
-    """Even light over a width of |z3 kappa| times the lenslet: first and second integrals of it (odd and even part), in closed form."""
+    """Even light over a width of |z3 kappa| times the lenslet: first and second integrals of it
+    (odd and even part), in closed form.
+    """
 
     def __init__(self, view):
         self.half = abs(view.z3 * view.kappa) * view.lenslet_width / 2
@@ -127,8 +170,9 @@ class RaySpot:
 class WaveSpot:
     """|Fourier transform of the opening with the phase k kappa u^2/2|^2 along one axis.
 
-    Its own transform is known: OTF(v) = (1 - v/w) sinc(kappa v (w - v)/lambda) for rays v apart on a lenslet w wide. So the second
-    integral is that of OTF (1 - cos 2 pi f s)/(2 pi f)^2 over the band, v = lambda z3 f, which Gauss-Legendre gives to rounding; it is tabulated.
+    Its own transform is known: OTF(v) = (1 - v/w) sinc(kappa v (w - v)/lambda) for rays v apart on
+    a lenslet w wide. So the second integral is that of OTF (1 - cos 2 pi f s)/(2 pi f)^2 over the
+    band, v = lambda z3 f, which Gauss-Legendre gives to rounding; it is tabulated.
     """
 
     def __init__(self, view, reach):
@@ -140,11 +184,14 @@ class WaveSpot:
         t, w = gauss(nodes_for(math.pi * s[-1] / cell + abs(view.k * view.kappa) * width**2 / 4))
         v = (t + 1) / 2 * width
         f = v / (view.wavelength * view.z3)
-        otf = (1 - v / width) * np.sinc(view.kappa * v * (width - v) / view.wavelength) * w / cell  # both signs of f
+        # both signs of f
+        otf = (1 - v / width) * np.sinc(view.kappa * v * (width - v) / view.wavelength) * w / cell
         even = np.empty(len(s))
         for start in range(0, len(s), 4096):
             part = slice(start, start + 4096)
-            even[part] = (2 * np.sin(np.pi * np.outer(s[part], f)) ** 2) @ (otf / (2 * np.pi * f) ** 2)
+            even[part] = (2 * np.sin(np.pi * np.outer(s[part], f)) ** 2) @ (
+                otf / (2 * np.pi * f) ** 2
+            )
         self._second = make_interp_spline(s, even, 5)
         self._first = self._second.derivative()
         self.reach = s[-1]
@@ -161,12 +208,18 @@ class WaveSpot:
 def _spot(view, model):
     if model == "ray":
         return RaySpot(view)
-    far = view.z3 / view.z2 * view.D1 / 2 + max(view.pixel_shape) * view.pixel_pitch / 2 + 2 * view.pixel_pitch
+    far = (
+        view.z3 / view.z2 * view.D1 / 2
+        + max(view.pixel_shape) * view.pixel_pitch / 2
+        + 2 * view.pixel_pitch
+    )
     return WaveSpot(view, far + (_reach(view, model) + 1) * view.superpixel_pitch)
 
 
 def _strips(view, lens, cells):
-    """The pupil as [(weight, top, bottom, left, right)], arrays of m: rectangles, or chords at nodes (bottom None, weight times m)."""
+    """The pupil as [(weight, top, bottom, left, right)], arrays of m: rectangles, or chords at
+    nodes (bottom None, weight times m).
+    """
     half = lens.aperture_diameter / 2
     strips = []
     if lens.aperture_shape == "square":
@@ -174,62 +227,101 @@ def _strips(view, lens, cells):
             ends = [np.clip(v, -half, half).reshape(1) for v in (y0, y1, x0, x1)]
             strips.append((np.array([t]), *ends))
         return strips
-    # the light of a pixel has the spot's band limit across the pupil, w/(lambda z2) cycles a metre, along y and through the chord's ends
+    # the light of a pixel has the spot's band limit across the pupil, w/(lambda z2) cycles a metre,
+    # along y and through the chord's ends
     slope = 2 * math.pi * view.lenslet_width / (view.wavelength * view.z2) * math.sqrt(2)
     discs = [(1.0, half)] + ([(-1.0, half * lens.obscuration)] if lens.obscuration else [])
     for sign, radius in discs:
         for cell, t in cells:
-            strips += [(sign * t * weight, y, None, left, right) for y, weight, left, right in cell_chords(cell, radius, slope)]
+            strips += [
+                (sign * t * weight, y, None, left, right)
+                for y, weight, left, right in cell_chords(cell, radius, slope)
+            ]
     return strips
 
 
 def _through_spot(view, spot, strips, edges, which, reach):
-    """Light (lenslet, pixel row, pixel column) of separable lenslets, times pupil area and cell area.
+    """Light (lenslet, pixel row, pixel column) of separable lenslets, times pupil
+    area and cell area.
 
-    edges: for both axes a list of pixel edges (2, pixel); which: for both axes the number of each lenslet in it.
+    edges: for both axes a list of pixel edges (2, pixel);
+    which: for both axes the number of each lenslet in it.
     """
     minify = view.z3 / view.z2
     out = np.zeros((len(which[0]), *(line[0].shape[1] for line in edges)))
     for rows, columns in view.neighbourhood(reach):
         for weight, top, bottom, left, right in strips:
             if bottom is None:
-                down = [_summed(spot.first, t, rows * view.superpixel_pitch, minify * top) for t in edges[0]]
+                down = [
+                    _summed(spot.first, t, rows * view.superpixel_pitch, minify * top)
+                    for t in edges[0]
+                ]
             else:
-                down = [(_summed(spot.second, t, rows * view.superpixel_pitch, minify * bottom) - _summed(spot.second, t, rows * view.superpixel_pitch, minify * top)) / minify
-                        for t in edges[0]]
-            across = [(_summed(spot.second, t, columns * view.superpixel_pitch, minify * right) - _summed(spot.second, t, columns * view.superpixel_pitch, minify * left)) / minify
-                      for t in edges[1]]
+                down = [
+                    (
+                        _summed(spot.second, t, rows * view.superpixel_pitch, minify * bottom)
+                        - _summed(spot.second, t, rows * view.superpixel_pitch, minify * top)
+                    )
+                    / minify
+                    for t in edges[0]
+                ]
+            across = [
+                (
+                    _summed(spot.second, t, columns * view.superpixel_pitch, minify * right)
+                    - _summed(spot.second, t, columns * view.superpixel_pitch, minify * left)
+                )
+                / minify
+                for t in edges[1]
+            ]
             for n, (i, j) in enumerate(zip(*which)):
                 out[n] += (weight[:, None] * down[i]).T @ across[j]
     return out * view.lenslet_width**2
 
 
 def _summed(integral, t, far, place):
-    """integral(upper edge + place) - integral(lower edge + place), summed over lenslets `far` (m) away: (place, pixel) for edges t (2, pixel)."""
+    """integral(upper edge + place) - integral(lower edge + place), summed over lenslets `far`
+    (m) away: (place, pixel) for edges t (2, pixel).
+    """
     s = t[:, None, None] + place[:, None, None] - far[:, None]
     return np.subtract(*integral(s[::-1])).sum(axis=1)
 
 
 def _through_opening(view, lens, cells, edges, reach):
-    """The same by rays for any pupil and lenslet: exact areas of the pupil, summed over nodes in the lenslet's opening."""
+    """The same by rays for any pupil and lenslet: exact areas of the pupil, summed over nodes in
+    the lenslet's opening.
+    """
     below, minify = pupil_measure(lens), view.z3 / view.z2
     total = 0.0
     for uy, ux, weight in _opening_nodes(view):
         for rows, columns in view.neighbourhood(reach):
             for m in rows:
                 for n in columns:
-                    y, x = (-(edges[axis] - far * view.superpixel_pitch - view.z3 * view.kappa * u) / minify for axis, far, u in ((0, m, uy), (1, n, ux)))
+                    y, x = (
+                        -(edges[axis] - far * view.superpixel_pitch - view.z3 * view.kappa * u)
+                        / minify
+                        for axis, far, u in ((0, m, uy), (1, n, ux))
+                    )
                     for (y0, y1, x0, x1), t in cells:
                         if y.min() >= y1 or y.max() <= y0 or x.min() >= x1 or x.max() <= x0:
                             continue
                         (bottom, top), (right, left) = np.clip(y, y0, y1), np.clip(x, x0, x1)
-                        light = sum(sign * below(v[:, None], h) for v, h, sign in ((bottom, right, 1), (top, left, 1), (bottom, left, -1), (top, right, -1)))
+                        light = sum(
+                            sign * below(v[:, None], h)
+                            for v, h, sign in (
+                                (bottom, right, 1),
+                                (top, left, 1),
+                                (bottom, left, -1),
+                                (top, right, -1),
+                            )
+                        )
                         total = total + weight * t * light
     return total * aperture_area(lens)
 
 
 def _opening_nodes(view):
-    """Nodes (y, x, area) over a lenslet's opening, enough for a spot z3 kappa times as large on pixels."""
+    """Nodes (y, x, area) over a lenslet's opening, enough for a spot z3 kappa times
+    as large on pixels.
+    """
     high, wide = view.lenslet_extent
     spread = abs(view.z3 * view.kappa) * view.lenslet_width / view.pixel_pitch
     if spread < 1e-6:

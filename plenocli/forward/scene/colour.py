@@ -1,9 +1,9 @@
 """Colour from spectra: CIE XYZ, CIELAB, linear sRGB, colour difference.
 
-Tristimulus values are scaled so that the perfect diffuser under the light in question has Y = 1.
-A spectrum known at a few wavelengths is taken as piecewise linear between them and constant beyond the outermost: every
-result is then a fixed linear map of the samples, exact for spectrally flat surfaces, usable from one band upwards, and
-the closer to the truth the more bands there are.
+Tristimulus values are scaled so that the perfect diffuser under the light in question has Y = 1. A
+spectrum known at a few wavelengths is taken as piecewise linear between them and constant beyond
+the outermost: every result is then a fixed linear map of the samples, exact for spectrally flat
+surfaces, usable from one band upwards, and the closer to the truth the more bands there are.
 """
 
 import numpy as np
@@ -12,13 +12,17 @@ from plenocli.forward.scene.tables import illuminant, observer
 
 # IEC 61966-2-1: linear sRGB from XYZ relative to D65, and the Bradford cone matrix (Lam 1985).
 _SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
 
 
 def xyz_weights(wavelengths, light="D65"):
-    """Matrix (3, band) that takes reflectances at `wavelengths` (band,) m to XYZ under `light` (a name, see tables).
+    """Matrix (3, band) that takes reflectances at `wavelengths` (band,) m to XYZ under `light` (a
+    name, see tables).
 
-    Rows sum to the XYZ of the light itself (Y = 1). Integrated over the 1 nm table of the CIE 1931 observer.
+    Rows sum to the XYZ of the light itself (Y = 1). Integrated over the 1 nm table of the
+    CIE 1931 observer.
     """
     wavelengths = np.asarray(wavelengths, dtype=np.float64)
     if wavelengths.ndim != 1 or not wavelengths.size or np.any(np.diff(wavelengths) <= 0):
@@ -40,13 +44,17 @@ def white_point(light="D65"):
 
 
 def adapt(values, source, target):
-    """XYZ (..., 3) seen by an eye adapted to white `source` (3,) moved to white `target` (3,); Bradford transform."""
+    """XYZ (..., 3) seen by an eye adapted to white `source` (3,) moved to white `target` (3,);
+    Bradford transform.
+    """
     gain = (_BRADFORD @ target) / (_BRADFORD @ source)
     return np.asarray(values) @ (np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)).T
 
 
 def linear_srgb(values, white=None):
-    """Linear sRGB (..., 3), unclipped, of XYZ (..., 3) relative to `white` (3,), adapted to D65 (default: already D65)."""
+    """Linear sRGB (..., 3), unclipped, of XYZ (..., 3) relative to `white` (3,), adapted to D65
+    (default: already D65).
+    """
     d65 = white_point("D65")
     if white is not None:
         values = adapt(values, white, d65)
@@ -57,13 +65,17 @@ def linear_srgb(values, white=None):
 def encode_srgb(linear):
     """Display values 0..1 of linear sRGB, clipped; IEC 61966-2-1."""
     linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
 
 
 def preview_rgb(wavelengths, cube, light="D65"):
-    """A picture (3, row, col) float32, linear sRGB and unclipped, of a reflectance cube (band, row, col) under `light`.
+    """A picture (3, row, col) float32, linear sRGB and unclipped, of a reflectance cube (band, row,
+    col) under `light`.
 
-    White surfaces look white whatever the light. For radiance relative to a white surface pass the quotient.
+    White surfaces look white whatever the light. For radiance relative to a white surface
+    pass the quotient.
     """
     matrix = linear_srgb(xyz_weights(wavelengths, light).T, white_point(light)).T
     return np.tensordot(matrix, np.asarray(cube, dtype=np.float64), axes=1).astype(np.float32)
@@ -73,7 +85,10 @@ def lab(values, white):
     """CIELAB (..., 3) of XYZ (..., 3) relative to `white` (3,); CIE 15:2004."""
     ratio = np.asarray(values, dtype=np.float64) / white
     f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+    return np.stack(
+        [116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])],
+        axis=-1,
+    )
 
 
 def delta_e_2000(first, second):
@@ -81,7 +96,9 @@ def delta_e_2000(first, second):
 
     Formulae of Sharma, Wu and Dalal, Color Research & Application 30 (2005) 21-30.
     """
-    (l1, a1, b1), (l2, a2, b2) = (np.moveaxis(np.asarray(v, dtype=np.float64), -1, 0) for v in (first, second))
+    (l1, a1, b1), (l2, a2, b2) = (
+        np.moveaxis(np.asarray(v, dtype=np.float64), -1, 0) for v in (first, second)
+    )
     c7 = ((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2) ** 7
     a1, a2 = (a * (1.5 - 0.5 * np.sqrt(c7 / (c7 + 25.0**7))) for a in (a1, a2))
     c1, c2 = np.hypot(a1, b1), np.hypot(a2, b2)
@@ -92,8 +109,16 @@ def delta_e_2000(first, second):
     dl, dc, dh = l2 - l1, c2 - c1, 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn) / 2)
     lm, cm = (l1 + l2) / 2, (c1 + c2) / 2
     far = np.abs(h1 - h2) > 180
-    hm = np.where(grey, h1 + h2, np.where(far, h1 + h2 + np.where(h1 + h2 < 360, 360, -360), h1 + h2) / 2)
-    t = 1 - 0.17 * _cos(hm - 30) + 0.24 * _cos(2 * hm) + 0.32 * _cos(3 * hm + 6) - 0.20 * _cos(4 * hm - 63)
+    hm = np.where(
+        grey, h1 + h2, np.where(far, h1 + h2 + np.where(h1 + h2 < 360, 360, -360), h1 + h2) / 2
+    )
+    t = (
+        1
+        - 0.17 * _cos(hm - 30)
+        + 0.24 * _cos(2 * hm)
+        + 0.32 * _cos(3 * hm + 6)
+        - 0.20 * _cos(4 * hm - 63)
+    )
     sl = 1 + 0.015 * (lm - 50) ** 2 / np.sqrt(20 + (lm - 50) ** 2)
     sc, sh = 1 + 0.045 * cm, 1 + 0.015 * cm * t
     rotation = 60 * np.exp(-(((hm - 275) / 25) ** 2))

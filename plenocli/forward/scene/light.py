@@ -1,7 +1,8 @@
-"""Spectral quadrature: which wavelengths carry the light of a source, and with what weight in photo-electrons.
+"""Spectral quadrature: which wavelengths carry the light of a source, and with what weight
+in photo-electrons.
 
-A source of spectral radiance E(l) gives photo-electrons in proportion to E(l) l dl (energy over the photon's h c / l).
-See docs/model.md, "From radiance to electrons".
+A source of spectral radiance E(l) gives photo-electrons in proportion to E(l) l dl (energy over the
+photon's h c / l). See docs/model.md, "From radiance to electrons".
 """
 
 from dataclasses import dataclass
@@ -15,28 +16,42 @@ VISIBLE = (400e-9, 700e-9)
 
 @dataclass(frozen=True)
 class Quadrature:
-    """Nodes of a source: wavelengths (node,) m ascending, photons (node,) relative photon radiance, summing to 1."""
+    """Nodes of a source: wavelengths (node,) m ascending, photons (node,) relative photon
+    radiance, summing to 1.
+    """
 
     wavelengths: np.ndarray
     photons: np.ndarray
 
 
 def broadband(camera, power, step=None):
-    """Nodes of white light through `camera`; `power(wavelengths)` is the relative spectral power of the illuminant.
+    """Nodes of white light through `camera`; `power(wavelengths)` is the relative spectral power
+    of the illuminant.
 
-    A camera with colour (filters in the pupil or on the sensor) is sampled uniformly over 400 to 700 nm, by default at
-    half of the narrowest filter width: the trapezoidal rule on a Gaussian band of FWHM w with step w/2 is exact to 1e-6.
-    Without colour the camera sees the lines of [light] wavelengths, equally strong.
+    A camera with colour (filters in the pupil or on the sensor) is sampled uniformly over 400 to
+    700 nm, by default at half of the narrowest filter width: the trapezoidal rule on a Gaussian
+    band of FWHM w with step w/2 is exact to 1e-6. Without colour the camera sees the lines of
+    [light] wavelengths, equally strong.
     """
     if not has_colour(camera):
         lines = np.array(camera.light.wavelengths)
         return Quadrature(lines, np.full(len(lines), 1 / len(lines)))
     if step is None:
-        step = min((f.fwhm for f in camera.filter_array.filters), default=20e-9) / 2 if camera.filter_array else 10e-9
+        step = (
+            min((f.fwhm for f in camera.filter_array.filters), default=20e-9) / 2
+            if camera.filter_array
+            else 10e-9
+        )
     low = min(VISIBLE[0], *camera.light.wavelengths)
     high = max(VISIBLE[1], *camera.light.wavelengths)
     if not 0 < step <= (high - low) / 2:
-        raise UsageError(f"a spectral step of {step * 1e9:g} nm does not resolve {low * 1e9:g} to {high * 1e9:g} nm", fix="choose about half of the narrowest filter width")
+        raise UsageError(
+            (
+                f"a spectral step of {step * 1e9:g} nm does not resolve {low * 1e9:g} "
+                f"to {high * 1e9:g} nm"
+            ),
+            fix="choose about half of the narrowest filter width",
+        )
     nodes = np.linspace(low, high, int(round((high - low) / step)) + 1)
     weights = np.ones(len(nodes))
     weights[[0, -1]] = 0.5
@@ -44,7 +59,9 @@ def broadband(camera, power, step=None):
 
 
 def narrow_band(centre, fwhm=0.0, nodes=5):
-    """Nodes of a narrow band around `centre` (m): one line, or a Gaussian band of width `fwhm` (m) by Gauss-Hermite nodes."""
+    """Nodes of a narrow band around `centre` (m): one line, or a Gaussian band of width `fwhm`
+    (m) by Gauss-Hermite nodes.
+    """
     if fwhm == 0:
         return Quadrature(np.array([centre]), np.ones(1))
     x, weights = np.polynomial.hermite_e.hermegauss(nodes)
@@ -53,7 +70,9 @@ def narrow_band(centre, fwhm=0.0, nodes=5):
 
 
 def broadened(lines, fwhm):
-    """Each of several lines widened to a Gaussian band: the union of narrow_band() nodes, equally strong."""
+    """Each of several lines widened to a Gaussian band: the union of narrow_band()
+    nodes, equally strong.
+    """
     bands = [narrow_band(line, fwhm) for line in lines]
     order = np.argsort(np.concatenate([b.wavelengths for b in bands]))
     wavelengths = np.concatenate([b.wavelengths for b in bands])[order]
@@ -61,12 +80,15 @@ def broadened(lines, fwhm):
 
 
 def band_weights(camera, wavelengths, power):
-    """What system matrices A_k at `wavelengths` (k,) m, ascending, make of a capture in white light of the spectral `power`.
+    """What system matrices A_k at `wavelengths` (k,) m, ascending, make of a capture in white light
+    of the spectral `power`.
 
-    Returns (bands (band,) m, weights (band, k)): the capture is y = sum_b (sum_k weights[b, k] A_k) x_b, in units where a mono
-    sensor's efficiency is 1. A camera without filters in its pupil has one band, its lines equally strong. Otherwise, where the
-    wavelengths are nodes of `broadband` no wider apart than a filter, bands are the [light] wavelengths, x is linear between
-    them and constant beyond; where they are not, each wavelength is a band and stands for all that its filter lets through.
+    Returns (bands (band,) m, weights (band, k)): the capture is y = sum_b (sum_k weights[b, k] A_k)
+    x_b, in units where a mono sensor's efficiency is 1. A camera without filters in its pupil has
+    one band, its lines equally strong. Otherwise, where the wavelengths are nodes of `broadband` no
+    wider apart than a filter, bands are the [light] wavelengths, x is linear between them and
+    constant beyond; where they are not, each wavelength is a band and stands for all that its
+    filter lets through.
     """
     from plenocli.forward.camera.pupil import filter_transmittance
 
@@ -85,21 +107,43 @@ def band_weights(camera, wavelengths, power):
     light = broadband(camera, power)
     passed = np.array([[filter_transmittance(f, w) for w in wavelengths] for f in filters])
     behind = passed.argmax(axis=0)
-    blocked = [w for w, t, k in zip(wavelengths, passed.max(axis=0), behind) if t < filter_transmittance(filters[k], filters[k].center) / 10]
+    blocked = [
+        w
+        for w, t, k in zip(wavelengths, passed.max(axis=0), behind)
+        if t < filter_transmittance(filters[k], filters[k].center) / 10
+    ]
     if blocked:
-        raise UsageError(f"no filter of the camera passes {blocked[0] * 1e9:.4g} nm, one of the wavelengths of its system matrix",
-                         fix="simulate-pif at the filters' wavelengths, or --spectral-step auto")
-    through = np.array([sum(n * filter_transmittance(f, w) for w, n in zip(light.wavelengths, light.photons)) for f in filters])
+        raise UsageError(
+            (
+                f"no filter of the camera passes {blocked[0] * 1e9:.4g} nm, one of the wavelengths "
+                "of its system matrix"
+            ),
+            fix="simulate-pif at the filters' wavelengths, or --spectral-step auto",
+        )
+    through = np.array(
+        [
+            sum(n * filter_transmittance(f, w) for w, n in zip(light.wavelengths, light.photons))
+            for f in filters
+        ]
+    )
     return wavelengths, np.diag(through[behind] / passed.max(axis=0) / np.bincount(behind)[behind])
 
 
 def has_colour(camera):
-    """Whether the camera tells wavelengths apart: filters in the pupil, or a colour filter array on the sensor."""
+    """Whether the camera tells wavelengths apart: filters in the pupil, or a colour filter
+    array on the sensor.
+    """
     return camera.filter_array is not None or camera.sensor.cfa != "mono"
 
 
 def _normalised(wavelengths, photons):
     total = photons.sum()
     if not (np.isfinite(total) and total > 0):
-        raise UsageError(f"the light has no power between {wavelengths[0] * 1e9:g} and {wavelengths[-1] * 1e9:g} nm", fix="choose another illuminant or other wavelengths")
+        raise UsageError(
+            (
+                f"the light has no power between {wavelengths[0] * 1e9:g} and "
+                f"{wavelengths[-1] * 1e9:g} nm"
+            ),
+            fix="choose another illuminant or other wavelengths",
+        )
     return Quadrature(wavelengths, photons / total)

@@ -1,4 +1,6 @@
-"""Photographs and spectral images resampled to the grid of object points by exact area averaging."""
+"""Photographs and spectral images resampled to the grid of object points by
+exact area averaging.
+"""
 
 import numpy as np
 
@@ -8,7 +10,8 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709 / sRGB primaries
 
 
 def luminance(picture):
-    """Linear luminance (rows, cols) of a linear picture (rows, cols[, channels]) with 1, 2, 3 or 4 channels.
+    """Linear luminance (rows, cols) of a linear picture (rows, cols[, channels]) with 1,
+    2, 3 or 4 channels.
 
     Two and four channels carry alpha last, which is left out. Weights of ITU-R BT.709.
     """
@@ -19,15 +22,19 @@ def luminance(picture):
     if channels in (1, 2):
         return picture[:, :, 0]
     if channels in (3, 4):
-        return picture[:, :, :3] @ _LUMINANCE.astype(picture.dtype if picture.dtype.kind == "f" else np.float64)
+        return picture[:, :, :3] @ _LUMINANCE.astype(
+            picture.dtype if picture.dtype.kind == "f" else np.float64
+        )
     raise ValueError(f"a picture of {channels} channels has no luminance")
 
 
 def area_average(values, count, axis=0, start=0.0, stop=None):
-    """Means of `values` over `count` equal cells that tile [start, stop) along `axis`, in units of input samples.
+    """Means of `values` over `count` equal cells that tile [start, stop) along `axis`, in
+    units of input samples.
 
-    The input is piecewise constant, sample k covering [k, k+1); cells may begin and end inside samples, so that the sum
-    of cell mean x cell width is exactly the integral of the input over [start, stop). Returns float64.
+    The input is piecewise constant, sample k covering [k, k+1); cells may begin and end inside
+    samples, so that the sum of cell mean x cell width is exactly the integral of the input over
+    [start, stop). Returns float64.
     """
     values = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
     length = values.shape[0]
@@ -43,10 +50,12 @@ def area_average(values, count, axis=0, start=0.0, stop=None):
 
 
 def sample_picture(picture, rows, cols, how="fit"):
-    """A picture (height, width[, channels]) on a grid of (rows, cols) object points; float32, centred.
+    """A picture (height, width[, channels]) on a grid of (rows, cols) object
+    points; float32, centred.
 
-    how="fit": the largest centred part with the grid's aspect ratio, averaged over equal cells (edges may cut pixels).
-    how="crop": the central rows x cols pixels at their native resolution; InputError if the picture is smaller.
+    how="fit": the largest centred part with the grid's aspect ratio, averaged over equal cells
+    (edges may cut pixels). how="crop": the central rows x cols pixels at their native resolution;
+    InputError if the picture is smaller.
     """
     picture = np.asarray(picture)
     height, width = picture.shape[:2]
@@ -55,7 +64,10 @@ def sample_picture(picture, rows, cols, how="fit"):
     if how == "crop":
         if height < rows or width < cols:
             raise InputError(
-                f"the picture is {height} x {width} pixels (rows x columns), smaller than the {rows} x {cols} object points",
+                (
+                    f"the picture is {height} x {width} pixels (rows x columns), smaller than the "
+                    f"{rows} x {cols} object points"
+                ),
                 fix='use a larger picture, or sample it with "fit" instead of "crop"',
             )
         top, left = (height - rows) // 2, (width - cols) // 2
@@ -70,9 +82,15 @@ def sample_picture(picture, rows, cols, how="fit"):
 
 
 def block_mean(values, block):
-    """Mean over non-overlapping blocks (h, w) of the last two axes: (..., R h, C w) -> (..., R, C) float64."""
+    """Mean over non-overlapping blocks (h, w) of the last two axes: (..., R h, C w) ->
+    (..., R, C) float64.
+    """
     values = np.asarray(values, dtype=np.float64)
     (height, width), (rows, cols) = block, values.shape[-2:]
     if rows % height or cols % width:
-        raise ValueError(f"{rows} x {cols} samples are no whole number of {height} x {width} blocks")
-    return values.reshape(*values.shape[:-2], rows // height, height, cols // width, width).mean(axis=(-3, -1))
+        raise ValueError(
+            f"{rows} x {cols} samples are no whole number of {height} x {width} blocks"
+        )
+    return values.reshape(*values.shape[:-2], rows // height, height, cols // width, width).mean(
+        axis=(-3, -1)
+    )

@@ -4,7 +4,9 @@ import numpy as np
 
 
 def reflectance_statistics(reflectance):
-    """(mean (band,), covariance (band, band)) of reflectances (surface, band); population covariance (divided by n)."""
+    """(mean (band,), covariance (band, band)) of reflectances (surface, band); population
+    covariance (divided by n).
+    """
     reflectance = np.asarray(reflectance, dtype=np.float64)
     mean = reflectance.mean(axis=0)
     centred = reflectance - mean
@@ -14,9 +16,10 @@ def reflectance_statistics(reflectance):
 def radiance_statistics(mean, covariance, light):
     """Statistics of radiance b = diag(E) r from those of reflectance r.
 
-    mean (band,), covariance (band, band) of r; light (band,): power E of the light in each band, any unit, which the
-    result inherits. Returns (mu_b = E mu_r, C_b = diag(E) C_r diag(E)); Berkner et al. 2013, spectral
-    model; docs/model.md, "Spectral response: calibration and demultiplexing".
+    mean (band,), covariance (band, band) of r;
+    light (band,): power E of the light in each band, any unit, which the result inherits.
+    Returns (mu_b = E mu_r, C_b = diag(E) C_r diag(E)); Berkner et al. 2013, spectral model;
+    docs/model.md, "Spectral response: calibration and demultiplexing".
     """
     light = np.asarray(light, dtype=np.float64)
     return light * mean, light[:, None] * np.asarray(covariance) * light[None, :]

@@ -1,7 +1,8 @@
 """Frozen spectral tables: ColorChecker, illuminants, standard observer, camera sensitivities.
 
-Wavelengths are in metres, ascending. Every table is read between its samples by linear interpolation; what holds
-outside its range is said at each function. Source of the numbers: colour-science (see make_tables.py).
+Wavelengths are in metres, ascending. Every table is read between its samples by linear
+interpolation; what holds outside its range is said at each function. Source of the numbers:
+colour-science (see make_tables.py).
 """
 
 import re
@@ -12,7 +13,8 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError
 
-#: The patches over which the spectral experiment averages its error (Berkner et al. 2013, spectral prototype).
+#: The patches over which the spectral experiment averages its error (Berkner et al. 2013,
+#: spectral prototype).
 SIX_PATCHES = ("white 9.5 (.05 D)", "black 2 (1.5 D)", "red", "orange", "green", "blue")
 
 _SECOND_RADIATION_CONSTANT = 1.438776877e-2  # m K, CODATA 2018
@@ -29,11 +31,15 @@ def _tables():
 
 
 def _names(kind):
-    return tuple(dict.fromkeys(key.split("/")[1] for key in _tables() if key.startswith(kind + "/")))
+    return tuple(
+        dict.fromkeys(key.split("/")[1] for key in _tables() if key.startswith(kind + "/"))
+    )
 
 
 def illuminant_names():
-    """Names of the tabulated illuminants; a blackbody is asked for by its temperature, as in "3200 K"."""
+    """Names of the tabulated illuminants; a blackbody is asked for by its
+    temperature, as in "3200 K".
+    """
     return _names("illuminant")
 
 
@@ -43,11 +49,12 @@ def camera_names():
 
 
 def colorchecker(wavelengths=None):
-    """The 24 patches of the ColorChecker (spectra of N. Ohta, 1997): (names, wavelengths, reflectance).
+    """The 24 patches of the ColorChecker (spectra of N. Ohta, 1997): (names,
+    wavelengths, reflectance).
 
-    names: tuple of 24 strings, row by row from "dark skin" to "black 2 (1.5 D)". wavelengths (n,) in m: the table's own,
-    380 to 780 nm by 5 nm, or those asked for. reflectance (24, n) float64 in 0..1, a fresh array; outside the table the
-    end values hold.
+    names: tuple of 24 strings, row by row from "dark skin" to "black 2 (1.5 D)". wavelengths (n,)
+    in m: the table's own, 380 to 780 nm by 5 nm, or those asked for. reflectance (24, n) float64 in
+    0..1, a fresh array; outside the table the end values hold.
     """
     tables = _tables()
     own, reflectance = tables["chart/wavelength_nm"] * 1e-9, tables["chart/reflectance"]
@@ -59,30 +66,36 @@ def colorchecker(wavelengths=None):
 
 
 def surfaces(wavelengths):
-    """Reflectances (99, n) of natural and man-made surfaces at `wavelengths` (n,) m: nature, skin, textiles, paints, plastics,
-    prints (the colour evaluation samples of CIE 224:2017, selected evenly from 105 000 measured spectra). 380 to 780 nm by
-    5 nm, end values beyond."""
+    """Reflectances (99, n) of natural and man-made surfaces at `wavelengths` (n,) m: nature, skin,
+    textiles, paints, plastics, prints (the colour evaluation samples of CIE 224:2017, selected
+    evenly from 105 000 measured spectra). 380 to 780 nm by 5 nm, end values beyond.
+    """
     own, rows = _tables()["surfaces/wavelength_nm"] * 1e-9, _tables()["surfaces/reflectance"]
     wavelengths = _checked(wavelengths)
     return np.array([np.interp(wavelengths, own, row) for row in rows])
 
 
 def patch_index(name):
-    """Index 0..23 of a ColorChecker patch by its name or the first word of it ("white", "black")."""
+    """Index 0..23 of a ColorChecker patch by its name or the first word of it
+    ("white", "black").
+    """
     names = colorchecker()[0]
     if name in names:
         return names.index(name)
     short = [i for i, full in enumerate(names) if full.split()[0] == name and full[-1] == ")"]
     if len(short) == 1:
         return short[0]
-    raise ConfigError(f"no ColorChecker patch is called {name!r}", fix=f"use one of: {', '.join(names)}")
+    raise ConfigError(
+        f"no ColorChecker patch is called {name!r}", fix=f"use one of: {', '.join(names)}"
+    )
 
 
 def illuminant(name, wavelengths):
-    """Relative spectral power (n,) of a light at `wavelengths` (n,) m, per unit wavelength, 1 at 560 nm.
+    """Relative spectral power (n,) of a light at `wavelengths` (n,) m, per unit
+    wavelength, 1 at 560 nm.
 
-    name: "A", "D50", "D65", "E", or a temperature such as "3200 K" for Planck's blackbody. Tables are 5 nm apart over
-    300 to 780 nm (E: 360 to 830); beyond them the end values hold.
+    name: "A", "D50", "D65", "E", or a temperature such as "3200 K" for Planck's blackbody. Tables
+        are 5 nm apart over 300 to 780 nm (E: 360 to 830); beyond them the end values hold.
     """
     wavelengths = _checked(wavelengths)
     if match := re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*K\s*", str(name)):
@@ -100,7 +113,8 @@ def blackbody(temperature, wavelengths):
     """Planck's spectral radiance (n,) at `temperature` K, relative to that at 560 nm."""
     if not 500 <= temperature <= 1e6:
         raise ConfigError(
-            f"a blackbody of {temperature:g} K is no light source for a camera", fix="use 500 K to 1000000 K, as in 3200 K"
+            f"a blackbody of {temperature:g} K is no light source for a camera",
+            fix="use 500 K to 1000000 K, as in 3200 K",
         )
 
     def planck(wavelength):
@@ -110,17 +124,23 @@ def blackbody(temperature, wavelengths):
 
 
 def camera_sensitivity(name, wavelengths):
-    """Relative spectral sensitivity of a camera: dict letter ("R", "G", "B") -> (n,) array at `wavelengths` (n,) m.
+    """Relative spectral sensitivity of a camera: dict letter ("R", "G", "B") -> (n,) array at
+    `wavelengths` (n,) m.
 
-    Each channel's table has its peak at 1, as published by NPL (the ratio between channels is not known from it); zero
-    outside the table (380 to 780 nm for the Nikon, 400 to 680 nm for the Sigma).
+    Each channel's table has its peak at 1, as published by NPL (the ratio between channels is not
+    known from it); zero outside the table (380 to 780 nm for the Nikon, 400 to 680
+    nm for the Sigma).
     """
     if name not in camera_names():
         raise ConfigError(
-            f"no sensitivity is known of a camera called {name!r}", "sensor.camera", f"use one of: {', '.join(camera_names())}"
+            f"no sensitivity is known of a camera called {name!r}",
+            "sensor.camera",
+            f"use one of: {', '.join(camera_names())}",
         )
     wavelengths = _checked(wavelengths)
-    own, letters, rows = (_tables()[f"camera/{name}/{part}"] for part in ("wavelength_nm", "letters", "sensitivity"))
+    own, letters, rows = (
+        _tables()[f"camera/{name}/{part}"] for part in ("wavelength_nm", "letters", "sensitivity")
+    )
     return {
         str(letter): np.interp(wavelengths, own * 1e-9, row, left=0.0, right=0.0)
         for letter, row in zip(letters, rows, strict=True)
@@ -128,7 +148,8 @@ def camera_sensitivity(name, wavelengths):
 
 
 def observer(wavelengths=None):
-    """CIE 1931 2-degree colour matching functions: (wavelengths (n,) m, xyz (3, n)); zero outside 360 to 830 nm.
+    """CIE 1931 2-degree colour matching functions: (wavelengths (n,) m, xyz (3, n)); zero
+    outside 360 to 830 nm.
 
     Without `wavelengths` the table itself, every nanometre.
     """
@@ -136,7 +157,9 @@ def observer(wavelengths=None):
     if wavelengths is None:
         return own, xyz.copy()
     wavelengths = _checked(wavelengths)
-    return wavelengths, np.array([np.interp(wavelengths, own, row, left=0.0, right=0.0) for row in xyz])
+    return wavelengths, np.array(
+        [np.interp(wavelengths, own, row, left=0.0, right=0.0) for row in xyz]
+    )
 
 
 def _checked(wavelengths):

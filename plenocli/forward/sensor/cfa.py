@@ -8,10 +8,11 @@ MONO = "Y"
 
 
 def cfa_map(shape, cfa, origin=(0, 0)):
-    """Colour letter of every pixel, (rows, columns) of one-letter strings; "Y" everywhere for "mono".
+    """Colour letter of every pixel, (rows, columns) of one-letter strings; "Y"
+    everywhere for "mono".
 
-    cfa: "mono" or the four letters of the top left 2x2 pixels, row by row. origin: sensor position (row, column) of
-    the first pixel, for windows cut out of a sensor.
+    cfa: "mono" or the four letters of the top left 2x2 pixels, row by row.
+    origin: sensor position (row, column) of the first pixel, for windows cut out of a sensor.
     """
     if cfa == "mono":
         return np.full(shape, MONO)
@@ -25,8 +26,9 @@ def cfa_map(shape, cfa, origin=(0, 0)):
 def sensitivity(camera, wavelengths):
     """Quantum efficiency by colour: (letters, (colour, wavelength)) for `wavelengths` in m.
 
-    A mono sensor has one colour "Y" with [sensor] quantum_efficiency at every wavelength; another one has the
-    measured relative sensitivities of [sensor] camera (peak 1) times quantum_efficiency.
+    A mono sensor has one colour "Y" with [sensor] quantum_efficiency at every wavelength; another
+    one has the measured relative sensitivities of [sensor] camera (peak 1)
+    times quantum_efficiency.
     """
     wavelengths = np.atleast_1d(np.asarray(wavelengths, float))
     efficiency = camera.sensor.quantum_efficiency

@@ -1,19 +1,26 @@
-"""Exposures of one scene made into one image: dark removed, exposure divided out, saturation masked, noise measured."""
+"""Exposures of one scene made into one image: dark removed, exposure divided out, saturation
+masked, noise measured.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-
-SATURATION = 0.985  # of the way from black to the white level: averaging electronics saturate softly
+# of the way from black to the white level: averaging electronics saturate softly
+SATURATION = 0.985
 SAME_EXPOSURE = 0.01
 
 
 @dataclass(frozen=True)
 class Dark:
-    """What the sensor reports without light. mean (rows, columns) DN at `exposure` s (None: unknown); black (2, 2) DN;
-    sigma: temporal noise of one frame, DN (None: no dark frame was given). variance: of the mean itself, DN^2."""
+    """What the sensor reports without light.
+
+    mean (rows, columns) DN at `exposure` s (None: unknown);
+    black (2, 2) DN;
+    sigma: temporal noise of one frame, DN (None: no dark frame was given).
+    variance: of the mean itself, DN^2.
+    """
 
     mean: np.ndarray
     black: np.ndarray
@@ -28,10 +35,16 @@ class Dark:
 
     def grows(self, exposure):
         """Whether the dark image at another exposure is another one."""
-        return not (self.exposure is None or exposure is None or abs(exposure / self.exposure - 1) < SAME_EXPOSURE)
+        return not (
+            self.exposure is None
+            or exposure is None
+            or abs(exposure / self.exposure - 1) < SAME_EXPOSURE
+        )
 
     def at(self, exposure):
-        """Expected dark image at another exposure: the part above the black level grows with time."""
+        """Expected dark image at another exposure: the part above the black
+        level grows with time.
+        """
         if not self.grows(exposure):
             return self.mean
         level = tiled(self.black, self.mean.shape)
@@ -45,18 +58,27 @@ def tiled(level, shape, dtype=np.float32):
 
 
 def make_dark(frames, exposures, black, shape):
-    """Dark from dark frames (possibly none): the mean of those at the longest exposure, noise from differences.
+    """Dark from dark frames (possibly none): the mean of those at the longest exposure,
+    noise from differences.
 
-    frames: list of (rows, columns) DN; exposures: s or None each; black (2, 2) DN. Without frames the black level
-    stands for the dark image. The noise of a single frame is a robust spread over pixels, at least the rounding's.
+    frames: list of (rows, columns) DN;
+    exposures: s or None each;
+    black (2, 2) DN. Without frames the black level stands for the dark image. The noise of a single
+        frame is a robust spread over pixels, at least the rounding's.
     """
     if not frames:
         return Dark(tiled(black, shape), np.asarray(black, float), None, None)
     longest = max((e for e in exposures if e is not None), default=None)
-    chosen = [np.asarray(f, np.float32) for f, e in zip(frames, exposures) if longest is None or (e and abs(e / longest - 1) < SAME_EXPOSURE)]
+    chosen = [
+        np.asarray(f, np.float32)
+        for f, e in zip(frames, exposures)
+        if longest is None or (e and abs(e / longest - 1) < SAME_EXPOSURE)
+    ]
     mean = sum(chosen) / np.float32(len(chosen))
     if len(chosen) > 1:
-        spread = float(np.sqrt(np.mean([np.var(a - b) / 2 for a, b in zip(chosen[::2], chosen[1::2])])))
+        spread = float(
+            np.sqrt(np.mean([np.var(a - b) / 2 for a, b in zip(chosen[::2], chosen[1::2])]))
+        )
     else:
         low, high = np.percentile((mean - tiled(black, shape))[::3, ::3], [15.87, 84.13])
         spread = float(high - low) / 2
@@ -65,7 +87,9 @@ def make_dark(frames, exposures, black, shape):
 
 
 def saturated(values, black, white):
-    """Mask of pixels at or near the white level (DN); nothing is saturated where the white level is unknown (inf)."""
+    """Mask of pixels at or near the white level (DN); nothing is saturated where the white
+    level is unknown (inf).
+    """
     if white is None or not np.isfinite(white):
         return np.zeros(values.shape, bool)
     top = tiled(np.asarray(black) + SATURATION * (white - np.asarray(black)), values.shape)
@@ -73,11 +97,14 @@ def saturated(values, black, white):
 
 
 def merge(frames, exposures, dark, white, reference):
-    """Mean signal, DN at exposure `reference` (s), of several frames: (signal float32 NaN where never good, weight).
+    """Mean signal, DN at exposure `reference` (s), of several frames: (signal float32 NaN where
+    never good, weight).
 
-    sum of (frame - dark) over sum of exposures, saturated pixels left out: the least-noise average of shot-limited
-    frames. exposures: s each, or all None (taken as equal). weight (rows, columns): good exposure time in units of
-    `reference`: the variance of the signal is (gain signal + read variance) / weight for frames near that exposure.
+    sum of (frame - dark) over sum of exposures, saturated pixels left out: the least-noise average
+    of shot-limited frames.
+    exposures: s each, or all None (taken as equal). weight (rows, columns): good exposure time in
+        units of `reference`: the variance of the signal is (gain signal + read variance) / weight
+        for frames near that exposure.
     """
     total, time = 0.0, 0.0
     for frame, exposure in zip(frames, exposures):
@@ -92,8 +119,9 @@ def merge(frames, exposures, dark, white, reference):
 def photon_transfer(first, second, limit=np.inf, bins=24):
     """Gain (DN per electron) and dark variance (DN^2) from two frames of one still scene.
 
-    Half the variance of the difference against the mean, by bins of the mean below `limit`; a straight line through
-    the bins (EMVA 1288, photon transfer method). Returns None where the picture has no range of levels.
+    Half the variance of the difference against the mean, by bins of the mean below `limit`; a
+    straight line through the bins (EMVA 1288, photon transfer method). Returns None where the
+    picture has no range of levels.
     """
     first, second = np.asarray(first, float).ravel(), np.asarray(second, float).ravel()
     mean, half = (first + second) / 2, (first - second) ** 2 / 2
@@ -111,15 +139,21 @@ def photon_transfer(first, second, limit=np.inf, bins=24):
         return None
     x = np.bincount(which, mean, len(count))[full] / count[full]
     y = np.bincount(which, half, len(count))[full] / count[full]
-    weight = np.sqrt(count[full]) / np.maximum(y, 1e-12)  # the variance of a variance goes with its square
-    slope, offset = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * weight[:, None], y * weight, rcond=None)[0]
+    # the variance of a variance goes with its square
+    weight = np.sqrt(count[full]) / np.maximum(y, 1e-12)
+    slope, offset = np.linalg.lstsq(
+        np.stack([x, np.ones_like(x)], axis=1) * weight[:, None], y * weight, rcond=None
+    )[0]
     return (float(slope), float(max(offset, 0.0))) if slope > 0 else None
 
 
 def bad_pixels(white, dark, top, step):
     """Mask of pixels that do not follow the light: dead in the white image, or hot in the dark one.
 
-    white: signal (rows, columns), NaN where saturated; dark: Dark; top: white level, DN; step: 1 mono, 2 mosaic.
+    white: signal (rows, columns), NaN where saturated;
+    dark: Dark;
+    top: white level, DN;
+    step: 1 mono, 2 mosaic.
     """
     bad = dead_pixels(np.nan_to_num(white), step)
     if dark.sigma is not None:
@@ -131,7 +165,9 @@ def bad_pixels(white, dark, top, step):
 
 
 def dead_pixels(image, step=1):
-    """Mask of pixels far outside the range of their four neighbours `step` px away: dead, or hot."""
+    """Mask of pixels far outside the range of their four neighbours `step` px
+    away: dead, or hot.
+    """
     neighbours = shifted_neighbours(image, step)
     high, low = np.maximum.reduce(neighbours), np.minimum.reduce(neighbours)
     sample = (image - high)[::7, ::7]

@@ -1,4 +1,6 @@
-"""Light from a whole scene onto a whole sensor through one system matrix that serves every lenslet."""
+"""Light from a whole scene onto a whole sensor through one system matrix that
+serves every lenslet.
+"""
 
 import numpy as np
 
@@ -7,14 +9,17 @@ from plenocli.base.tiling import to_blocks
 
 
 def superpixel_light(blocks, offsets, picture, samples):
-    """Carry a scene to the sensor: (light (lenslet_row, lenslet_column, pixel), white (pixel,)), float64.
+    """Carry a scene to the sensor: (light (lenslet_row, lenslet_column, pixel), white
+    (pixel,)), float64.
 
-    blocks: pairs (object points, A_o (lenslet offset, pixel, point)) that cover every point once, so that a fine matrix
-    streams through memory.  offsets (lenslet offset, 2).  picture (row, column): reflectance of the object points of the
-    whole array, samples = (rows, columns) of them a lenslet; beyond the array the scene goes on mirrored, as far as the
-    offsets reach.  None: no picture, and no light.  white is the superpixel of a uniform white object that goes on beyond
-    the array: a lenslet's own light and all of its neighbours'.
-    Object points add incoherently (docs/model.md, "The system matrix").
+    blocks: pairs (object points, A_o (lenslet offset, pixel, point)) that cover every point once,
+        so that a fine matrix streams through memory.
+    offsets (lenslet offset, 2).
+    picture (row, column): reflectance of the object points of the whole array, samples = (rows,
+        columns) of them a lenslet; beyond the array the scene goes on mirrored, as far as the
+        offsets reach. None: no picture, and no light. white is the superpixel of a uniform white
+        object that goes on beyond the array: a lenslet's own light and all of its neighbours'.
+        Object points add incoherently (docs/model.md, "The system matrix").
     """
     reach = np.abs(offsets).max(axis=0)
     if picture is not None:
@@ -23,7 +28,9 @@ def superpixel_light(blocks, offsets, picture, samples):
     light, white = 0.0, 0.0
     for part, block in blocks:
         if picture is not None:
-            light = light + BlockToeplitz(block, offsets, points.shape[:2]).forward(points[:, :, part]).astype(np.float64)
+            light = light + BlockToeplitz(block, offsets, points.shape[:2]).forward(
+                points[:, :, part]
+            ).astype(np.float64)
         white = white + block.sum(axis=(0, 2), dtype=np.float64)
     if picture is not None:
         light = light[reach[0] : light.shape[0] - reach[0], reach[1] : light.shape[1] - reach[1]]

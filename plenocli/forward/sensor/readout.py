@@ -1,6 +1,8 @@
-"""A capture as light, cut out superpixel by superpixel: dark taken off, exposure divided out, saturation masked.
+"""A capture as light, cut out superpixel by superpixel: dark taken off, exposure divided out,
+saturation masked.
 
-A whole mosaic in single precision would pass through memory several times; windows of some lenslets stay in the cache.
+A whole mosaic in single precision would pass through memory several times; windows of some lenslets
+stay in the cache.
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +15,14 @@ from plenocli.forward.sensor.superpixel import inside
 
 @dataclass(frozen=True)
 class Readout:
-    """values (rows, columns) as the sensor reports them; dark: plenocli.forward.sensor.frames.Dark; seconds: exposure (None: unknown); black
-    (2, 2) and white: levels beyond which pixels are saturated (white inf: none); scale: to the light of the calibration's
-    exposure; offset: taken off after that; ready: Levels that were cut before. `readout - number` is the capture with a larger
-    offset.
+    """values (rows, columns) as the sensor reports them;
+
+    dark: plenocli.forward.sensor.frames.Dark;
+    seconds: exposure (None: unknown);
+    black (2, 2) and white: levels beyond which pixels are saturated (white inf: none);
+    scale: to the light of the calibration's exposure;
+    offset: taken off after that;
+    ready: Levels that were cut before. `readout - number` is the capture with a larger offset.
     """
 
     values: np.ndarray
@@ -37,8 +43,10 @@ class Readout:
         return replace(self, offset=self.offset + float(offset))
 
     def cut(self, origin, window):
-        """Light (lenslet, h*w) float32 of windows (h, w) whose first pixels are at `origin` (lenslet, 2); NaN where a pixel is
-        saturated, and everywhere in windows that are not wholly on the sensor."""
+        """Light (lenslet, h*w) float32 of windows (h, w) whose first pixels are at `origin`
+        (lenslet, 2); NaN where a pixel is saturated, and everywhere in windows that are not
+        wholly on the sensor.
+        """
         return self.cutter(origin, window)(slice(None))
 
     def cutter(self, origin, window):
@@ -66,12 +74,24 @@ class _Cutter:
         self.mean = None if dark.flat else Levels(dark, origin, window)
         if readout.ready is not None and readout.ready.origin is origin:
             self.mean = readout.ready
-        self.level = np.float32(dark.black.flat[0]) if np.ptp(dark.black) == 0 else _tiles(dark.black, window)
-        self.growth = None if dark.flat or not dark.grows(readout.seconds) else np.float32(readout.seconds / dark.exposure)
+        self.level = (
+            np.float32(dark.black.flat[0])
+            if np.ptp(dark.black) == 0
+            else _tiles(dark.black, window)
+        )
+        self.growth = (
+            None
+            if dark.flat or not dark.grows(readout.seconds)
+            else np.float32(readout.seconds / dark.exposure)
+        )
         black = np.asarray(readout.black, float)
         top = black + SATURATION * (readout.white - black)
         self.least = top.min()
-        self.top = np.float32(self.least) if np.ptp(black) == 0 or not np.isfinite(self.least) else _tiles(top, window)
+        self.top = (
+            np.float32(self.least)
+            if np.ptp(black) == 0 or not np.isfinite(self.least)
+            else _tiles(top, window)
+        )
 
     def __call__(self, part):
         origin, readout = self.origin[part], self.readout
@@ -109,7 +129,7 @@ class Levels:
         """Cut them all now; returns itself."""
         kept = np.empty((len(self.origin), self.count), np.float32)
         for first in range(0, len(kept), 64):
-            kept[first:first + 64] = self(slice(first, first + 64))
+            kept[first : first + 64] = self(slice(first, first + 64))
         self.kept = kept
         return self
 
@@ -121,10 +141,14 @@ class Levels:
 
 
 def _tiles(level, window):
-    """A (2, 2) level by position under a window that starts at an even or odd row and column, (2, 2, h*w) float32."""
+    """A (2, 2) level by position under a window that starts at an even or odd row and column,
+    (2, 2, h*w) float32.
+    """
     out = np.empty((2, 2, *window), np.float32)
     for row in (0, 1):
         for column in (0, 1):
             tile = np.roll(np.asarray(level, np.float32), (-row, -column), (0, 1))
-            out[row, column] = np.tile(tile, (window[0] // 2 + 1, window[1] // 2 + 1))[: window[0], : window[1]]
+            out[row, column] = np.tile(tile, (window[0] // 2 + 1, window[1] // 2 + 1))[
+                : window[0], : window[1]
+            ]
     return out.reshape(2, 2, -1)

@@ -1,23 +1,29 @@
 """The lenslet grid of a white image: square or hexagonal, any rotation, pitch of 5 to 300 px.
 
-Method: autocorrelation for the first guess, maxima of the smoothed picture, windowed centroids, numbering by a walk over
-the lattice, then a robust fit of every superpixel's common look on the illumination-flattened image (vignetting left in
-biases the pitch) and the simplest smooth map that the places support. See docs/model.md, "Spectral response: calibration and demultiplexing".
+Method: autocorrelation for the first guess, maxima of the smoothed picture, windowed centroids,
+numbering by a walk over the lattice, then a robust fit of every superpixel's common look on the
+illumination-flattened image (vignetting left in biases the pitch) and the simplest smooth map that
+the places support. See docs/model.md, "Spectral response: calibration and demultiplexing".
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.text import by
+from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
 
 STRUCTURED = 0.2
-BORDER_WEIGHT = 0.1  # of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it
-FRAME_TOLERANCE = 0.4  # px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
-FIX = "give a white image (even light through the main lens) of a lenslet array in focus on the sensor"
+# of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it
+BORDER_WEIGHT = 0.1
+# px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
+FRAME_TOLERANCE = 0.4
+FIX = (
+    "give a white image (even light through the main lens) of a lenslet array "
+    "in focus on the sensor"
+)
 
 
 @dataclass(frozen=True)
@@ -25,10 +31,14 @@ class Lattice:
     """A lenslet grid. Positions are (row, column) px with pixel centres at integers.
 
     kind: "square" or "hexagonal" (rows of a hexagonal grid are offset by half a pitch).
-    pitch: lengths of the two lattice vectors, (down, right), px. angle: of the right vector, degrees, positive
-    towards larger rows. centres (R, C, 2): the fitted map at every site of the array; valid (R, C): the cell lies
-    in the frame and is lit; residual (R, C): distance of the measured place from the fit, px, NaN where not measured.
-    rms: of all residuals of valid sites. model: form of the map. basis (2, 2): mean lattice vectors [down, right] px.
+    pitch: lengths of the two lattice vectors, (down, right), px.
+    angle: of the right vector, degrees, positive towards larger rows.
+    centres (R, C, 2): the fitted map at every site of the array;
+    valid (R, C): the cell lies in the frame and is lit;
+    residual (R, C): distance of the measured place from the fit, px, NaN where not measured.
+    rms: of all residuals of valid sites.
+    model: form of the map.
+    basis (2, 2): mean lattice vectors [down, right] px.
     """
 
     kind: str
@@ -43,16 +53,21 @@ class Lattice:
 
 
 def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, window=1024):
-    """Find the lenslet grid of `white` (rows, columns); `dark` of the same shape or scalar is subtracted first.
+    """Find the lenslet grid of `white` (rows, columns); `dark` of the same shape or scalar
+    is subtracted first.
 
-    cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is scaled to the same mean.
-    lattice_kind: "auto", "square" or "hexagonal". near: (row, column) px close to the centre of any one superpixel;
-    needed only where filters in the pupil divide superpixels by dark lines as dark as their borders: then the phase
-    that fits most whole superpixels into the frame is taken, or else the darkest lines. Raises NumericsError, saying what was seen, where there is no
-    lattice, InputError for an image too small or not finite.
+    cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is
+        scaled to the same mean.
+    lattice_kind: "auto", "square" or "hexagonal".
+    near: (row, column) px close to the centre of any one superpixel; needed only where filters in
+        the pupil divide superpixels by dark lines as dark as their borders: then the phase that
+        fits most whole superpixels into the frame is taken, or else the darkest lines.
+    Raises NumericsError, saying what was seen, where there is no lattice, InputError for an image
+    too small or not finite.
     """
     mosaic = prepare(white, cfa, dark)
-    image = mosaic if cfa == "mono" else template.smoothed(mosaic)  # what is left of the 2x2 pattern goes
+    # what is left of the 2x2 pattern goes
+    image = mosaic if cfa == "mono" else template.smoothed(mosaic)
     crop = _brightest_crop(image, window)
     basis, _, structure = lattice.find_basis(crop)
     if basis is None:
@@ -62,14 +77,22 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     basis = lattice.oriented(basis, kind)
     sides = np.hypot(*basis.T)
     if sides.max() > 1.3 * sides.min():
-        raise NumericsError(f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by {sides[1]:.1f} px, which no square or hexagonal array does", fix=FIX)
+        raise NumericsError(
+            (
+                f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by "
+                f"{sides[1]:.1f} px, which no square or hexagonal array does"
+            ),
+            fix=FIX,
+        )
     pitch = float(np.hypot(*basis.T).min())
     index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
     inside = _whole(position, image.shape, 0.5 * pitch) & clean
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
-            f"no lenslet lattice in the image: a pitch of {pitch:.1f} px repeats, but only {int(inside.sum())} sites "
-            "in the frame follow it",
+            (
+                f"no lenslet lattice in the image: a pitch of {pitch:.1f} px repeats, but only "
+                f"{int(inside.sum())} sites in the frame follow it"
+            ),
             fix=FIX,
         )
     weight = np.where(lattice.surrounded(index[inside], kind), 1.0, BORDER_WEIGHT)
@@ -78,11 +101,15 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     miss = np.hypot(*(position - model.at(index)).T)
     if np.sqrt(np.mean(miss[inside] ** 2)) > 0.07 * pitch:
         raise NumericsError(
-            f"no lenslet lattice in the image: spots {pitch:.1f} px apart scatter by {np.median(miss[inside]):.1f} px about "
-            "the best grid",
+            (
+                f"no lenslet lattice in the image: spots {pitch:.1f} px apart scatter by "
+                f"{np.median(miss[inside]):.1f} px about the best grid"
+            ),
             fix=FIX,
         )
-    position[inside], _ = template.register(mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured)
+    position[inside], _ = template.register(
+        mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured
+    )
     model, _ = distortion.choose_model(index[inside], position[inside], weight)
     lit = None
     if structured and kind == "square":
@@ -94,23 +121,34 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
 
 
 def prepare(white, cfa="mono", dark=None):
-    """Float image with dark removed, CFA positions equalised, dead and hot pixels replaced, background at zero."""
+    """Float image with dark removed, CFA positions equalised, dead and hot pixels replaced,
+    background at zero.
+    """
     white = np.asarray(white)
     if white.ndim != 2 or min(white.shape) < 24:
-        raise InputError(f"a white image must be a single plane of at least 24 x 24 px, this has {by(white.shape)}")
+        raise InputError(
+            "a white image must be a single plane of at least 24 x 24 px, this "
+            f"has {by(white.shape)}"
+        )
     image = white.astype(np.float32)
     if dark is not None:
         image -= np.asarray(dark, np.float32)
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not finite")
     if np.ptp(image) <= 0:
-        raise NumericsError(f"no lenslet lattice in the image: every pixel has the value {float(white.flat[0]):g}", fix=FIX)
+        raise NumericsError(
+            f"no lenslet lattice in the image: every pixel has the value {float(white.flat[0]):g}",
+            fix=FIX,
+        )
     step = 1
     if cfa != "mono":
         step = 2
         means = np.array([[image[i::2, j::2].mean() for j in (0, 1)] for i in (0, 1)])
         if (means <= 0).any():
-            raise NumericsError("a colour of the mosaic saw no light in the white image", fix="use a broad-band white source")
+            raise NumericsError(
+                "a colour of the mosaic saw no light in the white image",
+                fix="use a broad-band white source",
+            )
         for i in (0, 1):
             for j in (0, 1):
                 image[i::2, j::2] *= np.float32(means.mean() / means[i, j])
@@ -124,7 +162,9 @@ def _replace_dead(image, step):
     if not bad.any():
         return image
     out = image.copy()
-    out[bad] = (sum(n[bad].astype(np.float64) for n in shifted_neighbours(image, step)) / 4).astype(np.float32)
+    out[bad] = (sum(n[bad].astype(np.float64) for n in shifted_neighbours(image, step)) / 4).astype(
+        np.float32
+    )
     return out
 
 
@@ -136,7 +176,11 @@ def _brightest_crop(image, window):
     for axis in (0, 1):
         size = min(window, image.shape[axis])
         profile = clipped.sum(axis=1 - axis)
-        centre = 4 * (profile * np.arange(len(profile))).sum() / total if total > 0 else image.shape[axis] / 2
+        centre = (
+            4 * (profile * np.arange(len(profile))).sum() / total
+            if total > 0
+            else image.shape[axis] / 2
+        )
         low.append(int(np.clip(centre - size / 2, 0, image.shape[axis] - size)))
     return image[low[0] : low[0] + window, low[1] : low[1] + window]
 
@@ -146,34 +190,48 @@ def _measured_sites(image, basis, kind, pitch, structured):
     window = spots.WIDE_WINDOW if structured else spots.WINDOW
     maxima = spots.find_maxima(image, pitch, 0.28 if structured else 0.18)
     if len(maxima) < 9:
-        raise NumericsError(f"no lenslet lattice in the image: {len(maxima)} bright spots at a pitch of {pitch:.1f} px", fix=FIX)
+        raise NumericsError(
+            (
+                f"no lenslet lattice in the image: {len(maxima)} bright spots at a "
+                f"pitch of {pitch:.1f} px"
+            ),
+            fix=FIX,
+        )
     position, flux = spots.windowed_centroids(image, maxima, pitch, iterations=2, window=window)
     middle = np.array(image.shape) / 2
     bright = np.flatnonzero(flux > 0.5 * np.median(flux))
     starts = bright[np.argsort(((position[bright] - middle) ** 2).sum(axis=1))]
     best, chosen = np.zeros(len(position), bool), None
-    for start in starts[:: max(1, len(starts) // 6)][:6]:  # a start on dust or a reflection strands the walk
+    # a start on dust or a reflection strands the walk
+    for start in starts[:: max(1, len(starts) // 6)][:6]:
         index, found = lattice.index_sites(position, basis, kind, start)
         if found.sum() > best.sum():
             best, chosen = found, index
         if best.sum() > 0.6 * len(position):
             break
     index, first, flux = chosen[best], position[best], flux[best]
-    surface, slope = _illumination(first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch))
+    surface, slope = _illumination(
+        first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch)
+    )
     slope = slope / np.maximum(surface, 1e-9)[:, None]
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
     if spread > 0.1:  # real white images have 0.02 at most
         raise NumericsError(
-            f"no lenslet lattice in the image: patches repeat every {pitch:.1f} px, but their brightness scatters by "
-            f"{100 * spread:.0f} % from one to the next (a chart or a scene, not even light)",
+            (
+                f"no lenslet lattice in the image: patches repeat every {pitch:.1f} px, but their "
+                f"brightness scatters by {100 * spread:.0f} % from one to the next (a chart or a "
+                "scene, not even light)"
+            ),
             fix=FIX,
         )
     return index, first, level > 0.3, slope
 
 
 def _illumination(position, flux, shape, whole):
-    """Smooth surface (order up to 4) through the fluxes of `whole` lenslets: values (N,) and gradients (N, 2) per px."""
+    """Smooth surface (order up to 4) through the fluxes of `whole` lenslets: values (N,) and
+    gradients (N, 2) per px.
+    """
     size = np.array(shape, float) / 2
     u = (position - size) / size
     use = whole if whole.sum() >= 9 else np.ones(len(u), bool)
@@ -185,8 +243,16 @@ def _illumination(position, flux, shape, whole):
         fit = np.linalg.lstsq(design * weight[:, None], flux * weight, rcond=None)[0]
         miss = np.abs(flux - design @ fit)
         weight = use / np.maximum(1, miss / max(3 * np.median(miss[use]), 1e-12))
-    down = np.stack([i * u[:, 0] ** max(i - 1, 0) * u[:, 1] ** j for i, j in powers], axis=1) @ fit / size[0]
-    right = np.stack([j * u[:, 0] ** i * u[:, 1] ** max(j - 1, 0) for i, j in powers], axis=1) @ fit / size[1]
+    down = (
+        np.stack([i * u[:, 0] ** max(i - 1, 0) * u[:, 1] ** j for i, j in powers], axis=1)
+        @ fit
+        / size[0]
+    )
+    right = (
+        np.stack([j * u[:, 0] ** i * u[:, 1] ** max(j - 1, 0) for i, j in powers], axis=1)
+        @ fit
+        / size[1]
+    )
     surface = np.maximum(design @ fit, 0.05 * np.median(flux))
     return surface, np.stack([down, right], axis=1)
 
@@ -194,9 +260,10 @@ def _illumination(position, flux, shape, whole):
 def _to_dark_borders(image, model, index, pitch, near):
     """The map moved so that cell borders lie on dark lines between superpixels.
 
-    The brightness of several parts draws a centroid towards the brightest; dark lines, seen in profiles along both
-    lattice directions of all cells folded into one, do not care. Lines between the parts may be as dark as those
-    between superpixels: of several candidates the one nearest to `near`, or the best filled frame, decides.
+    The brightness of several parts draws a centroid towards the brightest; dark lines, seen in
+    profiles along both lattice directions of all cells folded into one, do not care. Lines between
+    the parts may be as dark as those between superpixels: of several candidates the one nearest to
+    `near`, or the best filled frame, decides.
     """
     lines = [_dark_lines(image, model, index, pitch, axis) for axis in (0, 1)]
     best, chosen = None, model
@@ -208,36 +275,51 @@ def _to_dark_borders(image, model, index, pitch, near):
                 merit = (-np.hypot(*(moved.at(site) - near)), 0.0)
             else:
                 cells = _cells(moved, image.shape)
-                merit = (int(_whole(moved.at(cells), image.shape, 0.5 * pitch).sum()), depth_down + depth_right)
+                merit = (
+                    int(_whole(moved.at(cells), image.shape, 0.5 * pitch).sum()),
+                    depth_down + depth_right,
+                )
             if best is None or merit > best:
                 best, chosen = merit, moved
     return chosen
 
 
 def _dark_lines(image, model, index, pitch, axis):
-    """Dark lines across one lattice direction: [(distance of the line from the cell's border, cells; depth)]."""
+    """Dark lines across one lattice direction: [(distance of the line from the cell's
+    border, cells; depth)].
+    """
     chosen = index[:: max(1, len(index) // 300)]
     bins = max(24, int(4 * pitch))
     along = (np.arange(bins) + 0.5) / bins
     across = (np.arange(16) + 0.5) / 16 - 0.5
-    grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)[..., :: 1 if axis == 0 else -1]
-    vectors = np.stack([model.at(chosen + step / 2) - model.at(chosen - step / 2) for step in np.eye(2)], axis=1)
+    grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)[
+        ..., :: 1 if axis == 0 else -1
+    ]
+    vectors = np.stack(
+        [model.at(chosen + step / 2) - model.at(chosen - step / 2) for step in np.eye(2)], axis=1
+    )
     where = model.at(chosen)[:, None, None] + np.einsum("abk,nkd->nabd", grid, vectors)
     profile = _between(image, where).mean(axis=(0, 2), dtype=float)
     kernel = np.ones(max(1, bins // 24)) / max(1, bins // 24)
     smooth = np.convolve(np.tile(profile, 3), kernel, "same")[bins : 2 * bins]
     depth = smooth.max() - smooth
-    peaks = np.flatnonzero((depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max()))
+    peaks = np.flatnonzero(
+        (depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max())
+    )
     lines = []
     for peak in peaks:
         others = np.abs((along[peaks] - along[peak] + 0.5) % 1 - 0.5)
         reach = min(0.2, others[others > 0].min(initial=0.4) / 2)
-        lines.append((along[peak] + _line(along, profile, along[peak], reach) - 0.5, float(depth[peak])))
+        lines.append(
+            (along[peak] + _line(along, profile, along[peak], reach) - 0.5, float(depth[peak]))
+        )
     return lines
 
 
 def _between(image, where):
-    """Values of `image` at places (..., 2) px by linear interpolation, those outside at the border."""
+    """Values of `image` at places (..., 2) px by linear interpolation, those
+    outside at the border.
+    """
     where = np.clip(where, 0, np.array(image.shape) - 1)
     low = np.minimum(where.astype(int), np.array(image.shape) - 2)
     down, right = np.moveaxis((where - low).astype(np.float32), -1, 0)
@@ -247,10 +329,11 @@ def _between(image, where):
 
 
 def _line(along, profile, start, reach):
-    """Middle of the dark line at `start` less `start`, cells: midway between two blurred edges, each of its own side's brightness.
+    """Middle of the dark line at `start` less `start`, cells: midway between two blurred edges,
+    each of its own side's brightness.
 
-    The darkest place itself, or the centre of the darkness, lies nearer to the dimmer side: a quarter of a pixel between a filter
-    that passes much and one that passes little.
+    The darkest place itself, or the centre of the darkness, lies nearer to the dimmer side: a
+    quarter of a pixel between a filter that passes much and one that passes little.
     """
     from scipy.optimize import least_squares
     from scipy.special import erf
@@ -263,15 +346,24 @@ def _line(along, profile, start, reach):
 
     def miss(p):
         middle, half, blur, left, right = p
-        return (left * (1 - erf((x - middle + half) / blur)) + right * (1 + erf((x - middle - half) / blur))) / 2 - y / scale
+        return (
+            left * (1 - erf((x - middle + half) / blur))
+            + right * (1 + erf((x - middle - half) / blur))
+        ) / 2 - y / scale
 
-    found = least_squares(miss, [0.0, 0.25 * reach, 0.25 * reach, sides[0] / scale, sides[1] / scale],
-                          bounds=([-reach / 2, 0, 0.02 * reach, 0, 0], [reach / 2, reach, reach, 3, 3]), x_scale=[reach, reach, reach, 1, 1])
+    found = least_squares(
+        miss,
+        [0.0, 0.25 * reach, 0.25 * reach, sides[0] / scale, sides[1] / scale],
+        bounds=([-reach / 2, 0, 0.02 * reach, 0, 0], [reach / 2, reach, reach, 3, 3]),
+        x_scale=[reach, reach, reach, 1, 1],
+    )
     return float(found.x[0])
 
 
 def _index_at(model, position):
-    """Index (2,), not whole, that the map takes to `position`: Newton steps from the affine part."""
+    """Index (2,), not whole, that the map takes to `position`: Newton steps
+    from the affine part.
+    """
     site = np.zeros(2)
     for _ in range(20):
         here = model.at(site)
@@ -283,8 +375,13 @@ def _index_at(model, position):
 def _cells(model, shape):
     """Indices (M, N, 2) of a block of sites that covers the frame."""
     corners = np.array([_index_at(model, c) for c in [(0, 0), (0, shape[1]), (shape[0], 0), shape]])
-    low, high = np.floor(corners.min(axis=0)).astype(int) - 1, np.ceil(corners.max(axis=0)).astype(int) + 1
-    return np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1)
+    low, high = (
+        np.floor(corners.min(axis=0)).astype(int) - 1,
+        np.ceil(corners.max(axis=0)).astype(int) + 1,
+    )
+    return np.stack(
+        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1
+    )
 
 
 def _lit_cells(image, model):
@@ -305,18 +402,26 @@ def _whole(position, shape, margin):
 
 
 def _assemble(kind, model, index, miss, clean, shape, pitch, lit):
-    """Lay the sites out as an array (R, C) without empty border rows and columns; lit (N, 2): more sites that hold light."""
+    """Lay the sites out as an array (R, C) without empty border rows and columns;
+
+    lit (N, 2): more sites that hold light.
+    """
     site = lattice.to_array(index, kind)
     bright = site[clean] if lit is None else lattice.to_array(lit, kind)
     low, high = bright.min(axis=0), bright.max(axis=0)
     keep = ((site >= low) & (site <= high)).all(axis=1)
-    grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1)
+    grid = np.stack(
+        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1
+    )
     centres = model.at(lattice.from_array(grid, kind))
     residual, valid = np.full(grid.shape[:2], np.nan), np.zeros(grid.shape[:2], bool)
     residual[tuple((site[keep] - low).T)] = miss[keep]
     valid[tuple((bright - low).T)] = True
     frame = _whole(centres, shape, 0.5 * pitch)
-    valid = (valid & frame) | lattice.enclosed(valid & frame, frame, lattice.from_array(grid, kind), kind)  # under dust: still a lenslet
+    # under dust: still a lenslet
+    valid = (valid & frame) | lattice.enclosed(
+        valid & frame, frame, lattice.from_array(grid, kind), kind
+    )
     rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
     if rows.size:  # a border of cells that the frame cuts everywhere is of no use
         block = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))

@@ -1,11 +1,14 @@
-"""Smooth maps from lattice indices to pixels: affine, homography, homography with cubic distortion, polynomials; fitted robustly and chosen by the data."""
+"""Smooth maps from lattice indices to pixels: affine, homography, homography with cubic
+distortion, polynomials; fitted robustly and chosen by the data.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 ORDER = {"affine": 1, "poly2": 2, "poly3": 3, "poly5": 5}
-FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20, "poly5": 42}  # parameters, simplest first
+# parameters, simplest first
+FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20, "poly5": 42}
 
 MARGIN = 0.12  # of the residual
 ENOUGH = 2000  # sites for the first, rough part of a fit
@@ -15,9 +18,10 @@ ENOUGH = 2000  # sites for the first, rough part of a fit
 class GridModel:
     """Map from lattice index (m, n) to (row, column) px. `at` evaluates it; kind names its form.
 
-    With u = (index - shift) / scale, coefficients (K, 2) are those of the monomials of u for "affine" and "polyN".
-    Homography: rows 0-2 affine q, row 3 the perspective p: q / (1 + u.p). Radial: that, then with d = (q - middle) / span
-    q + span (k |d|^2 d + 2 (d.g) d + |d|^2 g); row 4 is g, which moves the centre of the distortion, row 5 is (k, 0).
+    With u = (index - shift) / scale, coefficients (K, 2) are those of the monomials of u for
+    "affine" and "polyN". Homography: rows 0-2 affine q, row 3 the perspective p: q / (1 + u.p).
+    Radial: that, then with d = (q - middle) / span q + span (k |d|^2 d + 2 (d.g) d + |d|^2 g); row
+    4 is g, which moves the centre of the distortion, row 5 is (k, 0).
     """
 
     kind: str
@@ -42,9 +46,11 @@ class GridModel:
 
 
 def fit_model(kind, index, position, weight=None, robust=True):
-    """Robust fit of one kind of map: least absolute residuals first, which a wrong border row does not tilt, then Tukey weights.
+    """Robust fit of one kind of map: least absolute residuals first, which a wrong border row does
+    not tilt, then Tukey weights.
 
-    index (N, 2), position (N, 2) px, weight (N,) of the sites; robust=False: plain least squares. Returns GridModel.
+    index (N, 2), position (N, 2) px, weight (N,) of the sites; robust=False: plain least squares.
+    Returns GridModel.
     """
     index, position = np.asarray(index, float), np.asarray(position, float)
     prior = np.ones(len(index)) if weight is None else np.asarray(weight, float)
@@ -56,20 +62,29 @@ def fit_model(kind, index, position, weight=None, robust=True):
         return model
     for _ in range(8):
         miss = _miss(model, index[few], position[few])
-        model = _least_squares(model, index[few], position[few], prior[few] / np.maximum(miss, 0.05 * np.median(miss) + 1e-9))
+        model = _least_squares(
+            model,
+            index[few],
+            position[few],
+            prior[few] / np.maximum(miss, 0.05 * np.median(miss) + 1e-9),
+        )
     for _ in range(4):
-        model = _least_squares(model, index, position, prior * _tukey(_miss(model, index, position)))
+        model = _least_squares(
+            model, index, position, prior * _tukey(_miss(model, index, position))
+        )
     return model
 
 
 def choose_model(index, position, weight=None):
     """The simplest map whose leave-one-out residual is within a margin of the best one.
 
-    All kinds are compared with one common set of weights, those of the richest (trimming each by its own residual
-    would flatter the stiff ones) and the weights squared: sites of little weight shall not choose. Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
-    The margin is two standard errors of an rms over N sites, at least MARGIN: what sampling and the frame's edges do to
-    exact lattices (a bend of half a site's own scatter passes unseen). index (N, 2), position (N, 2) px,
-    weight (N,). Returns (GridModel fitted to all, {kind: leave-one-out rms in px}).
+    All kinds are compared with one common set of weights, those of the richest (trimming each by
+    its own residual would flatter the stiff ones) and the weights squared: sites of little weight
+    shall not choose. Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
+    The margin is two standard errors of an rms over N sites, at least MARGIN: what sampling and the
+    frame's edges do to exact lattices (a bend of half a site's own scatter passes unseen). index
+    (N, 2), position (N, 2) px, weight (N,). Returns (GridModel fitted to all, {kind:
+    leave-one-out rms in px}).
     """
     count = len(index) if weight is None else weight.sum()
     allowed = [kind for kind, size in FREEDOM.items() if count >= 1.5 * size]
@@ -77,7 +92,9 @@ def choose_model(index, position, weight=None):
         return fit_model("affine", index, position, weight), {}
     index, position = np.asarray(index, float), np.asarray(position, float)
     fitted = {kind: fit_model(kind, index, position, weight) for kind in allowed}
-    common = _tukey(_miss(fitted[allowed[-1]], index, position)) * (1 if weight is None else np.asarray(weight) ** 2)
+    common = _tukey(_miss(fitted[allowed[-1]], index, position)) * (
+        1 if weight is None else np.asarray(weight) ** 2
+    )
     error = {kind: _left_out(model, index, position, common) for kind, model in fitted.items()}
     margin = 1 + max(MARGIN, 2 / np.sqrt(2 * count))
     best = min(error.values())
@@ -100,8 +117,14 @@ def _left_out(model, index, position, weight):
     design = _jacobian(model, index)
     rows = design.reshape(-1, design.shape[-1])
     normal = rows.T @ (rows * np.repeat(weight, 2)[:, None])
-    leverage = (design @ np.linalg.pinv(normal, rcond=1e-13, hermitian=True)) @ design.transpose(0, 2, 1) * weight[:, None, None]
-    rest = np.linalg.solve(np.eye(2) - np.minimum(leverage, 0.98), (position - model.at(index))[..., None])[..., 0]
+    leverage = (
+        (design @ np.linalg.pinv(normal, rcond=1e-13, hermitian=True))
+        @ design.transpose(0, 2, 1)
+        * weight[:, None, None]
+    )
+    rest = np.linalg.solve(
+        np.eye(2) - np.minimum(leverage, 0.98), (position - model.at(index))[..., None]
+    )[..., 0]
     return float(np.sqrt((weight[:, None] * rest**2).sum() / weight.sum()))
 
 
@@ -109,20 +132,36 @@ def _start(kind, index, position):
     shift = index.mean(axis=0)
     scale = max(1.0, np.abs(index - shift).max())
     middle, span = position.mean(axis=0), max(1.0, np.abs(position - position.mean(axis=0)).max())
-    rows = _monomials(np.zeros(2), ORDER[kind]).size if kind in ORDER else {"homography": 4, "radial": 6}[kind]
+    rows = (
+        _monomials(np.zeros(2), ORDER[kind]).size
+        if kind in ORDER
+        else {"homography": 4, "radial": 6}[kind]
+    )
     blank = GridModel(kind, np.zeros((rows, 2)), shift, scale, middle, span)
     if kind in ORDER:
         return blank
-    affine = _least_squares(replace(blank, kind="affine", coefficients=np.zeros((3, 2))), index, position, np.ones(len(index)))
+    affine = _least_squares(
+        replace(blank, kind="affine", coefficients=np.zeros((3, 2))),
+        index,
+        position,
+        np.ones(len(index)),
+    )
     blank.coefficients[:3] = affine.coefficients
     return blank
 
 
 def _least_squares(model, index, position, weight):
-    """The model after weighted least squares; for kinds not linear in their parameters, after one step towards it."""
+    """The model after weighted least squares; for kinds not linear in their parameters, after
+    one step towards it.
+    """
     if model.kind in ORDER:
         basis = _monomials((index - model.shift) / model.scale, ORDER[model.kind])
-        return replace(model, coefficients=_solve(basis.T @ (basis * weight[:, None]), basis.T @ (position * weight[:, None])))
+        return replace(
+            model,
+            coefficients=_solve(
+                basis.T @ (basis * weight[:, None]), basis.T @ (position * weight[:, None])
+            ),
+        )
     design, rest = _jacobian(model, index), position - model.at(index)  # a Gauss-Newton step
     rows, heavy = design.reshape(-1, design.shape[-1]), np.repeat(weight, 2)
     step = _solve(rows.T @ (rows * heavy[:, None]), rows.T @ (rest.ravel() * heavy))
@@ -134,15 +173,23 @@ def _solve(normal, right):
     """Solution of the normal equations, columns scaled to one, null directions left at zero."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * scale[:, None] * scale, rcond=1e-13, hermitian=True)
-    return scale[:, None] * (inverse @ (scale[:, None] * right)) if right.ndim == 2 else scale * (inverse @ (scale * right))
+    return (
+        scale[:, None] * (inverse @ (scale[:, None] * right))
+        if right.ndim == 2
+        else scale * (inverse @ (scale * right))
+    )
 
 
 def _jacobian(model, index):
-    """Derivatives (N, 2, parameters) of the position with the parameters: the coefficients, row by row."""
+    """Derivatives (N, 2, parameters) of the position with the parameters: the
+    coefficients, row by row.
+    """
     u = (index - model.shift) / model.scale
     both = np.eye(2)
     if model.kind in ORDER:
-        return np.einsum("nk,ab->nakb", _monomials(u, ORDER[model.kind]), both).reshape(len(u), 2, -1)
+        return np.einsum("nk,ab->nakb", _monomials(u, ORDER[model.kind]), both).reshape(
+            len(u), 2, -1
+        )
     basis, bottom = _monomials(u, 1), 1 + u @ model.coefficients[3]
     q = basis @ model.coefficients[:3] / bottom[:, None]
     linear = np.einsum("nk,ab->nakb", basis / bottom[:, None], both).reshape(len(u), 2, 6)
@@ -162,4 +209,11 @@ def _monomials(u, order):
     powers = [np.ones(u.shape)]
     for _ in range(order):
         powers.append(powers[-1] * u)
-    return np.stack([powers[total - j][..., 0] * powers[j][..., 1] for total in range(order + 1) for j in range(total + 1)], axis=-1)
+    return np.stack(
+        [
+            powers[total - j][..., 0] * powers[j][..., 1]
+            for total in range(order + 1)
+            for j in range(total + 1)
+        ],
+        axis=-1,
+    )

@@ -1,7 +1,8 @@
-"""Two-dimensional point lattices: the basis seen in an autocorrelation, reduced bases, indexing, array order.
+"""Two-dimensional point lattices: the basis seen in an autocorrelation, reduced bases,
+indexing, array order.
 
-Vectors are (row, column) in pixels. A basis is a (2, 2) array whose first vector points down the picture
-and whose second points right; a site (m, n) lies at origin + m * basis[0] + n * basis[1].
+Vectors are (row, column) in pixels. A basis is a (2, 2) array whose first vector points down the
+picture and whose second points right; a site (m, n) lies at origin + m * basis[0] + n * basis[1].
 """
 
 import numpy as np
@@ -14,10 +15,10 @@ HEXAGONAL_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)])
 def autocorrelation(image):
     """Autocorrelation of a (rows, columns) image after removal of a quadratic trend, 1 at zero lag.
 
-    The image is tapered (Hann) and every lag is divided by the taper's own overlap, so that peaks of a
-    periodic image keep their height. Unlike a Fourier peak, an autocorrelation peak does not vanish where
-    the form factor of a single lenslet has a zero. Returns (lags x lags, overlap), zero lag in the middle,
-    lags up to half the image.
+    The image is tapered (Hann) and every lag is divided by the taper's own overlap, so that peaks
+    of a periodic image keep their height. Unlike a Fourier peak, an autocorrelation peak does not
+    vanish where the form factor of a single lenslet has a zero. Returns (lags x lags, overlap),
+    zero lag in the middle, lags up to half the image.
     """
     from scipy import fft
 
@@ -39,12 +40,13 @@ def autocorrelation(image):
 
 
 def find_basis(image):
-    """Two shortest independent vectors of the lattice in `image`, (2, 2) px, and the strength of its peaks (0..1).
+    """Two shortest independent vectors of the lattice in `image`, (2, 2) px, and the strength
+    of its peaks (0..1).
 
-    Returns (None, strength, reason) when the autocorrelation has no lattice of peaks; else (basis, strength, structure),
-    structure being the correlation half a step away relative to a whole step: above about 0.3 the superpixels hold
-    several bright parts (filters in the pupil) rather than one spot.
-    The search covers lags of 4.5 to 330 px that fit into 0.48 of the image.
+    Returns (None, strength, reason) when the autocorrelation has no lattice of peaks; else (basis,
+    strength, structure), structure being the correlation half a step away relative to a whole step:
+    above about 0.3 the superpixels hold several bright parts (filters in the pupil) rather than one
+    spot. The search covers lags of 4.5 to 330 px that fit into 0.48 of the image.
     """
     from scipy import ndimage
 
@@ -58,7 +60,9 @@ def find_basis(image):
     smooth = ndimage.gaussian_filter(value, max(0.6, 0.2 * ring))
     reach = min(LARGEST_PITCH * 2.1, 0.96 * min(centre))
     size = int(max(3, 2 * (ring // 2) + 1))
-    peak = (smooth == ndimage.maximum_filter(smooth, size)) & (radius > max(SMALLEST_PITCH, 1.2 * ring))
+    peak = (smooth == ndimage.maximum_filter(smooth, size)) & (
+        radius > max(SMALLEST_PITCH, 1.2 * ring)
+    )
     peak &= (radius < reach) & (overlap > 0.05) & ((lag[0] > 0) | ((lag[0] == 0) & (lag[1] > 0)))
     where = np.argwhere(peak)
     if len(where) < 2:
@@ -67,10 +71,15 @@ def find_basis(image):
     strength = float(height.max())
     if strength < 0.03:
         return None, strength, f"the strongest repeat correlates by only {strength:.3f} (noise)"
-    strong = where[height > 0.85 * strength] - centre  # parts of a superpixel repeat too, but less well
+    # parts of a superpixel repeat too, but less well
+    strong = where[height > 0.85 * strength] - centre
     strong = strong[np.argsort(np.hypot(*strong.T))]
     first = strong[0]
-    sine = np.abs(first[0] * strong[:, 1] - first[1] * strong[:, 0]) / np.hypot(*first) / np.hypot(*strong.T)
+    sine = (
+        np.abs(first[0] * strong[:, 1] - first[1] * strong[:, 0])
+        / np.hypot(*first)
+        / np.hypot(*strong.T)
+    )
     rest = strong[sine > 0.4]
     if not len(rest) or np.hypot(*rest[0]) > 2.1 * np.hypot(*first):
         return None, strength, "it repeats in one direction only"
@@ -81,7 +90,10 @@ def find_basis(image):
 
 
 def reduced(basis):
-    """Gauss-Lagrange reduction of a (2, 2) basis: the shortest pair, at an angle of 60 to 90 degrees."""
+    """Gauss-Lagrange reduction of a (2, 2)
+
+    basis: the shortest pair, at an angle of 60 to 90 degrees.
+    """
     a, b = np.array(basis, float)
     for _ in range(50):
         if a @ a > b @ b:
@@ -94,16 +106,20 @@ def reduced(basis):
 
 
 def kind_of(basis):
-    """ "square" or "hexagonal": whichever the reduced `basis` is nearer to in angle and in side ratio."""
+    """ "square" or "hexagonal": whichever the reduced `basis` is nearer to in angle
+    and in side ratio.
+    """
     a, b = reduced(basis)
     cosine = a @ b / np.sqrt((a @ a) * (b @ b))
     ratio = np.sqrt((a @ a) / (b @ b))
-    # A hexagonal lattice has cosine 1/2; a square or rectangular one 0. A stretched hexagonal one keeps both.
+    # A hexagonal lattice has cosine 1/2; a square or rectangular one 0. A stretched
+    # hexagonal one keeps both.
     return "hexagonal" if cosine > 0.25 and ratio > 0.7 else "square"
 
 
 def oriented(basis, kind):
-    """The basis in the order of the picture: [down, right], right being the short vector nearest to the +column axis.
+    """The basis in the order of the picture: [down, right], right being the short vector nearest
+    to the +column axis.
 
     On a hexagonal lattice `down` makes 60 degrees with `right` (towards the next column).
     """
@@ -120,8 +136,10 @@ def oriented(basis, kind):
 def index_sites(spots, basis, kind, start, gate=0.28):
     """Number the spots by walking outwards from spot `start`, one lattice step at a time.
 
-    spots (N, 2) px; basis (2, 2) px as `oriented`; gate: largest miss of a prediction, in pitches. Every site
-    passes its own slowly adapted basis on, so perspective and distortion do not add up.
+    spots (N, 2) px;
+    basis (2, 2) px as `oriented`;
+    gate: largest miss of a prediction, in pitches. Every site passes its own slowly adapted basis
+        on, so perspective and distortion do not add up.
     Returns index (N, 2) int and found (N,) bool.
     """
     from scipy.spatial import cKDTree
@@ -157,18 +175,29 @@ def index_sites(spots, basis, kind, start, gate=0.28):
 
 
 def surrounded(index, kind):
-    """Which (N,) of the sites `index` (N, 2) have all neighbours, 6 on a hexagonal and 8 on a square lattice, among them."""
+    """Which (N,) of the sites `index` (N, 2) have all neighbours, 6 on a hexagonal and 8 on a
+    square lattice, among them.
+    """
     return _neighbours(index, np.ones(len(index), bool), kind) == len(_ring(kind))
 
 
 def enclosed(there, possible, index, kind):
-    """Which (R, C) of the `possible` (R, C) sites with indices (R, C, 2) have three quarters of their possible neighbours `there` (R, C)."""
-    have, could = (_neighbours(index.reshape(-1, 2), x.ravel(), kind).reshape(there.shape) for x in (there, possible))
+    """Which (R, C) of the `possible` (R, C) sites with indices (R, C, 2) have three quarters of
+    their possible neighbours `there` (R, C).
+    """
+    have, could = (
+        _neighbours(index.reshape(-1, 2), x.ravel(), kind).reshape(there.shape)
+        for x in (there, possible)
+    )
     return possible & (have >= 0.75 * could) & (have >= 2)
 
 
 def _ring(kind):
-    return HEXAGONAL_STEPS if kind == "hexagonal" else np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+    return (
+        HEXAGONAL_STEPS
+        if kind == "hexagonal"
+        else np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+    )
 
 
 def _neighbours(index, there, kind):
@@ -180,7 +209,9 @@ def _neighbours(index, there, kind):
 
 
 def to_array(index, kind):
-    """(row, column) of the lenslet array for lattice indices (m, n): hexagonal rows stay upright (offset rows)."""
+    """(row, column) of the lenslet array for lattice indices (m, n): hexagonal rows stay
+    upright (offset rows).
+    """
     index = np.asarray(index)
     shift = index[..., 0] // 2 if kind == "hexagonal" else 0
     return np.stack([index[..., 0], index[..., 1] + shift], axis=-1)
@@ -212,7 +243,9 @@ def _centre(value, half):
 
 
 def _first_negative_ring(value, radius):
-    """First radius, px, at which the mean over directions is negative: the end of the central peak."""
+    """First radius, px, at which the mean over directions is negative: the end
+    of the central peak.
+    """
     whole = np.rint(radius).astype(int)
     limit = min(value.shape) // 2
     inside = whole <= limit
@@ -225,7 +258,9 @@ def _refine_basis(value, centre, basis):
     """Least squares of the basis on the sub-pixel peaks at combinations of up to six steps."""
     limit = 0.92 * centre
     for reach in (1, 2, 4, 6):
-        steps = np.array([(i, j) for i in range(reach + 1) for j in range(-reach, reach + 1) if i or j > 0])
+        steps = np.array(
+            [(i, j) for i in range(reach + 1) for j in range(-reach, reach + 1) if i or j > 0]
+        )
         lag = steps @ basis
         keep = (np.abs(lag) < limit - 3).all(axis=1)
         radius = 0.22 * np.hypot(*basis.T).min()
@@ -241,7 +276,9 @@ def _refine_basis(value, centre, basis):
 
 
 def _peak_near(value, guess, radius):
-    """Sub-pixel maximum of `value` within `radius` of `guess` (parabola through three samples an axis), or None."""
+    """Sub-pixel maximum of `value` within `radius` of `guess` (parabola through three samples
+    an axis), or None.
+    """
     low = np.maximum(np.ceil(guess - max(radius, 1.01)).astype(int), 1)
     high = np.minimum(np.floor(guess + max(radius, 1.01)).astype(int), np.array(value.shape) - 2)
     if (high <= low).any():

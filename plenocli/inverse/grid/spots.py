@@ -3,12 +3,15 @@
 import numpy as np
 
 WINDOW = (0.25, 0.7)  # sigma and radius, of the pitch; wider windows take in the neighbours
-WIDE_WINDOW = (0.33, 0.95)  # for superpixels with several bright parts: only the fundamental period is left
-CORE_SIGMA = 0.13  # of the pitch: the middle of a spot, which the frame does not cut in a whole cell
+# for superpixels with several bright parts: only the fundamental period is left
+WIDE_WINDOW = (0.33, 0.95)
+# of the pitch: the middle of a spot, which the frame does not cut in a whole cell
+CORE_SIGMA = 0.13
 
 
 def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
-    """Maxima (N, 2), px, of `image` smoothed by a Gaussian of `sigma` pitches, above `threshold` of its bright level.
+    """Maxima (N, 2), px, of `image` smoothed by a Gaussian of `sigma` pitches, above `threshold`
+    of its bright level.
 
     Large spots are searched in a picture shrunk by whole block means.
     """
@@ -16,7 +19,11 @@ def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
 
     shrink = max(1, int(pitch // 10))
     rows, columns = (n // shrink for n in image.shape)
-    small = image[: rows * shrink, : columns * shrink].reshape(rows, shrink, columns, shrink).mean(axis=(1, 3))
+    small = (
+        image[: rows * shrink, : columns * shrink]
+        .reshape(rows, shrink, columns, shrink)
+        .mean(axis=(1, 3))
+    )
     smooth = ndimage.gaussian_filter(small, sigma * pitch / shrink, truncate=3.0, mode="nearest")
     size = max(3, 2 * int(0.25 * pitch / shrink) + 1)
     level = np.percentile(smooth[:: max(1, rows // 500), :: max(1, columns // 500)], 98)
@@ -27,9 +34,11 @@ def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
 def windowed_centroids(image, centres, pitch, iterations=3, window=WINDOW, batch_pixels=3_000_000):
     """Windowed centroids: where the tapered-Gaussian-weighted first moment vanishes (Newton steps).
 
-    image (rows, columns); centres (N, 2) px, first guesses; pitch px; window: sigma and radius in pitches. Where the
-    frame cuts a window, only pixels whose mirror image about the centre is also in the frame count, so that a cut does
-    not pull.
+    image (rows, columns);
+    centres (N, 2) px, first guesses;
+    pitch px;
+    window: sigma and radius in pitches. Where the frame cuts a window, only pixels whose mirror
+        image about the centre is also in the frame count, so that a cut does not pull.
     Returns positions (N, 2) px and flux (N,): mean of the middle of the spot.
     """
     image = np.ascontiguousarray(image, np.float32)
@@ -57,15 +66,28 @@ def _newton(image, centre, pitch, half, iterations, window):
             edge = image.shape[axis] - 1
             here = first[:, axis, None] + offset[:, axis, None]
             inside = np.abs(arm) <= np.minimum(here, edge - here) + 0.5
-            bell, taper = np.exp(-(arm**2) / (2 * variance)) * inside, np.clip(1 - (arm / radius) ** 2, 0, None)
+            bell, taper = (
+                np.exp(-(arm**2) / (2 * variance)) * inside,
+                np.clip(1 - (arm / radius) ** 2, 0, None),
+            )
             weights.append((bell * taper**2).astype(np.float32))
-            slopes.append(bell * taper * (taper * (1 - arm**2 / variance) - 4 * (arm / radius) ** 2))
+            slopes.append(
+                bell * taper * (taper * (1 - arm**2 / variance) - 4 * (arm / radius) ** 2)
+            )
         along = [(patch @ weights[1][:, :, None])[..., 0], (weights[0][:, None, :] @ patch)[:, 0]]
         for axis in (0, 1):
             moment = (along[axis] * weights[axis] * arms[axis]).sum(axis=1)
-            fall = (along[axis] * slopes[axis]).sum(axis=1)  # minus the derivative of the moment with the centre
+            # minus the derivative of the moment with the centre
+            fall = (along[axis] * slopes[axis]).sum(axis=1)
             least = 0.03 * np.abs(along[axis] * weights[axis]).sum(axis=1) + 1e-30
             offset[:, axis] += np.clip(moment / np.maximum(fall, least), -0.1 * pitch, 0.1 * pitch)
-    core = [np.exp(-0.5 * ((reach - offset[:, axis, None]) / (CORE_SIGMA * pitch)) ** 2).astype(np.float32) for axis in (0, 1)]
-    flux = np.einsum("ny,ny->n", (patch @ core[1][:, :, None])[..., 0], core[0]) / (core[0].sum(axis=1) * core[1].sum(axis=1))
+    core = [
+        np.exp(-0.5 * ((reach - offset[:, axis, None]) / (CORE_SIGMA * pitch)) ** 2).astype(
+            np.float32
+        )
+        for axis in (0, 1)
+    ]
+    flux = np.einsum("ny,ny->n", (patch @ core[1][:, :, None])[..., 0], core[0]) / (
+        core[0].sum(axis=1) * core[1].sum(axis=1)
+    )
     return first + offset, flux

@@ -1,7 +1,9 @@
-"""Sub-pixel places of superpixels by least squares on their common look: an empirical template, fitted robustly.
+"""Sub-pixel places of superpixels by least squares on their common look: an empirical
+template, fitted robustly.
 
-A centroid is moved by dust, by a neighbour that is missing and by noise far from the edges; a fit of the mean superpixel is
-not, since pixels that do not follow it lose their weight, and edges count as much as they tell.
+A centroid is moved by dust, by a neighbour that is missing and by noise far from the edges; a fit
+of the mean superpixel is not, since pixels that do not follow it lose their weight, and edges count
+as much as they tell.
 """
 
 from dataclasses import dataclass
@@ -11,15 +13,21 @@ import numpy as np
 REACH = 0.56  # of the pitch: radius of the window
 PHASES = 8  # sub-pixel phases an axis, at which the template is tabled; the rest is first order
 SIZE = 24  # px: larger superpixels are shrunk by whole block means to below twice this
-VARIANCE = 0.5  # px^2 of that smoothing: it moves a spot under uneven light by VARIANCE times the relative slope, towards the dark
-DEGENERATE = 0.1  # share of a tilt that is no shift, below which the two are not told apart: bells have 0.03, discs 0.4 and more
+# px^2 of that smoothing: it moves a spot under uneven light by VARIANCE times the relative
+# slope, towards the dark
+VARIANCE = 0.5
+# share of a tilt that is no shift, below which the two are not told apart: bells have 0.03,
+# discs 0.4 and more
+DEGENERATE = 0.1
 SMOOTHING = 0.8  # px: sampled discs and edges are aliased beyond
 
 
 @dataclass(frozen=True)
 class _Window:
-    """Pixels (K, 2) of a patch that count, their taper (K,), interpolation of P samples (a spline with P values) and,
-    for all pixels (P, P, 2) of a patch, their place and the place of the superpixel that they belong to."""
+    """Pixels (K, 2) of a patch that count, their taper (K,), interpolation of P samples (a spline
+    with P values) and, for all pixels (P, P, 2) of a patch, their place and the place of the
+    superpixel that they belong to.
+    """
 
     half: int
     pixels: np.ndarray
@@ -33,9 +41,13 @@ class _Window:
         return np.ravel_multi_index(tuple(self.pixels.T + self.half), (2 * self.half + 1,) * 2)
 
     def shifted(self, by, derivative=0):
-        """Matrices (N, P, P) that take P samples to their values, or slopes, at places moved `by` (N,) px."""
+        """Matrices (N, P, P) that take P samples to their values, or slopes, at places
+        moved `by` (N,) px.
+        """
         reach = np.arange(-self.half, self.half + 1.0)
-        return self.spline(np.clip(reach + by[:, None], -self.half, self.half), derivative).astype(np.float32)
+        return self.spline(np.clip(reach + by[:, None], -self.half, self.half), derivative).astype(
+            np.float32
+        )
 
     def lever(self, share):
         """Arms (P, P, 2), px, on which the illumination's slope acts: see `register`."""
@@ -43,14 +55,17 @@ class _Window:
 
 
 def register(image, centres, basis, slope=None, symmetric=True):
-    """Places (N, 2), px, of the superpixels near `centres` (N, 2) px, of whole cells in `image` (rows, columns).
+    """Places (N, 2), px, of the superpixels near `centres` (N, 2) px, of whole cells in
+    `image` (rows, columns).
 
-    Each patch is a * template(r - shift) + b under light that changes by `slope` (N, 2), relative per px: a share of it
-    continuously, the rest from one superpixel to the next (a lenslet dimmed as a whole); the share is estimated.
-    basis (2, 2) px: the lattice, which says whose light a pixel shows. symmetric: superpixels have a centre, that of
-    the template's point symmetry; otherwise (superpixels of
-    several parts) the median shift is zero: the phase stays that of `centres`.
-    Returns (positions, quality): quality (N,) is the share of a patch's pixels that follow the template.
+    Each patch is a * template(r - shift) + b under light that changes by `slope` (N, 2), relative
+    per px: a share of it continuously, the rest from one superpixel to the next (a lenslet dimmed
+    as a whole); the share is estimated.
+    basis (2, 2) px: the lattice, which says whose light a pixel shows.
+    symmetric: superpixels have a centre, that of the template's point symmetry; otherwise
+        (superpixels of several parts) the median shift is zero: the phase stays that of `centres`.
+    Returns (positions, quality): quality (N,) is the share of a patch's pixels that
+    follow the template.
     """
     pitch = np.hypot(*np.asarray(basis).T).min()
     shrink = max(1, int(pitch // SIZE))
@@ -69,18 +84,26 @@ def register(image, centres, basis, slope=None, symmetric=True):
         if turn == 0:
             share = _share_within(small, place, slope, bank, spread, window)
         place, quality = _fit_all(small, place, slope, window.lever(share), bank, spread, window)
-        place = place + (_centre(template, window) if symmetric else -np.median(place - first, axis=0))
+        place = place + (
+            _centre(template, window) if symmetric else -np.median(place - first, axis=0)
+        )
     place = place + share * VARIANCE * slope
     return place * shrink + (shrink - 1) / 2, quality
 
 
 def _block_means(image, shrink):
     rows, columns = (n // shrink for n in image.shape)
-    return np.ascontiguousarray(image[: rows * shrink, : columns * shrink].reshape(rows, shrink, columns, shrink).mean(axis=(1, 3)))
+    return np.ascontiguousarray(
+        image[: rows * shrink, : columns * shrink]
+        .reshape(rows, shrink, columns, shrink)
+        .mean(axis=(1, 3))
+    )
 
 
 def smoothed(image):
-    """(1 2 1)/4 smoothing of `image` (rows, columns) along both axes: a pattern of period two vanishes exactly."""
+    """(1 2 1)/4 smoothing of `image` (rows, columns) along both axes: a pattern of period
+    two vanishes exactly.
+    """
     for axis in (0, 1):
         image = np.moveaxis(image, axis, 0)
         out = 0.5 * image
@@ -93,7 +116,10 @@ def smoothed(image):
 
 
 def _make_window(basis):
-    """Window for a lattice in (shrunk) px. Shifting is cubic spline interpolation, a matrix per phase."""
+    """Window for a lattice in (shrunk) px.
+
+    Shifting is cubic spline interpolation, a matrix per phase.
+    """
     from scipy.interpolate import make_interp_spline
 
     pitch = np.hypot(*basis.T).min()
@@ -109,7 +135,9 @@ def _make_window(basis):
 
 
 def _centre(template, window):
-    """Centre (2,), px, of the template: about which it, smoothed as far as its sampling demands, is best its own point reflection."""
+    """Centre (2,), px, of the template: about which it, smoothed as far as its sampling demands,
+    is best its own point reflection.
+    """
     from scipy.ndimage import gaussian_filter, shift
 
     weight, centre = np.zeros(template.size), np.zeros(2)
@@ -125,17 +153,24 @@ def _centre(template, window):
 
 
 def _bank(template, window):
-    """The template at all sub-pixel phases: columns (PHASES^2, 4, K) template, minus its gradient, one."""
+    """The template at all sub-pixel phases: columns (PHASES^2, 4, K) template, minus
+    its gradient, one.
+    """
     phases = (np.arange(PHASES) + 0.5) / PHASES - 0.5
     back = window.shifted(-phases), window.shifted(-phases, 1)
     down, right = back[0] @ template, back[1] @ template
-    columns = [np.einsum("apq,brq->abpr", a, b, optimize=True) for a, b in ((down, back[0]), (-right, back[0]), (-down, back[1]))]
+    columns = [
+        np.einsum("apq,brq->abpr", a, b, optimize=True)
+        for a, b in ((down, back[0]), (-right, back[0]), (-down, back[1]))
+    ]
     columns = [c.reshape(PHASES**2, -1)[:, window.flat] for c in columns]
     return np.stack([*columns, np.ones_like(columns[0])], axis=1)
 
 
 def _groups(place, most):
-    """Sites that share a sub-pixel phase, at most `most` at a time: (phase number, phase (2,) px, sites, their pixels (n, 2))."""
+    """Sites that share a sub-pixel phase, at most `most` at a time: (phase number, phase (2,)
+    px, sites, their pixels (n, 2)).
+    """
     pixel = np.rint(place).astype(int)
     step = np.clip(np.floor((place - pixel + 0.5) * PHASES).astype(int), 0, PHASES - 1)
     number = step @ (PHASES, 1)
@@ -147,7 +182,9 @@ def _groups(place, most):
 
 
 def _patches(image, pixel, slope, lever, window):
-    """Pixels (N, K) around `pixel` with the illumination divided out, and which (N, K) lie in the frame; lever (P, P, 2) px."""
+    """Pixels (N, K) around `pixel` with the illumination divided out, and which (N, K) lie in
+    the frame; lever (P, P, 2) px.
+    """
     rows, columns = image.shape
     low, high = pixel.min(axis=0) - window.half, pixel.max(axis=0) + window.half
     whole = (low >= 0).all() and (high < image.shape).all()
@@ -159,50 +196,71 @@ def _patches(image, pixel, slope, lever, window):
         where = np.where(inside, where, 0)
     patch = image.ravel()[where]
     if slope.any():
-        patch /= np.maximum(1 + slope.astype(np.float32) @ lever.reshape(-1, 2)[window.flat].T, np.float32(0.2))
+        patch /= np.maximum(
+            1 + slope.astype(np.float32) @ lever.reshape(-1, 2)[window.flat].T, np.float32(0.2)
+        )
     return patch, inside
 
 
 def _sample(place, shape, half, quality, most):
-    """Up to `most` sites, evenly taken, whose patch lies in the frame (or else any) and follows the template."""
-    good = (np.rint(place) >= half).all(axis=1) & (np.rint(place) + half < np.array(shape)).all(axis=1)
+    """Up to `most` sites, evenly taken, whose patch lies in the frame (or else any) and
+    follows the template.
+    """
+    good = (np.rint(place) >= half).all(axis=1) & (np.rint(place) + half < np.array(shape)).all(
+        axis=1
+    )
     good &= quality >= np.median(quality) - 0.05
     chosen = np.flatnonzero(good) if good.sum() >= 9 else np.arange(len(place))
     return chosen[:: max(1, -(-len(chosen) // most))]
 
 
 def _template(image, place, slope, lever, quality, window):
-    """Mean look (P, P) of a superpixel of unit level: the mean of the middle half of all patches, shifted to their centres."""
+    """Mean look (P, P) of a superpixel of unit level: the mean of the middle half of all
+    patches, shifted to their centres.
+    """
     chosen = _sample(place, image.shape, window.half, quality, 600)
     pixel = np.rint(place[chosen]).astype(int)
     reach = np.arange(-window.half, window.half + 1)
     line = [np.clip(pixel[:, axis, None] + reach, 0, image.shape[axis] - 1) for axis in (0, 1)]
     patch = image[line[0][:, :, None], line[1][:, None, :]]
-    patch /= np.maximum(1 + np.einsum("nd,yxd->nyx", slope[chosen].astype(np.float32), lever), np.float32(0.2))
+    patch /= np.maximum(
+        1 + np.einsum("nd,yxd->nyx", slope[chosen].astype(np.float32), lever), np.float32(0.2)
+    )
     level = patch.reshape(len(patch), -1)[:, window.flat].mean(axis=1)
     patch /= np.maximum(level, 1e-20)[:, None, None]
     phase = (place[chosen] - pixel).T
-    there, back = ([window.shifted(sign * phase[0]), window.shifted(sign * phase[1]).transpose(0, 2, 1)] for sign in (1, -1))
+    there, back = (
+        [window.shifted(sign * phase[0]), window.shifted(sign * phase[1]).transpose(0, 2, 1)]
+        for sign in (1, -1)
+    )
     mean, quarter = 0.0, len(patch) // 4
     for turn in range(3):  # interpolation blurs: what is left of the patches, moved back, is put in
         rest = patch if turn == 0 else patch - back[0] @ mean @ back[1]
-        mean = mean + np.sort(there[0] @ rest @ there[1], axis=0)[quarter : len(patch) - quarter].mean(axis=0)
+        mean = mean + np.sort(there[0] @ rest @ there[1], axis=0)[
+            quarter : len(patch) - quarter
+        ].mean(axis=0)
     return mean
 
 
 def _solve(columns, patch, weight):
-    """Weighted least squares of patches (N, K) on columns (C, K): coefficients (N, C) and normal matrices (N, C, C)."""
+    """Weighted least squares of patches (N, K) on columns (C, K): coefficients (N, C) and normal
+    matrices (N, C, C).
+    """
     count = len(columns)
     i, j = np.triu_indices(count)
     normal = np.empty((len(patch), count, count))
     normal[:, i, j] = normal[:, j, i] = weight @ (columns[i] * columns[j]).T
     right = (weight * patch) @ columns.T
-    normal += 1e-7 * np.einsum("nii->ni", normal)[:, :, None] * np.eye(count) + 1e-30 * np.eye(count)
+    normal += 1e-7 * np.einsum("nii->ni", normal)[:, :, None] * np.eye(count) + 1e-30 * np.eye(
+        count
+    )
     return np.linalg.solve(normal, right[..., None].astype(float))[..., 0], normal
 
 
 def _trust(fit, columns, patch, spread):
-    """Tukey weights (N, K) of pixels by their miss from the fit, six times the usual one being worth nothing."""
+    """Tukey weights (N, K) of pixels by their miss from the fit, six times the usual one
+    being worth nothing.
+    """
     miss = patch - fit.astype(np.float32) @ columns
     miss /= spread
     miss *= (1 / (6 * np.maximum(fit[:, :1], 1e-9))).astype(np.float32)
@@ -213,19 +271,25 @@ def _trust(fit, columns, patch, spread):
 
 
 def _spread(image, place, slope, lever, bank, window):
-    """Usual miss (K,) of a patch of unit level from the template, pixel by pixel: noise and what varies from one to the next."""
+    """Usual miss (K,) of a patch of unit level from the template, pixel by pixel: noise and what
+    varies from one to the next.
+    """
     chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 600)
     misses = []
     for number, _, sites, pixel in _groups(place[chosen], 4096):
         patch, inside = _patches(image, pixel, slope[chosen[sites]], lever, window)
         fit, _ = _solve(bank[number], patch, np.broadcast_to(inside * window.taper, patch.shape))
-        misses.append(np.abs(patch - fit.astype(np.float32) @ bank[number]) / np.maximum(fit[:, :1], 1e-20))
+        misses.append(
+            np.abs(patch - fit.astype(np.float32) @ bank[number]) / np.maximum(fit[:, :1], 1e-20)
+        )
     spread = 1.48 * np.median(np.concatenate(misses), axis=0)
     return np.maximum(spread, 0.3 * np.percentile(spread, 90) + 1e-9).astype(np.float32)
 
 
 def _fit_all(image, place, slope, lever, bank, spread, window, iterations=4):
-    """New places (N, 2) and the share (N,) of pixels that follow the template: Tukey weights, from where the lattice expects each."""
+    """New places (N, 2) and the share (N,) of pixels that follow the template: Tukey weights,
+    from where the lattice expects each.
+    """
     out, quality = np.empty_like(place), np.empty(len(place))
     for number, phase, sites, pixel in _groups(place, 1 + 400_000 // len(spread)):
         columns = bank[number]
@@ -237,18 +301,22 @@ def _fit_all(image, place, slope, lever, bank, spread, window, iterations=4):
         for _ in range(iterations):
             trust = _trust(fit, columns, patch, spread)
             fit, _ = _solve(columns, patch, base * trust)
-        quality[sites] = ((trust > 0.25) & (base > 0)).sum(axis=1) / np.maximum((base > 0).sum(axis=1), 1)
+        quality[sites] = ((trust > 0.25) & (base > 0)).sum(axis=1) / np.maximum(
+            (base > 0).sum(axis=1), 1
+        )
         shift = fit[:, 1:3] / np.where(fit[:, :1] > 0, fit[:, :1], np.inf)
         out[sites] = pixel + phase + np.clip(shift, -2, 2)
     return out, quality
 
 
 def _share_within(image, place, slope, bank, spread, window):
-    """How much (0..1) of the illumination's gradient across lenslets also holds within a superpixel.
+    """How much (0..1) of the illumination's gradient across lenslets also holds
+    within a superpixel.
 
-    Light that falls off continuously over the sensor has it all, a vignetting that dims whole superpixels none. Fitted
-    to the pixels of all sites together, beside the shift of each. Where these cannot tell (a tilted bell is a moved
-    one: nearly nothing of the tilt is left beside the shift) it tends to 1.
+    Light that falls off continuously over the sensor has it all, a vignetting that dims whole
+    superpixels none. Fitted to the pixels of all sites together, beside the shift of each. Where
+    these cannot tell (a tilted bell is a moved one: nearly nothing of the tilt is left beside the
+    shift) it tends to 1.
     """
     chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 2000)
     whole = window.lever(0)
@@ -263,11 +331,18 @@ def _share_within(image, place, slope, bank, spread, window):
         weight = base * _trust(fit, columns, patch, spread)
         fit, normal = _solve(columns, patch, weight)
         level = np.maximum(fit[:, 0], 1e-9)
-        joint = np.einsum("nij,nj->ni", normal[:, :, 4:], tilt)  # the tilt's column, with all columns
+        # the tilt's column, with all columns
+        joint = np.einsum("nij,nj->ni", normal[:, :, 4:], tilt)
         own = np.einsum("ni,ni->n", joint[:, 4:], tilt)
         beside = np.linalg.solve(normal[:, :4, :4], joint[:, :4, None])[..., 0]
         right = (weight * patch) @ columns.T
-        value.append((np.einsum("ni,ni->n", right[:, 4:], tilt) - np.einsum("ni,ni->n", right[:, :4], beside)) / level)
+        value.append(
+            (
+                np.einsum("ni,ni->n", right[:, 4:], tilt)
+                - np.einsum("ni,ni->n", right[:, :4], beside)
+            )
+            / level
+        )
         trust.append(own - np.einsum("ni,ni->n", joint[:, :4], beside))
         total.append(own)
     value, trust, total = (np.concatenate(x) for x in (value, trust, total))

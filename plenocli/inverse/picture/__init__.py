@@ -1,4 +1,5 @@
-"""Pictures behind lenslets from a system matrix: least squares, LMMSE, priors over the whole sensor, the trial of methods.
+"""Pictures behind lenslets from a system matrix: least squares, LMMSE, priors over the whole
+sensor, the trial of methods.
 
 Sparse coding is sparse, training statistics are prior.
 """

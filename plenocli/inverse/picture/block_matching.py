@@ -1,9 +1,10 @@
 """Removal of white noise from a whole picture by block matching and collaborative filtering.
 
-Similar patches of a picture are stacked and transformed together (a cosine transform in each patch, Walsh-Hadamard across
-the stack), shrunk there and put back, overlaps averaged with weights: K. Dabov, A. Foi, V. Katkovnik, K. Egiazarian,
-IEEE Trans. Image Processing 16 (2007) 2080. Written from the paper, in matrix products on strips of the picture, so that
-memory does not grow with its height.
+Similar patches of a picture are stacked and transformed together (a cosine transform in each patch,
+Walsh-Hadamard across the stack), shrunk there and put back, overlaps averaged with weights: K.
+Dabov, A. Foi, V. Katkovnik, K. Egiazarian, IEEE Trans. Image Processing 16 (2007) 2080. Written
+from the paper, in matrix products on strips of the picture, so that memory does not
+grow with its height.
 """
 
 from functools import lru_cache
@@ -11,7 +12,9 @@ from functools import lru_cache
 import numpy as np
 
 PATCH, STEP, WINDOW, STACK = 8, 4, 9, 16
-"""Side of a patch, distance of reference patches, how far similar ones are searched, how many are stacked (a power of two)."""
+"""Side of a patch, distance of reference patches, how far similar ones are searched, how many
+are stacked (a power of two).
+"""
 THRESHOLD = 2.7
 """Coefficients below so many standard deviations of the noise vanish; the paper's value."""
 TOGETHER = 8192
@@ -19,19 +22,27 @@ TOGETHER = 8192
 
 
 def block_matching(picture, sigma, pilot=None):
-    """The picture (row, column) with its white noise of standard deviation `sigma` removed; float64, same shape.
+    """The picture (row, column) with its white noise of standard deviation `sigma` removed;
+    float64, same shape.
 
-    Without a pilot coefficients are cut at THRESHOLD sigma; with one (a picture like it with less noise), patches are
-    matched in the pilot and shrunk by the Wiener factor p^2 / (p^2 + sigma^2) of the pilot's coefficients p.
+    Without a pilot coefficients are cut at THRESHOLD sigma; with one (a picture like it with less
+    noise), patches are matched in the pilot and shrunk by the Wiener factor p^2 / (p^2 + sigma^2)
+    of the pilot's coefficients p.
     """
     picture = np.asarray(picture, float)
     unit = np.abs(picture).max()  # squares of very large or small values leave single precision
     if unit == 0:
         return picture.copy()
-    picture, sigma, pilot = picture / unit, sigma / unit, None if pilot is None else np.asarray(pilot, float) / unit
+    picture, sigma, pilot = (
+        picture / unit,
+        sigma / unit,
+        None if pilot is None else np.asarray(pilot, float) / unit,
+    )
     patch = min(PATCH, *picture.shape)
     rows, columns = (_corners(n, patch) for n in picture.shape)
-    least = min(WINDOW + 1, picture.shape[0] - patch + 1) * min(WINDOW + 1, picture.shape[1] - patch + 1)
+    least = min(WINDOW + 1, picture.shape[0] - patch + 1) * min(
+        WINDOW + 1, picture.shape[1] - patch + 1
+    )
     stack = min(STACK, 1 << (least.bit_length() - 1))
     guide = np.asarray(picture if pilot is None else pilot, np.float32)
     source = np.asarray(picture, np.float32)
@@ -39,33 +50,55 @@ def block_matching(picture, sigma, pilot=None):
     for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // TOGETHER))):
         span = slice(max(strip[0] - WINDOW, 0), min(strip[-1] + patch + WINDOW, picture.shape[0]))
         stacks = _match(guide[span], strip - span.start, columns, patch, stack)
-        one, two = _filter(source[span], None if pilot is None else guide[span], stacks, patch, sigma)
+        one, two = _filter(
+            source[span], None if pilot is None else guide[span], stacks, patch, sigma
+        )
         total[span] += one
         weight[span] += two
     return unit * total / weight
 
 
 def _corners(length, patch):
-    return np.unique(np.append(np.arange(0, length - patch + 1, max(1, min(STEP, patch // 2))), length - patch))
+    return np.unique(
+        np.append(np.arange(0, length - patch + 1, max(1, min(STEP, patch // 2))), length - patch)
+    )
 
 
 def _match(guide, rows, columns, patch, stack):
-    """Flat corners (reference, stack) of the patches most like those with corners at rows x columns, these first."""
+    """Flat corners (reference, stack) of the patches most like those with corners at rows x
+    columns, these first.
+    """
     height, width = guide.shape
-    sum_rows, sum_columns = (np.zeros((len(at), n), np.float32) for at, n in ((rows, height), (columns, width)))
+    sum_rows, sum_columns = (
+        np.zeros((len(at), n), np.float32) for at, n in ((rows, height), (columns, width))
+    )
     for sums, at in ((sum_rows, rows), (sum_columns, columns)):
         for k, first in enumerate(at):
             sums[k, first : first + patch] = 1
-    offsets = np.array([(r, c) for r in range(-WINDOW, WINDOW + 1) for c in range(-WINDOW, WINDOW + 1)])
+    offsets = np.array(
+        [(r, c) for r in range(-WINDOW, WINDOW + 1) for c in range(-WINDOW, WINDOW + 1)]
+    )
     distance = np.full((len(offsets), len(rows), len(columns)), np.inf, np.float32)
     for k, (down, right) in enumerate(offsets):
-        r, c = slice(max(0, -down), min(height, height - down)), slice(max(0, -right), min(width, width - right))
+        r, c = (
+            slice(max(0, -down), min(height, height - down)),
+            slice(max(0, -right), min(width, width - right)),
+        )
         if r.start >= r.stop or c.start >= c.stop:
             continue
-        at_r = slice(np.searchsorted(rows, -down), np.searchsorted(rows, height - patch - down, side="right"))
-        at_c = slice(np.searchsorted(columns, -right), np.searchsorted(columns, width - patch - right, side="right"))
-        change = guide[r, c] - guide[r.start + down : r.stop + down, c.start + right : c.stop + right]
-        distance[k, at_r, at_c] = sum_rows[at_r, r] @ np.square(change, out=change) @ sum_columns[at_c, c].T
+        at_r = slice(
+            np.searchsorted(rows, -down), np.searchsorted(rows, height - patch - down, side="right")
+        )
+        at_c = slice(
+            np.searchsorted(columns, -right),
+            np.searchsorted(columns, width - patch - right, side="right"),
+        )
+        change = (
+            guide[r, c] - guide[r.start + down : r.stop + down, c.start + right : c.stop + right]
+        )
+        distance[k, at_r, at_c] = (
+            sum_rows[at_r, r] @ np.square(change, out=change) @ sum_columns[at_c, c].T
+        )
     distance[len(offsets) // 2] = -1
     distance = distance.reshape(len(offsets), -1).T
     best = np.argpartition(distance, stack - 1, axis=1)[:, :stack]
@@ -75,13 +108,18 @@ def _match(guide, rows, columns, patch, stack):
 
 
 def _filter(source, guide, stacks, patch, sigma):
-    """(weighted sum, weights), each like source, of the filtered patches. guide: None, or the pilot."""
+    """(weighted sum, weights), each like source, of the filtered patches.
+
+    guide: None, or the pilot.
+    """
     shape = source.shape
     cosine, across, window = _transforms(patch, stacks.shape[1])
     index = stacks[:, :, None] + (np.arange(patch)[:, None] * shape[1] + np.arange(patch)).ravel()
 
     def forward(plane):
-        return across @ (plane.ravel()[index].reshape(-1, patch * patch) @ cosine.T).reshape(index.shape)
+        return across @ (plane.ravel()[index].reshape(-1, patch * patch) @ cosine.T).reshape(
+            index.shape
+        )
 
     spectrum = forward(source)
     if guide is None:
@@ -99,15 +137,26 @@ def _filter(source, guide, stacks, patch, sigma):
     back = ((across @ spectrum).reshape(-1, patch * patch) @ cosine).reshape(index.shape) * weight
     index, size = index.ravel(), source.size
     spread = np.broadcast_to(weight, back.shape)
-    return np.bincount(index, back.ravel(), size).reshape(shape), np.bincount(index, spread.ravel(), size).reshape(shape)
+    return np.bincount(index, back.ravel(), size).reshape(shape), np.bincount(
+        index, spread.ravel(), size
+    ).reshape(shape)
 
 
 @lru_cache(maxsize=8)
 def _transforms(patch, stack):
-    """(cosine transform of a patch, Walsh-Hadamard transform of a stack, Kaiser window), orthonormal, float32."""
+    """(cosine transform of a patch, Walsh-Hadamard transform of a stack, Kaiser window),
+    orthonormal, float32.
+    """
     from scipy.fft import dct
     from scipy.linalg import hadamard
 
     one = dct(np.eye(patch), axis=0, norm="ortho")
     window = np.kaiser(patch, 2.0)
-    return tuple(m.astype(np.float32) for m in (np.kron(one, one), hadamard(stack) / np.sqrt(stack), np.outer(window, window).ravel()))
+    return tuple(
+        m.astype(np.float32)
+        for m in (
+            np.kron(one, one),
+            hadamard(stack) / np.sqrt(stack),
+            np.outer(window, window).ravel(),
+        )
+    )

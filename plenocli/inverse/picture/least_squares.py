@@ -1,7 +1,9 @@
-"""Regularised least squares from one singular value decomposition: Tikhonov and truncated, for all lenslets at once.
+"""Regularised least squares from one singular value decomposition: Tikhonov and truncated, for
+all lenslets at once.
 
-y = A x + n with A = U diag(s) V^T. Only z = U^T y meets the unknown; what is left of y is pure noise, and measures it.
-All estimates are linear: they may leave [0, 1], and nothing is clipped here.
+y = A x + n with A = U diag(s) V^T. Only z = U^T y meets the unknown; what is left of y is pure
+noise, and measures it. All estimates are linear: they may leave [0, 1], and
+nothing is clipped here.
 """
 
 from dataclasses import dataclass
@@ -11,64 +13,95 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Svd:
-    """A = u diag(s) vt: u (pixel, k), s (k,) falling, vt (k, point), k = min(pixel, point)."""
+    """A = u diag(s)
+
+    vt: u (pixel, k), s (k,) falling, vt (k, point), k = min(pixel, point).
+    """
 
     u: np.ndarray
     s: np.ndarray
     vt: np.ndarray
 
     def compress(self, y):
-        """z = U^T y, (k, signal), from y (pixel, signal): no estimate that fits by least squares can tell z from y."""
+        """z = U^T y, (k, signal), from y (pixel, signal): no estimate that fits by least squares
+        can tell z from y.
+        """
         return self.u.T @ y
 
     def rank(self, relative=None):
-        """Singular values above `relative` times the largest (default: machine precision times the larger side)."""
-        floor = max(self.u.shape[0], self.vt.shape[1]) * np.finfo(float).eps if relative is None else relative
+        """Singular values above `relative` times the largest (default: machine precision
+        times the larger side).
+        """
+        floor = (
+            max(self.u.shape[0], self.vt.shape[1]) * np.finfo(float).eps
+            if relative is None
+            else relative
+        )
         return int(np.count_nonzero(self.s > floor * self.s[0]))
 
 
 def decompose(matrix):
-    """Svd of A (pixel, point), in float64. A zero or non-finite matrix is refused (NumericsError)."""
+    """Svd of A (pixel, point), in float64.
+
+    A zero or non-finite matrix is refused (NumericsError).
+    """
     from plenocli.base.errors import NumericsError
 
     a = np.asarray(matrix, float)
     if not np.all(np.isfinite(a)):
-        raise NumericsError("the system matrix holds values that are not finite", fix="rebuild it with simulate-pif")
+        raise NumericsError(
+            "the system matrix holds values that are not finite", fix="rebuild it with simulate-pif"
+        )
     u, s, vt = np.linalg.svd(a, full_matrices=False)
     if s[0] == 0:
-        raise NumericsError("the system matrix is zero: no light of the object reaches these pixels")
+        raise NumericsError(
+            "the system matrix is zero: no light of the object reaches these pixels"
+        )
     return Svd(u, s, vt)
 
 
 def estimate_noise(svd, y):
-    """Standard deviation of the noise in y (pixel, signal), from the part of y that A cannot produce.
+    """Standard deviation of the noise in y (pixel, signal), from the part of y
+    that A cannot produce.
 
-    Directions with s < 1e-6 s_0 count as such too. It is too large when the model is wrong (neighbours' light left out, for
-    instance), since that also shows up outside the range of A: a sound scale for the discrepancy rule, not a photometric
-    figure. NumericsError where A reaches every direction.
+    Directions with s < 1e-6 s_0 count as such too. It is too large when the model is wrong
+    (neighbours' light left out, for instance), since that also shows up outside the range of A: a
+    sound scale for the discrepancy rule, not a photometric figure. NumericsError where A
+    reaches every direction.
     """
     from plenocli.base.errors import NumericsError
 
     reached = svd.rank(1e-6)
     left = y.shape[0] - reached
     if left < 1:
-        raise NumericsError("the noise cannot be estimated: the system matrix reaches every pixel pattern", fix="give --noise-sigma")
+        raise NumericsError(
+            "the noise cannot be estimated: the system matrix reaches every pixel pattern",
+            fix="give --noise-sigma",
+        )
     residual = y - svd.u[:, :reached] @ (svd.u[:, :reached].T @ y)
     return float(np.sqrt(np.sum(residual**2) / (left * y.shape[1])))
 
 
 def resolution(svd, sigma, contrast):
-    """Diagonal (point,) of A^T A (A^T A + (sigma/contrast)^2)^-1: 1 where noise sigma lets a point be seen apart, 0 in the null space.
+    """Diagonal (point,) of A^T A (A^T A + (sigma/contrast)^2)^-1: 1 where noise sigma lets a point
+    be seen apart, 0 in the null space.
 
-    contrast: standard deviation of a point about its surroundings; points are taken to be independent, as the sensor cannot
-    know better. The mean is the share of the object's directions that the sensor sees.
+    contrast: standard deviation of a point about its surroundings; points are taken to be
+        independent, as the sensor cannot know better. The mean is the share of the object's
+        directions that the sensor sees.
     """
-    share = svd.s**2 / (svd.s**2 + (sigma / contrast) ** 2) if sigma > 0 else (svd.s > 1e-14 * svd.s[0]).astype(float)
+    share = (
+        svd.s**2 / (svd.s**2 + (sigma / contrast) ** 2)
+        if sigma > 0
+        else (svd.s > 1e-14 * svd.s[0]).astype(float)
+    )
     return np.einsum("kj,k,kj->j", svd.vt, share, svd.vt)
 
 
 def tikhonov(svd, z, alpha):
-    """argmin |y - Ax|^2 + alpha |x|^2, (point, signal), from z = U^T y (k, signal); alpha in units of s^2."""
+    """argmin |y - Ax|^2 + alpha |x|^2, (point, signal), from z = U^T y (k, signal);
+    alpha in units of s^2.
+    """
     return svd.vt.T @ ((svd.s / (svd.s**2 + alpha))[:, None] * z)
 
 
@@ -78,10 +111,12 @@ def truncated(svd, z, rank):
 
 
 def discrepancy_alpha(svd, z, sigma):
-    """alpha for which the residual of all signals together is what noise of standard deviation sigma leaves in z.
+    """alpha for which the residual of all signals together is what noise of standard deviation
+    sigma leaves in z.
 
-    Morozov's rule: sum |z - S V^T x|^2 = (number of entries of z) sigma^2; it rises with alpha, and is found by bisection in
-    log alpha between 1e-18 and 1e6 times s_0^2 (an end is returned where the rule cannot be met).
+    Morozov's rule: sum |z - S V^T x|^2 = (number of entries of z) sigma^2; it rises with alpha, and
+    is found by bisection in log alpha between 1e-18 and 1e6 times s_0^2 (an end is returned where
+    the rule cannot be met).
     """
     power, target = np.sum(z**2, axis=1), z.size * sigma**2
 
@@ -102,8 +137,9 @@ def discrepancy_alpha(svd, z, sigma):
 def best_rank(svd, z, sigma):
     """The truncation with the least estimated mean square error of x, all signals together.
 
-    An unbiased estimate in the manner of Stein and Mallows: direction k costs 2 sigma^2 / s_k^2 of noise and saves z_k^2 / s_k^2 of
-    picture, on average. (Morozov's rule keeps far too many directions here: it asks the cut to explain the weak ones too.)
+    An unbiased estimate in the manner of Stein and Mallows: direction k costs 2 sigma^2 / s_k^2 of
+    noise and saves z_k^2 / s_k^2 of picture, on average. (Morozov's rule keeps far too many
+    directions here: it asks the cut to explain the weak ones too.)
     """
     top = svd.rank()
     change = np.sum(2 * sigma**2 - z[:top] ** 2, axis=1) / svd.s[:top] ** 2
@@ -111,7 +147,10 @@ def best_rank(svd, z, sigma):
 
 
 def oracle_alpha(svd, z, truth):
-    """The alpha with the least mean square error against `truth` (point, signal). Needs the truth: a bound, not a method."""
+    """The alpha with the least mean square error against `truth` (point, signal).
+
+    Needs the truth: a bound, not a method.
+    """
     from scipy.optimize import minimize_scalar
 
     coordinates = svd.vt @ truth
@@ -122,12 +161,17 @@ def oracle_alpha(svd, z, truth):
 
     grid = np.arange(-14.0, 2.01, 0.5)
     best = grid[np.argmin([error(g) for g in grid])]
-    found = minimize_scalar(error, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3})
+    found = minimize_scalar(
+        error, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3}
+    )
     return float(10.0**found.x * svd.s[0] ** 2)
 
 
 def oracle_rank(svd, z, truth):
-    """The truncation with the least mean square error against `truth` (point, signal). Needs the truth."""
+    """The truncation with the least mean square error against `truth` (point, signal).
+
+    Needs the truth.
+    """
     top = svd.rank()
     coordinates = svd.vt[:top] @ truth
     change = np.sum((z[:top] / svd.s[:top, None] - coordinates) ** 2 - coordinates**2, axis=1)

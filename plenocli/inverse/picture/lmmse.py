@@ -1,9 +1,10 @@
 """Linear minimum mean square error (Wiener) reconstruction with the statistics of natural images.
 
-One covariance does not describe a photograph: sky and foliage differ a hundredfold in variance. So the second-order model
-is a Gaussian scale mixture (Portilla, Strela, Wainwright, Simoncelli, IEEE Trans. Image Processing 12 (2003) 1338): every
-lenslet's field has its own brightness, about which nothing is assumed, and its own contrast, the square root of a scale
-that multiplies the covariance and is estimated from the lenslet's own data.
+One covariance does not describe a photograph: sky and foliage differ a hundredfold in variance. So
+the second-order model is a Gaussian scale mixture (Portilla, Strela, Wainwright, Simoncelli, IEEE
+Trans. Image Processing 12 (2003) 1338): every lenslet's field has its own brightness, about which
+nothing is assumed, and its own contrast, the square root of a scale that multiplies the covariance
+and is estimated from the lenslet's own data.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,9 @@ SCALES = np.geomspace(1e-3, 30, 60)
 """Scales of the covariance that are tried."""
 
 IMPLAUSIBLE = 5
-"""Scale that a whole picture does not have: 2.2 times the contrast of the average photograph in every lenslet. By 22 photographs (docs/model.md)."""
+"""Scale that a whole picture does not have: 2.2 times the contrast of the average photograph in
+every lenslet. By 22 photographs (docs/model.md).
+"""
 
 ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
@@ -23,15 +26,23 @@ ROUNDS = 10
 TOGETHER = 200
 """Directions of A that are looked at together; after so many that hold no signal there is none."""
 LEVEL_SURE = 10
-"""A brightness about which nothing is assumed must stand so many times above the noise; else it belongs to the field."""
+"""A brightness about which nothing is assumed must stand so many times above the noise; else it
+belongs to the field.
+"""
 
 
 @dataclass(frozen=True)
 class Lmmse:
-    """Everything that `prepare` works out once. levels (level, pixel): y to brightnesses, one a band that can be told apart; even
-    (point, level): fields of brightness one; mean (point,), variance (point,): of a field about its brightness; analysis
-    (k, pixel), offset (k,): y to uncorrelated coordinates; power (k,): their variance at scale 1; gain (point, k): back to the
-    field; sigma: of a pixel. Points of several bands stand one band after the other."""
+    """Everything that `prepare` works out once.
+
+    levels (level, pixel): y to brightnesses, one a band that can be told apart;
+    even (point, level): fields of brightness one;
+    mean (point,), variance (point,): of a field about its brightness;
+    analysis (k, pixel), offset (k,): y to uncorrelated coordinates;
+    power (k,): their variance at scale 1;
+    gain (point, k): back to the field;
+    sigma: of a pixel. Points of several bands stand one band after the other.
+    """
 
     levels: np.ndarray
     even: np.ndarray
@@ -44,31 +55,45 @@ class Lmmse:
     sigma: float
 
     def apply(self, y, scale=1.0):
-        """(pixel, signal) -> (point, signal), with the covariance times `scale`, a number or one a signal."""
+        """(pixel, signal) -> (point, signal), with the covariance times `scale`, a
+        number or one a signal.
+        """
         w = self._coordinates(y)
-        field = self.gain @ (w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:])))
+        field = self.gain @ (
+            w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:]))
+        )
         return self.even @ (self.levels @ y) + self.mean[:, None] + field
 
     def adaptive(self, y):
-        """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the estimates and their predicted
-        standard deviations (point, signal), the scales (signal,)."""
+        """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the
+        estimates and their predicted standard deviations (point, signal), the scales (signal,).
+        """
         scale = self.scales(y)
         left = self.gain**2 @ (1 / (self.power[:, None] + self.sigma**2 / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
-        level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]  # the patterns are orthogonal
+        # the patterns are orthogonal
+        level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]
         return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
 
     def expected(self, scale=1.0):
-        """Root mean square error that it expects of fields whose covariance is `scale` times the given one."""
-        left = scale * np.maximum(self.variance - self.gain**2 @ (1 / (self.power + self.sigma**2 / scale)), 0)
-        return float(np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1)))))
+        """Root mean square error that it expects of fields whose covariance is `scale`
+        times the given one.
+        """
+        left = scale * np.maximum(
+            self.variance - self.gain**2 @ (1 / (self.power + self.sigma**2 / scale)), 0
+        )
+        return float(
+            np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1))))
+        )
 
     def brightness(self, y):
         """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
         return self.even.mean(axis=0) @ (self.levels @ y)
 
     def seen(self):
-        """Share of each point's variance about the brightness of its field that the superpixel determines at scale 1, (point,)."""
+        """Share of each point's variance about the brightness of its field that the superpixel
+        determines at scale 1, (point,).
+        """
         determined = self.gain**2 @ (1 / (self.power + self.sigma**2))
         return np.clip(determined / np.maximum(self.variance, np.finfo(float).tiny), 0, 1)
 
@@ -77,11 +102,15 @@ class Lmmse:
         return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])
 
     def implausible(self, y):
-        """Whether the signals y (pixel, signal) together would need more contrast than a photograph has: a scale of IMPLAUSIBLE or more."""
+        """Whether the signals y (pixel, signal) together would need more contrast than a
+        photograph has: a scale of IMPLAUSIBLE or more.
+        """
         return len(self.power) > 0 and self.common_scale(y) >= IMPLAUSIBLE
 
     def _likelihood(self, w):
-        """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale, signal), but for a constant."""
+        """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale,
+        signal), but for a constant.
+        """
         expected = np.outer(SCALES, self.power) + self.sigma**2
         return -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
 
@@ -92,8 +121,9 @@ class Lmmse:
     def scales(self, y):
         """The scale of each signal of y (pixel, signal): the posterior mean of its logarithm.
 
-        Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the mean and the deviation
-        (at least 0.2) that make all signals together most likely; one signal alone says little where noise is strong.
+        Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the
+        mean and the deviation (at least 0.2) that make all signals together most likely; one signal
+        alone says little where noise is strong.
         """
         likelihood = self._likelihood(self._coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
@@ -109,25 +139,35 @@ class Lmmse:
 
 
 def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
-    """The LMMSE estimator for y = A x + n, n white with standard deviation `sigma`, x = level + t with any level and t of
-    the given statistics at an unknown scale.
+    """The LMMSE estimator for y = A x + n, n white with standard deviation `sigma`, x = level + t
+    with any level and t of the given statistics at an unknown scale.
 
-    svd: of A, whose points are those of one band after the other.  mean (point,), covariance (point, point): of fields of
-    natural photographs; bands (band, band): covariance of the bands at a point, its diagonal about 1, so that fields have
-    kron(bands, covariance).  Their brightness, one a band, is taken out here, as the superpixel measures it: level(x) = F^+ A x,
-    F = A times fields of ones. What is left of y, (I - F F^+) y, depends on t alone, and
-    t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A m)  is worked out in the eigenvectors of the signal's covariance: of
-    directions of A whose signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept.  Bands that
-    the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their own: there it is part of t.  sigma > 0.
-    Source: Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md, "Spatial reconstruction".
+    svd: of A, whose points are those of one band after the other.
+    mean (point,), covariance (point, point): of fields of natural photographs;
+    bands (band, band): covariance of the bands at a point, its diagonal about 1, so that fields
+        have kron(bands, covariance). Their brightness, one a band, is taken out here, as the
+        superpixel measures it: level(x) = F^+ A x, F = A times fields of ones. What is left of y,
+        (I - F F^+) y, depends on t alone, and t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A
+        m) is worked out in the eigenvectors of the signal's covariance: of directions of A whose
+        signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept.
+        Bands that the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their
+        own: there it is part of t.
+    sigma > 0. Source: Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md,
+        "Spatial reconstruction".
     """
     from plenocli.base.errors import NumericsError
 
     if not sigma > 0:
-        raise NumericsError(f"LMMSE needs a positive noise level, not {sigma}", fix="give --noise-sigma, or use --method tikhonov")
+        raise NumericsError(
+            f"LMMSE needs a positive noise level, not {sigma}",
+            fix="give --noise-sigma, or use --method tikhonov",
+        )
     bands = np.asarray(bands, float)
     levels, even = _levels(svd, bands, np.mean(np.diag(covariance)), sigma)
-    left, weight = levels / np.linalg.norm(levels, axis=1)[:, None], (levels @ svd.u * svd.s) @ svd.vt
+    left, weight = (
+        levels / np.linalg.norm(levels, axis=1)[:, None],
+        (levels @ svd.u * svd.s) @ svd.vt,
+    )
     mean = np.tile(mean, len(bands))
     mean = mean - even @ (weight @ mean)
     pulled = _times(bands, covariance, weight.T)
@@ -147,21 +187,40 @@ def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
         used.append(first + loud)
         cross.append(along[:, loud])
     used = np.concatenate([*used, np.zeros(0, int)])
-    seen, cross = svd.s[used, None] * svd.vt[used], np.concatenate([*cross, np.zeros((svd.vt.shape[1], 0))], axis=1)
+    seen, cross = (
+        svd.s[used, None] * svd.vt[used],
+        np.concatenate([*cross, np.zeros((svd.vt.shape[1], 0))], axis=1),
+    )
     data = seen @ cross
     power, vectors = np.linalg.eigh((data + data.T) / 2)
     kept = power > 1e-4 * sigma**2
     power, vectors = power[kept], vectors[:, kept]
     analysis = vectors.T @ svd.u[:, used].T
     analysis = analysis - (analysis @ left.T) @ left
-    variance = np.kron(np.diag(bands), np.diag(covariance)) - np.sum(even * (2 * pulled - even @ (weight @ pulled)), axis=1)
-    return Lmmse(levels, even, mean, vectors.T @ (seen @ mean), analysis, power, cross @ vectors, variance, float(sigma))
+    variance = np.kron(np.diag(bands), np.diag(covariance)) - np.sum(
+        even * (2 * pulled - even @ (weight @ pulled)), axis=1
+    )
+    return Lmmse(
+        levels,
+        even,
+        mean,
+        vectors.T @ (seen @ mean),
+        analysis,
+        power,
+        cross @ vectors,
+        variance,
+        float(sigma),
+    )
 
 
 def _levels(svd, bands, variance, sigma):
-    """(levels (level, pixel), even (point, level)) of Lmmse: orthogonal rows that measure brightnesses, and the fields they stand for."""
+    """(levels (level, pixel), even (point, level)) of Lmmse: orthogonal rows that measure
+    brightnesses, and the fields they stand for.
+    """
     values, vectors = np.linalg.eigh(bands)
-    ones = np.kron(vectors * np.sqrt(np.maximum(values, 0)), np.ones((svd.vt.shape[1] // len(bands), 1)))
+    ones = np.kron(
+        vectors * np.sqrt(np.maximum(values, 0)), np.ones((svd.vt.shape[1] // len(bands), 1))
+    )
     u, s, vt = np.linalg.svd(svd.s[:, None] * (svd.vt @ ones), full_matrices=False)
     kept = s * np.sqrt(variance) > LEVEL_SURE * sigma
     kept[0] = True

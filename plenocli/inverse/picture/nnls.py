@@ -1,8 +1,10 @@
-"""Non-negative least squares: min |y - A x|^2, x >= 0; converged, or stopped early and saying where.
+"""Non-negative least squares: min |y - A x|^2, x >= 0; converged, or stopped
+early and saying where.
 
-"Non-linear least squares" is not one result: on a plenoptic system matrix the picture first improves and then drowns in
-noise as the iterations go on, so every result carries its stopping rule. A converged solution is checked against the
-optimality (KKT) conditions of the problem; the early-stopped one is the accelerated projected gradient method.
+"Non-linear least squares" is not one result: on a plenoptic system matrix the picture first
+improves and then drowns in noise as the iterations go on, so every result carries its stopping
+rule. A converged solution is checked against the optimality (KKT) conditions of the problem; the
+early-stopped one is the accelerated projected gradient method.
 """
 
 from dataclasses import dataclass
@@ -12,8 +14,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class NonNegative:
-    """x (point, signal) >= 0.  kkt (signal,): how far from optimal, see `kkt_violation`.  iterations: of the gradient method,
-    0 for the active-set one."""
+    """x (point, signal) >= 0.
+
+    kkt (signal,): how far from optimal, see `kkt_violation`.
+    iterations: of the gradient method, 0 for the active-set one.
+    """
 
     x: np.ndarray
     kkt: np.ndarray
@@ -23,7 +28,8 @@ class NonNegative:
 def kkt_violation(matrix, z, x):
     """Largest violation of the optimality conditions per signal, relative to the gradient at x = 0.
 
-    With g = A^T (A x - z): max_j of |g_j| where x_j > 0 and of max(-g_j, 0) where x_j = 0, over max_j |A^T z|_j.
+    With g = A^T (A x - z): max_j of |g_j| where x_j > 0 and of max(-g_j, 0) where x_j = 0,
+    over max_j |A^T z|_j.
     """
     g = matrix.T @ (matrix @ x - z)
     wrong = np.where(x > 0, np.abs(g), np.maximum(-g, 0)).max(axis=0)
@@ -31,10 +37,12 @@ def kkt_violation(matrix, z, x):
 
 
 def converged(matrix, z, *, tol=1e-10):
-    """The solution for each column of z (row, signal), by the active-set method of Lawson and Hanson (1974).
+    """The solution for each column of z (row, signal), by the active-set method of Lawson
+    and Hanson (1974).
 
-    matrix: (row, point); S V^T and U^T y serve as well as A and y, and are smaller. NumericsError where the conditions are
-    violated by more than `tol` (`kkt_violation`). About 2 s of CPU for a signal of 1600 points at 60 dB.
+    matrix: (row, point); S V^T and U^T y serve as well as A and y, and are smaller.
+    NumericsError where the conditions are violated by more than `tol` (`kkt_violation`). About 2 s
+    of CPU for a signal of 1600 points at 60 dB.
     """
     from scipy.optimize import nnls
 
@@ -44,15 +52,23 @@ def converged(matrix, z, *, tol=1e-10):
     x = np.stack([nnls(matrix, column, maxiter=20 * matrix.shape[1])[0] for column in z.T], axis=1)
     kkt = kkt_violation(matrix, z, x)
     if not np.all(kkt <= tol):
-        raise NumericsError(f"non-negative least squares reached {kkt.max():.1e} of the optimality conditions, not {tol:.1e}",
-                            fix="use --nnls-iterations, or --method tikhonov")
+        raise NumericsError(
+            (
+                f"non-negative least squares reached {kkt.max():.1e} of the optimality "
+                f"conditions, not {tol:.1e}"
+            ),
+            fix="use --nnls-iterations, or --method tikhonov",
+        )
     return NonNegative(x, kkt, 0)
 
 
 def projected_gradient(matrix, z, iterations, norm=None):
-    """The iterate after `iterations` steps from x = 0 of the accelerated projected gradient method (FISTA with x >= 0).
+    """The iterate after `iterations` steps from x = 0 of the accelerated projected gradient method
+    (FISTA with x >= 0).
 
-    matrix (row, point), z (row, signal); step 1/|A|_2^2, momentum restarted per signal where it points uphill. norm: |A|_2, if known.
+    matrix (row, point), z (row, signal); step 1/|A|_2^2, momentum restarted per signal
+    where it points uphill.
+    norm: |A|_2, if known.
     """
     matrix, z = np.asarray(matrix, float), np.asarray(z, float)
     gram, target = matrix.T @ matrix, matrix.T @ z

@@ -1,10 +1,13 @@
-"""Reconstruction that looks over the lenslet's edge: light that neighbours send, and scenes that go on next door.
+"""Reconstruction that looks over the lenslet's edge: light that neighbours send, and scenes
+that go on next door.
 
-The paper removes block edges "by performing object reconstruction from 3x3 lenslet areas and then averaging" (Berkner et
-al. 2013, section 3-2). Where only own superpixels are modelled, the 3x3 system falls apart into nine single ones and least
-squares gains nothing from it: what couples neighbours is the light between them and the prior. So LMMSE estimates each
-block from the nine superpixels around it, with the covariance of the scene across lenslets; the other methods work on
-superpixels from which the neighbours' light, as that estimate predicts it, is taken away. No 3x3 matrix is formed.
+The paper removes block edges "by performing object reconstruction from 3x3 lenslet areas and then
+averaging" (Berkner et al. 2013, section 3-2). Where only own superpixels are modelled, the 3x3
+system falls apart into nine single ones and least squares gains nothing from it: what couples
+neighbours is the light between them and the prior. So LMMSE estimates each block from the nine
+superpixels around it, with the covariance of the scene across lenslets; the other methods work on
+superpixels from which the neighbours' light, as that estimate predicts it, is taken away. No
+3x3 matrix is formed.
 """
 
 from dataclasses import dataclass
@@ -17,7 +20,9 @@ MOST = 256
 
 
 def by_lenslet(solve, y):
-    """`solve` (pixel, signal) -> (point, signal) on all superpixels y (lenslet_row, lenslet_column, pixel) at once."""
+    """`solve` (pixel, signal) -> (point, signal) on all superpixels y (lenslet_row,
+    lenslet_column, pixel) at once.
+    """
     rows, columns = y.shape[:2]
     return solve(y.reshape(rows * columns, -1).T).T.reshape(rows, columns, -1)
 
@@ -34,10 +39,11 @@ class JointLmmse:
     variance: np.ndarray
 
     def apply(self, y):
-        """(lenslet_row, lenslet_column, pixel) -> (x, sigma), both (lenslet_row, lenslet_column, point).
+        """(lenslet_row, lenslet_column, pixel) -> (x, sigma), both (lenslet_row,
+        lenslet_column, point).
 
-        Beyond the array's border there is nothing to look at: blocks there use the superpixels that exist. Light from
-        outside the array is taken to have the scene's mean and covariance.
+        Beyond the array's border there is nothing to look at: blocks there use the superpixels that
+        exist. Light from outside the array is taken to have the scene's mean and covariance.
         """
         from scipy.linalg import cholesky, solve_triangular
 
@@ -57,28 +63,44 @@ class JointLmmse:
             factor = cholesky(self.data[np.ix_(keep, keep)], lower=True)
             whitened = solve_triangular(factor, cross.T, lower=True)
             near = [d for d, there in zip(ring, inside) if there]
-            seen = np.stack([np.concatenate([z[r + dr, c + dc] for dr, dc in near]) for r, c in lenslets], axis=1)
+            seen = np.stack(
+                [np.concatenate([z[r + dr, c + dc] for dr, dc in near]) for r, c in lenslets],
+                axis=1,
+            )
             estimate = self.mean + whitened.T @ solve_triangular(factor, seen, lower=True)
-            error = np.sqrt(np.maximum(self.variance - np.einsum("ij,ij->j", whitened, whitened), 0))
+            error = np.sqrt(
+                np.maximum(self.variance - np.einsum("ij,ij->j", whitened, whitened), 0)
+            )
             for k, (r, c) in enumerate(lenslets):
                 x[r, c], sigma[r, c] = estimate[:, k], error
         return x, sigma
 
 
-def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigma, bands=((1.0,),), *, most=MOST):
-    """Set up LMMSE from 3x3 superpixels for a scene with the stationary `autocovariance` (lags up to `needed_reach`).
+def prepare_joint(
+    svd, blocks, offsets, object_shape, mean, autocovariance, sigma, bands=((1.0,),), *, most=MOST
+):
+    """Set up LMMSE from 3x3 superpixels for a scene with the stationary `autocovariance` (lags up
+    to `needed_reach`).
 
-    svd: of the own block A_0.  blocks (offset, pixel, point), offsets (offset, 2): as in BlockToeplitz, points of several bands
-    one band after the other.  object_shape: points (rows, columns) of a block in one band.  mean, autocovariance: of
-    natural.autocovariance.  bands (band, band): covariance of the bands at a point, its diagonal about 1.  sigma > 0: noise of
-    a pixel.  Superpixels are seen through at most `most` left singular vectors of A_0, those whose signal can exceed a hundredth of
-    the noise: a linear reduction of the data, for which the estimate is exact, neighbours' light included. Covariances are
-    inner products of each vector's footprint on the object with the footprints filtered by the autocovariance (FFT).
+    svd: of the own block A_0.
+    blocks (offset, pixel, point), offsets (offset, 2): as in BlockToeplitz, points of several bands
+        one band after the other.
+    object_shape: points (rows, columns) of a block in one band.
+    mean, autocovariance: of natural.autocovariance.
+    bands (band, band): covariance of the bands at a point, its diagonal about 1.
+    sigma > 0: noise of a pixel. Superpixels are seen through at most `most` left singular vectors
+        of A_0, those whose signal can exceed a hundredth of the noise: a linear reduction of the
+        data, for which the estimate is exact, neighbours' light included. Covariances are inner
+        products of each vector's footprint on the object with the footprints filtered by the
+        autocovariance (FFT).
     """
     from plenocli.base.errors import NumericsError
 
     if not sigma > 0:
-        raise NumericsError(f"LMMSE needs a positive noise level, not {sigma}", fix="give --noise-sigma, or use --method tikhonov")
+        raise NumericsError(
+            f"LMMSE needs a positive noise level, not {sigma}",
+            fix="give --noise-sigma, or use --method tikhonov",
+        )
     blocks, offsets = np.asarray(blocks, float), np.asarray(offsets, int)
     rows, columns = object_shape
     bands = np.asarray(bands, float)
@@ -97,25 +119,47 @@ def prepare_joint(svd, blocks, offsets, object_shape, mean, autocovariance, sigm
     margin = 2 * RING * np.array([rows, columns])
     filtered = _filter(footprint, autocovariance, margin)
     if count > 1 or bands[0, 0] != 1:
-        filtered = np.einsum("ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])).reshape(filtered.shape)
+        filtered = np.einsum(
+            "ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])
+        ).reshape(filtered.shape)
 
     def shifted(dr, dc):
-        """The filtered footprints as seen by a lenslet (dr, dc) from the one whose footprints they are."""
+        """The filtered footprints as seen by a lenslet (dr, dc) from the one whose
+        footprints they are.
+        """
         r, c = margin[0] + dr * rows, margin[1] + dc * columns
         return filtered[:, r : r + footprint.shape[1], c : c + footprint.shape[2]]
 
     flat = footprint.reshape(used, -1)
     ring = [(dr, dc) for dr in range(-RING, RING + 1) for dc in range(-RING, RING + 1)]
-    pairs = {(dr, dc): flat @ shifted(dr, dc).reshape(used, -1).T for dr in range(-2 * RING, 2 * RING + 1) for dc in range(-2 * RING, 2 * RING + 1)}
+    pairs = {
+        (dr, dc): flat @ shifted(dr, dc).reshape(used, -1).T
+        for dr in range(-2 * RING, 2 * RING + 1)
+        for dc in range(-2 * RING, 2 * RING + 1)
+    }
     data = np.block([[pairs[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
     data = (data + data.T) / 2
-    # what rounding may have taken away, in proportion to each coordinate's light: almost without noise data would be no covariance
-    rounding = len(data) * np.finfo(float).eps * np.abs(autocovariance).sum() * brightest * np.einsum("ij,ij->i", flat, flat)
+    # what rounding may have taken away, in proportion to each coordinate's light: almost without
+    # noise data would be no covariance
+    rounding = (
+        len(data)
+        * np.finfo(float).eps
+        * np.abs(autocovariance).sum()
+        * brightest
+        * np.einsum("ij,ij->i", flat, flat)
+    )
     data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(ring))
     own = np.s_[:, reach * rows : (reach + 1) * rows, reach * columns : (reach + 1) * columns]
     cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
     middle = autocovariance.shape[0] // 2
-    return JointLmmse(mean, analysis, mean * response.sum(axis=(0, 2)), cross, data, np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns))
+    return JointLmmse(
+        mean,
+        analysis,
+        mean * response.sum(axis=(0, 2)),
+        cross,
+        data,
+        np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns),
+    )
 
 
 def needed_reach(object_shape, offsets):
@@ -125,7 +169,9 @@ def needed_reach(object_shape, offsets):
 
 
 def _filter(footprint, autocovariance, margin):
-    """footprint convolved with the autocovariance, on its own grid enlarged by `margin` on each side."""
+    """footprint convolved with the autocovariance, on its own grid enlarged by
+    `margin` on each side.
+    """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     reach = autocovariance.shape[0] // 2

@@ -1,8 +1,10 @@
-"""Methods of reconstruct that look at one lenslet at a time. Each takes (camera, y (pixel, signal), sigma, truth or None, report) and
-returns x (point, signal); camera is the Estimators that asks. The report learns the method's parameters.
+"""Methods of reconstruct that look at one lenslet at a time.
 
-Where a lenslet takes long, what is the same for all is worked out first, and the lenslets are solved in batches, by a function of
-(camera, batch, ...) that other processes can run.
+Each takes (camera, y (pixel, signal), sigma, truth or None, report) and returns x (point, signal);
+camera is the Estimators that asks. The report learns the method's parameters.
+
+Where a lenslet takes long, what is the same for all is worked out first, and the lenslets are
+solved in batches, by a function of (camera, batch, ...) that other processes can run.
 """
 
 import numpy as np
@@ -13,10 +15,14 @@ from plenocli.base.progress import note
 SPLIT = ("nnls", "dictionary")
 """Methods whose lenslets are solved in batches."""
 BATCH = {"nnls": 64, "nnls converged": 4, "dictionary": 128}
-"""Lenslets of a batch: some seconds of work. The same however many work, as the last digits depend on it."""
+"""Lenslets of a batch: some seconds of work. The same however many work, as the last
+digits depend on it.
+"""
 HINDSIGHT = "oracle: least error against the truth, which no camera has"
 LOUDER_POWER = 1.75
-"""Lambda grows with the noise to this power, by validation; 2 would be the most probable code of coefficients with one Laplacian density."""
+"""Lambda grows with the noise to this power, by validation; 2 would be the most probable code of
+coefficients with one Laplacian density.
+"""
 TOO_LOUD = 50
 """Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
@@ -34,7 +40,11 @@ def tikhonov(camera, y, sigma, truth, report):
     svd, alpha, rule = camera.svd, camera.settings.alpha, "given"
     z = svd.compress(y)
     if alpha is None:
-        alpha, rule = (linear.discrepancy_alpha(svd, z, sigma), "discrepancy") if truth is None else (linear.oracle_alpha(svd, z, truth), HINDSIGHT)
+        alpha, rule = (
+            (linear.discrepancy_alpha(svd, z, sigma), "discrepancy")
+            if truth is None
+            else (linear.oracle_alpha(svd, z, truth), HINDSIGHT)
+        )
     report |= {"alpha": float(alpha), "rule": rule}
     return linear.tikhonov(svd, z, alpha)
 
@@ -46,7 +56,11 @@ def tsvd(camera, y, sigma, truth, report):
     svd, rank, rule = camera.svd, camera.settings.rank, "given"
     z = svd.compress(y)
     if rank is None:
-        rank, rule = (linear.best_rank(svd, z, sigma), "least estimated error") if truth is None else (linear.oracle_rank(svd, z, truth), HINDSIGHT)
+        rank, rule = (
+            (linear.best_rank(svd, z, sigma), "least estimated error")
+            if truth is None
+            else (linear.oracle_rank(svd, z, truth), HINDSIGHT)
+        )
     rank = min(rank, svd.rank())
     report |= {"rank": int(rank), "rule": rule}
     return linear.truncated(svd, z, rank)
@@ -57,11 +71,20 @@ def nnls(camera, y, sigma, truth, report):
     svd, steps = camera.svd, camera.settings.nnls_iterations
     lenslets, points = y.shape[1], svd.vt.shape[1]
     if not steps and lenslets * points > 50_000:
-        note(f"converged non-negative least squares of {lenslets} lenslets takes about {2 * lenslets * (points / 1600) ** 2.5 / 60:.0f} minutes of CPU; "
-             "--nnls-iterations 300 stops early")
-    found = camera.in_batches(nnls_batch, svd.compress(y), BATCH["nnls" if steps else "nnls converged"])
-    report |= {"kkt_violation": max(kkt for _, kkt in found),
-               "rule": f"stopped after {steps} steps of accelerated projected gradient from 0" if steps else "converged, optimality conditions checked"}
+        note(
+            f"converged non-negative least squares of {lenslets} lenslets takes about "
+            f"{2 * lenslets * (points / 1600) ** 2.5 / 60:.0f} minutes of CPU; "
+            "--nnls-iterations 300 stops early"
+        )
+    found = camera.in_batches(
+        nnls_batch, svd.compress(y), BATCH["nnls" if steps else "nnls converged"]
+    )
+    report |= {
+        "kkt_violation": max(kkt for _, kkt in found),
+        "rule": f"stopped after {steps} steps of accelerated projected gradient from 0"
+        if steps
+        else "converged, optimality conditions checked",
+    }
     return np.concatenate([x for x, _ in found], axis=1)
 
 
@@ -70,7 +93,11 @@ def nnls_batch(camera, z):
     from plenocli.inverse.picture import nnls
 
     matrix, steps = camera.svd.s[:, None] * camera.svd.vt, camera.settings.nnls_iterations
-    found = nnls.projected_gradient(matrix, z, steps, norm=camera.svd.s[0]) if steps else nnls.converged(matrix, z)
+    found = (
+        nnls.projected_gradient(matrix, z, steps, norm=camera.svd.s[0])
+        if steps
+        else nnls.converged(matrix, z)
+    )
     return found.x, float(found.kkt.max())
 
 
@@ -83,28 +110,49 @@ def dictionary(camera, y, sigma, truth, report):
     louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
     lam = asked if asked is not None else float(attrs["lambda"]) * louder**LOUDER_POWER
     if louder > TOO_LOUD:
-        note(f"the dictionary was learnt for {louder:.3g} times less noise than this capture has: --method lmmse is as good or better here")
+        note(
+            f"the dictionary was learnt for {louder:.3g} times less noise than this capture has: "
+            "--method lmmse is as good or better here"
+        )
     kept = min(svd.rank(), attrs["parameters"].get("directions", len(svd.s)))
     z = svd.compress(y)[:kept] / scale
     found = camera.in_batches(dictionary_batch, z, BATCH["dictionary"], lam)
     nonzeros = sum(n * part.shape[1] for part, _, n in found) / z.shape[1]
-    rule = "given" if asked is not None else "lambda as learnt" if louder < 1.01 else f"lambda as learnt, times {louder**LOUDER_POWER:.3g} for {louder:.3g} times the noise"
-    report |= {"lambda": lam, "rule": rule, "average": "over the mirror images of the dictionary", "worst_gap": max(gap for _, gap, _ in found), "nonzeros": nonzeros}
+    rule = (
+        "given"
+        if asked is not None
+        else "lambda as learnt"
+        if louder < 1.01
+        else f"lambda as learnt, times {louder**LOUDER_POWER:.3g} for {louder:.3g} times the noise"
+    )
+    report |= {
+        "lambda": lam,
+        "rule": rule,
+        "average": "over the mirror images of the dictionary",
+        "worst_gap": max(gap for _, gap, _ in found),
+        "nonzeros": nonzeros,
+    }
     return np.concatenate([x for x, _, _ in found], axis=1)
 
 
 def dictionary_batch(camera, z, lam):
-    """(x (point, signal), worst gap, mean non-zeros) of compressed signals z (direction, signal), relative to the largest singular value."""
+    """(x (point, signal), worst gap, mean non-zeros) of compressed signals z (direction,
+    signal), relative to the largest singular value.
+    """
     from plenocli.inverse.sparse.dictionary import averaged
 
     atoms, paint, _ = camera.learnt
     svd, kept = camera.svd, len(z)
     seen = (svd.s[:kept, None] / float(svd.s[0])) * svd.vt[:kept]
-    return averaged(seen, atoms, z, lam, camera.system.object_shape, synthesis=paint, workers=camera.threads)
+    return averaged(
+        seen, atoms, z, lam, camera.system.object_shape, synthesis=paint, workers=camera.threads
+    )
 
 
 def read_dictionary(path, system, mem_limit=None):
-    """(atoms that code, atoms that paint, attributes) of a dictionary for `system`; a note where it was learnt for another matrix."""
+    """(atoms that code, atoms that paint, attributes) of a dictionary for `system`; a note where
+    it was learnt for another matrix.
+    """
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
 
@@ -112,11 +160,26 @@ def read_dictionary(path, system, mem_limit=None):
     atoms = np.asarray(artefact.data["dictionary/atoms"], float)
     if len(atoms) != system.own.shape[1]:
         several = f" in {len(system.bands)} bands" if len(system.bands) > 1 else ""
-        raise InputError(f"has atoms of {len(atoms)} points, the system matrix {system.own.shape[1]}{several}", path,
-                         "use another method: dictionaries have one band" if several else "learn it with this pif")
+        raise InputError(
+            f"has atoms of {len(atoms)} points, the system matrix {system.own.shape[1]}{several}",
+            path,
+            "use another method: dictionaries have one band"
+            if several
+            else "learn it with this pif",
+        )
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
         note(f"the dictionary was learnt for another system matrix than {system.path.name}")
-    return atoms, np.asarray(artefact.data.get("dictionary/synthesis", atoms), float), artefact.attrs["dictionary"]
+    return (
+        atoms,
+        np.asarray(artefact.data.get("dictionary/synthesis", atoms), float),
+        artefact.attrs["dictionary"],
+    )
 
 
-METHODS = {"block-mean": block_mean, "tikhonov": tikhonov, "tsvd": tsvd, "nnls": nnls, "dictionary": dictionary}
+METHODS = {
+    "block-mean": block_mean,
+    "tikhonov": tikhonov,
+    "tsvd": tsvd,
+    "nnls": nnls,
+    "dictionary": dictionary,
+}

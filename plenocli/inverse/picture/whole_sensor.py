@@ -1,9 +1,12 @@
-"""Reconstruction of all lenslets together: the data of every lenslet, and a prior that sees the whole picture.
+"""Reconstruction of all lenslets together: the data of every lenslet, and a prior that sees
+the whole picture.
 
-Half-quadratic splitting takes turns between  x = argmin |y - A x|^2/sigma^2 + |x - v|^2/tau^2  (the proximal step, in closed form
-through the singular value decomposition of the own block) and a denoiser, v = D(x, tau), of the whole picture, while tau
-falls ("plug and play": Venkatakrishnan, Bouman, Wohlberg, GlobalSIP 2013; the schedule as in Zhang et al., IEEE Trans. PAMI
-44 (2022) 6360). Total variation is the convex case, by the alternating direction method of multipliers (Boyd et al. 2011).
+Half-quadratic splitting takes turns between x = argmin |y - A x|^2/sigma^2 + |x - v|^2/tau^2 (the
+proximal step, in closed form through the singular value decomposition of the own block) and a
+denoiser, v = D(x, tau), of the whole picture, while tau falls ("plug and play": Venkatakrishnan,
+Bouman, Wohlberg, GlobalSIP 2013; the schedule as in Zhang et al., IEEE Trans. PAMI 44 (2022) 6360).
+Total variation is the convex case, by the alternating direction method of multipliers
+(Boyd et al. 2011).
 """
 
 import numpy as np
@@ -11,8 +14,9 @@ import numpy as np
 from plenocli.base.tiling import to_blocks, to_plane
 
 FROM, TO, ROUNDS = 6.0, 0.1, 10
-"""Plug and play: first and last tau over the error that is expected at the start, and rounds in between; chosen on validation
-scenes (docs/model.md)."""
+"""Plug and play: first and last tau over the error that is expected at the start, and rounds in
+between; chosen on validation scenes (docs/model.md).
+"""
 TV_WEIGHT, TV_ROUNDS = 0.2, 20
 """Total variation: its weight times the error expected at the start, and rounds of ADMM."""
 
@@ -20,10 +24,14 @@ TV_WEIGHT, TV_ROUNDS = 0.2, 20
 class DataTerm:
     """|y - A x|^2/sigma^2 of a sensor, in the directions of the own block that can be seen.
 
-    svd: of the own block.  object_shape: points (rows, columns) of a block in one band.  y (lenslet_row, lenslet_column, pixel):
-    own light, neighbours' taken away.  sigma > 0: noise of a pixel.  contrast: what a point may differ from what the prior
-    expects; singular vectors whose signal is then below 3 % of the noise are dropped.  held: (mask (lenslet_row,
-    lenslet_column), x like y's lenslets (.., point)) of lenslets whose light is not their own: their objects stay what they are.
+    svd: of the own block.
+    object_shape: points (rows, columns) of a block in one band.
+    y (lenslet_row, lenslet_column, pixel): own light, neighbours' taken away.
+    sigma > 0: noise of a pixel.
+    contrast: what a point may differ from what the prior expects; singular vectors whose signal is
+        then below 3 % of the noise are dropped.
+    held: (mask (lenslet_row, lenslet_column), x like y's lenslets (.., point)) of lenslets whose
+        light is not their own: their objects stay what they are.
     """
 
     def __init__(self, svd, object_shape, y, sigma, contrast=0.1, held=None):
@@ -32,7 +40,9 @@ class DataTerm:
         self.s, self.vt, self.z = svd.s[:kept], svd.vt[:kept], y @ svd.u[:, :kept]
 
     def proximal(self, picture, tau):
-        """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column) or (band, row, column)."""
+        """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column)
+        or (band, row, column).
+        """
         v = to_blocks(picture, self.shape)
         share = self.s / (self.s**2 + (self.sigma / tau) ** 2)
         x = v + ((self.z - (v @ self.vt.T) * self.s) * share) @ self.vt
@@ -43,26 +53,36 @@ class DataTerm:
 
 
 def schedule(error):
-    """Falling tau for `plug_and_play` from a picture whose root mean square error is expected to be `error`."""
+    """Falling tau for `plug_and_play` from a picture whose root mean square error is
+    expected to be `error`.
+    """
     return np.geomspace(FROM * error, TO * error, ROUNDS)
 
 
 def denoiser(bands):
-    """Block matching for pictures (row, column), or (band, row, column) whose bands have the covariance `bands` (band, band): these
-    are turned into uncorrelated ones, most of them nearly flat, which leaves white noise white."""
+    """Block matching for pictures (row, column), or (band, row, column) whose bands have the
+    covariance `bands` (band, band): these are turned into uncorrelated ones, most of them nearly
+    flat, which leaves white noise white.
+    """
     from plenocli.inverse.picture.block_matching import block_matching
 
     def denoise(picture, tau):
         if picture.ndim == 2:
             return block_matching(picture, tau)
         turn = np.linalg.eigh(bands)[1].T
-        return np.tensordot(turn.T, np.stack([block_matching(plane, tau) for plane in np.tensordot(turn, picture, 1)]), 1)
+        return np.tensordot(
+            turn.T,
+            np.stack([block_matching(plane, tau) for plane in np.tensordot(turn, picture, 1)]),
+            1,
+        )
 
     return denoise
 
 
 def plug_and_play(term, start, denoise, taus):
-    """The picture (row, column) after a round of v = denoise(x, tau), x = proximal(v, tau) for each tau, from x = start."""
+    """The picture (row, column) after a round of v = denoise(x, tau), x = proximal(v, tau) for
+    each tau, from x = start.
+    """
     x = start
     for tau in taus:
         x = term.proximal(denoise(x, tau), tau)
@@ -70,8 +90,8 @@ def plug_and_play(term, start, denoise, taus):
 
 
 def total_variation(term, start, error, rounds=range(TV_ROUNDS)):
-    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by a round of ADMM for each of `rounds`
-    from x = start.
+    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by a round of ADMM for
+    each of `rounds` from x = start.
 
     error: root mean square error expected of `start`; it also scales the penalty, tau = error.
     """

@@ -1,4 +1,6 @@
-"""What natural images look like to one lenslet: training patches, their mean and covariance, their autocovariance."""
+"""What natural images look like to one lenslet: training patches, their mean and covariance,
+their autocovariance.
+"""
 
 import numpy as np
 
@@ -6,9 +8,11 @@ import numpy as np
 def draw_patches(images, shape, count, rng, *, flips=True):
     """`count` random patches as columns, (point, count) float64, points numbered row by row.
 
-    images: 2-D arrays of linear luminance in [0, 1], each at least `shape` (rows, columns) large; an image is drawn with
-    probability proportional to the number of its patch positions, a position uniformly.  flips: mirror at random, which
-    leaves the statistics of natural scenes alone and doubles what few photographs have to say.
+    images: 2-D arrays of linear luminance in [0, 1], each at least `shape` (rows, columns) large;
+        an image is drawn with probability proportional to the number of its patch positions, a
+        position uniformly.
+    flips: mirror at random, which leaves the statistics of natural scenes alone and doubles what
+        few photographs have to say.
     """
     rows, columns = shape
     room = [(i.shape[0] - rows + 1, i.shape[1] - columns + 1) for i in images]
@@ -19,9 +23,14 @@ def draw_patches(images, shape, count, rng, *, flips=True):
     place = rng.random((count, 2))
     mirror = rng.integers(0, 2, (count, 2)) if flips else np.zeros((count, 2), int)
     corner = (place * np.array(room)[which]).astype(int)
-    patches = np.empty((count, rows, columns))  # written one by one, which columns of a matrix would make slow
-    for patch, image, (r, c), (down, right) in zip(patches, which.tolist(), corner.tolist(), mirror.tolist()):
-        patch[:] = images[image][r : r + rows, c : c + columns][:: -1 if down else 1, :: -1 if right else 1]
+    # written one by one, which columns of a matrix would make slow
+    patches = np.empty((count, rows, columns))
+    for patch, image, (r, c), (down, right) in zip(
+        patches, which.tolist(), corner.tolist(), mirror.tolist()
+    ):
+        patch[:] = images[image][r : r + rows, c : c + columns][
+            :: -1 if down else 1, :: -1 if right else 1
+        ]
     return patches.reshape(count, -1).T
 
 
@@ -33,12 +42,15 @@ def mean_covariance(patches):
 
 
 def autocovariance(images, reach):
-    """(mean, C) of the images taken as one stationary field: C[dr + reach, dc + reach], lags up to `reach` each way.
+    """(mean, C) of the images taken as one stationary field: C[dr + reach, dc + reach], lags up
+    to `reach` each way.
 
-    Each image's overlap-normalised autocovariance about the common mean, weighted by its pixels, made symmetric under
-    reversal of either axis. Lags beyond half an image's side rest on few pairs, and are tapered to zero from there. What is measured
-    so is not quite an autocovariance: as one period of a periodic field its spectrum dips below zero (for photographs by a thousandth
-    of the variance or less in all). It is cut there, the variance kept, so that points with all their lags within `reach` have a covariance.
+    Each image's overlap-normalised autocovariance about the common mean, weighted by its pixels,
+    made symmetric under reversal of either axis. Lags beyond half an image's side rest on few
+    pairs, and are tapered to zero from there. What is measured so is not quite an autocovariance:
+    as one period of a periodic field its spectrum dips below zero (for photographs by a thousandth
+    of the variance or less in all). It is cut there, the variance kept, so that points with all
+    their lags within `reach` have a covariance.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -47,15 +59,26 @@ def autocovariance(images, reach):
     lags = np.arange(-reach, reach + 1)
     for image in images:
         shape = [next_fast_len(n + reach, real=True) for n in image.shape]
-        power = [np.abs(rfft2(x, shape)) ** 2 for x in (np.asarray(image, float) - mean, np.ones(image.shape))]
+        power = [
+            np.abs(rfft2(x, shape)) ** 2
+            for x in (np.asarray(image, float) - mean, np.ones(image.shape))
+        ]
         lag_sum, lag_count = (irfft2(p, shape) for p in power)
-        reached = (np.abs(lags)[:, None] < image.shape[0]) & (np.abs(lags)[None, :] < image.shape[1])
+        reached = (np.abs(lags)[:, None] < image.shape[0]) & (
+            np.abs(lags)[None, :] < image.shape[1]
+        )
         total += np.where(reached, lag_sum[np.ix_(lags, lags)], 0)
         pairs += np.where(reached, np.round(lag_count[np.ix_(lags, lags)]), 0)
     field = total / np.maximum(pairs, 1)
     field = (field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]) / 4
     half = np.median([min(i.shape) for i in images]) / 2
-    taper = np.cos(np.pi / 2 * np.clip((np.abs(lags) - half) / max(reach - half, 1), 0, 1)) ** 2 if reach > half else 1.0 + 0 * lags
+    taper = (
+        np.cos(np.pi / 2 * np.clip((np.abs(lags) - half) / max(reach - half, 1), 0, 1)) ** 2
+        if reach > half
+        else 1.0 + 0 * lags
+    )
     field *= taper[:, None] * taper[None, :]
-    cut = np.fft.fftshift(np.fft.ifft2(np.maximum(np.fft.fft2(np.fft.ifftshift(field)).real, 0)).real)
+    cut = np.fft.fftshift(
+        np.fft.ifft2(np.maximum(np.fft.fft2(np.fft.ifftshift(field)).real, 0)).real
+    )
     return float(mean), cut * (field[reach, reach] / max(cut[reach, reach], np.finfo(float).tiny))

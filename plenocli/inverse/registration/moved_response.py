@@ -1,6 +1,8 @@
-"""Responses of lenslets that are made where they are asked for: moved since the calibration, or widened by stray light.
+"""Responses of lenslets that are made where they are asked for: moved since the calibration, or
+widened by stray light.
 
-A sensor of thousands of superpixels has hundreds of megabytes of responses; one capture's own copy of them never exists whole.
+A sensor of thousands of superpixels has hundreds of megabytes of responses; one capture's own copy
+of them never exists whole.
 """
 
 import numpy as np
@@ -8,30 +10,46 @@ import numpy as np
 from plenocli.inverse.registration.motion import Smooth, _parity
 
 NODES = 1 / 16
-"""px between displacements for which pictures are moved, where lenslets have many: the rest is first order, good to 2e-4 of the peak."""
+"""px between displacements for which pictures are moved, where lenslets have many: the rest is
+first order, good to 2e-4 of the peak.
+"""
 KEPT = 64
 """Displacements whose pictures are kept."""
 
 
 class Moved:
-    """Responses (R, C, pixel, band) whose light is displaced by `rest` (R, C, 2) px within windows that went from `before` to `after`
-    (R, C, 2) by whole periods of the mosaic. response: of the calibration, (pixel, band) or (R, C, pixel, band). reference:
-    plenocli.inverse.registration.motion.Reference of it. `moved[rows, columns]` makes (lenslet, pixel, band).
+    """Responses (R, C, pixel, band) whose light is displaced by `rest` (R, C, 2) px within windows
+    that went from `before` to `after` (R, C, 2) by whole periods of the mosaic.
 
-    What lenslets have in common is moved, and its change added to each lenslet's own response: a spline would spread the noise of
-    single responses, magnified where a colour is weak, and what a lenslet has alone is as good as its noise or belongs to the pixels.
+    response: of the calibration, (pixel, band) or (R, C, pixel, band).
+    reference: plenocli.inverse.registration.motion.Reference of it. `moved[rows, columns]` makes
+        (lenslet, pixel, band).
+
+    What lenslets have in common is moved, and its change added to each lenslet's own response: a
+    spline would spread the noise of single responses, magnified where a colour is weak, and what a
+    lenslet has alone is as good as its noise or belongs to the pixels.
     """
 
     ndim = 4
 
     def __init__(self, response, before, after, rest, reference):
         self.shape = (*before.shape[:2], *response.shape[-2:])
-        self._response, self._before, self._after, self._rest, self._reference = response, before, after, np.round(rest, 4), reference
+        self._response, self._before, self._after, self._rest, self._reference = (
+            response,
+            before,
+            after,
+            np.round(rest, 4),
+            reference,
+        )
         self._even = bool(np.ptp(self._rest.reshape(-1, 2), axis=0).max() == 0)
         self._made = {}
 
     def __getitem__(self, places):
-        out = self._response[places] if self._response.ndim > 2 else np.array(np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])))
+        out = (
+            self._response[places]
+            if self._response.ndim > 2
+            else np.array(np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])))
+        )
         rest, kinds = self._rest[places], self._reference.kinds(self._before[places])
         nodes = rest if self._even else np.rint(rest / NODES) * NODES
         groups, which = np.unique(np.column_stack([kinds, nodes]), axis=0, return_inverse=True)
@@ -50,43 +68,65 @@ class Moved:
         return out
 
     def _change(self, kind, node, places, one):
-        """(what a displacement by `node` changes in the common pictures and its derivatives (3 rank, pixel, band), which pixels (pixel,)
-        cannot be told after it, the Basis or None)."""
+        """(what a displacement by `node` changes in the common pictures and its derivatives (3
+        rank, pixel, band), which pixels (pixel,) cannot be told after it, the Basis or None).
+        """
         if (kind, node) not in self._made:
             if len(self._made) >= KEPT:
                 self._made.clear()
             reference = self._reference
             basis = None if reference.shared else reference.bases[kind]
             pictures = self._response[None] if basis is None else basis.pictures
-            typical = self._response[None] if basis is None else basis.mixed(basis.middle[None].astype(np.float32))
+            typical = (
+                self._response[None]
+                if basis is None
+                else basis.mixed(basis.middle[None].astype(np.float32))
+            )
             before, after = (np.array([o[places][one]]) for o in (self._before, self._after))
             shift = np.array([node])
             settings = reference.window, reference.cfa, reference.gains
-            parts = Smooth(pictures, before.repeat(len(pictures), axis=0), *settings).at(after.repeat(len(pictures), axis=0), shift, derivatives=True, sharp=False)
+            parts = Smooth(pictures, before.repeat(len(pictures), axis=0), *settings).at(
+                after.repeat(len(pictures), axis=0), shift, derivatives=True, sharp=False
+            )
             seen = Smooth(typical, before, *settings).at(after, shift)[0]
             parts[0] = parts[0] - pictures
-            self._made[kind, node] = np.nan_to_num(np.concatenate(parts)), ~np.isfinite(seen).all(axis=-1), basis
+            self._made[kind, node] = (
+                np.nan_to_num(np.concatenate(parts)),
+                ~np.isfinite(seen).all(axis=-1),
+                basis,
+            )
         return self._made[kind, node]
 
 
 class Widened:
-    """Responses (R, C, pixel, band + n) with `patterns` (4, pixel, n) as further bands, chosen by the parity of windows' first pixels
-    `origin` (R, C, 2)."""
+    """Responses (R, C, pixel, band + n) with `patterns` (4, pixel, n) as further bands, chosen by
+    the parity of windows' first pixels `origin` (R, C, 2).
+    """
 
     ndim = 4
 
     def __init__(self, response, patterns, origin):
-        self.shape = (*origin.shape[:2], response.shape[-2], response.shape[-1] + patterns.shape[-1])
+        self.shape = (
+            *origin.shape[:2],
+            response.shape[-2],
+            response.shape[-1] + patterns.shape[-1],
+        )
         self._response, self._patterns, self._origin = response, patterns, origin
 
     def __getitem__(self, places):
         more = self._patterns[_parity(self._origin[places])]
-        own = self._response[places] if self._response.ndim > 2 else np.broadcast_to(self._response, (len(more), *self._response.shape))
+        own = (
+            self._response[places]
+            if self._response.ndim > 2
+            else np.broadcast_to(self._response, (len(more), *self._response.shape))
+        )
         return np.concatenate([own, more], axis=-1)
 
 
 def widened(response, patterns, origin, sites):
-    """As Widened, one array (pixel, band + n) where one response and one pattern serve all lenslets at `sites`."""
+    """As Widened, one array (pixel, band + n) where one response and one pattern serve all
+    lenslets at `sites`.
+    """
     kinds = np.unique(_parity(origin[sites]))
     if response.ndim == 2 and len(kinds) == 1:
         return np.concatenate([response, patterns[kinds[0]]], axis=-1)
@@ -94,11 +134,20 @@ def widened(response, patterns, origin, sites):
 
 
 def even_light(window, cfa):
-    """Patterns (4, pixel, colour) of stray light that is even over a superpixel, by the parity of the window's first pixel: 1 where a
-    pixel has that colour, NaN at the border, where the neighbours' light cannot be told from stray light."""
+    """Patterns (4, pixel, colour) of stray light that is even over a superpixel, by the parity of
+    the window's first pixel: 1 where a pixel has that colour, NaN at the border, where the
+    neighbours' light cannot be told from stray light.
+    """
     from plenocli.forward.sensor.cfa import MONO, cfa_map
     from plenocli.inverse.registration.motion import PARITIES, own_pixels
 
     letters = dict.fromkeys(cfa if cfa != "mono" else MONO)
-    patterns = np.stack([np.stack([cfa_map(window, cfa, corner).ravel() == letter for letter in letters], axis=-1) for corner in PARITIES])
+    patterns = np.stack(
+        [
+            np.stack(
+                [cfa_map(window, cfa, corner).ravel() == letter for letter in letters], axis=-1
+            )
+            for corner in PARITIES
+        ]
+    )
     return np.where(own_pixels(window)[:, None], patterns, np.nan).astype(np.float32)

@@ -6,7 +6,8 @@ INVISIBLE = 1e-6
 
 
 def column_coherence(effective, block=512):
-    """(largest, mean, visible): |cosine| over pairs of different columns of D `effective` (pixel, atom), None without a pair.
+    """(largest, mean, visible): |cosine| over pairs of different columns of D `effective` (pixel,
+    atom), None without a pair.
 
     visible (atom,) bool: columns of at least INVISIBLE of the largest norm, which alone count.
     """

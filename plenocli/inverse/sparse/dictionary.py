@@ -1,16 +1,19 @@
-"""Dictionary learning for incoherent sampling (Berkner et al. 2013, Fig. 4, Algorithm 1), made sound.
+"""Dictionary learning for incoherent sampling (Berkner et al. 2013, Fig. 4,
+Algorithm 1), made sound.
 
-Each iteration draws a batch X of clean training patches, measures them with noise, Y = A X + n, codes Y sparsely with
-D = A Phi, and then refits Phi to the clean patches: min (1/B)|X - Phi C|^2 + delta |A Phi|^2, columns normalised.
-A is scaled to unit spectral norm and x lies in [0, 1]: lambda and delta mean nothing before that. Where the paper is
-silent or its pseudo-code does not work:
-- atom 0 is constant and free of the penalty (nearly all light is in the mean, which the total flux fixes well); all other
-  atoms have zero mean, so that it is not learnt over and over;
-- the dictionary step is solved in closed form (a Sylvester equation), and its normal equations are checked; the paper's
-  gradient steps are there beside it (`gradient_step`);
-- directions in which the sensor sees less than a hundredth of the noise's power are left out of the coding;
+Each iteration draws a batch X of clean training patches, measures them with noise, Y = A X + n,
+codes Y sparsely with D = A Phi, and then refits Phi to the clean patches: min (1/B)|X - Phi C|^2 +
+delta |A Phi|^2, columns normalised. A is scaled to unit spectral norm and x lies in [0, 1]: lambda
+and delta mean nothing before that. Where the paper is silent or its pseudo-code does not work:
+- atom 0 is constant and free of the penalty (nearly all light is in the mean, which the total flux
+  fixes well); all other atoms have zero mean, so that it is not learnt over and over;
+- the dictionary step is solved in closed form (a Sylvester equation), and its normal equations are
+  checked; the paper's gradient steps are there beside it (`gradient_step`);
+- directions in which the sensor sees less than a hundredth of the noise's power are left
+  out of the coding;
 - atoms that no patch of the batch used are replaced by training patches;
-- iteration i draws from its own random stream, so a resumed run equals an uninterrupted one bit for bit;
+- iteration i draws from its own random stream, so a resumed run equals an
+  uninterrupted one bit for bit;
 - progress is measured on a fixed validation batch, since each iteration has another objective.
 """
 
@@ -18,15 +21,32 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from plenocli.inverse.sparse.coherence import column_coherence
-from plenocli.inverse.sparse.l1.solve import lambda_path, sparse_code
 from plenocli.inverse.prior.natural_images import draw_patches
-from plenocli.inverse.sparse.dictionary_step import dictionary_step, gradient_step, moments, ridge_of
+from plenocli.inverse.sparse.coherence import column_coherence
+from plenocli.inverse.sparse.dictionary_step import (
+    dictionary_step,
+    gradient_step,
+    moments,
+    ridge_of,
+)
+from plenocli.inverse.sparse.l1.solve import lambda_path, sparse_code
 
-HISTORY = ("objective", "validation_psnr", "dead_share", "nonzeros", "change", "coherence_mean", "coherence_max", "worst_gap", "step_residual")
-"""After each iteration: validation objective (mean over patches), validation PSNR (dB, peak 1), share of atoms replaced, mean
-number of penalised atoms in use, |Phi - previous Phi|_F over kept atoms, mean and largest |cosine| of two columns of
-A Phi (kept atoms), largest relative duality gap, relative residual of the dictionary step's normal equations."""
+HISTORY = (
+    "objective",
+    "validation_psnr",
+    "dead_share",
+    "nonzeros",
+    "change",
+    "coherence_mean",
+    "coherence_max",
+    "worst_gap",
+    "step_residual",
+)
+"""After each iteration: validation objective (mean over patches), validation PSNR (dB, peak 1),
+share of atoms replaced, mean number of penalised atoms in use, |Phi - previous Phi|_F over kept
+atoms, mean and largest |cosine| of two columns of A Phi (kept atoms), largest relative duality gap,
+relative residual of the dictionary step's normal equations.
+"""
 
 SYNTHESIS_WEIGHT = 4.0
 """Patches an atom that the learnt atoms are worth against the regression of those that paint."""
@@ -36,10 +56,13 @@ _DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION, _DRAW_POWER, _DRAW_SYNTHESIS = r
 
 @dataclass(frozen=True)
 class Settings:
-    """lam, delta: weights in the scaled problem (see `Learner`).  batch: patches an iteration (the paper: at least 4 per
-    atom).  snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.  initial: patches, random or pca.
+    """lam, delta: weights in the scaled problem (see `Learner`).
+    batch: patches an iteration (the paper: at least 4 per atom).
+    snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.
+    initial: patches, random or pca.
     gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form.
-    tol: relative duality gap of the coding."""
+    tol: relative duality gap of the coding.
+    """
 
     atoms: int
     batch: int
@@ -54,12 +77,16 @@ class Settings:
 
 
 FAINT = 0.01
-"""Directions with less than this ratio of signal to noise power (mean over training patches) are not coded."""
+"""Directions with less than this ratio of signal to noise power (mean over training
+patches) are not coded.
+"""
 
 
 @dataclass
 class State:
-    """What a resumed run needs: iterations done, atoms (point, atom) float64 of unit norm, history name -> list of floats."""
+    """What a resumed run needs: iterations done, atoms (point, atom) float64 of unit norm,
+    history name -> list of floats.
+    """
 
     iteration: int
     atoms: np.ndarray
@@ -68,7 +95,8 @@ class State:
     def save(self):
         """{name: array}, from which `State.load` restores the same state bit for bit."""
         return {"iteration": np.array(self.iteration), "atoms": self.atoms.astype(np.float64)} | {
-            f"history_{name}": np.array(values, np.float64) for name, values in self.history.items()}
+            f"history_{name}": np.array(values, np.float64) for name, values in self.history.items()
+        }
 
     @classmethod
     def load(cls, fields):
@@ -79,11 +107,14 @@ class State:
 class Learner:
     """Algorithm 1 for one system matrix and one set of training images.
 
-    svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which everything is divided.
-    training, held_out: lists of 2-D linear images in [0, 1]; validation patches come from `held_out` (other scenes).
-    object_shape: points (rows, columns) of a patch.  A appears only as S V^T / scale acting on patches, `seen`: U^T y carries all
-    that least squares can see, and noise in it is as white as in y, so it is drawn there. `seen` ends where FAINT says: what
-    follows is noise to the coder, and half of its work.
+    svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which
+        everything is divided.
+    training, held_out: lists of 2-D linear images in [0, 1];
+    validation patches come from `held_out` (other scenes).
+    object_shape: points (rows, columns) of a patch. A appears only as S V^T / scale acting on
+        patches, `seen`: U^T y carries all that least squares can see, and noise in it is as white
+        as in y, so it is drawn there. `seen` ends where FAINT says: what follows is noise to the
+        coder, and half of its work.
     """
 
     def __init__(self, svd, object_shape, training, held_out, settings, *, workers=None):
@@ -101,13 +132,20 @@ class Learner:
         self._step_basis = None
 
     def _leave_out_faint(self):
-        patches = draw_patches(self.training, self.object_shape, 512, np.random.default_rng([self.settings.seed, _DRAW_POWER]))
+        patches = draw_patches(
+            self.training,
+            self.object_shape,
+            512,
+            np.random.default_rng([self.settings.seed, _DRAW_POWER]),
+        )
         power = np.mean((self.seen @ patches) ** 2, axis=1)
         strong = np.flatnonzero(power >= FAINT * self._noise_power(np.sum(power)))
         self.seen = np.ascontiguousarray(self.seen[: strong[-1] + 1 if len(strong) else 1])
 
     def _noise_power(self, signal_power):
-        """sigma^2 from the signal's power summed over all directions, which is that summed over all pixels."""
+        """sigma^2 from the signal's power summed over all directions, which is that
+        summed over all pixels.
+        """
         return signal_power / self.pixels * 10 ** (-self.settings.snr_db / 10)
 
     def measure(self, patches, rng):
@@ -126,7 +164,12 @@ class Learner:
         if self.settings.initial == "random":
             atoms = rng.uniform(-0.5, 0.5, (points, count))
         else:
-            atoms = draw_patches(self.training, self.object_shape, max(count, 2 * points if self.settings.initial == "pca" else 0), rng)
+            atoms = draw_patches(
+                self.training,
+                self.object_shape,
+                max(count, 2 * points if self.settings.initial == "pca" else 0),
+                rng,
+            )
             if self.settings.initial == "pca":
                 centred = atoms - atoms.mean(axis=0)
                 basis = np.linalg.svd(centred, full_matrices=False)[0][:, : points - 1]
@@ -137,7 +180,14 @@ class Learner:
 
     def code(self, atoms, measured, tol=None):
         """Sparse code (SparseCode) of measured patches with the atoms; atom 0 is free."""
-        return sparse_code(self.seen @ atoms, measured, self.settings.lam, free=[0], tol=tol or self.settings.tol, workers=self.workers)
+        return sparse_code(
+            self.seen @ atoms,
+            measured,
+            self.settings.lam,
+            free=[0],
+            tol=tol or self.settings.tol,
+            workers=self.workers,
+        )
 
     def step(self, state):
         """One iteration; `state` is left as it was."""
@@ -149,7 +199,11 @@ class Learner:
         refitted, residual = self._refit(patches, code.c[1:], state.atoms[:, 1:])
         norm = np.linalg.norm(refitted, axis=0)
         dead = (np.count_nonzero(code.c[1:], axis=1) == 0) | (norm < 1e-9)
-        fresh = draw_patches(self.training, self.object_shape, int(dead.sum()), rng) if dead.any() else np.zeros((len(refitted), 0))
+        fresh = (
+            draw_patches(self.training, self.object_shape, int(dead.sum()), rng)
+            if dead.any()
+            else np.zeros((len(refitted), 0))
+        )
         refitted[:, dead] = fresh
         atoms = _with_constant(_unit(refitted, rng))
         after = State(state.iteration + 1, atoms, {k: list(v) for k, v in state.history.items()})
@@ -157,31 +211,67 @@ class Learner:
         return after
 
     def validate(self, atoms):
-        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst gap) of a dictionary."""
+        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst
+        gap) of a dictionary.
+        """
         code = self.code(atoms, self.measured)
-        return float(code.objective.mean()), psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean()), float(code.gap.max())
+        return (
+            float(code.objective.mean()),
+            psnr(atoms @ code.c, self.validation),
+            float(np.count_nonzero(code.c[1:], axis=0).mean()),
+            float(code.gap.max()),
+        )
 
     def validate_path(self, atoms, lams):
-        """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda, from the largest down."""
+        """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda,
+        from the largest down.
+        """
         table = []
-        for lam, code in lambda_path(self.seen @ atoms, self.measured, lams, free=[0], tol=self.settings.tol, workers=self.workers):
-            table.append((lam, psnr(atoms @ code.c, self.validation), float(np.count_nonzero(code.c[1:], axis=0).mean())))
+        for lam, code in lambda_path(
+            self.seen @ atoms,
+            self.measured,
+            lams,
+            free=[0],
+            tol=self.settings.tol,
+            workers=self.workers,
+        ):
+            table.append(
+                (
+                    lam,
+                    psnr(atoms @ code.c, self.validation),
+                    float(np.count_nonzero(code.c[1:], axis=0).mean()),
+                )
+            )
         return table
 
     def _record(self, after, before, dead, gap, residual):
         objective, quality, nonzeros, worst = self.validate(after.atoms)
-        largest, mean = (value or 0.0 for value in column_coherence(self.seen @ after.atoms[:, 1:])[:2])
+        largest, mean = (
+            value or 0.0 for value in column_coherence(self.seen @ after.atoms[:, 1:])[:2]
+        )
         change = float(np.linalg.norm((after.atoms - before.atoms)[:, ~dead]))
-        values = (objective, quality, float(dead[1:].mean()), nonzeros, change, mean, largest, max(gap, worst), residual)
+        values = (
+            objective,
+            quality,
+            float(dead[1:].mean()),
+            nonzeros,
+            change,
+            mean,
+            largest,
+            max(gap, worst),
+            residual,
+        )
         for name, value in zip(HISTORY, values):
             after.history[name].append(value)
 
     def synthesis(self, state, batches=4):
-        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X - Phi' C|^2 + e |Phi' - Phi|^2.
+        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X -
+        Phi' C|^2 + e |Phi' - Phi|^2.
 
-        They only paint; the coding keeps the learnt atoms. An l1 code is biased towards zero and knows nothing of what the sensor does
-        not see; the regression makes up for both. `batches` fresh batches; e pulls towards the learnt atoms as strongly as
-        SYNTHESIS_WEIGHT patches an atom would, each with the median power of a coefficient.
+        They only paint; the coding keeps the learnt atoms. An l1 code is biased towards zero and
+        knows nothing of what the sensor does not see; the regression makes up for both. `batches`
+        fresh batches; e pulls towards the learnt atoms as strongly as SYNTHESIS_WEIGHT patches an
+        atom would, each with the median power of a coefficient.
         """
         rng = np.random.default_rng([self.settings.seed, _DRAW_SYNTHESIS, state.iteration])
         gram, right = 0.0, 0.0
@@ -191,10 +281,15 @@ class Learner:
             gram, right = gram + part[0] / batches, right + part[1] / batches
         weight = SYNTHESIS_WEIGHT * self.settings.atoms / (batches * self.settings.batch)
         ridge = max(weight * np.median(np.diag(gram)[1:]), ridge_of(gram))
-        return state.atoms + np.linalg.solve(gram + ridge * np.eye(len(gram)), (right - state.atoms @ gram).T).T
+        return (
+            state.atoms
+            + np.linalg.solve(gram + ridge * np.eye(len(gram)), (right - state.atoms @ gram).T).T
+        )
 
     def _refit(self, patches, c, atoms):
-        """Zero-mean atoms (point, atom - 1) of the dictionary step, and the relative residual of its normal equations."""
+        """Zero-mean atoms (point, atom - 1) of the dictionary step, and the relative residual of
+        its normal equations.
+        """
         if self._step_basis is None:
             centred = self.seen - self.seen.mean(axis=1, keepdims=True)
             strength, basis = np.linalg.svd(centred, full_matrices=False)[1:]
@@ -202,30 +297,46 @@ class Learner:
         gram, right = moments(patches, c)
         right -= right.mean(axis=0)  # as if every patch had mean zero
         if self.settings.gradient_steps:
-            return gradient_step(*self._step_basis, gram, right, self.settings.delta, atoms, self.settings.gradient_steps)
+            return gradient_step(
+                *self._step_basis,
+                gram,
+                right,
+                self.settings.delta,
+                atoms,
+                self.settings.gradient_steps,
+            )
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
 
 
 def mirror_images(shape):
-    """Permutations (image, point) that mirror an object of `shape` points (rows, columns): 4 of them; 8, with the transposes, of a square one."""
+    """Permutations (image, point) that mirror an object of `shape` points (rows, columns): 4 of
+    them; 8, with the transposes, of a square one.
+    """
     index = np.arange(int(np.prod(shape))).reshape(shape)
     images = [index, index[::-1], index[:, ::-1], index[::-1, ::-1]]
-    return np.stack([i.ravel() for i in images + ([i.T for i in images] if shape[0] == shape[1] else [])])
+    return np.stack(
+        [i.ravel() for i in images + ([i.T for i in images] if shape[0] == shape[1] else [])]
+    )
 
 
 def averaged(seen, atoms, measured, lam, shape, *, synthesis=None, tol=1e-6, workers=None):
-    """(x (point, signal), worst gap, mean non-zeros): the mean of the estimates by all mirror images of a dictionary.
+    """(x (point, signal), worst gap, mean non-zeros): the mean of the estimates by all mirror
+    images of a dictionary.
 
-    seen (row, point), measured (row, signal): matrix and signals, as in `Learner`.  atoms (point, atom), the first free; `synthesis`
-    atoms paint.  A dictionary stands for scenes that may as well be mirrored, so that its images are as good as itself; each errs in its own way, as translates do
-    in cycle spinning (Coifman & Donoho 1995).
+    seen (row, point), measured (row, signal): matrix and signals, as in `Learner`. atoms (point,
+    atom), the first free; `synthesis` atoms paint. A dictionary stands for scenes that may as well
+    be mirrored, so that its images are as good as itself; each errs in its own way, as translates
+    do in cycle spinning (Coifman & Donoho 1995).
     """
     paint, total, worst, nonzeros = atoms if synthesis is None else synthesis, 0.0, 0.0, 0.0
     images = mirror_images(shape)
     for image in images:
         code = sparse_code(seen @ atoms[image], measured, lam, free=[0], tol=tol, workers=workers)
         total = total + paint[image] @ code.c
-        worst, nonzeros = max(worst, float(code.gap.max())), nonzeros + float(np.count_nonzero(code.c[1:], axis=0).mean()) / len(images)
+        worst, nonzeros = (
+            max(worst, float(code.gap.max())),
+            nonzeros + float(np.count_nonzero(code.c[1:], axis=0).mean()) / len(images),
+        )
     return total / len(images), worst, nonzeros
 
 

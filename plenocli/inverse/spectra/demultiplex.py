@@ -1,9 +1,11 @@
-"""Band radiances behind a lenslet from its pixels: x = F b + noise, with predicted standard deviations.
+"""Band radiances behind a lenslet from its pixels: x = F b + noise, with predicted
+standard deviations.
 
-F (..., pixel, band) is the response of a superpixel, x (..., pixel) its values, b (..., band) the radiances. Leading
-axes (lenslets) broadcast and are worked off in batches. Least squares goes through QR and SVD factorisations, never
-through F^T F, whose condition number is the square. Sources: Berkner et al. 2013, section on spectral
-demultiplexing; S. M. Kay, Fundamentals of Statistical Signal Processing I (1993), ch. 6 (BLUE) and 12 (LMMSE).
+F (..., pixel, band) is the response of a superpixel, x (..., pixel) its values, b (..., band) the
+radiances. Leading axes (lenslets) broadcast and are worked off in batches. Least squares goes
+through QR and SVD factorisations, never through F^T F, whose condition number is the square.
+Sources: Berkner et al. 2013, section on spectral demultiplexing; S. M. Kay, Fundamentals of
+Statistical Signal Processing I (1993), ch. 6 (BLUE) and 12 (LMMSE).
 """
 
 import numpy as np
@@ -16,12 +18,17 @@ LARGEST_CONDITION = 1e10
 
 
 def choose_pixels(response):
-    """Pixel (..., band) with the largest response in each band. Choose on the calibration, never on a capture (noise wins there)."""
+    """Pixel (..., band) with the largest response in each band.
+
+    Choose on the calibration, never on a capture (noise wins there).
+    """
     return np.where(np.isfinite(response), response, -np.inf).argmax(axis=-2)
 
 
 def condition_number(response):
-    """Condition number (...) of each F by its singular values; inf where a band is invisible, NaN where F is NaN throughout."""
+    """Condition number (...) of each F by its singular values; inf where a band is invisible,
+    NaN where F is NaN throughout.
+    """
     clean = _masked(response)
     value = np.linalg.svd(clean, compute_uv=False)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -29,7 +36,9 @@ def condition_number(response):
 
 
 def column_angles(response):
-    """Angles (..., band, band), degrees, between the columns of F: 90 is perfect separation, 0 none."""
+    """Angles (..., band, band), degrees, between the columns of F: 90 is perfect
+    separation, 0 none.
+    """
     clean = _masked(response)
     length = np.sqrt((clean**2).sum(axis=-2))
     unit = clean / np.where(length > 0, length, np.inf)[..., None, :]
@@ -37,11 +46,13 @@ def column_angles(response):
 
 
 def calibration_bias(response, variance):
-    """Errors-in-variables bias B (..., band, band) of least squares with a measured F-hat: its mean answer is (I + B) b.
+    """Errors-in-variables bias B (..., band, band) of least squares with a measured F-hat: its mean
+    answer is (I + B) b.
 
-    response (..., pixel, band); variance (pixel, band) of its entries, independent of each other. To second order,
-    B = E[F+ dF F+ dF] - (F^T F)^-1 E[dF^T (I - F F+) dF]: the second term, which dominates with many pixels, attenuates;
-    the first can amplify where pixels are few. Expansion of the pseudo-inverse (G. H. Golub, V. Pereyra 1973).
+    response (..., pixel, band); variance (pixel, band) of its entries, independent of each other.
+    To second order, B = E[F+ dF F+ dF] - (F^T F)^-1 E[dF^T (I - F F+) dF]: the second term, which
+    dominates with many pixels, attenuates; the first can amplify where pixels are few. Expansion of
+    the pseudo-inverse (G. H. Golub, V. Pereyra 1973).
     """
     f = _masked(response)
     pseudo = np.linalg.pinv(f)
@@ -53,17 +64,23 @@ def calibration_bias(response, variance):
 
 
 def noise_variance(response, radiance, gain, read_variance, response_variance=None):
-    """Variance (..., pixel) of the pixel values, DN^2: gain * E[F b] + read_variance [+ b^2 var(F)].
+    """Variance (..., pixel) of the pixel values, DN^2: gain * E[F b] +
+    read_variance [+ b^2 var(F)].
 
-    radiance (..., band): the expected one, not the outcome of a noisy pixel; negative parts count as zero. gain in DN
-    per electron; read_variance in DN^2, with the 1/12 of the rounding; response_variance (..., pixel, band) or (band,)
-    adds what the calibration does not know.
+    radiance (..., band): the expected one, not the outcome of a noisy pixel; negative
+        parts count as zero.
+    gain in DN per electron;
+    read_variance in DN^2, with the 1/12 of the rounding;
+    response_variance (..., pixel, band) or (band,) adds what the calibration does not know.
     """
     radiance = np.clip(radiance, 0, None)
     mean = (np.nan_to_num(response) @ radiance[..., None])[..., 0]
     variance = gain * np.clip(mean, 0, None) + read_variance
     if response_variance is not None:
-        spread = np.broadcast_to(np.nan_to_num(response_variance), response.shape[-2:] if np.ndim(response_variance) < 3 else response.shape)
+        spread = np.broadcast_to(
+            np.nan_to_num(response_variance),
+            response.shape[-2:] if np.ndim(response_variance) < 3 else response.shape,
+        )
         variance = variance + (spread @ (radiance**2)[..., None])[..., 0]
     return variance
 
@@ -71,21 +88,28 @@ def noise_variance(response, radiance, gain, read_variance, response_variance=No
 def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, prior=None):
     """Radiances b and their predicted standard deviations: two (..., band) arrays.
 
-    response F (..., pixel, band) or shared (pixel, band); values x (..., pixel). NaN in either masks the pixel.
+    response F (..., pixel, band) or shared (pixel, band); values x (..., pixel). NaN in
+    either masks the pixel.
     method:
       pinv          b = F^+ x; covariance F^+ S F^+T
       wls           least squares weighted by S^-1; covariance (F^T S^-1 F)^-1
-      lmmse         with prior (mean (band,), covariance (band, band)); covariance (C^-1 + F^T S^-1 F)^-1
-      nnls          b >= 0, otherwise as wls where S is known, as pinv where not; sigma of the unconstrained answer
-      single-pixel  b_k = x[p_k] / F[p_k, k] for the calibrated `pixels` (..., band); sigma without the crosstalk bias
-    variance S (..., pixel) or scalar: of the values. Without it S is estimated from the residual, one number a
-    superpixel; wls and lmmse then raise NumericsError. Superpixels with fewer good pixels than bands, or whose F has
-    a condition number above 1e10, give NaN.
+      lmmse         with prior (mean (band,), covariance (band, band)); covariance
+                    (C^-1 + F^T S^-1 F)^-1
+      nnls          b >= 0, otherwise as wls where S is known, as pinv where not; sigma of the
+                    unconstrained answer
+      single-pixel  b_k = x[p_k] / F[p_k, k] for the calibrated `pixels` (..., band); sigma without
+                    the crosstalk bias
+    variance S (..., pixel) or scalar: of the values. Without it S is estimated from the residual,
+    one number a superpixel; wls and lmmse then raise NumericsError. Superpixels with fewer good
+    pixels than bands, or whose F has a condition number above 1e10, give NaN.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}")
     if variance is None and method in ("wls", "lmmse"):
-        raise NumericsError(f"{method} weighs pixels by their noise, which is not known", fix="give the sensor's gain and read noise (--camera) or use pinv")
+        raise NumericsError(
+            f"{method} weighs pixels by their noise, which is not known",
+            fix="give the sensor's gain and read noise (--camera) or use pinv",
+        )
     if method == "lmmse" and prior is None:
         raise NumericsError("lmmse needs the mean and covariance of the radiances", fix="use wls")
     if method == "single-pixel" and pixels is None:
@@ -96,7 +120,9 @@ def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, 
     flat = values.reshape(total, count)
     per_lenslet = response.ndim > 2
     response = response.reshape(total, count, bands) if per_lenslet else response
-    noise = None if variance is None else np.broadcast_to(variance, values.shape).reshape(total, count)
+    noise = (
+        None if variance is None else np.broadcast_to(variance, values.shape).reshape(total, count)
+    )
     if pixels is not None:
         pixels = np.broadcast_to(pixels, (*lead, bands)).reshape(total, bands)
     out = np.empty((2, total, bands))
@@ -113,13 +139,17 @@ def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, 
 
 
 def _masked(response):
-    """F with zero rows where a pixel is not known in every band: such a row takes no part in least squares."""
+    """F with zero rows where a pixel is not known in every band: such a row takes no
+    part in least squares.
+    """
     response = np.asarray(response, float)
     return np.where(np.isfinite(response).all(axis=-1)[..., None], response, 0.0)
 
 
 def _least_squares(response, values, method, variance, prior):
-    """One batch: response (lenslet or 1, pixel, band), values (lenslet, pixel), variance (lenslet, pixel) or None."""
+    """One batch: response (lenslet or 1, pixel, band), values (lenslet, pixel), variance
+    (lenslet, pixel) or None.
+    """
     f, x = _masked(response), values.astype(float)
     bands = f.shape[-1]
     used = np.isfinite(x) & (f != 0).any(axis=-1)
@@ -163,7 +193,9 @@ def _sigma(inverse, q, f, x, b, variance, used, weighted):
 
 
 def _non_negative(r, projected, b):
-    """min |R b - Q^T x| with b >= 0 where the free answer b has a negative part; R stands for F exactly."""
+    """min |R b - Q^T x| with b >= 0 where the free answer b has a negative part; R
+    stands for F exactly.
+    """
     from scipy.optimize import nnls
 
     b = np.array(b)

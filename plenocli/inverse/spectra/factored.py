@@ -1,10 +1,12 @@
-"""Least squares for many superpixels at the speed of memory: responses factored once, captures carried by matrix products.
+"""Least squares for many superpixels at the speed of memory: responses factored once, captures
+carried by matrix products.
 
 F = Q R, once a calibration. A capture then needs, by superpixel, Q^T x, Q^T W Q and Q^T W r with
-the residual r of the plain answer: products in single precision over blocks of lenslets that stay in the cache. Q is
-orthonormal, so that these normal equations have the condition of the weights W, not the square of that of F, and R enters
-in double precision (A. Bjorck, Numerical Methods for Least Squares Problems, 1996, sections 2.4 and 4.4). Superpixels that
-lost so many pixels that this fails are said to be hard, and `plenocli.inverse.spectra.demultiplex.demultiplex` does them.
+the residual r of the plain answer: products in single precision over blocks of lenslets that stay
+in the cache. Q is orthonormal, so that these normal equations have the condition of the weights W,
+not the square of that of F, and R enters in double precision (A. Bjorck, Numerical Methods for
+Least Squares Problems, 1996, sections 2.4 and 4.4). Superpixels that lost so many pixels that this
+fails are said to be hard, and `plenocli.inverse.spectra.demultiplex.demultiplex` does them.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -15,18 +17,25 @@ import numpy as np
 
 from plenocli.inverse.spectra.demultiplex import LARGEST_CONDITION
 
-BLOCK_NUMBERS = 90_000, 45_000  # pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
-COMPILED_NUMBERS = 360_000  # of a block that is compiled, where only a superpixel must stay there and calls cost more
+# pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
+BLOCK_NUMBERS = 90_000, 45_000
+# of a block that is compiled, where only a superpixel must stay there and calls cost more
+COMPILED_NUMBERS = 360_000
 COMPILED_FROM = 4_000_000  # pixels from which importing numba pays
 FACTOR_NUMBERS = 250_000
 STREAMED_NUMBERS = 2_000_000  # pixels whose factors are held at a time where none are kept
-HARD = 1e-3  # least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
+# least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
+HARD = 1e-3
 
 
 @dataclass(frozen=True)
 class Factored:
-    """q (lenslet or 1, band, pixel) float32 and r (lenslet or 1, band, band) of F = Q R. used (lenslet or 1, pixel): known in
-    every band, None where all are; sound (lenslet or 1): condition number below 1e10. q is None where sums were made already."""
+    """q (lenslet or 1, band, pixel) float32 and r (lenslet or 1, band, band) of F = Q R.
+
+    used (lenslet or 1, pixel): known in every band, None where all are;
+    sound (lenslet or 1): condition number below 1e10.
+    q is None where sums were made already.
+    """
 
     q: np.ndarray | None
     r: np.ndarray
@@ -49,7 +58,9 @@ class Factored:
         return None if self.used is None else np.nonzero(~self.used)
 
     def blanks(self, part):
-        """Indices of the pixels that are not used in a block (lenslet, pixel) of the lenslets in the slice `part`; None: there are none."""
+        """Indices of the pixels that are not used in a block (lenslet, pixel) of the lenslets in
+        the slice `part`; None: there are none.
+        """
         if self.blank is None:
             return None
         rows, pixels = self.blank
@@ -62,15 +73,25 @@ class Factored:
         """The Factored of lenslets by their index."""
         if self.shared:
             return self
-        return Factored(self.q[which], self.r[which], None if self.used is None else self.used[which], self.sound[which])
+        return Factored(
+            self.q[which],
+            self.r[which],
+            None if self.used is None else self.used[which],
+            self.sound[which],
+        )
 
 
 @dataclass(frozen=True)
 class Sums:
     """What superpixels say about their radiances; c = R b are coordinates in the basis Q.
 
-    plain c (lenslet, band): unweighted least squares; start (lenslet, band, band): its Q^T Q over the pixels there are; normal
-    Q^T W Q, right Q^T W (x - Q c); spread Q^T W^-1 Q, or None; chi: sum of W (x - Q c)^2; count: pixels; hard (lenslet).
+    plain c (lenslet, band): unweighted least squares;
+    start (lenslet, band, band): its Q^T Q over the pixels there are;
+    normal Q^T W Q, right Q^T W (x - Q c);
+    spread Q^T W^-1 Q, or None;
+    chi: sum of W (x - Q c)^2;
+    count: pixels;
+    hard (lenslet).
     """
 
     plain: np.ndarray
@@ -84,7 +105,8 @@ class Sums:
 
 
 def factor(response, which=None, threads=1):
-    """Factored responses (pixel, band), or (..., pixel, band) at the places `which` (a tuple of index arrays, None: all, flattened).
+    """Factored responses (pixel, band), or (..., pixel, band) at the places `which` (a tuple of
+    index arrays, None: all, flattened).
 
     NaN in any band masks a pixel. The result does not depend on `threads`.
     """
@@ -100,7 +122,9 @@ def factor(response, which=None, threads=1):
 
     def work(first):
         part = slice(first, first + step)
-        f = np.ascontiguousarray(np.swapaxes(response[tuple(w[part] for w in which)], -1, -2), float)
+        f = np.ascontiguousarray(
+            np.swapaxes(response[tuple(w[part] for w in which)], -1, -2), float
+        )
         good = np.isfinite(f).all(axis=1)
         if not good.all():
             f = np.where(good[:, None], f, 0)
@@ -115,12 +139,16 @@ def factor(response, which=None, threads=1):
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, firsts))
     singular = np.linalg.svd(r, compute_uv=False)
-    return Factored(q, r, None if used.all() else used, singular[:, -1] > singular[:, 0] / LARGEST_CONDITION)
+    return Factored(
+        q, r, None if used.all() else used, singular[:, -1] > singular[:, 0] / LARGEST_CONDITION
+    )
 
 
 def _orthogonal(f):
-    """(Q^T, R) of F^T (lenslet, band, pixel): Cholesky factors of Q^T Q twice (Y. Yamamoto et al., ETNA 44, 2015), which is as good as
-    Householder's reflections up to condition numbers of 1e7; those where F is worse."""
+    """(Q^T, R) of F^T (lenslet, band, pixel): Cholesky factors of Q^T Q twice (Y. Yamamoto et al.,
+    ETNA 44, 2015), which is as good as Householder's reflections up to condition numbers of 1e7;
+    those where F is worse.
+    """
     size = np.sqrt(np.vecdot(f, f))
     q = f / np.where(size > 0, size, 1)[..., None]
     gram = q @ np.swapaxes(q, -1, -2)
@@ -139,52 +167,109 @@ def _orthogonal(f):
     return q, r
 
 
-def collect(factored, cut, total, noise=None, response_variance=None, radiance=None, doubt=None, sandwich=False, among=None):
+def collect(
+    factored,
+    cut,
+    total,
+    noise=None,
+    response_variance=None,
+    radiance=None,
+    doubt=None,
+    sandwich=False,
+    among=None,
+):
     """Sums of `total` superpixels.
 
-    cut(part): values (lenslet, pixel) float32 of a slice of them, which may be overwritten; NaN masks a pixel. noise (gain, read
-    variance): pixels weigh as 1 / (gain F b + read variance [+ b^2 response_variance (pixel, band)]), b being the plain answer, or
-    `radiance` (lenslet, band); None: all weigh 1. doubt (pixel, band): variance of the response that counts in chi alone.
-    sandwich: whether `spread` is wanted. among: superpixels of which these are a part (None: all).
+    cut(part): values (lenslet, pixel) float32 of a slice of them, which may be overwritten;
+        NaN masks a pixel.
+    noise (gain, read variance): pixels weigh as 1 / (gain F b + read variance [+ b^2
+        response_variance (pixel, band)]), b being the plain answer, or `radiance` (lenslet, band);
+        None: all weigh 1.
+    doubt (pixel, band): variance of the response that counts in chi alone.
+    sandwich: whether `spread` is wanted.
+    among: superpixels of which these are a part (None: all).
     """
     bands = factored.r.shape[-1]
     basis = (_One if factored.shared else _Each)(factored)
     variance = None if noise is None else _Variance(factored, noise, response_variance, doubt)
     square = (total, bands, bands)
-    out = Sums(np.zeros((total, bands)), np.broadcast_to(np.eye(bands), square).copy(), np.empty(square), np.zeros((total, bands)),
-               np.empty(square) if sandwich else None, np.zeros(total), np.full(total, factored.q.shape[-1]), np.zeros(total, bool))
+    out = Sums(
+        np.zeros((total, bands)),
+        np.broadcast_to(np.eye(bands), square).copy(),
+        np.empty(square),
+        np.zeros((total, bands)),
+        np.empty(square) if sandwich else None,
+        np.zeros(total),
+        np.full(total, factored.q.shape[-1]),
+        np.zeros(total, bool),
+    )
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
-    kernel = None if factored.shared or variance is None or radiance is not None or doubt is not None else _kernel((among or total) * factored.q.shape[-1])
-    step = max(1, (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS) // factored.q.shape[-1])
+    kernel = (
+        None
+        if factored.shared or variance is None or radiance is not None or doubt is not None
+        else _kernel((among or total) * factored.q.shape[-1])
+    )
+    step = max(
+        1,
+        (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS)
+        // factored.q.shape[-1],
+    )
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
         x = cut(part)
         if kernel is None or not _compiled(kernel, factored, part, x, variance, out):
             x = x if kernel is None else cut(part)
-            _block(factored, basis, part, x, variance, None if radiance is None else radiance[part], out)
+            _block(
+                factored,
+                basis,
+                part,
+                x,
+                variance,
+                None if radiance is None else radiance[part],
+                out,
+            )
     return out
 
 
 def stream(response, which, cut, **settings):
-    """(Factored without q, Sums) of the superpixels at `which`, as collect(factor(response, which), ...), which never holds all
-    of Q: for responses that serve one capture. Arguments as theirs."""
+    """(Factored without q, Sums) of the superpixels at `which`, as collect(factor(response, which),
+    ...), which never holds all of Q: for responses that serve one capture. Arguments as theirs.
+    """
     total = len(which[0])
     step = max(1, STREAMED_NUMBERS // response.shape[-2])
     factors, sums = [], []
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
-        own = settings | ({"radiance": settings["radiance"][part]} if settings.get("radiance") is not None else {})
+        own = settings | (
+            {"radiance": settings["radiance"][part]} if settings.get("radiance") is not None else {}
+        )
         factored = factor(response, tuple(w[part] for w in which))
-        sums.append(collect(factored, lambda inner: cut(slice(first + inner.start, first + inner.stop)), part.stop - first, among=total, **own))
+        sums.append(
+            collect(
+                factored,
+                lambda inner: cut(slice(first + inner.start, first + inner.stop)),
+                part.stop - first,
+                among=total,
+                **own,
+            )
+        )
         factors.append((factored.r, factored.sound))
     r, sound = (np.concatenate(parts) for parts in zip(*factors))
-    joined = (None if getattr(sums[0], one.name) is None else np.concatenate([getattr(s, one.name) for s in sums]) for one in fields(Sums))
+    joined = (
+        None
+        if getattr(sums[0], one.name) is None
+        else np.concatenate([getattr(s, one.name) for s in sums])
+        for one in fields(Sums)
+    )
     return Factored(None, r, None, sound), Sums(*joined)
 
 
 def _kernel(pixels):
-    """The compiled sums where there is enough to do for them, and numba; or None. One basis for all is as quick without."""
+    """The compiled sums where there is enough to do for them, and numba; or None.
+
+    One basis for all is as quick without.
+    """
     if pixels < COMPILED_FROM:
         return None
     from plenocli.inverse.spectra.factored_kernel import superpixels
@@ -193,16 +278,29 @@ def _kernel(pixels):
 
 
 def _compiled(kernel, factored, part, x, variance, out):
-    """Fill `out` for one block by the compiled kernel; False where some lenslet lacks pixels, which is left to _block."""
+    """Fill `out` for one block by the compiled kernel; False where some lenslet lacks pixels,
+    which is left to _block.
+    """
     blank = factored.blanks(part)
     if blank is not None:
         x[blank] = 0
     known = variance.known if variance.known is not None else np.empty((0, x.shape[1]), np.float32)
     sandwich = out.spread is not None
-    kernel(factored.q[part], factored.inverse[part], x, np.float32(variance.gain), variance.read, known, sandwich, out.plain[part], out.normal[part], out.right[part],
-           out.spread[part] if sandwich else out.normal[part], out.chi[part])
+    kernel(
+        factored.q[part],
+        factored.inverse[part],
+        x,
+        np.float32(variance.gain),
+        variance.read,
+        known,
+        sandwich,
+        out.plain[part],
+        out.normal[part],
+        out.right[part],
+        out.spread[part] if sandwich else out.normal[part],
+        out.chi[part],
+    )
     return not np.isnan(out.plain[part]).any()
-
 
 
 def _block(factored, basis, part, x, variance, radiance, out):
@@ -228,7 +326,9 @@ def _block(factored, basis, part, x, variance, radiance, out):
             kept[holes[0]] *= holes[1]
         out.spread[part] = basis.normal(part, kept)
     if variance.doubt is not None:
-        out.chi[part] = np.vecdot(x / (weight + variance.square(part, c, radiance) @ variance.doubt), x)
+        out.chi[part] = np.vecdot(
+            x / (weight + variance.square(part, c, radiance) @ variance.doubt), x
+        )
     np.reciprocal(weight, out=weight)
     if holes is not None:
         weight[holes[0]] *= holes[1]
@@ -240,7 +340,9 @@ def _block(factored, basis, part, x, variance, radiance, out):
 
 
 def _holes(factored, basis, part, x, c, blank, out):
-    """(rows, their masks as numbers) of lenslets in this block that lack pixels; x is 0 there, c and `out` made good."""
+    """(rows, their masks as numbers) of lenslets in this block that lack pixels; x is 0 there, c
+    and `out` made good.
+    """
     rows = np.flatnonzero(np.isnan(c).any(axis=1))
     mask = np.isfinite(x)
     if blank is not None:
@@ -262,7 +364,8 @@ def _add(target, factor, left, right):
     """target += factor * left @ right in one pass, all float32 (n, k), (k, m), (n, m)."""
     from scipy.linalg.blas import sgemm
 
-    done = sgemm(factor, right.T, left.T, 1.0, target.T, overwrite_c=True)  # BLAS counts along columns
+    # BLAS counts along columns
+    done = sgemm(factor, right.T, left.T, 1.0, target.T, overwrite_c=True)
     if not np.shares_memory(done, target):
         target[:] = done.T
 
@@ -292,12 +395,18 @@ class _One:
         _add(x, -1.0, c.astype(np.float32), self.wide)
 
     def mixed(self, part, c, mean, weights, patterns):
-        """Q c + weights (lenslet, n) @ patterns (n, pixel), in a buffer that the next call overwrites."""
+        """Q c + weights (lenslet, n) @ patterns (n, pixel), in a buffer that the
+        next call overwrites.
+        """
         if len(self.buffer) < len(c):
             self.buffer = np.empty((len(c), self.wide.shape[1]), np.float32)
         if self.terms is None:
             self.terms = np.concatenate([self.wide, patterns])
-        return np.matmul(np.concatenate([c, weights], axis=1, dtype=np.float32, casting="same_kind"), self.terms, out=self.buffer[: len(c)])
+        return np.matmul(
+            np.concatenate([c, weights], axis=1, dtype=np.float32, casting="same_kind"),
+            self.terms,
+            out=self.buffer[: len(c)],
+        )
 
     def normal(self, part, weight):
         """Q^T W Q (lenslet, band, band), float64."""
@@ -343,22 +452,32 @@ class _Each:
 
 
 class _Variance:
-    """Variance of pixel values: gain F b + read variance + b^2 var(F), at least the read variance."""
+    """Variance of pixel values: gain F b + read variance + b^2 var(F), at least
+    the read variance.
+    """
 
     def __init__(self, factored, noise, response_variance, doubt):
         self.factored = factored
         self.gain, self.read = noise[0], np.float32(max(noise[1], 1e-12))
-        self.known, self.doubt = (None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32) for v in (response_variance, doubt))
+        self.known, self.doubt = (
+            None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32)
+            for v in (response_variance, doubt)
+        )
         constant = np.full((1, factored.q.shape[-1]), self.read)
         self.patterns = constant if self.known is None else np.concatenate([constant, self.known])
 
     def of(self, basis, part, c, mean, radiance):
-        """(lenslet, pixel) in the buffer of `basis`; b from c, whose picture `mean` may be, or `radiance` where given."""
+        """(lenslet, pixel) in the buffer of `basis`; b from c, whose picture `mean` may be, or
+        `radiance` where given.
+        """
         weights = np.ones((len(c), 1))
         if self.known is not None:
             weights = np.concatenate([weights, self.square(part, c, radiance)], axis=1)
         if radiance is not None:
-            c, mean = (self._own(self.factored.r, part) @ np.clip(radiance, 0, None)[..., None])[..., 0], None
+            c, mean = (
+                (self._own(self.factored.r, part) @ np.clip(radiance, 0, None)[..., None])[..., 0],
+                None,
+            )
         if mean is not None:
             mean *= np.float32(self.gain)
         out = basis.mixed(part, self.gain * c, mean, weights, self.patterns)
@@ -366,28 +485,40 @@ class _Variance:
 
     def square(self, part, c, radiance):
         """b^2 (lenslet, band) float32, negative radiances counting as 0."""
-        b = (self._own(self.factored.inverse, part) @ c[..., None])[..., 0] if radiance is None else radiance
+        b = (
+            (self._own(self.factored.inverse, part) @ c[..., None])[..., 0]
+            if radiance is None
+            else radiance
+        )
         return np.square(np.clip(b, 0, None)).astype(np.float32)
 
     def _own(self, matrices, part):
         return matrices[part] if len(matrices) > 1 else matrices
 
 
-# --- answers ------------------------------------------------------------------------------------------------------------
+# --- answers --------------------------------------------------------------------------------------
+
 
 def answer(factored, sums, method, prior=None, weighed=True):
-    """Radiances and their standard deviations, two (lenslet, band), of pinv, wls, lmmse or nnls; NaN where a superpixel has too few
-    good pixels or a condition number above 1e10, and where it is hard.
+    """Radiances and their standard deviations, two (lenslet, band), of pinv, wls, lmmse or nnls;
+    NaN where a superpixel has too few good pixels or a condition number above 1e10,
+    and where it is hard.
 
-    prior: (mean (band,), covariance (band, band)) for lmmse. weighed: whether `sums` are, by the noise; where they are not, it
-    is estimated from the residual, one number a superpixel.
+    prior: (mean (band,), covariance (band, band)) for lmmse.
+    weighed: whether `sums` are, by the noise; where they are not, it is estimated from the
+        residual, one number a superpixel.
     """
     bands = factored.r.shape[-1]
     inverse = factored.inverse
     known = factored.sound & ~sums.hard & (sums.count >= (0 if method == "lmmse" else bands))
-    normal = np.where(known[:, None, None], sums.start if method == "pinv" else sums.normal, np.eye(bands))
+    normal = np.where(
+        known[:, None, None], sums.start if method == "pinv" else sums.normal, np.eye(bands)
+    )
     if not weighed:
-        covariance, c = np.linalg.inv(normal) * (sums.chi / np.maximum(sums.count - bands, 1))[:, None, None], sums.plain
+        covariance, c = (
+            np.linalg.inv(normal) * (sums.chi / np.maximum(sums.count - bands, 1))[:, None, None],
+            sums.plain,
+        )
     elif method == "pinv":
         back = np.linalg.inv(normal)
         covariance, c = back @ np.where(known[:, None, None], sums.spread, 0) @ back, sums.plain
@@ -395,19 +526,31 @@ def answer(factored, sums, method, prior=None, weighed=True):
         mean, given = (np.asarray(p, float) for p in prior)
         pull = np.swapaxes(inverse, -1, -2) @ np.linalg.inv(given) @ inverse
         covariance = np.linalg.inv(normal + pull)
-        c = sums.plain + (covariance @ (sums.right + (pull @ (factored.r @ mean - sums.plain)[..., None])[..., 0])[..., None])[..., 0]
+        c = (
+            sums.plain
+            + (
+                covariance
+                @ (sums.right + (pull @ (factored.r @ mean - sums.plain)[..., None])[..., 0])[
+                    ..., None
+                ]
+            )[..., 0]
+        )
     else:
         covariance = np.linalg.inv(normal)
         c = sums.plain + (covariance @ sums.right[..., None])[..., 0]
     b = (inverse @ c[..., None])[..., 0]
-    sigma = np.sqrt(np.diagonal(inverse @ covariance @ np.swapaxes(inverse, -1, -2), axis1=-2, axis2=-1))
+    sigma = np.sqrt(
+        np.diagonal(inverse @ covariance @ np.swapaxes(inverse, -1, -2), axis1=-2, axis2=-1)
+    )
     if method == "nnls":
         b = _non_negative(np.broadcast_to(factored.r, normal.shape), normal, c, b)
     return np.where(known[:, None], b, np.nan), np.where(known[:, None], sigma, np.nan)
 
 
 def _non_negative(r, normal, c, b):
-    """min |L^T (R b - c)| with b >= 0, L L^T = Q^T W Q, where the free answer b has a negative part."""
+    """min |L^T (R b - c)| with b >= 0, L L^T = Q^T W Q, where the free answer b
+    has a negative part.
+    """
     from scipy.optimize import nnls
 
     b = np.array(b)

@@ -1,7 +1,9 @@
-"""The sums of plenocli.inverse.spectra.factored for one superpixel after another, compiled by numba; None where it is not installed.
+"""The sums of plenocli.inverse.spectra.factored for one superpixel after another, compiled by
+numba; None where it is not installed.
 
-Imported late, because importing numba takes a second. A superpixel's basis is read from memory once and everything else about
-it stays in the cache, where the array version passes over it a dozen times.
+Imported late, because importing numba takes a second. A superpixel's basis is read from memory once
+and everything else about it stays in the cache, where the array version passes
+over it a dozen times.
 """
 
 import numpy as np
@@ -11,7 +13,9 @@ try:
 except ImportError:
     superpixels = None
 else:
-    _jit = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
+    _jit = numba.njit(
+        cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True
+    )
 
     @_jit
     def _dot(a, b):
@@ -22,7 +26,9 @@ else:
 
     @_jit
     def _dots(a, rows, first, out):
-        """out[k] = a . rows[k] for k from `first`; four at a time, since loading numbers is what takes the time."""
+        """out[k] = a . rows[k] for k from `first`; four at a time, since loading numbers is
+        what takes the time.
+        """
         k = first
         while k + 3 < len(rows):
             one, two, three, four = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -43,7 +49,12 @@ else:
         """out += weights @ rows."""
         k = 0
         while k + 3 < len(rows):
-            one, two, three, four = np.float32(weights[k]), np.float32(weights[k + 1]), np.float32(weights[k + 2]), np.float32(weights[k + 3])
+            one, two, three, four = (
+                np.float32(weights[k]),
+                np.float32(weights[k + 1]),
+                np.float32(weights[k + 2]),
+                np.float32(weights[k + 3]),
+            )
             b, c, d, e = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
             for p in range(out.size):
                 out[p] += one * b[p] + two * c[p] + three * d[p] + four * e[p]
@@ -72,7 +83,18 @@ else:
     def _normal_of_four(a, b, c, d, weight, out):
         """As _normal for the usual four bands: ten sums in one pass, a third of the time."""
         zero = np.float32(0)
-        aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+        aa, ab, ac, ad, bb, bc, bd, cc, cd, dd = (
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+            zero,
+        )
         for p in range(weight.size):
             w = weight[p]
             wa, wb, wc, wd = w * a[p], w * b[p], w * c[p], w * d[p]
@@ -96,13 +118,20 @@ else:
 
     @_jit
     def superpixels(q, inverse, x, gain, read, known, sandwich, plain, normal, right, spread, chi):
-        """Fill plain, right (lenslet, band), normal and, with sandwich, spread (lenslet, band, band) and chi (lenslet).
+        """Fill plain, right (lenslet, band), normal and, with sandwich, spread (lenslet, band,
+        band) and chi (lenslet).
 
-        q (lenslet, band, pixel), x (lenslet, pixel), which becomes the residual, gain, read and known (band or 0, pixel): float32;
-        inverse (lenslet, band, band): of R, float64. A lenslet with NaN in x gets NaN in plain and nothing else.
+        q (lenslet, band, pixel), x (lenslet, pixel), which becomes the residual, gain, read and
+        known (band or 0, pixel): float32;
+        inverse (lenslet, band, band): of R, float64. A lenslet with NaN in x gets NaN in
+            plain and nothing else.
         """
         count, pixels = x.shape
-        variance, weight, carried = np.empty(pixels, np.float32), np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+        variance, weight, carried = (
+            np.empty(pixels, np.float32),
+            np.empty(pixels, np.float32),
+            np.empty(pixels, np.float32),
+        )
         square = np.empty(len(known))
         for n in range(count):
             own, r = q[n], inverse[n]

@@ -1,8 +1,9 @@
 """Responses of many lenslets cleaned of noise by what they have in common.
 
-Lenslets differ by gain, by where they lie within their pixels and little else, so that their responses, one a row, are a
-matrix of rank six or so below noise of full rank (docs/model.md, "The response predicted"). What stands out of the noise is kept, and
-shrunk as Gavish and Donoho (2017) find it optimal for white noise of known size: nothing is tuned.
+Lenslets differ by gain, by where they lie within their pixels and little else, so that their
+responses, one a row, are a matrix of rank six or so below noise of full rank (docs/model.md, "The
+response predicted"). What stands out of the noise is kept, and shrunk as Gavish and Donoho (2017)
+find it optimal for white noise of known size: nothing is tuned.
 """
 
 from dataclasses import dataclass, replace
@@ -14,17 +15,21 @@ BLOCK = 1024
 LEAST = 12
 """Fewer lenslets have little in common to find."""
 EDGE = 1.1
-"""How far above the largest eigenvalue of noise alone one must be to count: noise is not quite alike in all lenslets."""
+"""How far above the largest eigenvalue of noise alone one must be to count: noise is not quite
+alike in all lenslets.
+"""
 FILLS = 3
 """Rounds in which pixels that are not known are filled in from what the others say."""
 
 
 def low_rank(response, variance, groups=None):
-    """Responses (lenslet, pixel, band) without most of their noise: (response, share of the noise variance left, largest rank).
+    """Responses (lenslet, pixel, band) without most of their noise: (response, share of the noise
+    variance left, largest rank).
 
-    variance (pixel, band): of one entry, mean over lenslets, in the units of response squared. groups (lenslet,): lenslets of one
-    number are alike (windows that begin on one colour of the sensor's filters); each is cleaned for itself. NaN stays NaN, and lenslets
-    in groups of fewer than LEAST stay as they are.
+    variance (pixel, band): of one entry, mean over lenslets, in the units of response squared.
+    groups (lenslet,): lenslets of one number are alike (windows that begin on one colour of the
+        sensor's filters); each is cleaned for itself. NaN stays NaN, and lenslets in groups of
+        fewer than LEAST stay as they are.
     """
     out = np.array(response, np.float32)
     groups = np.zeros(len(out), int) if groups is None else np.asarray(groups)
@@ -42,9 +47,11 @@ def low_rank(response, variance, groups=None):
 
 @dataclass(frozen=True)
 class Basis:
-    """What responses have in common: pictures (rank, pixel, band) of which each is a mixture, dual (rank, pixel * band), whose
-    products with a response are its coefficients, middle (rank,): mean coefficients, and the share of a response's noise variance
-    that is left in its mixture. NaN in pictures: no response knows it."""
+    """What responses have in common: pictures (rank, pixel, band) of which each is a mixture, dual
+    (rank, pixel * band), whose products with a response are its coefficients, middle (rank,): mean
+    coefficients, and the share of a response's noise variance that is left in its mixture. NaN in
+    pictures: no response knows it.
+    """
 
     pictures: np.ndarray
     dual: np.ndarray
@@ -61,26 +68,42 @@ class Basis:
 
     def mixed(self, coefficients):
         """Responses (lenslet, pixel, band) of coefficients (lenslet, rank)."""
-        return (coefficients @ self.pictures.reshape(len(self.pictures), -1)).reshape(-1, *self.pictures.shape[1:])
+        return (coefficients @ self.pictures.reshape(len(self.pictures), -1)).reshape(
+            -1, *self.pictures.shape[1:]
+        )
 
 
 def common(response, variance):
-    """The Basis of responses (lenslet, pixel, band): what stands out of noise of variance (pixel, band); all of it where they are few."""
+    """The Basis of responses (lenslet, pixel, band): what stands out of noise of variance
+    (pixel, band); all of it where they are few.
+    """
     matrix, known, scale, _, use = _whitened(response, variance)
     m, n = matrix.shape
     filled = np.where(known, matrix, _level(matrix, known))
     squares, vectors = _decomposed(filled)
     keep = squares > ((np.sqrt(m) + np.sqrt(n)) ** 2 * EDGE if m >= LEAST else 1e-9 * squares[-1])
     keep[-1] = True
-    unit = (vectors[:, keep] / np.sqrt(np.maximum(squares[keep], 1e-30))).T.astype(np.float32) @ filled
-    pictures, dual = np.full((len(unit), use.size), np.nan, np.float32), np.zeros((len(unit), use.size), np.float32)
+    unit = (vectors[:, keep] / np.sqrt(np.maximum(squares[keep], 1e-30))).T.astype(
+        np.float32
+    ) @ filled
+    pictures, dual = (
+        np.full((len(unit), use.size), np.nan, np.float32),
+        np.zeros((len(unit), use.size), np.float32),
+    )
     pictures[:, use], dual[:, use] = unit * scale, unit / scale
-    found = Basis(pictures.reshape(-1, *response.shape[1:]), dual, np.zeros(len(unit)), min(1.0, int(keep.sum()) * (1 / m + 1 / n)))
+    found = Basis(
+        pictures.reshape(-1, *response.shape[1:]),
+        dual,
+        np.zeros(len(unit)),
+        min(1.0, int(keep.sum()) * (1 / m + 1 / n)),
+    )
     return replace(found, middle=found.coefficients(response).mean(axis=0))
 
 
 def _whitened(response, variance):
-    """(matrix (lenslet, entry) whose noise has unit variance, which are known, scale by entry, by lenslet, entries used)."""
+    """(matrix (lenslet, entry) whose noise has unit variance, which are known, scale by entry,
+    by lenslet, entries used).
+    """
     count = len(response)
     matrix = response.reshape(count, -1)
     known = np.isfinite(matrix)
@@ -89,7 +112,9 @@ def _whitened(response, variance):
     matrix, known, scale = matrix[:, use] / scale[use], known[:, use], scale[use]
     # shot noise goes with a lenslet's light
     light = np.where(known, matrix * scale, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    rows = np.sqrt(np.clip(light / max(float(light.mean()), 1e-30), 0.05, None)).astype(np.float32)[:, None]
+    rows = np.sqrt(np.clip(light / max(float(light.mean()), 1e-30), 0.05, None)).astype(np.float32)[
+        :, None
+    ]
     return matrix / rows, known, scale, rows, use
 
 
@@ -116,9 +141,11 @@ def _cleaned(response, variance):
 
 
 def _shrunk(matrix):
-    """(matrix of low rank, its rank, share of the noise left in it) from one with white noise of unit variance.
+    """(matrix of low rank, its rank, share of the noise left in it) from one with white
+    noise of unit variance.
 
-    A singular value s above the noise's edge becomes sqrt((s^2 - m - n)^2 - 4 m n)/s; the others vanish.
+    A singular value s above the noise's edge becomes sqrt((s^2 - m - n)^2 - 4 m n)/s;
+    the others vanish.
     """
     m, n = matrix.shape
     squares, vectors = _decomposed(matrix)

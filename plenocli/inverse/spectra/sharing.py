@@ -1,9 +1,11 @@
-"""Whether one response F serves all lenslets: what they differ by, beside what their noise explains.
+"""Whether one response F serves all lenslets: what they differ by, beside what
+their noise explains.
 
-An F of its own brings a lenslet the noise of its calibration, a shared one brings it what it differs from the others by.
-Either is a wrong F, and costs its lenslet's radiances F+ dF b; the noise of both is known, so that what one of them costs more
-can be told without a truth (C. L. Mallows, Some comments on C_p, Technometrics 15, 1973). docs/model.md,
-"Spectral response: calibration and demultiplexing".
+An F of its own brings a lenslet the noise of its calibration, a shared one brings it what it
+differs from the others by. Either is a wrong F, and costs its lenslet's radiances F+ dF b; the
+noise of both is known, so that what one of them costs more can be told without a truth (C. L.
+Mallows, Some comments on C_p, Technometrics 15, 1973). docs/model.md, "Spectral response:
+calibration and demultiplexing".
 """
 
 from dataclasses import dataclass
@@ -11,15 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 
 SURE = 4.0
-"""Standard deviations by which a pixel must scatter more among lenslets than its noise, to be said to differ."""
+"""Standard deviations by which a pixel must scatter more among lenslets than its noise, to
+be said to differ.
+"""
 
 
 @dataclass(frozen=True)
 class Differences:
-    """How lenslets' responses differ. excess: mean square of the errors in radiance that differences from the mean response
-    make, over what the noise of F alone would make (1: alike); error: root mean square error of radiances by the shared F's
-    faults over that by the faults of own ones; worst: the largest single lenslet's excess, and its number; spread (pixel, band):
-    variance of F over lenslets beyond its noise."""
+    """How lenslets' responses differ.
+
+    excess: mean square of the errors in radiance that differences from the mean response make, over
+        what the noise of F alone would make (1: alike);
+    error: root mean square error of radiances by the shared F's faults over that by the
+        faults of own ones;
+    worst: the largest single lenslet's excess, and its number;
+    spread (pixel, band): variance of F over lenslets beyond its noise.
+    """
 
     excess: float
     error: float
@@ -29,9 +38,11 @@ class Differences:
 
 
 def differences(response, mean, variance, step=256):
-    """Differences of responses (lenslet, pixel, band) from their mean (pixel, band); variance (pixel, band) of one entry, known.
+    """Differences of responses (lenslet, pixel, band) from their mean (pixel, band); variance
+    (pixel, band) of one entry, known.
 
-    Radiances count by the light that they bring (columns of F at length 1). NaN entries differ by nothing.
+    Radiances count by the light that they bring (columns of F at length 1). NaN entries
+    differ by nothing.
     """
     count = len(response)
     size = np.sqrt(np.nansum(mean.astype(float) ** 2, axis=0))
@@ -44,7 +55,9 @@ def differences(response, mean, variance, step=256):
         part = response[first : first + step] - mean
         np.nan_to_num(part, copy=False)
         square = square + np.einsum("npk,npk->pk", part, part, dtype=float)
-        share[first : first + step] = np.square((back @ part) * weight, dtype=float).sum(axis=(1, 2))
+        share[first : first + step] = np.square((back @ part) * weight, dtype=float).sum(
+            axis=(1, 2)
+        )
     share /= max(noise, 1e-300) * (1 - 1 / max(count, 2))
     excess, left = float(share.mean()), 1 / count
     beyond = square / max(count - 1, 1) - variance

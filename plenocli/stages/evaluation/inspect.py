@@ -6,7 +6,8 @@ import numpy as np
 
 
 def run_inspect(path, *, mem_limit=None):
-    """Read and verify the file at `path` and describe it as a JSON-able dict with "file", "bytes", "type" and what it holds.
+    """Read and verify the file at `path` and describe it as a JSON-able dict with "file", "bytes",
+    "type" and what it holds.
 
     Raises InputError for a file that a stage would refuse, with the same words.
     """
@@ -35,27 +36,58 @@ def _artefact(path, mem_limit):
     datasets = {}
     for name, values in artefact.data.items():
         field = schema.field_for(name)
-        datasets[name] = {"shape": list(values.shape), "dtype": str(values.dtype), "unit": field.unit, "meaning": field.doc} | _statistics(values)
-    attributes = {where: {name: {"value": _json(value), "unit": schema.attr_for(where, name).unit} for name, value in named.items()}
-                  for where, named in artefact.attrs.items() if named}
-    return {"type": "artefact", "kind": artefact.kind, "schema_version": schema.version, "what": schema.doc, "verified": True,
-            "command": origin.command, "seed": origin.seed, "inputs": origin.inputs, "accuracy": origin.accuracy, "config": origin.config,
-            "datasets": datasets, "attributes": attributes}
+        datasets[name] = {
+            "shape": list(values.shape),
+            "dtype": str(values.dtype),
+            "unit": field.unit,
+            "meaning": field.doc,
+        } | _statistics(values)
+    attributes = {
+        where: {
+            name: {"value": _json(value), "unit": schema.attr_for(where, name).unit}
+            for name, value in named.items()
+        }
+        for where, named in artefact.attrs.items()
+        if named
+    }
+    return {
+        "type": "artefact",
+        "kind": artefact.kind,
+        "schema_version": schema.version,
+        "what": schema.doc,
+        "verified": True,
+        "command": origin.command,
+        "seed": origin.seed,
+        "inputs": origin.inputs,
+        "accuracy": origin.accuracy,
+        "config": origin.config,
+        "datasets": datasets,
+        "attributes": attributes,
+    }
 
 
 def _exr(path, mem_limit):
-    from plenocli.files.images.exr import read_exr
+    from plenocli.files.images.exr import DIGEST, read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
-    from plenocli.files.images.exr import DIGEST
 
     channels, attrs = read_exr(path, mem_limit=mem_limit)
     rows, columns = next(iter(channels.values())).shape
-    report = {"type": "exr", "rows": rows, "columns": columns, "verified": DIGEST in attrs,
-              "channels": {name: _statistics(plane) for name, plane in channels.items()}, "attributes": attrs}
+    report = {
+        "type": "exr",
+        "rows": rows,
+        "columns": columns,
+        "verified": DIGEST in attrs,
+        "channels": {name: _statistics(plane) for name, plane in channels.items()},
+        "attributes": attrs,
+    }
     if is_spectral(path):
         spectral = read_spectral_exr(path, mem_limit=mem_limit)
-        report |= {"type": "spectral exr", "quantity": spectral.quantity, "wavelengths_m": [float(w) for w in spectral.wavelengths],
-                   "has_sigma": spectral.sigma is not None}
+        report |= {
+            "type": "spectral exr",
+            "quantity": spectral.quantity,
+            "wavelengths_m": [float(w) for w in spectral.wavelengths],
+            "has_sigma": spectral.sigma is not None,
+        }
     return report
 
 
@@ -63,8 +95,15 @@ def _picture(path, kind, mem_limit):
     from plenocli.files.images.pictures import read_stored
 
     values, names, bits = read_stored(path, kind, mem_limit)
-    return {"type": kind, "rows": values.shape[0], "columns": values.shape[1], "bits": bits, "dtype": str(values.dtype), "verified": False,
-            "channels": {name: _statistics(values[..., i]) for i, name in enumerate(names)}}
+    return {
+        "type": kind,
+        "rows": values.shape[0],
+        "columns": values.shape[1],
+        "bits": bits,
+        "dtype": str(values.dtype),
+        "verified": False,
+        "channels": {name: _statistics(values[..., i]) for i, name in enumerate(names)},
+    }
 
 
 def _raw(path, mem_limit):
@@ -73,13 +112,32 @@ def _raw(path, mem_limit):
     mosaic = read_mosaic(path, mem_limit=mem_limit)
     values, meta = mosaic.values, dict(mosaic.meta)
     camera = " ".join(str(meta.pop(name)) for name in ("make", "model") if meta.get(name)) or None
-    positions = {f"{letter} ({i}, {j})": _statistics(values[i::2, j::2]) | {"black": float(mosaic.black[i, j])}
-                 for (i, j), letter in zip([(0, 0), (0, 1), (1, 0), (1, 1)], "mmmm" if mosaic.cfa == "mono" else mosaic.cfa)}
-    return {"type": "dng" if mosaic.source == "dng" else "raw", "rows": values.shape[0], "columns": values.shape[1], "cfa": mosaic.cfa,
-            "black": mosaic.black.tolist(), "white": mosaic.white, "exposure_s": mosaic.exposure_s, "iso": meta.pop("iso", None),
-            "f_number": meta.pop("f_number", None), "focal_length_m": meta.pop("focal_length_m", None), "camera": camera,
-            "dtype": str(values.dtype), "verified": bool(meta.pop("verified", False)),
-            "zeros": float(np.mean(values == 0)), "saturated": float(np.mean(values >= mosaic.white)), "positions": positions, "meta": _json(meta)}
+    positions = {
+        f"{letter} ({i}, {j})": _statistics(values[i::2, j::2])
+        | {"black": float(mosaic.black[i, j])}
+        for (i, j), letter in zip(
+            [(0, 0), (0, 1), (1, 0), (1, 1)], "mmmm" if mosaic.cfa == "mono" else mosaic.cfa
+        )
+    }
+    return {
+        "type": "dng" if mosaic.source == "dng" else "raw",
+        "rows": values.shape[0],
+        "columns": values.shape[1],
+        "cfa": mosaic.cfa,
+        "black": mosaic.black.tolist(),
+        "white": mosaic.white,
+        "exposure_s": mosaic.exposure_s,
+        "iso": meta.pop("iso", None),
+        "f_number": meta.pop("f_number", None),
+        "focal_length_m": meta.pop("focal_length_m", None),
+        "camera": camera,
+        "dtype": str(values.dtype),
+        "verified": bool(meta.pop("verified", False)),
+        "zeros": float(np.mean(values == 0)),
+        "saturated": float(np.mean(values >= mosaic.white)),
+        "positions": positions,
+        "meta": _json(meta),
+    }
 
 
 def _statistics(values):
@@ -89,7 +147,11 @@ def _statistics(values):
     known = values[~np.isnan(values)] if values.dtype.kind == "f" else values
     if known.size == 0:
         return {"nan": int(values.size)}
-    out = {"min": float(known.min()), "max": float(known.max()), "mean": float(known.mean(dtype=np.float64))}
+    out = {
+        "min": float(known.min()),
+        "max": float(known.max()),
+        "mean": float(known.mean(dtype=np.float64)),
+    }
     return out | ({"nan": int(values.size - known.size)} if known.size < values.size else {})
 
 
@@ -103,38 +165,76 @@ def _json(value):
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
-# --- as text -----------------------------------------------------------------------------------------------------------
+# --- as text --------------------------------------------------------------------------------------
+
 
 def describe(report):
     """The report of `run_inspect` as lines for a terminal."""
     lines = [f"{report['file']}: {_headline(report)}, {report['bytes']} bytes"]
-    lines.append("  digest verified" if report["verified"] else "  no digest in the file: damage to its values would go unseen")
-    return "\n".join(lines + {"artefact": _artefact_lines, "raw": _raw_lines, "dng": _raw_lines}.get(report["type"], _channel_lines)(report))
+    lines.append(
+        "  digest verified"
+        if report["verified"]
+        else "  no digest in the file: damage to its values would go unseen"
+    )
+    return "\n".join(
+        lines
+        + {"artefact": _artefact_lines, "raw": _raw_lines, "dng": _raw_lines}.get(
+            report["type"], _channel_lines
+        )(report)
+    )
 
 
 def _headline(report):
     if report["type"] == "artefact":
-        return f"{report['kind']} (version {report['schema_version']}): {report['what'].rstrip('.')}"
+        return (
+            f"{report['kind']} (version {report['schema_version']}): {report['what'].rstrip('.')}"
+        )
     return f"{report['type']}, {report['rows']} x {report['columns']} pixels (rows x columns)"
 
 
 def _artefact_lines(report):
-    lines = [f"  command   {report['command'] or '-'}", f"  seed      {'-' if report['seed'] is None else report['seed']}"]
-    lines += [f"  input     {role}: {entry['name']} sha256 {entry['sha256'][:16]}..." for role, entry in report["inputs"].items()]
+    lines = [
+        f"  command   {report['command'] or '-'}",
+        f"  seed      {'-' if report['seed'] is None else report['seed']}",
+    ]
+    lines += [
+        f"  input     {role}: {entry['name']} sha256 {entry['sha256'][:16]}..."
+        for role, entry in report["inputs"].items()
+    ]
     lines += [f"  accuracy  {name}: {_short(value)}" for name, value in report["accuracy"].items()]
-    lines += [f"  /{where} @{name} = {_short(entry['value'])} {entry['unit']}".rstrip() for where, named in report["attributes"].items() for name, entry in named.items()]
+    lines += [
+        f"  /{where} @{name} = {_short(entry['value'])} {entry['unit']}".rstrip()
+        for where, named in report["attributes"].items()
+        for name, entry in named.items()
+    ]
     for name, entry in report["datasets"].items():
         shape = " x ".join(map(str, entry["shape"])) or "scalar"
-        lines.append(f"  /{name}  {shape} {entry['dtype']} [{entry['unit']}]  {_range(entry)}  {entry['meaning']}")
+        lines.append(
+            f"  /{name}  {shape} {entry['dtype']} [{entry['unit']}]  "
+            f"{_range(entry)}  {entry['meaning']}"
+        )
     return lines
 
 
 def _raw_lines(report):
     black = report["black"]
     unit = {"exposure_s": "s", "f_number": "", "focal_length_m": "m", "iso": ""}
-    lines = [f"  camera         {report['camera'] or 'unknown'}", f"  cfa            {report['cfa']}",
-             f"  black          {black[0][0]:g} {black[0][1]:g} / {black[1][0]:g} {black[1][1]:g} DN (rows of the 2x2 cell)", f"  white          {report['white']:g} DN"]
-    lines += [f"  {name:<14} {'unknown' if report[name] is None else f'{report[name]:.6g} {label}'.rstrip()}" for name, label in unit.items()]
+    lines = [
+        f"  camera         {report['camera'] or 'unknown'}",
+        f"  cfa            {report['cfa']}",
+        (
+            f"  black          {black[0][0]:g} {black[0][1]:g} / {black[1][0]:g} {black[1][1]:g} "
+            "DN (rows of the 2x2 cell)"
+        ),
+        f"  white          {report['white']:g} DN",
+    ]
+    lines += [
+        (
+            f"  {name:<14} "
+            f"{'unknown' if report[name] is None else f'{report[name]:.6g} {label}'.rstrip()}"
+        )
+        for name, label in unit.items()
+    ]
     lines.append(f"  zeros          {report['zeros']:.3%}, saturated {report['saturated']:.3%}")
     lines += [f"  {name:<14} {_range(entry)}" for name, entry in report["positions"].items()]
     return lines
@@ -144,15 +244,22 @@ def _channel_lines(report):
     lines = [f"  bits      {report['bits']}"] if "bits" in report else []
     if "wavelengths_m" in report:
         nm = [w * 1e9 for w in report["wavelengths_m"]]
-        lines.append(f"  {report['quantity']}, {len(nm)} bands, {nm[0]:.6g} to {nm[-1]:.6g} nm{', with sigma' if report['has_sigma'] else ''}")
+        lines.append(
+            f"  {report['quantity']}, {len(nm)} bands, {nm[0]:.6g} to {nm[-1]:.6g} "
+            f"nm{', with sigma' if report['has_sigma'] else ''}"
+        )
     lines += [f"  {name:<18} {_range(entry)}" for name, entry in report["channels"].items()]
-    return lines + [f"  @{name} = {_short(value)}" for name, value in report.get("attributes", {}).items()]
+    return lines + [
+        f"  @{name} = {_short(value)}" for name, value in report.get("attributes", {}).items()
+    ]
 
 
 def _range(entry):
     if "min" not in entry:
         return "all NaN" if "nan" in entry else _short(entry["value"])
-    return f"min {entry['min']:.6g} max {entry['max']:.6g} mean {entry['mean']:.6g}" + (f" NaN {entry['nan']}" if "nan" in entry else "")
+    return f"min {entry['min']:.6g} max {entry['max']:.6g} mean {entry['mean']:.6g}" + (
+        f" NaN {entry['nan']}" if "nan" in entry else ""
+    )
 
 
 def _short(value):

@@ -3,10 +3,10 @@
 import numpy as np
 
 from plenocli.base.errors import PlenoError
+from plenocli.files.read.results import block_of, read_result, read_truth
+from plenocli.files.read.run_folder import RunFolder
 from plenocli.report.page import Page
 from plenocli.report.score_page import add_reconstructions, add_spectra, add_table
-from plenocli.files.read.run_folder import RunFolder
-from plenocli.files.read.results import block_of, read_result, read_truth
 
 _CAPTURES = 3  # drawn in a section; the rest are listed
 _SPECTRA = 4
@@ -15,28 +15,48 @@ _SPECTRA = 4
 def run_report(folder, output, *, title=None, overwrite=False):
     """Write one self-contained page about a run folder; returns a summary dict.
 
-    InputError where the folder holds nothing to show. Files that cannot be read are named on the page and in the summary.
+    InputError where the folder holds nothing to show. Files that cannot be read are named on the
+    page and in the summary.
     """
     from plenocli.files.atomic import check_output, publish
 
     check_output(output, overwrite=overwrite, suffixes=(".html",))
     run = RunFolder(folder)
-    page = Page(title or f"plenocli report: {run.root.resolve().name}", "A plenoptic camera modelled end to end: what it captured, what was recovered, and how good that is.")
+    page = Page(
+        title or f"plenocli report: {run.root.resolve().name}",
+        (
+            "A plenoptic camera modelled end to end: what it captured, what was recovered, "
+            "and how good that is."
+        ),
+    )
     scores = run.of_kind("score")
     spatial = [file for file in scores if _of_pictures(file)]
     spectral = [file for file in scores if _of_bands(file)]
     page.cards(_headlines(spatial, spectral))
     for name, problem in run.unreadable:
         page.warning(f"{name} could not be read: it {problem}.")
-    sections = [_spatial(page, run, spatial), _spectral(page, run, spectral), _refocused(page, run, scores), _designs(page, run)]
+    sections = [
+        _spatial(page, run, spatial),
+        _spectral(page, run, spectral),
+        _refocused(page, run, scores),
+        _designs(page, run),
+    ]
     _files(page, run)
     publish(output, page.render().encode(), overwrite=overwrite)
-    return {"output": str(output), "files": len(run.files), "unreadable": [name for name, _ in run.unreadable], "scores": len(scores),
-            "sections": [name for name in sections if name]}
+    return {
+        "output": str(output),
+        "files": len(run.files),
+        "unreadable": [name for name, _ in run.unreadable],
+        "scores": len(scores),
+        "sections": [name for name in sections if name],
+    }
 
 
 def _of_pictures(file):
-    return any("psnr_db" in entry["metrics"] and not entry.get("wavelengths_nm") for entry in file.content["results"])
+    return any(
+        "psnr_db" in entry["metrics"] and not entry.get("wavelengths_nm")
+        for entry in file.content["results"]
+    )
 
 
 def _of_bands(file):
@@ -47,46 +67,97 @@ def _headlines(spatial, spectral):
     """The best number of each experiment."""
     cards = []
     for file in spatial:
-        best = max((e for e in file.content["results"] if e["metrics"].get("psnr_db") is not None), key=lambda e: e["metrics"]["psnr_db"], default=None)
+        best = max(
+            (e for e in file.content["results"] if e["metrics"].get("psnr_db") is not None),
+            key=lambda e: e["metrics"]["psnr_db"],
+            default=None,
+        )
         if best:
-            cards.append((f"{best['metrics']['psnr_db']:.2f} dB", f"best PSNR, {best['label']} ({file.path.stem})"))
+            cards.append(
+                (
+                    f"{best['metrics']['psnr_db']:.2f} dB",
+                    f"best PSNR, {best['label']} ({file.path.stem})",
+                )
+            )
     entries = [e for file in spectral for e in file.content["results"]]
     errors = [(e["metrics"].get("six_patch_rmse", e["metrics"].get("rmse")), e) for e in entries]
     errors = [(value, e) for value, e in errors if value is not None]
     if errors:
         value, entry = min(errors, key=lambda pair: pair[0])
         cards.append((f"{value:.4f}", f"least RMSE in reflectance, {entry['label']}"))
-    ratios = [(e["metrics"]["snr_capture_mean_db"], e) for e in entries if e["metrics"].get("snr_capture_mean_db") is not None]
+    ratios = [
+        (e["metrics"]["snr_capture_mean_db"], e)
+        for e in entries
+        if e["metrics"].get("snr_capture_mean_db") is not None
+    ]
     if ratios:
         value, entry = max(ratios, key=lambda pair: pair[0])
         cards.append((f"{value:.1f} dB", f"best capture SNR, mean of bands, {entry['label']}"))
     return cards
 
 
-# --- spatial -----------------------------------------------------------------------------------------------------------
+# --- spatial --------------------------------------------------------------------------------------
+
 
 def _spatial(page, run, scores):
     """The section about pictures; returns its name, or None where there is nothing to show."""
     from plenocli.report.pictures import method_bars
 
-    images = [file for file in run.of_kind("image") if not any(user.kind == "capture" for user in run.users(file))]
-    # What an image came from directly is a picture's matrix or capture; without images, whatever no calibration used.
-    direct = {digest for file in (*images, *run.of_kind("dictionary")) for digest in file.sources.values()}
-    calibrated = {digest for file in (*run.of_kind("calibration"), *run.of_kind("spectra")) for digest in file.sources.values()}
+    images = [
+        file
+        for file in run.of_kind("image")
+        if not any(user.kind == "capture" for user in run.users(file))
+    ]
+    # What an image came from directly is a picture's matrix or capture; without images, whatever
+    # no calibration used.
+    direct = {
+        digest for file in (*images, *run.of_kind("dictionary")) for digest in file.sources.values()
+    }
+    calibrated = {
+        digest
+        for file in (*run.of_kind("calibration"), *run.of_kind("spectra"))
+        for digest in file.sources.values()
+    }
     homes = {file.folder for file in run.of_kind("calibration")}
 
-    def here(file):  # a DNG does not say what it was for: what lies with a calibration belongs to it
-        return file.digest in direct or not (file.digest in calibrated or homes & {file.folder, *file.folder.parents})
+    # a DNG does not say what it was for: what lies with a calibration belongs to it
+    def here(file):
+        return file.digest in direct or not (
+            file.digest in calibrated or homes & {file.folder, *file.folder.parents}
+        )
 
-    matrices, captures = filter(here, run.of_kind("pif")), list(filter(here, run.of_kind("capture")))
+    matrices, captures = (
+        filter(here, run.of_kind("pif")),
+        list(filter(here, run.of_kind("capture"))),
+    )
     matrices = sorted(matrices, key=lambda file: file.digest not in direct)
     if not (scores or images or matrices or run.of_kind("dictionary") or captures):
         return None
-    page.section("Spatial", "Wave optics carries each object point through main lens and lenslet to the pixels behind it: one column of the system matrix A. "
-                            "Inverting A gives more object points than there are lenslets.")
+    page.section(
+        "Spatial",
+        (
+            "Wave optics carries each object point through main lens and lenslet to the pixels "
+            "behind it: one column of the system matrix A. Inverting A gives more object points "
+            "than there are lenslets."
+        ),
+    )
     if scores:
-        page.figure(method_bars([(file.path.stem, [e for e in file.content["results"] if e["metrics"].get("psnr_db") is not None]) for file in scores]),
-                    "Quality of every method; the dashed line is the PSNR of one value a lenslet.")
+        page.figure(
+            method_bars(
+                [
+                    (
+                        file.path.stem,
+                        [
+                            e
+                            for e in file.content["results"]
+                            if e["metrics"].get("psnr_db") is not None
+                        ],
+                    )
+                    for file in scores
+                ]
+            ),
+            "Quality of every method; the dashed line is the PSNR of one value a lenslet.",
+        )
     for file in scores:
         page.heading(file.name.removesuffix(".json"), file.command)
         add_table(page, file.content)
@@ -107,7 +178,10 @@ def _spatial(page, run, scores):
 def _drawn_results(page, run, file):
     """Pictures of the results of a score document, as far as they still lie in the folder."""
     truth = run.by_digest(file.sources.get("truth"))
-    digests = [file.sources.get(f"result {number}") for number in range(1, len(file.content["results"]) + 1)]
+    digests = [
+        file.sources.get(f"result {number}")
+        for number in range(1, len(file.content["results"]) + 1)
+    ]
     pairs = []
     for entry, digest in zip(file.content["results"], digests, strict=True):
         found = run.by_digest(digest)
@@ -116,7 +190,16 @@ def _drawn_results(page, run, file):
         try:
             result = read_result(found.path)
             if result.wavelengths is None:
-                pairs.append((entry, {"result": result, "truth": read_truth(truth.path, result), "block": block_of(result, truth.path)}))
+                pairs.append(
+                    (
+                        entry,
+                        {
+                            "result": result,
+                            "truth": read_truth(truth.path, result),
+                            "block": block_of(result, truth.path),
+                        },
+                    )
+                )
         except PlenoError as error:
             page.warning(str(error))
     for shape in dict.fromkeys(pair[1]["truth"].shape for pair in pairs):
@@ -147,7 +230,14 @@ def _capture(page, run, file):
     if file.kind == "capture" and file.path.suffix == ".h5":
         centres = file.artefact().data.get("capture/lenslet_centre")
     calibration = next((u for u in run.users(file) if u.kind == "calibration"), None) or next(
-        (run.by_digest(d) for u in run.users(file) for d in u.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "calibration"), None)
+        (
+            run.by_digest(d)
+            for u in run.users(file)
+            for d in u.sources.values()
+            if run.by_digest(d) and run.by_digest(d).kind == "calibration"
+        ),
+        None,
+    )
     if centres is None and calibration is not None:
         centres = calibration.artefact().data["grid/centre"]
     _add(page, capture_figures(mosaic, file.name, centres))
@@ -160,8 +250,14 @@ def _refocused(page, run, scores):
     found = run.of_kind("lightfield")
     if not found:
         return None
-    page.section("Depth", "One capture focused on other planes. A slope is what a plane's picture moves for each pixel of view: 0 is focused on the lenslets, "
-                          "and one of parallax across the pupil is what geometry can tell.")
+    page.section(
+        "Depth",
+        (
+            "One capture focused on other planes. A slope is what a plane's picture moves for each "
+            "pixel of view: 0 is focused on the lenslets, and one of parallax across the pupil is "
+            "what geometry can tell."
+        ),
+    )
     for file in scores:
         if any(entry.get("kind") == "lightfield" for entry in file.content["results"]):
             page.heading(file.name.removesuffix(".json"), file.command)
@@ -179,7 +275,13 @@ def _designs(page, run):
     found = run.of_kind("sweep")
     if not found:
         return None
-    page.section("Design space", "Many cameras carried through the stages. A design is on the front if no other is at least as good in everything that was asked for, and better in one.")
+    page.section(
+        "Design space",
+        (
+            "Many cameras carried through the stages. A design is on the front if no other is at "
+            "least as good in everything that was asked for, and better in one."
+        ),
+    )
     for file in found:
         page.heading(file.name.removesuffix(".h5"), file.command)
         artefact = file.artefact()
@@ -187,7 +289,10 @@ def _designs(page, run):
             _add(page, front_figures(artefact))
             page.table(*front_rows(artefact), text=True)
         else:
-            page.warning(f"{file.name}: no design has all figures of the front; `plenocli inspect` shows the reasons.")
+            page.warning(
+                f"{file.name}: no design has all figures of the front; `plenocli "
+                "inspect` shows the reasons."
+            )
     return "Design space"
 
 
@@ -203,31 +308,68 @@ def _matrix(page, file):
     data, attrs = artefact.data, artefact.attrs.get("pif", {})
     page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.command)
     bands, lenslets, pixels, points = data["pif/A"].shape
-    facts = [("bands x superpixels x pixels x object points", f"{bands} x {lenslets} x {pixels} x {points}")]
-    facts += [(label, _text(attrs[name])) for name, label in (
-        ("rank", "numerical rank"), ("condition", "condition number"), ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
-        ("coherent_ring", "rings of neighbours added coherently"), ("kappa", "kappa [1/m]"), ("model", "propagation")) if name in attrs]
-    page.table(["", ""], [list(fact) for fact in [*facts, *_plan(artefact.provenance.accuracy)]], text=True)
-    why = [*artefact.provenance.accuracy.get("reasons", ()), *(f"left out: {text}" for text in artefact.provenance.accuracy.get("left_out", ()))]
+    facts = [
+        (
+            "bands x superpixels x pixels x object points",
+            f"{bands} x {lenslets} x {pixels} x {points}",
+        )
+    ]
+    facts += [
+        (label, _text(attrs[name]))
+        for name, label in (
+            ("rank", "numerical rank"),
+            ("condition", "condition number"),
+            ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
+            ("coherent_ring", "rings of neighbours added coherently"),
+            ("kappa", "kappa [1/m]"),
+            ("model", "propagation"),
+        )
+        if name in attrs
+    ]
+    page.table(
+        ["", ""], [list(fact) for fact in [*facts, *_plan(artefact.provenance.accuracy)]], text=True
+    )
+    why = [
+        *artefact.provenance.accuracy.get("reasons", ()),
+        *(f"left out: {text}" for text in artefact.provenance.accuracy.get("left_out", ())),
+    ]
     if why:
         page.code("\n".join(map(str, why)), "Why: the accuracy plan")
     _add(page, matrix_figures(artefact))
 
 
 def _plan(record):
-    """(label, text) of what simulate-pif planned: the accuracy asked for, what it expects, and where that comes from."""
-    parts = ", ".join(f"{name} {_text(error)}" for name, error in sorted(record.get("by_source", {}).items(), key=lambda item: -item[1]) if error)
-    texts = {"accuracy asked for": f"{_text(record['asked'])} ({record.get('asked_by', 'request')})" if "asked" in record else None,
-             "error expected": f"{_text(record['estimated'])}" + (f": {parts}" if parts else "") if "estimated" in record else None,
-             "computed by": record.get("rung"),
-             "error of that model itself": _text(record["model_error"]) if record.get("model_error") is not None else None}
+    """(label, text) of what simulate-pif planned: the accuracy asked for, what it expects, and
+    where that comes from.
+    """
+    parts = ", ".join(
+        f"{name} {_text(error)}"
+        for name, error in sorted(record.get("by_source", {}).items(), key=lambda item: -item[1])
+        if error
+    )
+    texts = {
+        "accuracy asked for": f"{_text(record['asked'])} ({record.get('asked_by', 'request')})"
+        if "asked" in record
+        else None,
+        "error expected": f"{_text(record['estimated'])}" + (f": {parts}" if parts else "")
+        if "estimated" in record
+        else None,
+        "computed by": record.get("rung"),
+        "error of that model itself": _text(record["model_error"])
+        if record.get("model_error") is not None
+        else None,
+    }
     return [(label, text) for label, text in texts.items() if text is not None]
 
 
 def _text(value):
     if isinstance(value, (list, tuple, np.ndarray)):
         values = np.ravel(value)
-        return _text(values[0]) if values.size == 1 else f"{_text(values.min())} to {_text(values.max())}"
+        return (
+            _text(values[0])
+            if values.size == 1
+            else f"{_text(values.min())} to {_text(values.max())}"
+        )
     return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
 
 
@@ -237,27 +379,56 @@ def _dictionary(page, run, file):
     artefact = file.artefact()
     page.heading(f"Dictionary {file.name.removesuffix('.h5')}", file.command)
     attrs = artefact.attrs.get("dictionary", {})
-    rows = [[name.replace("_", " "), _text(value)] for name, value in attrs.items() if isinstance(value, (int, float, np.number)) and not isinstance(value, bool)]
+    rows = [
+        [name.replace("_", " "), _text(value)]
+        for name, value in attrs.items()
+        if isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    ]
     page.table(["", ""], rows, text=True)
     notes = attrs.get("notes")
     if isinstance(notes, dict) and notes.get("beats_lmmse") is False:
-        page.warning(f"This dictionary does not beat LMMSE on held-out pictures ({notes.get('averaged_psnr_db', notes.get('validation_psnr_db', 0)):.2f} against "
-                     f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead.")
-    matrix = next((run.by_digest(d) for d in file.sources.values() if run.by_digest(d) and run.by_digest(d).kind == "pif"), None)
+        page.warning(
+            "This dictionary does not beat LMMSE on held-out pictures "
+            f"({notes.get('averaged_psnr_db', notes.get('validation_psnr_db', 0)):.2f} against "
+            f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead."
+        )
+    matrix = next(
+        (
+            run.by_digest(d)
+            for d in file.sources.values()
+            if run.by_digest(d) and run.by_digest(d).kind == "pif"
+        ),
+        None,
+    )
     system = None if matrix is None else own_matrix(matrix.artefact())
     _add(page, dictionary_figures(read_result(file.path), file.name, learning(artefact), system))
 
 
-# --- spectral ----------------------------------------------------------------------------------------------------------
+# --- spectral -------------------------------------------------------------------------------------
+
 
 def _spectral(page, run, scores):
     """The section about spectra; returns its name, or None where there is nothing to show."""
     calibrations, spectra = run.of_kind("calibration"), run.of_kind("spectra")
     if not (scores or calibrations or spectra):
         return None
-    page.section("Spectral", "Filters in the pupil of the main lens send each band to its own pixels behind a lenslet. The response F, measured under "
-                             "narrow-band light, is inverted for every lenslet.")
-    responses = [file for file in scores if all(entry.get("kind") == "calibration" for entry in file.content["results"] if "error" not in entry)]
+    page.section(
+        "Spectral",
+        (
+            "Filters in the pupil of the main lens send each band to its own pixels behind a "
+            "lenslet. The response F, measured under narrow-band light, is "
+            "inverted for every lenslet."
+        ),
+    )
+    responses = [
+        file
+        for file in scores
+        if all(
+            entry.get("kind") == "calibration"
+            for entry in file.content["results"]
+            if "error" not in entry
+        )
+    ]
     groups = {}
     for file in scores:
         if file not in responses:
@@ -270,14 +441,19 @@ def _spectral(page, run, scores):
     for file in responses:
         _agreement(page, run, file)
     scored = {digest for file in scores for digest in file.sources.values()}
-    _bands_alone(page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)])
+    _bands_alone(
+        page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)]
+    )
     described = set()
     for file in calibrations:
         _calibration(page, file, described)
     sources = {digest for file in (*calibrations, *spectra) for digest in file.sources.values()}
     captures = [f for f in run.of_kind("capture") if f.digest in sources]
     # one of each sort before a second of any: the pipelines name files by what they show
-    sorts = [next((f for f in captures if word in f.path.name), None) for word in ("chart", "white", "band")]
+    sorts = [
+        next((f for f in captures if word in f.path.name), None)
+        for word in ("chart", "white", "band")
+    ]
     captures = list(dict.fromkeys(f.digest for f in [*sorts, *captures] if f))
     if captures:
         page.heading("Captures")
@@ -288,10 +464,22 @@ def _spectral(page, run, scores):
 
 def _merged_scores(page, run, files):
     """All score documents of one folder in one table and one set of bars."""
-    results = [entry for file in files for entry in file.content["results"] if entry.get("wavelengths_nm")]
-    document = {"results": results, "definitions": {name: text for file in files for name, text in file.content["definitions"].items()}}
+    results = [
+        entry for file in files for entry in file.content["results"] if entry.get("wavelengths_nm")
+    ]
+    document = {
+        "results": results,
+        "definitions": {
+            name: text for file in files for name, text in file.content["definitions"].items()
+        },
+    }
     add_table(page, document)
-    digests = [file.sources.get(f"result {number}") for file in files for number, entry in enumerate(file.content["results"], start=1) if entry.get("wavelengths_nm")]
+    digests = [
+        file.sources.get(f"result {number}")
+        for file in files
+        for number, entry in enumerate(file.content["results"], start=1)
+        if entry.get("wavelengths_nm")
+    ]
     pairs = []
     for entry, digest in zip(results, digests, strict=True):
         found = run.by_digest(digest)
@@ -301,10 +489,12 @@ def _merged_scores(page, run, files):
 
 
 def _agreement(page, run, file):
-    """Responses beside the one that was measured, band by band, and where in the superpixel the first one differs."""
+    """Responses beside the one that was measured, band by band, and where in the superpixel the
+    first one differs.
+    """
     from plenocli.evaluation.metrics.response import response_error
-    from plenocli.report.spectral_pictures import response_errors
     from plenocli.evaluation.response_score import paired_responses
+    from plenocli.report.spectral_pictures import response_errors
 
     page.heading("Responses compared", file.command)
     add_table(page, file.content)
@@ -313,11 +503,18 @@ def _agreement(page, run, file):
         return
     response, other, wavelengths, window = paired_responses(first.path, truth.path)
     error, _, mean = response_error(response, other)
-    page.figure(response_errors(error, np.nanmax(mean, axis=0), window, wavelengths), f"{first.name} less {truth.name}, after a gain for each band.")
+    page.figure(
+        response_errors(error, np.nanmax(mean, axis=0), window, wavelengths),
+        f"{first.name} less {truth.name}, after a gain for each band.",
+    )
 
 
 def _is_white(run, file):
-    return any(role.startswith("white") and digest == file.digest for user in run.users(file) for role, digest in user.sources.items())
+    return any(
+        role.startswith("white") and digest == file.digest
+        for user in run.users(file)
+        for role, digest in user.sources.items()
+    )
 
 
 def _bands_alone(page, files):
@@ -325,7 +522,10 @@ def _bands_alone(page, files):
 
     for file in files[:_SPECTRA]:
         result = read_result(file.path)
-        page.figure(band_pictures(result.values, result.wavelengths, result.quantity or "value"), f"{file.name}: one value a lenslet and band; not scored.")
+        page.figure(
+            band_pictures(result.values, result.wavelengths, result.quantity or "value"),
+            f"{file.name}: one value a lenslet and band; not scored.",
+        )
 
 
 def _calibration(page, file, described):
@@ -336,9 +536,18 @@ def _calibration(page, file, described):
     attrs = artefact.attrs
     page.heading(f"Calibration {file.name.removesuffix('.h5')}", file.command)
     grid, response = attrs.get("grid", {}), attrs.get("response", {})
-    rows = [[label, _listed(of[name])] for of, name, label in (
-        (grid, "lattice", "lattice"), (grid, "pitch", "pitch, rows and columns [px]"), (grid, "angle", "rotation [deg]"), (grid, "rms", "rms distance from the lattice [px]"),
-        (grid, "lenslets", "lenslets"), (response, "condition", "median condition number of F")) if name in of]
+    rows = [
+        [label, _listed(of[name])]
+        for of, name, label in (
+            (grid, "lattice", "lattice"),
+            (grid, "pitch", "pitch, rows and columns [px]"),
+            (grid, "angle", "rotation [deg]"),
+            (grid, "rms", "rms distance from the lattice [px]"),
+            (grid, "lenslets", "lenslets"),
+            (response, "condition", "median condition number of F"),
+        )
+        if name in of
+    ]
     page.table(["", ""], rows, text=True)
     if artefact.provenance.config not in described:
         described.add(artefact.provenance.config)
@@ -355,18 +564,41 @@ def _filters(artefact):
         camera = parse_camera(artefact.provenance.config)
     except PlenoError:  # measured, or made by a program that describes cameras otherwise
         return []
-    return [(filters_picture(camera), "Filters in the pupil of the main lens, seen along the light, and their transmittance.")] if camera.filter_array else []
+    return (
+        [
+            (
+                filters_picture(camera),
+                (
+                    "Filters in the pupil of the main lens, seen along the light, and "
+                    "their transmittance."
+                ),
+            )
+        ]
+        if camera.filter_array
+        else []
+    )
 
 
 def _listed(value):
-    return " x ".join(f"{v:.5g}" for v in np.ravel(value)) if not isinstance(value, (str, int, float)) else _text(value)
+    return (
+        " x ".join(f"{v:.5g}" for v in np.ravel(value))
+        if not isinstance(value, (str, int, float))
+        else _text(value)
+    )
 
 
-# --- files -------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
+
 
 def _files(page, run):
     """Every file with the command that made it, and the configurations."""
-    page.section("Files and provenance", "Artefacts carry the SHA-256 of their inputs; every one listed here was verified when this page was made.")
+    page.section(
+        "Files and provenance",
+        (
+            "Artefacts carry the SHA-256 of their inputs; every one listed here was verified "
+            "when this page was made."
+        ),
+    )
     rows = [[file.name, file.kind, file.digest[:12], file.command] for file in run.files]
     page.table(["file", "kind", "SHA-256", "made by"], rows, text=True)
     configs = {}
@@ -374,4 +606,6 @@ def _files(page, run):
         if file.config:
             configs.setdefault(file.config, []).append(file.name)
     for config, names in configs.items():
-        page.code(config, f"Camera of {', '.join(names[:4])}{' and others' if len(names) > 4 else ''}")
+        page.code(
+            config, f"Camera of {', '.join(names[:4])}{' and others' if len(names) > 4 else ''}"
+        )

@@ -1,4 +1,6 @@
-"""simulate-pif: the system matrix of a camera by wave optics, with what it can and cannot resolve."""
+"""simulate-pif: the system matrix of a camera by wave optics, with what it can
+and cannot resolve.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +13,9 @@ from plenocli.base.progress import bar, note
 
 @dataclass(frozen=True)
 class Settings:
-    """What the command line says beyond the camera: wavelengths in m (empty: the camera's), spectral_step m, "auto" or None."""
+    """What the command line says beyond the camera: wavelengths in m (empty: the camera's),
+    spectral_step m, "auto" or None.
+    """
 
     wavelengths: tuple = ()
     spectral_step: object = None
@@ -25,33 +29,50 @@ class Settings:
     mem_limit: int = 8 << 30
 
 
-def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=False, workers=1, command=""):
-    """Compute A and write it as a pif artefact; returns a summary dict. With `explain` only the plan is made.
+def run_simulate_pif(
+    camera_path, output, settings, *, explain=False, overwrite=False, workers=1, command=""
+):
+    """Compute A and write it as a pif artefact; returns a summary dict.
 
-    Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where memory or accuracy do not
-    suffice, OutputError where the file cannot be written.
+    With `explain` only the plan is made.
+
+    Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where
+    memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
+    from plenocli.base.threads import one_thread
+    from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
-    from plenocli.forward.accuracy.dial import plan_pif
-    from plenocli.forward.accuracy.explain import expectation
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.read.cameras import camera_files, read_camera
-    from plenocli.forward.propagation.diagnosis import describe
-    from plenocli.base.threads import one_thread
-    from plenocli.forward.propagation.system_matrix import build_pif
-    from plenocli.files.artefacts import pif_pieces
     from plenocli.files.read.scene_needs import read_needs
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.forward.accuracy.explain import expectation
+    from plenocli.forward.propagation.diagnosis import describe
+    from plenocli.forward.propagation.system_matrix import build_pif
 
     if not explain:
         if output is None:
-            raise UsageError("no output file given", "--output", "write -o pif.h5, or --explain to see the plan only")
+            raise UsageError(
+                "no output file given",
+                "--output",
+                "write -o pif.h5, or --explain to see the plan only",
+            )
         check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
     camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
-    plan = plan_pif(camera, wavelengths=_wavelengths(camera, settings), superpixels=settings.superpixels, coherent_ring=settings.coherent_ring,
-                    accuracy=settings.accuracy, model=settings.model, dtype=settings.dtype, needs=needs, lenslet=settings.lenslet)
+    plan = plan_pif(
+        camera,
+        wavelengths=_wavelengths(camera, settings),
+        superpixels=settings.superpixels,
+        coherent_ring=settings.coherent_ring,
+        accuracy=settings.accuracy,
+        model=settings.model,
+        dtype=settings.dtype,
+        needs=needs,
+        lenslet=settings.lenslet,
+    )
     if explain:
         return _explained(plan, pif_pieces.cost(plan, settings.mem_limit)[1])
     chosen = pif_pieces.layout(plan, settings.mem_limit, camera_path)
@@ -59,7 +80,13 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
         if line:
             note(line)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
-    provenance = Provenance(command, describe_inputs(camera_files(camera_path, camera) | {"scene": scene}), None, to_toml(camera), accuracy_record(plan))
+    provenance = Provenance(
+        command,
+        describe_inputs(camera_files(camera_path, camera) | {"scene": scene}),
+        None,
+        to_toml(camera),
+        accuracy_record(plan),
+    )
 
     def finish(pif, found):
         data, attrs = _contents(pif, found)
@@ -69,10 +96,17 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
         return Artefact("pif", data, attrs, provenance)
 
     # the diagnosis too: its singular values must not depend on the cores of a machine
-    with one_thread(), bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress:
-        options = dict(progress=lambda done, total: progress.update(done - progress.n), workers=workers)
+    with (
+        one_thread(),
+        bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress,
+    ):
+        options = dict(
+            progress=lambda done, total: progress.update(done - progress.n), workers=workers
+        )
         if chosen.streamed:
-            pif, found = pif_pieces.stream_pif(camera, plan, output, chosen, finish, overwrite=overwrite, **options)
+            pif, found = pif_pieces.stream_pif(
+                camera, plan, output, chosen, finish, overwrite=overwrite, **options
+            )
         else:
             pif = build_pif(camera, plan, **options)
             found = describe(pif)
@@ -84,32 +118,58 @@ def run_simulate_pif(camera_path, output, settings, *, explain=False, overwrite=
 
 
 def accuracy_record(plan):
-    """What an artefact says of the accuracy it was made with, JSON-able: asked (and by whom), estimated, by source, model, reasons."""
-    return {"asked": plan.accuracy, "asked_by": plan.asked_by, "estimated": plan.estimated, "by_source": plan.split, "model": plan.model, "model_error": plan.model_error, "rung": plan.rung,
-            "reasons": [*plan.reasons, *plan.warnings], "left_out": list(plan.left_out)}
+    """What an artefact says of the accuracy it was made with, JSON-able: asked (and by whom),
+    estimated, by source, model, reasons.
+    """
+    return {
+        "asked": plan.accuracy,
+        "asked_by": plan.asked_by,
+        "estimated": plan.estimated,
+        "by_source": plan.split,
+        "model": plan.model,
+        "model_error": plan.model_error,
+        "rung": plan.rung,
+        "reasons": [*plan.reasons, *plan.warnings],
+        "left_out": list(plan.left_out),
+    }
 
 
 def _explained(plan, memory):
     from plenocli.forward.accuracy.explain import candidates, explain
 
     considered = candidates(plan)
-    return {"plan": explain(plan, memory), "memory": memory, "accuracy": accuracy_record(plan), "considered": considered,
-            "seconds": next(c["seconds"] for c in considered if c["chosen"]), "bytes": plan.bytes, "superpixels": list(plan.superpixels),
-            "coherent_ring": plan.coherent_ring, "estimated_accuracy": plan.estimated}
+    return {
+        "plan": explain(plan, memory),
+        "memory": memory,
+        "accuracy": accuracy_record(plan),
+        "considered": considered,
+        "seconds": next(c["seconds"] for c in considered if c["chosen"]),
+        "bytes": plan.bytes,
+        "superpixels": list(plan.superpixels),
+        "coherent_ring": plan.coherent_ring,
+        "estimated_accuracy": plan.estimated,
+    }
 
 
 def _wavelengths(camera, settings):
     if settings.wavelengths and settings.spectral_step is not None:
-        raise UsageError("--wavelength and --spectral-step contradict each other", fix="leave one of them out")
+        raise UsageError(
+            "--wavelength and --spectral-step contradict each other", fix="leave one of them out"
+        )
     if settings.wavelengths:
         return tuple(sorted(set(settings.wavelengths)))
     if settings.spectral_step is None:
         return None
-    from plenocli.forward.scene.tables import illuminant
     from plenocli.forward.scene.light import broadband
+    from plenocli.forward.scene.tables import illuminant
 
     step = None if settings.spectral_step == "auto" else settings.spectral_step
-    return tuple(float(w) for w in broadband(camera, lambda w: illuminant(camera.light.illuminant, w), step).wavelengths)
+    return tuple(
+        float(w)
+        for w in broadband(
+            camera, lambda w: illuminant(camera.light.illuminant, w), step
+        ).wavelengths
+    )
 
 
 def _window(camera, lenslet):
@@ -130,8 +190,14 @@ def _contents(pif, found):
         "pif/column_energy": pif.column_energy,
     }
     notes = pif.notes
-    attrs = {"coherent_ring": notes["coherent_ring"], "kappa": notes["kappa"], "eps": notes["eps"], "superpixel_pitch": notes["superpixel_pitch"],
-             "model": notes["model"], "notes": notes}
+    attrs = {
+        "coherent_ring": notes["coherent_ring"],
+        "kappa": notes["kappa"],
+        "eps": notes["eps"],
+        "superpixel_pitch": notes["superpixel_pitch"],
+        "model": notes["model"],
+        "notes": notes,
+    }
     if "singular_values" in found:
         data["pif/singular_values"] = found["singular_values"]
     attrs |= {key: found[key] for key in ("rank", "condition", "symmetry_defect") if key in found}
@@ -139,13 +205,32 @@ def _contents(pif, found):
 
 
 def _summary(output, pif, found, plan):
-    keep = {key: found[key] for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max") if key in found}
+    keep = {
+        key: found[key]
+        for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max")
+        if key in found
+    }
     bands, _, pixels, points = plan.shape
-    return {"output": str(output), "bands": bands, "superpixels": list(plan.superpixels), "pixels": pixels, "points": points,
-            "wavelengths": pif.wavelength.tolist(), "model": plan.model, "rung": plan.rung, "coherent_ring": plan.coherent_ring, "accuracy": plan.accuracy,
-            "estimated_accuracy": plan.estimated, "kappa": pif.notes["kappa"], "eps": pif.notes["eps"],
-            "bytes": plan.bytes, "nominal_seconds": plan.chosen.seconds(),
-            "quartic_phase_rad": pif.notes["quartic_phase_rad"], "warnings": [*plan.warnings, *found["warnings"]], **keep}
+    return {
+        "output": str(output),
+        "bands": bands,
+        "superpixels": list(plan.superpixels),
+        "pixels": pixels,
+        "points": points,
+        "wavelengths": pif.wavelength.tolist(),
+        "model": plan.model,
+        "rung": plan.rung,
+        "coherent_ring": plan.coherent_ring,
+        "accuracy": plan.accuracy,
+        "estimated_accuracy": plan.estimated,
+        "kappa": pif.notes["kappa"],
+        "eps": pif.notes["eps"],
+        "bytes": plan.bytes,
+        "nominal_seconds": plan.chosen.seconds(),
+        "quartic_phase_rad": pif.notes["quartic_phase_rad"],
+        "warnings": [*plan.warnings, *found["warnings"]],
+        **keep,
+    }
 
 
 def line(report):
@@ -153,10 +238,16 @@ def line(report):
     if "plan" in report:
         return report["plan"]
     low, high = min(report["energy_min"]), max(report["energy_max"])
-    text = (f"{Path(report['output'])}: A of {report['bands']} band(s), {report['superpixels'][0]}x{report['superpixels'][1]} superpixels, "
-            f"{report['pixels']} pixels, {report['points']} points; column energy {low:.3f} to {high:.3f}")
+    text = (
+        f"{Path(report['output'])}: A of {report['bands']} band(s), "
+        f"{report['superpixels'][0]}x{report['superpixels'][1]} superpixels, {report['pixels']} "
+        f"pixels, {report['points']} points; column energy {low:.3f} to {high:.3f}"
+    )
     if "rank" in report:
-        text += f"; rank {min(report['rank'])} ({min(report['rank_60db'])} above 60 dB noise), condition {max(report['condition']):.1e}"
+        text += (
+            f"; rank {min(report['rank'])} ({min(report['rank_60db'])} above 60 dB noise), "
+            f"condition {max(report['condition']):.1e}"
+        )
     if "symmetry_defect" in report:
         text += f"; symmetry defect {min(report['symmetry_defect']):.1e}"
     return f"{text}; {report['rung']}, estimated error {report['estimated_accuracy']:.1g}"

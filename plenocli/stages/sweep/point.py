@@ -1,8 +1,10 @@
-"""One point of a sweep: a camera carried through the stages, from its description to the figures of score.
+"""One point of a sweep: a camera carried through the stages, from its description to
+the figures of score.
 
-What goes in and what comes out are plain dicts, so that a point is the same work in any process. Its files live in a folder of
-their own while it lasts; only figures are kept. Every figure is reproducible: what a matrix costs is counted by its plan at
-nominal rates; the time that was measured stands apart.
+What goes in and what comes out are plain dicts, so that a point is the same work in any process.
+Its files live in a folder of their own while it lasts; only figures are kept. Every figure is
+reproducible: what a matrix costs is counted by its plan at nominal rates; the time that was
+measured stands apart.
 """
 
 import contextlib
@@ -17,39 +19,62 @@ from pathlib import Path
 from plenocli.base.errors import OutputError, PlenoError
 from plenocli.base.progress import heard
 
-CHAINS = {"spatial": ("simulate-pif", "capture-sim", "reconstruct", "score"),
-          "spectral": ("simulate-pif", "capture-sim", "simulate-response", "calibrate", "demux", "score")}
+CHAINS = {
+    "spatial": ("simulate-pif", "capture-sim", "reconstruct", "score"),
+    "spectral": ("simulate-pif", "capture-sim", "simulate-response", "calibrate", "demux", "score"),
+}
 """Stages of each chain, whose options may be set."""
 
 DESIGN = {
-    "matrix_seconds": "time to compute the system matrix on one core at nominal speed, as its plan counts it, s",
+    "matrix_seconds": (
+        "time to compute the system matrix on one core at nominal speed, as its plan counts it, s"
+    ),
     "matrix_bytes": "size of the system matrix, bytes",
     "lenslets": "lenslets of the array",
     "sensor_pixels": "pixels of the sensor",
     "object_points": "object points over the whole array",
-    "lenslet_field_m": "width of one lenslet's field on the object: pitch times object distance over array distance, m",
+    "lenslet_field_m": (
+        "width of one lenslet's field on the object: pitch times object distance "
+        "over array distance, m"
+    ),
 }
 """Figures of every point beside those of score."""
 
-_BY_ITSELF = {"refine", "bandwidth", "spectral_step", "superpixels", "coherent_ring", "accuracy", "model"}
+_BY_ITSELF = {
+    "refine",
+    "bandwidth",
+    "spectral_step",
+    "superpixels",
+    "coherent_ring",
+    "accuracy",
+    "model",
+}
 """Options of capture-sim with which it computes a matrix of its own."""
 _WHITE, _DARK, _BAND = 1_000_001, 1_000_002, 1_000_003
 """Seeds of the captures beside the one of the scene, over its seed: no two draw the same noise."""
 
 
 def task_of(chain, camera, options, seed):
-    """The task of one point: {"chain", "camera": resolved TOML, "settings": stage -> option -> value}, with what the chain supposes.
+    """The task of one point: {"chain", "camera": resolved TOML, "settings": stage -> option ->
+    value}, with what the chain supposes.
 
     options: stage -> option -> value, as the command line reads them; only those given.
     """
-    settings = {stage: dict(options.get(stage, {})) for stage in CHAINS[chain] if stage != "calibrate" or stage in options}
+    settings = {
+        stage: dict(options.get(stage, {}))
+        for stage in CHAINS[chain]
+        if stage != "calibrate" or stage in options
+    }
     capture = settings["capture-sim"]
     if not capture.keys() & {"scene", "target"}:
-        capture |= {"scene": "skimage:astronaut"} if chain == "spatial" else {"target": "colorchecker"}
+        capture |= (
+            {"scene": "skimage:astronaut"} if chain == "spatial" else {"target": "colorchecker"}
+        )
     if chain == "spectral" and "wavelengths" not in settings["simulate-pif"]:
         settings["simulate-pif"].setdefault("spectral_step", "auto")
     if chain == "spatial":
-        settings["reconstruct"].setdefault("method", "lmmse")  # auto would try several methods at every point
+        # auto would try several methods at every point
+        settings["reconstruct"].setdefault("method", "lmmse")
     for stage in ("capture-sim", "reconstruct"):
         settings.get(stage, {}).setdefault("seed", seed)
     from plenocli.files.config.camera_file import to_toml
@@ -58,25 +83,38 @@ def task_of(chain, camera, options, seed):
 
 
 def point_key(task, files):
-    """What a point is known by: SHA-256 of everything that its figures depend on. files: path -> SHA-256 of the files it names."""
+    """What a point is known by: SHA-256 of everything that its figures depend on.
+
+    files: path -> SHA-256 of the files it names.
+    """
     return _digest(task, files)
 
 
 def matrix_key(task, camera, files):
-    """What the matrix of a point is known by: of the camera only what A depends on, so that points share it."""
+    """What the matrix of a point is known by: of the camera only what A depends on, so
+    that points share it.
+    """
     settings = task["settings"]["simulate-pif"]
     kept = camera.model_dump(mode="json")
     # without an accuracy asked for, the sensor's noise decides how exact the matrix is
     noise = {"full_well", "read_noise"} if settings.get("accuracy") is not None else set()
     colour = set() if task["chain"] == "spectral" else {"cfa"}
-    for section, names in (("lenslet_array", {"count"}), ("light", {"illuminant", "white_exposure"}),
-                           ("sensor", {"camera", "bits", "black_level", "gain", "quantum_efficiency"} | colour | noise)):
+    for section, names in (
+        ("lenslet_array", {"count"}),
+        ("light", {"illuminant", "white_exposure"}),
+        (
+            "sensor",
+            {"camera", "bits", "black_level", "gain", "quantum_efficiency"} | colour | noise,
+        ),
+    ):
         kept[section] = {name: value for name, value in kept[section].items() if name not in names}
     return _digest({"camera": kept, "settings": settings}, files)
 
 
 def _digest(value, files):
-    """SHA-256 of the version and of a JSON-able value, with paths of `files` (path -> digest) standing as what they hold."""
+    """SHA-256 of the version and of a JSON-able value, with paths of `files` (path -> digest)
+    standing as what they hold.
+    """
     from plenocli import __version__
 
     def content(part):
@@ -90,33 +128,51 @@ def _digest(value, files):
                 part = part.replace(path, f"sha256 {digest}")
         return part
 
-    return hashlib.sha256(json.dumps([__version__, content(value)], sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps([__version__, content(value)], sort_keys=True).encode()
+    ).hexdigest()
 
 
 def _require_files(task):
-    """OutputError where this process does not see what the task names: then it is not the design that is at fault."""
+    """OutputError where this process does not see what the task names: then it is not the
+    design that is at fault.
+    """
     for path in (*task.get("files", ()), *([task["matrix"]] if task.get("matrix") else ())):
         if not os.path.isfile(path):
-            raise OutputError(f"{socket.gethostname()} does not see this file", path, "workers need the same files under the same names: put them on a file system that all share")
+            raise OutputError(
+                f"{socket.gethostname()} does not see this file",
+                path,
+                (
+                    "workers need the same files under the same names: put them on a file "
+                    "system that all share"
+                ),
+            )
 
 
 def run_matrix(task):
-    """The system matrix of a task: {"content": bytes of the artefact, "info": its cost and what simulate-pif said}. PlenoError."""
+    """The system matrix of a task: {"content": bytes of the artefact, "info": its cost and what
+    simulate-pif said}. PlenoError.
+    """
     _require_files(task)
     with _folder(task) as folder, heard() as notes:
         try:
             info = _simulate_pif(task, folder)
         except PlenoError as error:
             raise _elsewhere(error, folder) from None
-        return {"content": (folder / "pif.h5").read_bytes(), "info": info | {"notes": _without(folder, notes)}}
+        return {
+            "content": (folder / "pif.h5").read_bytes(),
+            "info": info | {"notes": _without(folder, notes)},
+        }
 
 
 def run_point(task):
-    """The figures of a task: {"status": exit code, "reason", "metrics": name -> number, "notes", "seconds"}.
+    """The figures of a task: {"status": exit code, "reason", "metrics": name -> number,
+    "notes", "seconds"}.
 
-    task["matrix"]: where the system matrix lies already, with task["info"] about it, or None; "files": what else is read;
-    "scratch": folder for files, or None; "mem_limit": bytes. A camera or an option that a stage
-    refuses is a result like any other; what keeps files from being written is raised (OutputError).
+    task["matrix"]: where the system matrix lies already, with task["info"] about it, or None;
+    "files": what else is read; "scratch": folder for files, or None; "mem_limit": bytes. A camera
+    or an option that a stage refuses is a result like any other; what keeps files from being
+    written is raised (OutputError).
     """
     start = time.process_time()
     _require_files(task)
@@ -126,34 +182,67 @@ def run_point(task):
                 info, pif = _simulate_pif(task, folder), folder / "pif.h5"
             else:
                 info, pif = task["info"], Path(task["matrix"])
-            settings = {stage: values | _memory(task) if stage in ("capture-sim", "reconstruct") else values for stage, values in task["settings"].items()}
-            metrics = {"spatial": _spatial, "spectral": _spectral}[task["chain"]](settings, folder, pif)
-            found = {"status": 0, "reason": "", "metrics": _design(folder / "camera.toml", info) | metrics}
+            settings = {
+                stage: values | _memory(task) if stage in ("capture-sim", "reconstruct") else values
+                for stage, values in task["settings"].items()
+            }
+            metrics = {"spatial": _spatial, "spectral": _spectral}[task["chain"]](
+                settings, folder, pif
+            )
+            found = {
+                "status": 0,
+                "reason": "",
+                "metrics": _design(folder / "camera.toml", info) | metrics,
+            }
         except OutputError:
             raise
         except PlenoError as error:
             found = refused(_elsewhere(error, folder))
-        return found | {"notes": _without(folder, [*(task.get("info") or {}).get("notes", ()), *notes]), "seconds": time.process_time() - start}
+        return found | {
+            "notes": _without(folder, [*(task.get("info") or {}).get("notes", ()), *notes]),
+            "seconds": time.process_time() - start,
+        }
 
 
 def refused(error):
     """The result of a point that a stage refused: its exit code and the reason."""
-    return {"status": error.exit_code, "reason": str(error), "metrics": {}, "notes": [], "seconds": 0.0}
+    return {
+        "status": error.exit_code,
+        "reason": str(error),
+        "metrics": {},
+        "notes": [],
+        "seconds": 0.0,
+    }
 
 
 def _elsewhere(error, folder):
     """The error without the folder of this run, so that it reads the same wherever it happened."""
-    return type(error)(*(None if part is None else part.replace(f"{folder}/", "") for part in (error.what, error.where, error.fix)))
+    return type(error)(
+        *(
+            None if part is None else part.replace(f"{folder}/", "")
+            for part in (error.what, error.where, error.fix)
+        )
+    )
 
 
 @contextlib.contextmanager
 def _folder(task):
     with contextlib.ExitStack() as stack:
         try:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="plenocli-", dir=task.get("scratch"), ignore_cleanup_errors=True)))
+            folder = Path(
+                stack.enter_context(
+                    tempfile.TemporaryDirectory(
+                        prefix="plenocli-", dir=task.get("scratch"), ignore_cleanup_errors=True
+                    )
+                )
+            )
             (folder / "camera.toml").write_text(task["camera"], encoding="utf-8")
         except OSError as error:
-            raise OutputError(f"cannot be written ({error.strerror})", task.get("scratch") or tempfile.gettempdir(), "free some space there, then run again: what is finished is kept") from None
+            raise OutputError(
+                f"cannot be written ({error.strerror})",
+                task.get("scratch") or tempfile.gettempdir(),
+                "free some space there, then run again: what is finished is kept",
+            ) from None
         yield folder
 
 
@@ -164,7 +253,11 @@ def _without(folder, texts):
 def _simulate_pif(task, folder):
     from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 
-    report = run_simulate_pif(folder / "camera.toml", folder / "pif.h5", _settings(Settings, task["settings"]["simulate-pif"] | _memory(task)))
+    report = run_simulate_pif(
+        folder / "camera.toml",
+        folder / "pif.h5",
+        _settings(Settings, task["settings"]["simulate-pif"] | _memory(task)),
+    )
     return {"matrix_seconds": report["nominal_seconds"], "matrix_bytes": report["bytes"]}
 
 
@@ -174,7 +267,11 @@ def _memory(task):
 
 def _settings(kind, values):
     """A Settings of a stage from what JSON keeps of its options."""
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items() if name in kind.__dataclass_fields__}
+    values = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in values.items()
+        if name in kind.__dataclass_fields__
+    }
     return kind(**values)
 
 
@@ -186,7 +283,9 @@ def _capture(settings, folder, name, pif, *, seed=0, **changes):
     scene = None if values.get("target") else values.get("scene")
     own = pif is None or values.keys() & _BY_ITSELF
     made = _settings(Settings, values | {"seed": values["seed"] + seed})
-    run_capture_sim(folder / "camera.toml", folder / name, made, scene=scene, pif=None if own else pif)
+    run_capture_sim(
+        folder / "camera.toml", folder / name, made, scene=scene, pif=None if own else pif
+    )
     return folder / name
 
 
@@ -208,31 +307,72 @@ def _spectral(settings, folder, pif):
 
     scene = _capture(settings, folder, "scene.h5", pif)
     white = _capture(settings, folder, "white.h5", pif, target="white", seed=_WHITE)
-    response = _measured(settings, folder, pif, white) if "calibrate" in settings else _predicted(settings, folder)
-    run_demux([scene], folder / "spectra.h5", calibration=response, settings=_settings(Settings, settings["demux"] | {"reference": white}))
+    response = (
+        _measured(settings, folder, pif, white)
+        if "calibrate" in settings
+        else _predicted(settings, folder)
+    )
+    run_demux(
+        [scene],
+        folder / "spectra.h5",
+        calibration=response,
+        settings=_settings(Settings, settings["demux"] | {"reference": white}),
+    )
     shown = settings["capture-sim"].get("target") or settings["capture-sim"]["scene"]
     if shown == "colorchecker":
-        return _score(settings, folder, "spectra.h5", truth=shown, patches=shown, camera=folder / "camera.toml")
+        return _score(
+            settings,
+            folder,
+            "spectra.h5",
+            truth=shown,
+            patches=shown,
+            camera=folder / "camera.toml",
+        )
     return _score(settings, folder, "spectra.h5", truth=scene)
 
 
 def _predicted(settings, folder):
     from plenocli.stages.forward.simulate_response import Settings, run_simulate_response
 
-    run_simulate_response(folder / "camera.toml", folder / "response.h5", _settings(Settings, settings["simulate-response"]))
+    run_simulate_response(
+        folder / "camera.toml",
+        folder / "response.h5",
+        _settings(Settings, settings["simulate-response"]),
+    )
     return folder / "response.h5"
 
 
 def _measured(settings, folder, pif, white):
-    """The response calibrated from captures of a white target under narrow-band light, as a real camera's is."""
+    """The response calibrated from captures of a white target under narrow-band light, as
+    a real camera's is.
+    """
     from plenocli.files.config.camera_file import load_camera
     from plenocli.stages.inverse.calibrate import run_calibrate
 
     dark = _capture(settings, folder, "dark.h5", pif, target="dark", seed=_DARK)
-    optics = {name: value for name, value in settings["simulate-pif"].items() if name in ("model", "accuracy", "superpixels", "coherent_ring")}
-    bands = [(w, _capture(settings, folder, f"band{i}.h5", None, target=f"mono:{w * 1e9:.9g}nm", seed=_BAND + i, **optics))
-             for i, w in enumerate(load_camera(folder / "camera.toml").light.wavelengths)]
-    run_calibrate(folder / "response.h5", whites=[white], darks=[dark], bands=bands, **settings["calibrate"])
+    optics = {
+        name: value
+        for name, value in settings["simulate-pif"].items()
+        if name in ("model", "accuracy", "superpixels", "coherent_ring")
+    }
+    bands = [
+        (
+            w,
+            _capture(
+                settings,
+                folder,
+                f"band{i}.h5",
+                None,
+                target=f"mono:{w * 1e9:.9g}nm",
+                seed=_BAND + i,
+                **optics,
+            ),
+        )
+        for i, w in enumerate(load_camera(folder / "camera.toml").light.wavelengths)
+    ]
+    run_calibrate(
+        folder / "response.h5", whites=[white], darks=[dark], bands=bands, **settings["calibrate"]
+    )
     return folder / "response.h5"
 
 
@@ -240,7 +380,11 @@ def _score(settings, folder, result, **truth):
     from plenocli.stages.evaluation.score import run_score
 
     document = run_score([folder / result], folder / "score.json", **truth, **settings["score"])
-    return {name: float(value) for name, value in document["metrics"].items() if isinstance(value, (int, float)) and not isinstance(value, bool)}
+    return {
+        name: float(value)
+        for name, value in document["metrics"].items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }
 
 
 def _design(camera_path, info):
@@ -250,6 +394,11 @@ def _design(camera_path, info):
     array = camera.lenslet_array
     lenslets = array.count[0] * array.count[1]
     pixels, samples = camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet
-    return {"matrix_seconds": info["matrix_seconds"], "matrix_bytes": float(info["matrix_bytes"]), "lenslets": float(lenslets),
-            "sensor_pixels": float(lenslets * pixels[0] * pixels[1]), "object_points": float(lenslets * samples[0] * samples[1]),
-            "lenslet_field_m": array.pitch * camera.object.distance / array.distance}
+    return {
+        "matrix_seconds": info["matrix_seconds"],
+        "matrix_bytes": float(info["matrix_bytes"]),
+        "lenslets": float(lenslets),
+        "sensor_pixels": float(lenslets * pixels[0] * pixels[1]),
+        "object_points": float(lenslets * samples[0] * samples[1]),
+        "lenslet_field_m": array.pitch * camera.object.distance / array.distance,
+    }

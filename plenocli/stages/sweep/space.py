@@ -31,7 +31,9 @@ class Row:
 
 @dataclass
 class Space:
-    """A sweep file with all that it names: the description, its axes, the camera it starts from and how options are read."""
+    """A sweep file with all that it names: the description, its axes, the camera it starts from
+    and how options are read.
+    """
 
     path: Path
     sweep: object
@@ -47,17 +49,33 @@ class Space:
         """The Row of a point; refused already where no such camera can be."""
         from plenocli.files.config.sweep_file import changed, options_of
 
-        options = {stage: self.read_options(stage, self._located(values)) for stage, values in options_of(self.sweep, point).items()}
+        options = {
+            stage: self.read_options(stage, self._located(values))
+            for stage, values in options_of(self.sweep, point).items()
+        }
         self._remember(options)
         row = Row(number, point)
         try:
-            row.camera = self._camera(changed(self.base, {**self.sweep.set, **point}, self.sweep.follow))
+            row.camera = self._camera(
+                changed(self.base, {**self.sweep.set, **point}, self.sweep.follow)
+            )
         except ConfigError as error:
             row.result = refused(error)
-            row.key = point_key({"refused": point, "options": plain(options), "base": self.base, "chain": self.chain}, self.files)
+            row.key = point_key(
+                {
+                    "refused": point,
+                    "options": plain(options),
+                    "base": self.base,
+                    "chain": self.chain,
+                },
+                self.files,
+            )
             return row
         row.task = task_of(self.chain, row.camera, plain(options), self.seed)
-        row.key, row.matrix = point_key(row.task, self.files), matrix_key(row.task, row.camera, self.files)
+        row.key, row.matrix = (
+            point_key(row.task, self.files),
+            matrix_key(row.task, row.camera, self.files),
+        )
         return row
 
     def _camera(self, data):
@@ -85,13 +103,16 @@ class Space:
 
     def _located(self, values):
         """Options whose files, named relative to the sweep file, are found from anywhere."""
+
         def place(value):
             if isinstance(value, list):
                 return [place(v) for v in value]
             known = isinstance(value, str) and (self.path.parent / value).is_file()
             return str((self.path.parent / value).resolve()) if known else value
 
-        return {name: place(value) if name in _EXTERNAL else value for name, value in values.items()}
+        return {
+            name: place(value) if name in _EXTERNAL else value for name, value in values.items()
+        }
 
     def _remember(self, options):
         for values in options.values():
@@ -102,10 +123,13 @@ class Space:
 
 
 def open_space(path, read_options, seed=0):
-    """The Space of the sweep file at `path`. read_options(stage, values): option -> value of a stage as its command line reads them;
-    UsageError. Errors: InputError for files, ConfigError for what they say."""
-    from plenocli.files.config.toml_file import read_text
+    """The Space of the sweep file at `path`.
+
+    read_options(stage, values): option -> value of a stage as its command line reads them;
+    UsageError. Errors: InputError for files, ConfigError for what they say.
+    """
     from plenocli.files.config.sweep_file import STAGES, load_sweep
+    from plenocli.files.config.toml_file import read_text
 
     path = Path(path)
     sweep, axes = load_sweep(path)
@@ -115,8 +139,18 @@ def open_space(path, read_options, seed=0):
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", camera_path, "mend the line") from None
     chain = sweep.chain or ("spectral" if "filter_array" in base else "spatial")
-    named = [*sweep.options, *(head for key in [*sweep.varied, *sweep.set] if (head := key.partition(".")[0]) in STAGES)]
+    named = [
+        *sweep.options,
+        *(head for key in [*sweep.varied, *sweep.set] if (head := key.partition(".")[0]) in STAGES),
+    ]
     for stage in named:
         if stage not in CHAINS[chain]:
-            raise ConfigError(f"{stage} is no stage of the {chain} chain ({', '.join(CHAINS[chain])})", path, f"leave it out, or set chain = \"{'spatial' if chain == 'spectral' else 'spectral'}\"")
+            raise ConfigError(
+                f"{stage} is no stage of the {chain} chain ({', '.join(CHAINS[chain])})",
+                path,
+                (
+                    "leave it out, or set chain = "
+                    f'"{"spatial" if chain == "spectral" else "spectral"}"'
+                ),
+            )
     return Space(path, sweep, axes, chain, base, camera_path, read_options, seed)

@@ -1,4 +1,6 @@
-"""Where results of single points are kept while a sweep runs and after it, and how points that are missing are computed."""
+"""Where results of single points are kept while a sweep runs and after it, and how points that
+are missing are computed.
+"""
 
 import contextlib
 import shutil
@@ -7,9 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from plenocli.base.errors import OutputError, PlenoError, UsageError
-from plenocli.stages.sweep.point import refused, run_matrix, run_point
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost
+from plenocli.stages.sweep.point import refused, run_matrix, run_point
 
 
 @contextlib.contextmanager
@@ -24,7 +26,11 @@ def open_store(output, plot, overwrite, inputs):
     check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs)
     if plot is not None:
         if find_spec("matplotlib") is None:
-            raise UsageError("pictures need matplotlib, which is not installed", "--plot", "pip install 'plenocli[plot]', or leave it out")
+            raise UsageError(
+                "pictures need matplotlib, which is not installed",
+                "--plot",
+                "pip install 'plenocli[plot]', or leave it out",
+            )
         check_output(plot, overwrite=again, inputs=inputs, suffixes=(".png",))
     store = Store(folder, output, plot, overwrite, again)
     try:
@@ -34,12 +40,20 @@ def open_store(output, plot, overwrite, inputs):
 
 
 class Store:
-    """Results by content key in the folder beside OUT: points.jsonl, and while they are needed the matrices that points share."""
+    """Results by content key in the folder beside OUT: points.jsonl, and while they are needed
+    the matrices that points share.
+    """
 
     def __init__(self, folder, output, plot=None, overwrite=False, again=False):
         from plenocli.execution.journal import Journal
 
-        self.folder, self.output, self.plot, self.overwrite, self.again = folder, output, plot, overwrite, again
+        self.folder, self.output, self.plot, self.overwrite, self.again = (
+            folder,
+            output,
+            plot,
+            overwrite,
+            again,
+        )
         try:
             folder.mkdir(exist_ok=True)
             self.journal = Journal(folder / "points.jsonl")
@@ -47,32 +61,55 @@ class Store:
             for name in ("scratch", "matrices"):
                 (folder / name).mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(f"cannot be made ({error.strerror})", folder, "check the folder and its permissions") from None
+            raise OutputError(
+                f"cannot be made ({error.strerror})", folder, "check the folder and its permissions"
+            ) from None
 
     def close(self):
         """Let go of the folder; scratch files go, and all of it where no point was finished."""
-        shutil.rmtree(self.folder / "scratch" if self.journal.records else self.folder, ignore_errors=True)
+        shutil.rmtree(
+            self.folder / "scratch" if self.journal.records else self.folder, ignore_errors=True
+        )
         self.journal.close()
 
     def evaluate(self, rows, pool, files=(), mem_limit=None, label="points"):
-        """Give every row its result, from the journal or through `pool`; returns the number of points computed.
+        """Give every row its result, from the journal or through `pool`; returns the number
+        of points computed.
 
-        Rows of one content key are computed once, a matrix that several need is computed once, before them. files: what tasks
-        read; mem_limit: as run_sweep; what was refused under another limit is tried again. OutputError at the end where a worker was lost: all others are done then.
+        Rows of one content key are computed once, a matrix that several need is computed
+        once, before them.
+        files: what tasks read;
+        mem_limit: as run_sweep; what was refused under another limit is tried again.
+        OutputError at the end where a worker was lost: all others are done then.
         """
         todo = {}
         for row in rows:
             known = self.journal.records.get(row.key)
-            if row.task is not None and row.key not in todo and (known is None or (known["status"] == 5 and known.get("mem_limit") != mem_limit)):
+            if (
+                row.task is not None
+                and row.key not in todo
+                and (
+                    known is None or (known["status"] == 5 and known.get("mem_limit") != mem_limit)
+                )
+            ):
                 todo[row.key] = row
         groups = {}
         for row in todo.values():
             groups.setdefault(row.matrix, []).append(row)
         with bar(None, len(todo), label) as progress:
             scratch = None if pool.far else str((self.folder / "scratch").resolve())
-            lost = _Work(self, groups, pool, {"scratch": scratch, "files": list(files), "mem_limit": mem_limit}).run(progress)
+            lost = _Work(
+                self,
+                groups,
+                pool,
+                {"scratch": scratch, "files": list(files), "mem_limit": mem_limit},
+            ).run(progress)
         if lost:
-            raise OutputError(f"{len(lost)} of {len(todo)} points have no result: {lost[0]}", self.output, "the others are kept; run the command again")
+            raise OutputError(
+                f"{len(lost)} of {len(todo)} points have no result: {lost[0]}",
+                self.output,
+                "the others are kept; run the command again",
+            )
         for row in rows:
             if row.task is not None:
                 row.result = self.journal.records[row.key]
@@ -80,11 +117,17 @@ class Store:
 
 
 class _Work:
-    """Points through a pool, those of one matrix after it; at most as many matrices lie on the disk as are in use."""
+    """Points through a pool, those of one matrix after it; at most as many matrices lie on the
+    disk as are in use.
+    """
 
     def __init__(self, store, groups, pool, surroundings):
         self.store, self.pool, self.surroundings = store, pool, surroundings
-        self.groups, self.waiting, self.ready = {key: list(rows) for key, rows in groups.items()}, deque(groups), deque()
+        self.groups, self.waiting, self.ready = (
+            {key: list(rows) for key, rows in groups.items()},
+            deque(groups),
+            deque(),
+        )
         self.left = {key: len(rows) for key, rows in groups.items()}
         self.lost, self.running = [], 0
 
@@ -111,7 +154,9 @@ class _Work:
                 progress.update()
 
     def _open(self, key):
-        """Make the first tasks of a group ready: its matrix, or its points where that lies there or serves one alone."""
+        """Make the first tasks of a group ready: its matrix, or its points where that lies there
+        or serves one alone.
+        """
         rows, path = self.groups[key], self._path(key)
         info = self.store.journal.records.get(f"matrix {key}")
         if info is not None and path.is_file():
@@ -123,10 +168,18 @@ class _Work:
 
     def _points(self, key, path, info):
         for row in self.groups[key]:
-            self.ready.append((("point", key, row), run_point, row.task | self.surroundings | {"matrix": path, "info": info}))
+            self.ready.append(
+                (
+                    ("point", key, row),
+                    run_point,
+                    row.task | self.surroundings | {"matrix": path, "info": info},
+                )
+            )
 
     def _matrix(self, key, result):
-        """Keep a matrix and make its points ready, or refuse them all; returns how many were refused."""
+        """Keep a matrix and make its points ready, or refuse them all; returns how
+        many were refused.
+        """
         from plenocli.files.atomic import publish
 
         if isinstance(result, PlenoError):

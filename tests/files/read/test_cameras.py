@@ -1,4 +1,6 @@
-"""Cameras with files: pupils as pictures and wavefronts as grids, read, checked, attached, and named in the provenance."""
+"""Cameras with files: pupils as pictures and wavefronts as grids, read, checked, attached, and
+named in the provenance.
+"""
 
 import hashlib
 from pathlib import Path
@@ -8,11 +10,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
-from plenocli.files.images.exr import write_exr
-from plenocli.cli.main import run
-from plenocli.files.config.camera_file import load_camera, to_toml
 from plenocli.base.errors import ConfigError, InputError
+from plenocli.cli.main import run
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.config.camera_file import load_camera, to_toml
+from plenocli.files.images.exr import write_exr
 from plenocli.files.read.cameras import camera_files, read_camera
 
 TINY = (Path(__file__).resolve().parents[3] / "sample_configs" / "tiny.toml").read_text()
@@ -21,8 +23,13 @@ TINY = (Path(__file__).resolve().parents[3] / "sample_configs" / "tiny.toml").re
 def write_png(path, values):
     rows, columns, *channels = values.shape
     output = oiio.ImageOutput.create("png")
-    assert output.open(str(path), oiio.ImageSpec(columns, rows, channels[0] if channels else 1, str(values.dtype)))
-    assert output.write_image(np.ascontiguousarray(values).reshape(rows, columns, -1)) and output.close()
+    assert output.open(
+        str(path), oiio.ImageSpec(columns, rows, channels[0] if channels else 1, str(values.dtype))
+    )
+    assert (
+        output.write_image(np.ascontiguousarray(values).reshape(rows, columns, -1))
+        and output.close()
+    )
 
 
 def write_h5(path, values, units=None, name="wavefront"):
@@ -44,13 +51,17 @@ def test_a_png_is_transmittance_over_full_scale_and_not_srgb(tmp_path, dtype, fu
     write_png(tmp_path / "pupil.png", values)
     camera = read_camera(described(tmp_path, 'aperture_image = "pupil.png"'))
     assert camera.main_lens.aperture_shape == "image"
-    np.testing.assert_allclose(camera.main_lens.samples("aperture_image"), values / full, atol=1e-12)
+    np.testing.assert_allclose(
+        camera.main_lens.samples("aperture_image"), values / full, atol=1e-12
+    )
 
 
 def test_grey_pictures_of_three_channels_pass_and_colour_does_not(tmp_path):
     grey = np.full((4, 4, 3), 99, np.uint8)
     write_png(tmp_path / "pupil.png", grey)
-    assert read_camera(described(tmp_path, 'aperture_image = "pupil.png"')).main_lens.samples("aperture_image")[0, 0] == pytest.approx(99 / 255)
+    assert read_camera(described(tmp_path, 'aperture_image = "pupil.png"')).main_lens.samples(
+        "aperture_image"
+    )[0, 0] == pytest.approx(99 / 255)
     grey[1, 1, 2] = 98
     write_png(tmp_path / "pupil.png", grey)
     with pytest.raises(InputError, match="pupil.png: is a colour picture"):
@@ -61,23 +72,29 @@ def test_wavefronts_come_from_hdf5_and_exr_in_metres(tmp_path):
     values = np.random.default_rng(2).normal(0, 50e-9, (9, 9))
     write_h5(tmp_path / "w.h5", values, "m")
     write_exr(tmp_path / "w.exr", {"W": values})
-    first, second = (read_camera(described(tmp_path, f'wavefront = "{name}"')).main_lens.samples("wavefront") for name in ("w.h5", "w.exr"))
+    first, second = (
+        read_camera(described(tmp_path, f'wavefront = "{name}"')).main_lens.samples("wavefront")
+        for name in ("w.h5", "w.exr")
+    )
     np.testing.assert_array_equal(first, values)
     np.testing.assert_allclose(second, values, rtol=1e-6)
     assert not first.flags.writeable
 
 
-@pytest.mark.parametrize("key, values, message", [
-    ("aperture_image", np.zeros((4, 4)), "lets no light through"),
-    ("aperture_image", np.full((4, 4), -0.1), "within 0 ... 1"),
-    ("aperture_image", np.full((4, 4), 1.5), "within 0 ... 1"),
-    ("aperture_image", np.full((4, 5), 0.5), "square grid"),
-    ("aperture_image", np.full((4, 4), np.nan), "NaN"),
-    ("wavefront", np.full((4, 4), np.inf), "NaN or infinite"),
-    ("wavefront", np.zeros((3, 3)), "4 to 1024"),
-    ("wavefront", np.full((5, 5), 2e-3), "at most 0.001 m"),
-    ("wavefront", np.zeros((5, 6)), "square grid"),
-])
+@pytest.mark.parametrize(
+    "key, values, message",
+    [
+        ("aperture_image", np.zeros((4, 4)), "lets no light through"),
+        ("aperture_image", np.full((4, 4), -0.1), "within 0 ... 1"),
+        ("aperture_image", np.full((4, 4), 1.5), "within 0 ... 1"),
+        ("aperture_image", np.full((4, 5), 0.5), "square grid"),
+        ("aperture_image", np.full((4, 4), np.nan), "NaN"),
+        ("wavefront", np.full((4, 4), np.inf), "NaN or infinite"),
+        ("wavefront", np.zeros((3, 3)), "4 to 1024"),
+        ("wavefront", np.full((5, 5), 2e-3), "at most 0.001 m"),
+        ("wavefront", np.zeros((5, 6)), "square grid"),
+    ],
+)
 def test_values_that_cannot_be_are_refused_with_the_file(tmp_path, key, values, message):
     write_exr(tmp_path / "map.exr", {"Y": values})
     with pytest.raises(InputError, match=f"map.exr: .*{message}.*main_lens. {key} in camera.toml"):
@@ -122,9 +139,13 @@ def test_values_stay_with_a_camera_that_changes_elsewhere(tmp_path):
     write_h5(tmp_path / "w.h5", np.eye(5) * 1e-9)
     path = described(tmp_path, 'wavefront = "w.h5"')
     camera = read_camera(path)
-    finer = camera.replace(**{"object.samples_per_lenslet": (24, 24), "main_lens.focal_length": 0.051})
+    finer = camera.replace(
+        **{"object.samples_per_lenslet": (24, 24), "main_lens.focal_length": 0.051}
+    )
     np.testing.assert_array_equal(finer.main_lens.samples("wavefront"), np.eye(5) * 1e-9)
-    assert camera == read_camera(path) and camera != finer and 'wavefront = "w.h5"' in to_toml(camera)
+    assert (
+        camera == read_camera(path) and camera != finer and 'wavefront = "w.h5"' in to_toml(camera)
+    )
     with pytest.raises(ConfigError, match="'w.h5' are missing"):
         load_camera(path).main_lens.samples("wavefront")
     write_h5(tmp_path / "w.h5", np.eye(5) * 2e-9)
@@ -136,12 +157,32 @@ def test_provenance_names_the_files_and_a_capture_refuses_a_matrix_of_others(tmp
     write_h5(tmp_path / "w.h5", np.random.default_rng(3).normal(0, 20e-9, (6, 6)))
     path = described(tmp_path, 'aperture_image = "pupil.png"', 'wavefront = "w.h5"')
     assert set(camera_files(path, read_camera(path))) == {"camera", "aperture image", "wavefront"}
-    request = ["--superpixels", "1x1", "--coherent-ring", "0", "--accuracy", "1e-3", "--model", "fresnel"]
+    request = [
+        "--superpixels",
+        "1x1",
+        "--coherent-ring",
+        "0",
+        "--accuracy",
+        "1e-3",
+        "--model",
+        "fresnel",
+    ]
     assert run(["simulate-pif", str(path), "-o", str(tmp_path / "pif.h5"), *request]) == 0
     inputs = read_artefact(tmp_path / "pif.h5", "pif").provenance.inputs
     for role, name in (("aperture image", "pupil.png"), ("wavefront", "w.h5")):
-        assert inputs[role] == {"name": name, "sha256": hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()}
-    capture = ["capture-sim", str(path), "--target", "white", "--pif", str(tmp_path / "pif.h5"), "-o"]
+        assert inputs[role] == {
+            "name": name,
+            "sha256": hashlib.sha256((tmp_path / name).read_bytes()).hexdigest(),
+        }
+    capture = [
+        "capture-sim",
+        str(path),
+        "--target",
+        "white",
+        "--pif",
+        str(tmp_path / "pif.h5"),
+        "-o",
+    ]
     assert run([*capture, str(tmp_path / "one.h5")]) == 0
     write_h5(tmp_path / "w.h5", np.zeros((6, 6)))
     assert run([*capture, str(tmp_path / "two.h5")]) == 3
@@ -149,16 +190,64 @@ def test_provenance_names_the_files_and_a_capture_refuses_a_matrix_of_others(tmp
 
 
 def test_a_hexagonal_camera_has_a_matrix_but_no_captures_or_pictures_yet(tmp_path, capsys):
-    text = TINY.replace("count = [5, 5]", 'count = [5, 5]\nlattice = "hexagonal"').replace("pixels_per_lenslet = [13, 13]", "pixels_per_lenslet = [11, 13]")
+    text = TINY.replace("count = [5, 5]", 'count = [5, 5]\nlattice = "hexagonal"').replace(
+        "pixels_per_lenslet = [13, 13]", "pixels_per_lenslet = [11, 13]"
+    )
     (tmp_path / "camera.toml").write_text(text)
-    request = ["--superpixels", "3x3", "--coherent-ring", "0", "--accuracy", "1e-2", "--model", "fresnel"]
-    assert run(["simulate-pif", str(tmp_path / "camera.toml"), "-o", str(tmp_path / "pif.h5"), *request]) == 0
+    request = [
+        "--superpixels",
+        "3x3",
+        "--coherent-ring",
+        "0",
+        "--accuracy",
+        "1e-2",
+        "--model",
+        "fresnel",
+    ]
+    assert (
+        run(
+            [
+                "simulate-pif",
+                str(tmp_path / "camera.toml"),
+                "-o",
+                str(tmp_path / "pif.h5"),
+                *request,
+            ]
+        )
+        == 0
+    )
     pif = read_artefact(tmp_path / "pif.h5", "pif")
-    assert pif.data["pif/lenslet_offset"].tolist() == [[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)]
+    assert pif.data["pif/lenslet_offset"].tolist() == [
+        [r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)
+    ]
     assert 'aperture_shape = "hexagon"' in pif.provenance.config
     assert 0 < pif.data["pif/column_energy"].min() and pif.data["pif/column_energy"].max() < 1
     capsys.readouterr()
-    assert run(["capture-sim", str(tmp_path / "camera.toml"), "--target", "white", "-o", str(tmp_path / "c.h5")]) == 2
+    assert (
+        run(
+            [
+                "capture-sim",
+                str(tmp_path / "camera.toml"),
+                "--target",
+                "white",
+                "-o",
+                str(tmp_path / "c.h5"),
+            ]
+        )
+        == 2
+    )
     assert "hexagonal" in capsys.readouterr().err
-    assert run(["learn-dict", "skimage:camera", "--pif", str(tmp_path / "pif.h5"), "-o", str(tmp_path / "d.h5")]) == 3
+    assert (
+        run(
+            [
+                "learn-dict",
+                "skimage:camera",
+                "--pif",
+                str(tmp_path / "pif.h5"),
+                "-o",
+                str(tmp_path / "d.h5"),
+            ]
+        )
+        == 3
+    )
     assert "hexagonal lattice, whose object blocks do not tile" in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""The dial: it takes the cheapest rung that serves, says why the others lost, and refuses what cannot be had."""
+"""The dial: it takes the cheapest rung that serves, says why the others lost, and refuses
+what cannot be had.
+"""
 
 import math
 from dataclasses import replace
@@ -6,29 +8,55 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy import dial
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.accuracy.explain import _duration, candidates, expectation, explain
 from plenocli.forward.accuracy.needs import Needs, sensor_noise
 from plenocli.forward.propagation.models import Rung
-from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.propagation.sampling import size_band
 from tests.forward.propagation.cameras import small_camera
 
 
 def rung(name, model, error, operations, reason=None):
-    return Rung(name, model, lambda camera, view: reason, lambda camera, view: error, size_band,
-                lambda camera, view, band, shape, double: {"operations": operations * (2 if double else 1), "seconds": 0.0, "bytes": 1000})
+    return Rung(
+        name,
+        model,
+        lambda camera, view: reason,
+        lambda camera, view: error,
+        size_band,
+        lambda camera, view, band, shape, double: {
+            "operations": operations * (2 if double else 1),
+            "seconds": 0.0,
+            "bytes": 1000,
+        },
+    )
 
 
 @pytest.fixture
 def ladder(monkeypatch):
-    """Three rungs whose errors and costs are known: 0.1 for one second, 1e-3 for ten, 0 for a hundred (nominal, single precision)."""
-    rungs = (rung("coarse", "ray", 0.1, 60e9), rung("middle", "fresnel", 1e-3, 600e9), rung("fine", "exact", 0.0, 6000e9))
+    """Three rungs whose errors and costs are known: 0.1 for one second, 1e-3 for ten, 0 for a
+    hundred (nominal, single precision).
+    """
+    rungs = (
+        rung("coarse", "ray", 0.1, 60e9),
+        rung("middle", "fresnel", 1e-3, 600e9),
+        rung("fine", "exact", 0.0, 6000e9),
+    )
     monkeypatch.setattr(dial, "RUNGS", rungs)
 
 
-@pytest.mark.parametrize("accuracy, chosen", [(0.2, "coarse"), (0.101, "middle"), (0.09, "middle"), (2e-3, "middle"), (9e-4, "fine"), (2e-4, "fine")])
+@pytest.mark.parametrize(
+    "accuracy, chosen",
+    [
+        (0.2, "coarse"),
+        (0.101, "middle"),
+        (0.09, "middle"),
+        (2e-3, "middle"),
+        (9e-4, "fine"),
+        (2e-4, "fine"),
+    ],
+)
 def test_the_cheapest_rung_that_serves_is_taken(ladder, accuracy, chosen):
     plan = plan_pif(small_camera(), accuracy=accuracy)
     assert plan.rung == chosen and plan.estimated <= accuracy
@@ -40,7 +68,10 @@ def test_the_cheapest_rung_that_serves_is_taken(ladder, accuracy, chosen):
         if error > accuracy:
             assert "model error" in table[name]["reason"]
     if accuracy == 0.2:
-        assert "10 times the cost" in table["middle"]["reason"] and "1e+02 times" in table["fine"]["reason"]
+        assert (
+            "10 times the cost" in table["middle"]["reason"]
+            and "1e+02 times" in table["fine"]["reason"]
+        )
     text = explain(plan)
     assert all(name in text for name in table) and "chosen" in text and "error by source" in text
 
@@ -71,13 +102,19 @@ def test_default_accuracy_is_what_noise_lets_be_seen(ladder):
     assert quiet.accuracy == pytest.approx(3e-3) and "night.toml" in quiet.asked_by
     # a finer accuracy asked for is not computed where noise hides it, and the plan says so
     hidden = plan_pif(camera, accuracy=1e-4, needs=Needs(noise=0.1, source="night.toml"))
-    assert hidden.accuracy == pytest.approx(0.03) and any("hides" in text for text in hidden.left_out)
+    assert hidden.accuracy == pytest.approx(0.03) and any(
+        "hides" in text for text in hidden.left_out
+    )
 
 
 def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
     monkeypatch.setattr(dial, "RUNGS", (rung("only", "fresnel", 0.05, 1e9),))
     plan = plan_pif(small_camera())
-    assert plan.rung == "only" and plan.accuracy > 0.05 and any("best there is" in warning for warning in plan.warnings)
+    assert (
+        plan.rung == "only"
+        and plan.accuracy > 0.05
+        and any("best there is" in warning for warning in plan.warnings)
+    )
     with pytest.raises(NumericsError, match="name a model"):
         plan_pif(small_camera(), accuracy=1e-3)
     monkeypatch.setattr(dial, "RUNGS", (rung("only", "fresnel", 0.0, 1e9, reason="it rains"),))
@@ -85,31 +122,47 @@ def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
         plan_pif(small_camera(), accuracy=1e-3)
 
 
-FAR_OUT = {"main_lens__aperture_diameter": 55e-3, "object__distance": 0.15, "lenslet_array__pitch": 60e-6, "sensor__pixels_per_lenslet": (3, 3), "sensor__pixel_pitch": 20e-6}
+FAR_OUT = {
+    "main_lens__aperture_diameter": 55e-3,
+    "object__distance": 0.15,
+    "lenslet_array__pitch": 60e-6,
+    "sensor__pixels_per_lenslet": (3, 3),
+    "sensor__pixel_pitch": 20e-6,
+}
 
 
 def test_a_field_that_cannot_be_sampled_is_left_to_rays_before_any_work():
     camera = small_camera(**FAR_OUT)
     plan = plan_pif(camera)
-    assert plan.rung == "rays" and plan.estimated <= plan.accuracy <= dial.COARSEST and any("best there is" in warning for warning in plan.warnings)
+    assert (
+        plan.rung == "rays"
+        and plan.estimated <= plan.accuracy <= dial.COARSEST
+        and any("best there is" in warning for warning in plan.warnings)
+    )
     assert all("nodes per axis" in c.why for c in plan.candidates if c.model != "ray")
     with pytest.raises(NumericsError, match="best is about 0.32"):
         plan_pif(camera, accuracy=1e-3)
     # nor is a default that has little to do with the camera taken silently
     with pytest.raises(NumericsError, match="no model comes nearer"):
         plan_pif(small_camera(**FAR_OUT, light__wavelengths=(2e-6,)))
-    with pytest.raises(NumericsError, match="fresnel, low rank and fresnel, triple product: the field"):
+    with pytest.raises(
+        NumericsError, match="fresnel, low rank and fresnel, triple product: the field"
+    ):
         plan_pif(camera, model="fresnel")
 
 
 def test_what_too_many_terms_refuse_may_be_had_coarser(monkeypatch):
     """The message and the default name what the fine rung can do, not the coarse rung's error."""
+
     def size(view, grid, ring, accuracy, tolerance):
         if accuracy < 0.0123:
             raise NumericsError("a million terms", "model", "ask for less")
         return size_band(view, grid, ring, accuracy, tolerance)
 
-    coarse, fine = rung("coarse", "ray", 0.7, 60e9), replace(rung("fine", "exact", 0.0, 6000e9), size=size)
+    coarse, fine = (
+        rung("coarse", "ray", 0.7, 60e9),
+        replace(rung("fine", "exact", 0.0, 6000e9), size=size),
+    )
     monkeypatch.setattr(dial, "RUNGS", (coarse, fine))
     with pytest.raises(NumericsError, match="fine: a million terms") as caught:
         plan_pif(small_camera(), accuracy=1e-4)
@@ -124,9 +177,15 @@ def test_a_scene_narrows_the_model(ladder):
     camera = small_camera(light__wavelengths=(450e-9, 550e-9, 650e-9))
     plan = plan_pif(camera, accuracy=1e-2, needs=Needs(spectrum=(500e-9, 700e-9), lenslets=(1, 2)))
     assert [b.wavelength for b in plan.bands] == [550e-9, 650e-9]
-    assert any("1 wavelength" in text for text in plan.left_out) and any("7 of 9 lenslets" in text for text in plan.left_out)
+    assert any("1 wavelength" in text for text in plan.left_out) and any(
+        "7 of 9 lenslets" in text for text in plan.left_out
+    )
     near = plan_pif(camera, accuracy=1e-2, needs=Needs(depth=(0.45, 0.55)))
-    assert near.superpixels == plan_pif(camera.replace(**{"object.distance": 0.45}), accuracy=1e-2).superpixels > plan.superpixels
+    assert (
+        near.superpixels
+        == plan_pif(camera.replace(**{"object.distance": 0.45}), accuracy=1e-2).superpixels
+        > plan.superpixels
+    )
     assert near.bands[0].window >= max(near.superpixels) // 2 + 1
     # light outside the camera's wavelengths changes nothing
     assert len(plan_pif(camera, accuracy=1e-2, needs=Needs(spectrum=(900e-9, 1e-6))).bands) == 3
@@ -135,14 +194,25 @@ def test_a_scene_narrows_the_model(ladder):
 def test_double_precision_and_storage_follow_the_accuracy(ladder):
     camera = small_camera()
     fine, coarse = (plan_pif(camera, accuracy=a, coherent_ring=0) for a in (1e-7, 1e-3))
-    assert fine.double and fine.dtype == "float64" and not coarse.double and coarse.dtype == "float32"
+    assert (
+        fine.double and fine.dtype == "float64" and not coarse.double and coarse.dtype == "float32"
+    )
     assert plan_pif(camera, accuracy=1e-3, dtype=np.float64).bytes == 2 * coarse.bytes
 
 
-@pytest.mark.parametrize("request_, error", [
-    ({"model": "magic"}, UsageError), ({"coherent_ring": -1}, UsageError), ({"coherent_ring": 1.5}, UsageError), ({"superpixels": (2, 2)}, UsageError),
-    ({"accuracy": 0.0}, NumericsError), ({"accuracy": 2.0}, NumericsError), ({"accuracy": float("nan")}, NumericsError),
-], ids=str)
+@pytest.mark.parametrize(
+    "request_, error",
+    [
+        ({"model": "magic"}, UsageError),
+        ({"coherent_ring": -1}, UsageError),
+        ({"coherent_ring": 1.5}, UsageError),
+        ({"superpixels": (2, 2)}, UsageError),
+        ({"accuracy": 0.0}, NumericsError),
+        ({"accuracy": 2.0}, NumericsError),
+        ({"accuracy": float("nan")}, NumericsError),
+    ],
+    ids=str,
+)
 def test_refusals(ladder, request_, error):
     with pytest.raises(error):
         plan_pif(small_camera(), **request_)
@@ -156,14 +226,37 @@ def test_plans_do_not_depend_on_the_machine(ladder, monkeypatch):
 
 
 def test_long_work_is_announced_with_what_would_take_less(ladder, monkeypatch):
-    monkeypatch.setattr("plenocli.forward.accuracy.explain.seconds_here", lambda candidate: 2 * candidate.seconds())
+    monkeypatch.setattr(
+        "plenocli.forward.accuracy.explain.seconds_here", lambda candidate: 2 * candidate.seconds()
+    )
     camera = small_camera()
     assert expectation(plan_pif(camera, accuracy=2e-3)) is None  # ten seconds
-    assert expectation(plan_pif(camera, accuracy=2e-3), times=3) == "about 60 s on one core (middle, error 0.001); --model ray takes 6 s at an error of 0.1"
-    assert expectation(plan_pif(camera, accuracy=2e-4), 3 << 30) == "about 3.3 min on one core and 3.00 GiB of memory (fine, error 0.0002); --model fresnel takes 20 s at an error of 0.001"
-    assert expectation(plan_pif(camera, accuracy=2e-3, model="fresnel"), times=3) == "about 60 s on one core (middle, error 0.0007)"
+    assert (
+        expectation(plan_pif(camera, accuracy=2e-3), times=3)
+        == "about 60 s on one core (middle, error 0.001); --model ray takes 6 s at an error of 0.1"
+    )
+    assert expectation(plan_pif(camera, accuracy=2e-4), 3 << 30) == (
+        "about 3.3 min on one core and 3.00 GiB of memory (fine, error 0.0002); --model "
+        "fresnel takes 20 s at an error of 0.001"
+    )
+    assert (
+        expectation(plan_pif(camera, accuracy=2e-3, model="fresnel"), times=3)
+        == "about 60 s on one core (middle, error 0.0007)"
+    )
 
 
-@pytest.mark.parametrize("seconds, words", [(0.0123, "0.012 s"), (9.96, "10 s"), (99.4, "99 s"), (99.6, "1.7 min"), (5969, "99 min"), (5971, "1.7 h"), (71.4 * 3600, "71 h"), (1e7, "116 days")])
+@pytest.mark.parametrize(
+    "seconds, words",
+    [
+        (0.0123, "0.012 s"),
+        (9.96, "10 s"),
+        (99.4, "99 s"),
+        (99.6, "1.7 min"),
+        (5969, "99 min"),
+        (5971, "1.7 h"),
+        (71.4 * 3600, "71 h"),
+        (1e7, "116 days"),
+    ],
+)
 def test_durations_as_people_say_them(seconds, words):
     assert _duration(seconds) == words

@@ -15,12 +15,26 @@ def glass(n):
 def singlet(r1, r2, thickness, n, stop_radius=1e-3, image_distance=0.0):
     """A lens of radii r1, r2 (m; infinite for a plane) with the stop at its first surface."""
     c1, c2 = (0.0 if math.isinf(r) else 1 / r for r in (r1, r2))
-    return Prescription((Surface(c1, thickness, glass(n)), Surface(c2, image_distance)), 0, stop_radius)
+    return Prescription(
+        (Surface(c1, thickness, glass(n)), Surface(c2, image_distance)), 0, stop_radius
+    )
 
 
 def triplet():
-    """A Cooke triplet of 50 mm, F/5, with the stop between its second and third lens, in mm from a textbook prescription."""
-    rows = [(22.01359, 3.25896, "N-SK16"), (-435.76044, 6.00755, None), (-22.21328, 0.99997, "F2"), (20.29192, 2.3, None), (math.inf, 2.45041, None),
-            (79.6836, 2.95208, "N-SK16"), (-18.39533, 42.2, None)]
-    surfaces = tuple(Surface(0.0 if math.isinf(r) else 1e3 / r, t * 1e-3, medium(g) if g else AIR) for r, t, g in rows)
+    """A Cooke triplet of 50 mm, F/5, with the stop between its second and third lens, in mm from
+    a textbook prescription.
+    """
+    rows = [
+        (22.01359, 3.25896, "N-SK16"),
+        (-435.76044, 6.00755, None),
+        (-22.21328, 0.99997, "F2"),
+        (20.29192, 2.3, None),
+        (math.inf, 2.45041, None),
+        (79.6836, 2.95208, "N-SK16"),
+        (-18.39533, 42.2, None),
+    ]
+    surfaces = tuple(
+        Surface(0.0 if math.isinf(r) else 1e3 / r, t * 1e-3, medium(g) if g else AIR)
+        for r, t, g in rows
+    )
     return Prescription(surfaces, 4, 4.1e-3, D_LINE, name="triplet")

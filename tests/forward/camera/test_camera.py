@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.files.config.camera_file import camera_schema, load_camera, parse_camera, to_toml
 from plenocli.base.errors import ConfigError, InputError
+from plenocli.files.config.camera_file import camera_schema, load_camera, parse_camera, to_toml
 
 SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
 TINY = (SAMPLES / "tiny.toml").read_text()
@@ -19,7 +19,9 @@ def test_every_sample_reads_and_survives_its_own_text(path):
     assert parse_camera(to_toml(camera)) == camera
     assert to_toml(parse_camera(to_toml(camera))) == to_toml(camera)
     if camera.lenslet_array.lattice == "square":
-        assert max(abs(m) for m in camera.pixel_mismatch) < 1e-9, "superpixels of the samples tile whole pixels"
+        assert max(abs(m) for m in camera.pixel_mismatch) < 1e-9, (
+            "superpixels of the samples tile whole pixels"
+        )
 
 
 def test_alternatives_are_resolved():
@@ -33,7 +35,9 @@ def test_alternatives_are_resolved():
 def test_replace_checks_again():
     camera = parse_camera(TINY)
     finer = camera.replace(**{"object.samples_per_lenslet": (24, 24)})
-    assert finer.object.samples_per_lenslet == (24, 24) and finer.lenslet_array == camera.lenslet_array
+    assert (
+        finer.object.samples_per_lenslet == (24, 24) and finer.lenslet_array == camera.lenslet_array
+    )
     with pytest.raises(ConfigError, match="object.distance"):
         camera.replace(**{"object.distance": -1.0})
 
@@ -41,8 +45,16 @@ def test_replace_checks_again():
 @pytest.mark.parametrize(
     "old, new, message",
     [
-        ('focal_length = "50 mm"', 'focal_lenght = "50 mm"', r"main_lens.focal_lenght: unknown key; did you mean focal_length\?"),
-        ('focal_length = "50 mm"', "focal_length = 50", "main_lens.focal_length: 50 needs its unit"),
+        (
+            'focal_length = "50 mm"',
+            'focal_lenght = "50 mm"',
+            r"main_lens.focal_lenght: unknown key; did you mean focal_length\?",
+        ),
+        (
+            'focal_length = "50 mm"',
+            "focal_length = 50",
+            "main_lens.focal_length: 50 needs its unit",
+        ),
         ('"2 um"', '"2 kg"', "sensor.pixel_pitch: '2 kg' is no length"),
         ('"2 um"', '"-2 um"', "sensor.pixel_pitch: '-2 um' is outside"),
         ('"2 um"', '"nan um"', "sensor.pixel_pitch"),
@@ -52,9 +64,17 @@ def test_replace_checks_again():
         ('["550 nm"]', "[]", "light.wavelengths"),
         ('["550 nm"]', '["550 nm", "540 nm"]', "light: wavelengths must ascend"),
         ('["550 nm"]', '["550 mm"]', "light.wavelengths.0: '550 mm' is outside 100 nm ... 100 um"),
-        ("f_number = 8", 'f_number = 8\naperture_diameter = "5 mm"', "main_lens: give exactly one of aperture_diameter and f_number"),
-        ("count = [5, 5]", 'count = [5, 5]\npitch = "26 um"', "lenslet_array: give exactly one of pitch"),
-        ("[sensor]", '[sensor]\ncfa = "RGGB"', "sensor: cfa = \"RGGB\" needs camera"),
+        (
+            "f_number = 8",
+            'f_number = 8\naperture_diameter = "5 mm"',
+            "main_lens: give exactly one of aperture_diameter and f_number",
+        ),
+        (
+            "count = [5, 5]",
+            'count = [5, 5]\npitch = "26 um"',
+            "lenslet_array: give exactly one of pitch",
+        ),
+        ("[sensor]", '[sensor]\ncfa = "RGGB"', 'sensor: cfa = "RGGB" needs camera'),
         ("[light]", "[lights]", "lights: unknown key; did you mean light"),
     ],
 )
@@ -66,13 +86,21 @@ def test_violations_are_named(old, new, message):
 
 def test_all_violations_come_together():
     with pytest.raises(ConfigError) as caught:
-        parse_camera(TINY.replace('"50 mm"', "50").replace('"2 um"', '"2 kg"').replace("count = [5, 5]", "cuont = [5, 5]"), "mine.toml")
+        parse_camera(
+            TINY.replace('"50 mm"', "50")
+            .replace('"2 um"', '"2 kg"')
+            .replace("count = [5, 5]", "cuont = [5, 5]"),
+            "mine.toml",
+        )
     assert str(caught.value).startswith("mine.toml: 3 violations")
     assert "did you mean count?" in str(caught.value) and caught.value.exit_code == 2
 
 
 def test_files_that_are_no_description(tmp_path):
-    for name, content in {"binary.toml": b"\xff\xfe\x00", "huge.toml": b"#" * (1 << 20) + b"#"}.items():
+    for name, content in {
+        "binary.toml": b"\xff\xfe\x00",
+        "huge.toml": b"#" * (1 << 20) + b"#",
+    }.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=name):
             load_camera(tmp_path / name)
@@ -89,23 +117,37 @@ def test_files_that_are_no_description(tmp_path):
 
 
 def test_schema_names_every_section():
-    assert {"main_lens", "object", "lenslet_array", "sensor", "light", "filter_array"} <= set(camera_schema()["properties"])
+    assert {"main_lens", "object", "lenslet_array", "sensor", "light", "filter_array"} <= set(
+        camera_schema()["properties"]
+    )
 
 
 @pytest.mark.parametrize("shape", ["", ', shape = "box"'])
 def test_a_band_of_light_instead_of_lines(shape):
-    text = TINY.replace('wavelengths = ["550 nm"]', f'band = {{ center = "550 nm", fwhm = "10 nm"{shape} }}')
+    text = TINY.replace(
+        'wavelengths = ["550 nm"]', f'band = {{ center = "550 nm", fwhm = "10 nm"{shape} }}'
+    )
     camera = parse_camera(text)
-    assert camera.light.wavelengths == (550e-9,) and camera.light.band.fwhm == 10e-9 and camera.light.design_wavelength == 550e-9
+    assert (
+        camera.light.wavelengths == (550e-9,)
+        and camera.light.band.fwhm == 10e-9
+        and camera.light.design_wavelength == 550e-9
+    )
     assert camera.light.band.shape == ("box" if shape else "gaussian")
     assert parse_camera(to_toml(camera)) == camera
 
 
-@pytest.mark.parametrize("light, words", [
-    ('wavelengths = ["540 nm"]\nband = { center = "550 nm", fwhm = "10 nm" }', "exactly one of wavelengths and band"),
-    ('illuminant = "D65"', "exactly one of wavelengths and band"),
-    ('band = { center = "550 nm", fwhm = "300 nm" }', "more than a third of the centre"),
-])
+@pytest.mark.parametrize(
+    "light, words",
+    [
+        (
+            'wavelengths = ["540 nm"]\nband = { center = "550 nm", fwhm = "10 nm" }',
+            "exactly one of wavelengths and band",
+        ),
+        ('illuminant = "D65"', "exactly one of wavelengths and band"),
+        ('band = { center = "550 nm", fwhm = "300 nm" }', "more than a third of the centre"),
+    ],
+)
 def test_bands_that_cannot_be(light, words):
     with pytest.raises(ConfigError, match=words):
         parse_camera(TINY.replace('wavelengths = ["550 nm"]', light))

@@ -1,4 +1,6 @@
-"""What a camera takes from a traced lens: wavefronts, colour and the thin lens it stands for, against closed forms."""
+"""What a camera takes from a traced lens: wavefronts, colour and the thin lens it stands for,
+against closed forms.
+"""
 
 import math
 from dataclasses import replace
@@ -8,7 +10,21 @@ import pytest
 
 from plenocli.base.errors import ConfigError, NumericsError
 from plenocli.forward.camera.glass import medium
-from plenocli.forward.camera.lens import camera_lens, chief_height, disc_points, distortion, first_order, focal_shift, image_plane, lateral_colour, noll_coefficients, paraxial_image, transmitted, wavefront, wavefront_grid
+from plenocli.forward.camera.lens import (
+    camera_lens,
+    chief_height,
+    disc_points,
+    distortion,
+    first_order,
+    focal_shift,
+    image_plane,
+    lateral_colour,
+    noll_coefficients,
+    paraxial_image,
+    transmitted,
+    wavefront,
+    wavefront_grid,
+)
 from plenocli.forward.camera.prescription import Prescription, Surface
 from plenocli.forward.camera.pupil import zernike
 from plenocli.forward.camera.raytrace import aim, to_plane, trace
@@ -18,8 +34,14 @@ POINTS, WEIGHTS = disc_points(12, 48)
 
 
 def perfect_lens(n=1.7, focal_length=50e-3):
-    """Plano-hyperbolic: a plane, then a hyperboloid of conic constant -n^2, free of spherical aberration for infinity."""
-    return Prescription((Surface(0.0, 5e-3, glass(n)), Surface(-1 / (focal_length * (n - 1)), 0.0, conic=-n * n)), 0, 10e-3)
+    """Plano-hyperbolic: a plane, then a hyperboloid of conic constant -n^2, free of spherical
+    aberration for infinity.
+    """
+    return Prescription(
+        (Surface(0.0, 5e-3, glass(n)), Surface(-1 / (focal_length * (n - 1)), 0.0, conic=-n * n)),
+        0,
+        10e-3,
+    )
 
 
 def test_disc_points_integrate_polynomials():
@@ -37,8 +59,9 @@ def test_the_hyperbolic_lens_has_no_wavefront_error_on_axis():
 
 
 def test_defocus_is_the_textbook_s():
-    """The perfect lens with its sensor moved by dz: W is the difference of two spheres' sags; W > 0 at the rim where the sensor is too near,
-    as k eps r^2/2 with eps = 1/z1 + 1/z2 - 1/f has it."""
+    """The perfect lens with its sensor moved by dz: W is the difference of two spheres' sags; W > 0
+    at the rim where the sensor is too near, as k eps r^2/2 with eps = 1/z1 + 1/z2 - 1/f has it.
+    """
     lens, dz = perfect_lens(), -40e-6
     image = paraxial_image(lens, D_LINE)
     wave = wavefront(lens, D_LINE, POINTS, image_distance=image + dz)
@@ -53,39 +76,63 @@ def test_defocus_is_the_textbook_s():
 
 
 def test_third_order_spherical_aberration_of_a_plano_convex_lens():
-    """Seidel's sum for a thin lens at infinity: W040 = h^4 (n-1)... of shape q, position p = -1 (Welford, thin lens); here by its closed form
-    W = h^4/(32 f^3 n (n-1)) [(n+2)/(n-1) q^2 - 4 (n+1) q + (3n+2)(n-1) + n^3/(n-1)] for p = -1."""
+    """Seidel's sum for a thin lens at infinity: W040 = h^4 (n-1)... of shape q, position p = -1
+    (Welford, thin lens); here by its closed form W = h^4/(32 f^3 n (n-1)) [(n+2)/(n-1) q^2 - 4
+    (n+1) q + (3n+2)(n-1) + n^3/(n-1)] for p = -1.
+    """
     n, f, h = 1.5, 0.5, 5e-3
-    for radii, q in (((f * (n - 1), math.inf), 1.0), ((math.inf, -f * (n - 1)), -1.0), ((2 * f * (n - 1), -2 * f * (n - 1)), 0.0)):
+    for radii, q in (
+        ((f * (n - 1), math.inf), 1.0),
+        ((math.inf, -f * (n - 1)), -1.0),
+        ((2 * f * (n - 1), -2 * f * (n - 1)), 0.0),
+    ):
         lens = singlet(*radii, 1e-9, n, stop_radius=h)
         wave = wavefront(lens, D_LINE, np.array([[0.0], [1.0]]))
-        expected = h**4 / (32 * f**3 * n * (n - 1)) * ((n + 2) / (n - 1) * q * q - 4 * (n + 1) * q + (3 * n + 2) * (n - 1) + n**3 / (n - 1))
+        expected = (
+            h**4
+            / (32 * f**3 * n * (n - 1))
+            * ((n + 2) / (n - 1) * q * q - 4 * (n + 1) * q + (3 * n + 2) * (n - 1) + n**3 / (n - 1))
+        )
         # a positive lens focuses its rim short of the paraxial image: there the wave runs ahead
         assert wave.error[0] == pytest.approx(-expected, rel=2e-3)
 
 
 def test_transverse_aberration_is_the_slope_of_the_wavefront():
-    """Rays leave the reference sphere along the gradient of W: -R dW/d(pupil) is where they miss the centre."""
+    """Rays leave the reference sphere along the gradient of W: -R dW/d(pupil) is where
+    they miss the centre.
+    """
     lens, h = triplet(), 1e-4
-    lens = replace(lens, surfaces=(*lens.surfaces[:-1], replace(lens.surfaces[-1], thickness=42.0e-3)))
+    lens = replace(
+        lens, surfaces=(*lens.surfaces[:-1], replace(lens.surfaces[-1], thickness=42.0e-3))
+    )
     angle = math.radians(12)
     base = np.random.default_rng(1).uniform(-0.6, 0.6, (2, 30))
-    waves = [wavefront(lens, 550e-9, base + np.array([[dx], [dy]]), angle) for dx, dy in ((h, 0), (-h, 0), (0, h), (0, -h))]
+    waves = [
+        wavefront(lens, 550e-9, base + np.array([[dx], [dy]]), angle)
+        for dx, dy in ((h, 0), (-h, 0), (0, h), (0, -h))
+    ]
     rays = to_plane(trace(lens.surfaces, aim(lens, 550e-9, base, angle=angle), 550e-9), 42.0e-3)
     missed = rays.position[:2] - waves[0].centre[:2, None]
     for plus, minus in ((0, 1), (2, 3)):
-        step = waves[plus].cosines - waves[minus].cosines  # of the radii; the sphere's points move by -R step
+        # of the radii; the sphere's points move by -R step
+        step = waves[plus].cosines - waves[minus].cosines
         # dW = D.dQ, and D differs from the radius, normal to dQ, by miss/R
-        assert waves[plus].error - waves[minus].error == pytest.approx(-(missed * step).sum(axis=0), rel=2e-2, abs=2e-12)
+        assert waves[plus].error - waves[minus].error == pytest.approx(
+            -(missed * step).sum(axis=0), rel=2e-2, abs=2e-12
+        )
 
 
 def test_telecentric_and_distant_pupils_agree():
-    """With the stop in the front focus the exit pupil is at infinity and the reference sphere a plane wave's."""
+    """With the stop in the front focus the exit pupil is at infinity and the reference
+    sphere a plane wave's.
+    """
     n, f = 1.6, 30e-3
     lens = singlet(math.inf, -f * (n - 1), 4e-3, n)
     first = first_order(lens, D_LINE)
     gap = first.focal_length - first.front_principal
-    near, far = (Prescription((Surface(0.0, gap + shift), *lens.surfaces), 0, 2e-3) for shift in (0.0, 1e-7))
+    near, far = (
+        Prescription((Surface(0.0, gap + shift), *lens.surfaces), 0, 2e-3) for shift in (0.0, 1e-7)
+    )
     a, b = (wavefront(lens, D_LINE, POINTS, math.radians(4)) for lens in (near, far))
     assert abs(b.radius) > 1e3
     assert a.error == pytest.approx(b.error, abs=1e-10) and a.error.std() > 5e-7
@@ -113,7 +160,9 @@ def test_the_grid_is_the_wavefront_and_upright():
     grid = wavefront_grid(lens, D_LINE, 16, angle=angle)
     row, column = 3, 9
     point = np.array([[(column + 0.5) / 8 - 1], [(row + 0.5) / 8 - 1]])
-    assert grid[row, column] == pytest.approx(wavefront(lens, D_LINE, point, angle).error[0], rel=1e-9)
+    assert grid[row, column] == pytest.approx(
+        wavefront(lens, D_LINE, point, angle).error[0], rel=1e-9
+    )
     assert np.isnan(grid[0, 0]) and np.allclose(grid, grid[:, ::-1], equal_nan=True, atol=1e-14)
     assert not np.allclose(grid, grid[::-1], equal_nan=True, atol=1e-8)
 
@@ -123,19 +172,26 @@ def test_focal_shift_of_a_thin_singlet():
     bk7 = medium("N-BK7")
     lens = Prescription((Surface(1 / 40e-3, 1e-9, bk7), Surface(-1 / 40e-3)), 0, 2e-3)
     f = {w: 1 / ((bk7.index(w) - 1) * 2 / 40e-3) for w in (450e-9, 650e-9, D_LINE)}
-    assert focal_shift(lens, [450e-9, 650e-9]) == pytest.approx([f[450e-9] - f[D_LINE], f[650e-9] - f[D_LINE]], rel=1e-5)
+    assert focal_shift(lens, [450e-9, 650e-9]) == pytest.approx(
+        [f[450e-9] - f[D_LINE], f[650e-9] - f[D_LINE]], rel=1e-5
+    )
     near = focal_shift(lens, [450e-9], 0.2)[0]
     assert near == pytest.approx(1 / (1 / f[450e-9] - 5) - 1 / (1 / f[D_LINE] - 5), rel=1e-5)
 
 
 def test_lateral_colour_of_a_plate_and_a_prism_like_field():
-    """A thin singlet with the stop on it has none to first order; the triplet's is the difference of its chief rays, object held."""
+    """A thin singlet with the stop on it has none to first order; the triplet's is the
+    difference of its chief rays, object held.
+    """
     bk7 = medium("N-BK7")
     thin = Prescription((Surface(1 / 40e-3, 1e-9, bk7), Surface(-1 / 40e-3)), 0, 1e-3)
     assert abs(lateral_colour(thin, [450e-9], 0.01)[0]) < 1e-12
     lens = triplet()
     heights = [chief_height(lens, w, 0.2) for w in (486e-9, D_LINE)]
-    assert lateral_colour(lens, [486e-9], 0.2)[0] == pytest.approx(heights[0] - heights[1]) and abs(heights[0] - heights[1]) > 1e-7
+    assert (
+        lateral_colour(lens, [486e-9], 0.2)[0] == pytest.approx(heights[0] - heights[1])
+        and abs(heights[0] - heights[1]) > 1e-7
+    )
     # near object: the object point stays, whatever the entrance pupil does
     shift = lateral_colour(lens, [486e-9], 0.2, 0.3)[0]
     assert abs(shift) < 20e-6
@@ -146,7 +202,16 @@ def test_distortion_vanishes_for_a_stop_at_a_thin_lens_and_for_symmetry_at_unit_
     assert abs(distortion(lens, D_LINE, 0.2)) < 1e-7
     half = (Surface(1 / 20e-3, 4e-3, medium("N-SK16")), Surface(1 / 60e-3, 3e-3))
     turned = Prescription(half, 0, 2e-3).reversed().surfaces
-    whole = Prescription((*half, Surface(0.0, 3e-3), replace(turned[0], thickness=4e-3), replace(turned[1], thickness=0.0)), 2, 1e-3)
+    whole = Prescription(
+        (
+            *half,
+            Surface(0.0, 3e-3),
+            replace(turned[0], thickness=4e-3),
+            replace(turned[1], thickness=0.0),
+        ),
+        2,
+        1e-3,
+    )
     data = first_order(whole, D_LINE)
     unit = 2 * data.focal_length - data.front_principal
     assert paraxial_image(whole, D_LINE, unit) == pytest.approx(unit)
@@ -156,24 +221,34 @@ def test_distortion_vanishes_for_a_stop_at_a_thin_lens_and_for_symmetry_at_unit_
 
 
 def test_vignetting_is_the_overlap_of_two_circles():
-    """A stop of radius r and a diaphragm of the same radius a distance d before it cut a lens shape for oblique light."""
+    """A stop of radius r and a diaphragm of the same radius a distance d before it cut a lens
+    shape for oblique light.
+    """
     r, d, angle = 2e-3, 5e-3, 0.3
-    lens = Prescription((Surface(0.0, d, semi_diameter=r), Surface(1 / 40e-3, 1e-9, glass(1.5)), Surface()), 1, r)
+    lens = Prescription(
+        (Surface(0.0, d, semi_diameter=r), Surface(1 / 40e-3, 1e-9, glass(1.5)), Surface()), 1, r
+    )
     # the stop is on the first curved vertex; its sag is 0.05 mm at the rim
     shift = d * math.tan(angle) / r
     overlap = (2 * math.acos(shift / 2) - shift / 2 * math.sqrt(4 - shift * shift)) / math.pi
     assert transmitted(lens, D_LINE, angle, rings=96) == pytest.approx(overlap, abs=0.01)
     assert transmitted(lens, D_LINE, 0.0) == 1.0
-    assert np.isnan(wavefront(lens, D_LINE, POINTS, angle).error).mean() == pytest.approx(1 - overlap, abs=0.05)
+    assert np.isnan(wavefront(lens, D_LINE, POINTS, angle).error).mean() == pytest.approx(
+        1 - overlap, abs=0.05
+    )
 
 
 def test_the_image_plane_is_the_described_one_for_the_described_object_only():
-    lens = replace(perfect_lens(), surfaces=(perfect_lens().surfaces[0], replace(perfect_lens().surfaces[1], thickness=49e-3)))
+    lens = replace(
+        perfect_lens(),
+        surfaces=(perfect_lens().surfaces[0], replace(perfect_lens().surfaces[1], thickness=49e-3)),
+    )
     assert image_plane(lens) == 49e-3
     assert image_plane(lens, 0.5) == pytest.approx(paraxial_image(lens, D_LINE, 0.5)) != 49e-3
 
 
-# --- in a camera ---------------------------------------------------------------------------------------------------------
+# --- in a camera ----------------------------------------------------------------------------------
+
 
 def test_a_thin_lens_in_a_camera_is_itself():
     bk7 = medium("N-BK7")
@@ -187,17 +262,30 @@ def test_a_thin_lens_in_a_camera_is_itself():
 
 
 def test_a_traced_lens_in_a_camera_has_the_wavefront_of_its_rays():
-    """eps(l) and the Noll terms of W(l) together are the wavefront about the fixed sensor plane, over direction cosines."""
+    """eps(l) and the Noll terms of W(l) together are the wavefront about the fixed sensor plane,
+    over direction cosines.
+    """
     lens, z1 = triplet(), 0.55
     inside = camera_lens(lens, z1, 9e-3, 550e-9)
     sensor = paraxial_image(inside.lens, 550e-9, inside.object_distance)
     for w in (450e-9, 550e-9, 650e-9):
-        wave = wavefront(inside.lens, w, POINTS, object_distance=inside.object_distance, image_distance=sensor)
+        wave = wavefront(
+            inside.lens, w, POINTS, object_distance=inside.object_distance, image_distance=sensor
+        )
         y, x = (-c * inside.z2 for c in wave.cosines[::-1])
         eps = 1 / z1 + 1 / inside.z2 - 1 / inside.focal_length(w)
-        unit = np.hypot(*wavefront(inside.lens, w, np.array([[0.0], [1.0]]), object_distance=inside.object_distance).cosines)[0] * inside.z2
+        unit = (
+            np.hypot(
+                *wavefront(
+                    inside.lens, w, np.array([[0.0], [1.0]]), object_distance=inside.object_distance
+                ).cosines
+            )[0]
+            * inside.z2
+        )
         assert unit == pytest.approx(4.5e-3, rel=2e-2)
-        model = eps * (x * x + y * y) / 2 + sum(c * zernike(j, y / unit, x / unit) for j, c in inside.aberrations(w))
+        model = eps * (x * x + y * y) / 2 + sum(
+            c * zernike(j, y / unit, x / unit) for j, c in inside.aberrations(w)
+        )
         gap = wave.error - model
         assert np.ptp(gap) < 0.01 * w, w / 1e-9
         assert np.ptp(wave.error) > 0.2 * w
@@ -216,7 +304,9 @@ def test_rays_that_do_not_get_through_are_told_with_their_number_and_angle():
         noll_coefficients(triplet(), D_LINE, 40, rings=4)
     with pytest.raises(NumericsError, match="chief ray at 80 degrees"):
         wavefront(singlet(math.inf, 6e-3, 4e-3, 1.5, 1e-4), D_LINE, POINTS, angle=math.radians(80))
-    telecentric = Prescription((Surface(100.0, 0.0, glass(1.5)), Surface(0.0, 0.02), Surface(0.0, 5e-3)), 2, 1e-3)
+    telecentric = Prescription(
+        (Surface(100.0, 0.0, glass(1.5)), Surface(0.0, 0.02), Surface(0.0, 5e-3)), 2, 1e-3
+    )
     with pytest.raises(NumericsError, match="telecentric entrance pupils"):
         wavefront(telecentric, D_LINE, POINTS)
     inside = camera_lens(triplet(), 0.55, 8e-3, 550e-9)

@@ -1,7 +1,7 @@
 """Small cameras for the tests of the optics."""
 
-from plenocli.forward.accuracy import dial as accuracy
 from plenocli.files.config.camera_file import parse_camera
+from plenocli.forward.accuracy import dial as accuracy
 from plenocli.forward.camera.model import Camera
 
 TEXT = """
@@ -28,7 +28,9 @@ WAVELENGTH = 550e-9
 
 
 def small_camera(**changes):
-    """f/8, 26 um superpixels of 13x13 pixels, 8x8 points, in focus, sensor at the lenslets' focus; dotted keys change it."""
+    """f/8, 26 um superpixels of 13x13 pixels, 8x8 points, in focus, sensor at the lenslets'
+    focus; dotted keys change it.
+    """
     data = parse_camera(TEXT).model_dump()
     for key, value in changes.items():
         section, _, name = key.partition("__")
@@ -44,14 +46,20 @@ def pupil_conjugate(camera):
 
 def plan_pif(camera, **request):
     """The plan of the paraxial model at 1e-4, unless `request` says otherwise."""
-    return accuracy.plan_pif(camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)
+    return accuracy.plan_pif(
+        camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request
+    )
 
 
 def system_matrix(camera, **request):
     """The matrix of the paraxial model at 1e-4, unless `request` says otherwise."""
-    return accuracy.system_matrix(camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)
+    return accuracy.system_matrix(
+        camera, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request
+    )
 
 
 def pif_builder(camera, wavelength, **request):
     """A builder of the paraxial model at 1e-4, unless `request` says otherwise."""
-    return accuracy.pif_builder(camera, wavelength, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request)
+    return accuracy.pif_builder(
+        camera, wavelength, **{"model": "fresnel", "accuracy": 1e-4, "dtype": "float32"} | request
+    )

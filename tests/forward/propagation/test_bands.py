@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from plenocli.forward.accuracy.dial import plan_pif
-from plenocli.forward.camera.model import Band
 from plenocli.base.errors import NumericsError
-from plenocli.forward.propagation.bands import band_matrix, combined, node_count, rule_error, spectral_error, spectral_nodes
+from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.propagation.system_matrix import PifBuilder
-from plenocli.forward.propagation.sampling import size_band
+from plenocli.forward.camera.model import Band
+from plenocli.forward.propagation.bands import (
+    band_matrix,
+    combined,
+    node_count,
+    rule_error,
+    spectral_error,
+    spectral_nodes,
+)
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
+from plenocli.forward.propagation.sampling import size_band
+from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import small_camera
 from tests.reference.window import column_energies
 
@@ -29,10 +36,16 @@ def banded(fwhm, shape="gaussian", **changes):
 @pytest.mark.parametrize("shape", ["gaussian", "box"])
 def test_nodes_have_the_mean_and_the_width_of_the_band(shape):
     wavelengths, shares = spectral_nodes(band(10e-9, shape), 7)
-    assert shares.sum() == pytest.approx(1) and np.all(np.diff(wavelengths) > 0) and shares @ wavelengths == pytest.approx(550e-9)
+    assert (
+        shares.sum() == pytest.approx(1)
+        and np.all(np.diff(wavelengths) > 0)
+        and shares @ wavelengths == pytest.approx(550e-9)
+    )
     assert np.all(np.abs(wavelengths - 550e-9) < (15e-9 if shape == "gaussian" else 5e-9))
     # the tails that are cut off beyond 3.5 standard deviations hold 6e-3 of a Gaussian's variance
-    variance, off = {"gaussian": (10e-9**2 / (8 * np.log(2)), 8e-3), "box": (10e-9**2 / 12, 1e-9)}[shape]
+    variance, off = {"gaussian": (10e-9**2 / (8 * np.log(2)), 8e-3), "box": (10e-9**2 / 12, 1e-9)}[
+        shape
+    ]
     assert shares @ (wavelengths - 550e-9) ** 2 == pytest.approx(variance, rel=off)
 
 
@@ -40,20 +53,36 @@ def test_nodes_have_the_mean_and_the_width_of_the_band(shape):
 def test_error_of_the_rule_is_that_of_integrals(shape):
     x, w = spectral_nodes(band(2.0e-9, shape), 3)
     phases = np.linspace(0, 3, 65)
-    density = (lambda t: np.exp(-np.log(2) * t * t)) if shape == "gaussian" else (lambda t: float(abs(t) <= 1))
+    density = (
+        (lambda t: np.exp(-np.log(2) * t * t))
+        if shape == "gaussian"
+        else (lambda t: float(abs(t) <= 1))
+    )
     reach = 3 if shape == "gaussian" else 1
     whole = quad(density, -reach, reach)[0]
-    worst = max(abs(np.cos(p * (x - 550e-9) / 1e-9) @ w - quad(lambda t: np.cos(p * t) * density(t), -reach, reach)[0] / whole) for p in phases)
+    worst = max(
+        abs(
+            np.cos(p * (x - 550e-9) / 1e-9) @ w
+            - quad(lambda t: np.cos(p * t) * density(t), -reach, reach)[0] / whole
+        )
+        for p in phases
+    )
     assert rule_error(shape, 3, 3.0) == pytest.approx(worst, rel=1e-6)
 
 
 def brute(camera, count, window, point=(-9.7e-6, 3.2e-6)):
     nodes = spectral_nodes(camera.light.band, count)
-    return sum(s * column_energies(camera, w, point, window, [(0, 0)], pixel_nodes=7)[0, 0] for w, s in zip(*nodes))
+    return sum(
+        s * column_energies(camera, w, point, window, [(0, 0)], pixel_nodes=7)[0, 0]
+        for w, s in zip(*nodes)
+    )
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "box"])
-@pytest.mark.parametrize("fwhm, change, window", [(10e-9, {}, None), (60e-9, {}, None), (60e-9, {"object__distance": 0.52}, 1), (100e-9, {}, 1)])
+@pytest.mark.parametrize(
+    "fwhm, change, window",
+    [(10e-9, {}, None), (60e-9, {}, None), (60e-9, {"object__distance": 0.52}, 1), (100e-9, {}, 1)],
+)
 def test_as_many_wavelengths_as_the_rule_says_keep_the_accuracy(fwhm, change, window, shape):
     """Doubled nodes change a column by no more than asked; the estimate is not wasteful either."""
     camera = banded(fwhm, shape, **change)

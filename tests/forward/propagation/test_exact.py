@@ -1,21 +1,33 @@
-"""The exact rung against direct sums of Rayleigh and Sommerfeld's integral, and what must hold of it."""
+"""The exact rung against direct sums of Rayleigh and Sommerfeld's integral, and
+what must hold of it.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from plenocli.forward.accuracy import dial as accuracy
 from plenocli.base.errors import NumericsError
-from plenocli.forward.propagation.exact import lenslets as exact, low_rank_product as product
-from plenocli.forward.propagation.bands import spectral_nodes
-from plenocli.forward.propagation.exact.lenslets import fresnel_model_error
+from plenocli.forward.accuracy import dial as accuracy
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.propagation.system_matrix import PifBuilder
+from plenocli.forward.propagation.bands import spectral_nodes
+from plenocli.forward.propagation.exact import lenslets as exact
+from plenocli.forward.propagation.exact import low_rank_product as product
+from plenocli.forward.propagation.exact.lenslets import fresnel_model_error
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
+from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.reference.fresnel import sensor_nodes
-from tests.reference.rayleigh import column_energies, field_of_spheres, field_on_array, lens_phase, main_lens_field, pupil_directions, rayleigh_products, rayleigh_sum
+from tests.reference.rayleigh import (
+    column_energies,
+    field_of_spheres,
+    field_on_array,
+    lens_phase,
+    main_lens_field,
+    pupil_directions,
+    rayleigh_products,
+    rayleigh_sum,
+)
 from tests.reference.rayleigh import nodes as rayleigh_nodes
 
 ISOLATED = [(0, 0)]
@@ -25,21 +37,38 @@ PROFILES = ["hyperbolic", "parabolic"]
 
 
 def fast_camera(f_number=2.5, **changes):
-    """18 um superpixels of 9x9 pixels at another f-number of main lens and lenslets: at f/2.5 a lenslet's corner is 3 rad from where
-    the separable phase has it."""
+    """18 um superpixels of 9x9 pixels at another f-number of main lens and lenslets: at f/2.5 a
+    lenslet's corner is 3 rad from where the separable phase has it.
+    """
     focal = 18e-6 * f_number
-    return small_camera(**{"main_lens__aperture_diameter": 55e-3 / f_number, "lenslet_array__focal_length": focal, "lenslet_array__pitch": 18e-6,
-                           "sensor__distance": focal, "sensor__pixels_per_lenslet": (9, 9)} | changes)
+    return small_camera(
+        **{
+            "main_lens__aperture_diameter": 55e-3 / f_number,
+            "lenslet_array__focal_length": focal,
+            "lenslet_array__pitch": 18e-6,
+            "sensor__distance": focal,
+            "sensor__pixels_per_lenslet": (9, 9),
+        }
+        | changes
+    )
 
 
 def image_points(camera, points):
     shape, pitch = camera.object.samples_per_lenslet, camera.lenslet_array.pitch
-    return [tuple((i - (n - 1) / 2) * pitch / n for i, n in zip(divmod(p, shape[1]), shape)) for p in points]
+    return [
+        tuple((i - (n - 1) / 2) * pitch / n for i, n in zip(divmod(p, shape[1]), shape))
+        for p in points
+    ]
 
 
 def columns(camera, points, *, superpixel=0, superpixels=(1, 1), ring=0, asked=1e-4, **changes):
     """Pixel energies (point, row, column) on one superpixel by the exact rung."""
-    plan = replace(accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=ring), **changes)
+    plan = replace(
+        accuracy.plan_pif(
+            camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=ring
+        ),
+        **changes,
+    )
     builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
     return builder.columns(points)[superpixel].T.reshape(-1, *builder.pixel_shape)
 
@@ -52,14 +81,21 @@ def errors(found, truth):
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_accuracy_holds_in_the_worst_column(profile):
     camera, points = fast_camera(lenslet_array__profile=profile), [0, 3, 9, 27, 35]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=11)
+    truth = column_energies(
+        camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=11
+    )
     for asked in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
         assert errors(columns(camera, points, asked=asked), truth).max() <= asked
 
 
 def test_the_reference_has_converged():
     camera, point = fast_camera(), image_points(fast_camera(), [0])
-    coarse, fine = (column_energies(camera, WAVELENGTH, point, ISOLATED, (0, 0), pixel_nodes=n, density=d, rows=[2, 7]) for n, d in ((11, 1.0), (13, 1.3)))
+    coarse, fine = (
+        column_energies(
+            camera, WAVELENGTH, point, ISOLATED, (0, 0), pixel_nodes=n, density=d, rows=[2, 7]
+        )
+        for n, d in ((11, 1.0), (13, 1.3))
+    )
     assert errors(coarse, fine).max() < 2e-10
 
 
@@ -72,43 +108,73 @@ def test_the_reference_as_products_is_the_sum_itself(place):
     true = rayleigh_sum(fields, y, x, v, u, z, k)
     fields = fields[:, np.argsort(y)][:, :, np.argsort(x)]
     found = rayleigh_products(fields, np.sort(y), np.sort(x), np.sort(v), np.sort(u), z, k)
-    assert np.linalg.norm(found - true[:, np.argsort(v)][:, :, np.argsort(u)]) < 1e-10 * np.linalg.norm(true)
+    assert np.linalg.norm(
+        found - true[:, np.argsort(v)][:, :, np.argsort(u)]
+    ) < 1e-10 * np.linalg.norm(true)
 
 
 def test_the_reference_of_the_main_lens_by_axes_is_that_by_directions():
     camera = fast_camera(4.0, object__distance=0.54)
     y, point = np.linspace(-3e-5, 3e-5, 9), (3e-6, -4e-6)
     whole = field_on_array(camera, WAVELENGTH, point, y, y, pupil_directions(camera))
-    assert np.linalg.norm(main_lens_field(camera, 4e-5)(point, y, y) - whole) < 1e-8 * np.linalg.norm(whole)
+    assert np.linalg.norm(
+        main_lens_field(camera, 4e-5)(point, y, y) - whole
+    ) < 1e-8 * np.linalg.norm(whole)
 
 
-@pytest.mark.parametrize("change", [
-    {"sensor__pixels_per_lenslet": (7, 10)},
-    {"object__samples_per_lenslet": (5, 8)},
-    {"object__distance": 0.53},
-    {"lenslet_array__fill_factor": 0.8},
-    {"sensor__distance": 41e-6, "sensor__pixel_fill_factor": 0.64},
-    {"main_lens__aperture_shape": "square"},
-    {"main_lens__apodisation": "uniform-pupil", "lenslet_array__profile": "parabolic"},
-    {"main_lens__apodisation": "uniform-sine", "main_lens__aperture_shape": "annulus", "main_lens__obscuration": 0.4},
-], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sensor__pixels_per_lenslet": (7, 10)},
+        {"object__samples_per_lenslet": (5, 8)},
+        {"object__distance": 0.53},
+        {"lenslet_array__fill_factor": 0.8},
+        {"sensor__distance": 41e-6, "sensor__pixel_fill_factor": 0.64},
+        {"main_lens__aperture_shape": "square"},
+        {"main_lens__apodisation": "uniform-pupil", "lenslet_array__profile": "parabolic"},
+        {
+            "main_lens__apodisation": "uniform-sine",
+            "main_lens__aperture_shape": "annulus",
+            "main_lens__obscuration": 0.4,
+        },
+    ],
+    ids=str,
+)
 def test_every_kind_of_camera(change):
     camera, points = fast_camera(**change), [0, 12, 19]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    truth = column_energies(
+        camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9
+    )
     assert errors(columns(camera, points, asked=1e-5), truth).max() <= 1e-5
 
 
 def test_a_pupil_given_as_a_picture():
     picture = np.random.default_rng(2).uniform(0.1, 1, (3, 3))
-    camera, points = fast_camera(main_lens__aperture_shape="image", main_lens__aperture_image="p.png").attach(aperture_image=picture), [0, 12, 19]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    camera, points = (
+        fast_camera(main_lens__aperture_shape="image", main_lens__aperture_image="p.png").attach(
+            aperture_image=picture
+        ),
+        [0, 12, 19],
+    )
+    truth = column_energies(
+        camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9
+    )
     assert errors(columns(camera, points, asked=1e-5), truth).max() <= 1e-5
 
 
 def test_a_band_of_light_is_the_sum_of_its_wavelengths():
-    camera, points = fast_camera(light__wavelengths=(WAVELENGTH,), light__band={"center": WAVELENGTH, "fwhm": 15e-9, "shape": "gaussian"}), [0, 12, 19]
-    truth = sum(share * column_energies(camera, w, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
-                for w, share in zip(*spectral_nodes(camera.light.band, 12)))
+    camera, points = (
+        fast_camera(
+            light__wavelengths=(WAVELENGTH,),
+            light__band={"center": WAVELENGTH, "fwhm": 15e-9, "shape": "gaussian"},
+        ),
+        [0, 12, 19],
+    )
+    truth = sum(
+        share
+        * column_energies(camera, w, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+        for w, share in zip(*spectral_nodes(camera.light.band, 12))
+    )
     for asked in (1e-2, 1e-4):
         plan = accuracy.plan_pif(camera, accuracy=asked, superpixels=(1, 1), coherent_ring=0)
         assert plan.model == "exact" and plan.band_nodes > 1
@@ -117,46 +183,118 @@ def test_a_band_of_light_is_the_sum_of_its_wavelengths():
 
 def test_a_window_of_pixels_off_the_superpixel_s_centre():
     camera, points, shift = fast_camera(), [0, 12, 63], (0.3, -0.2)
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, tuple(s * camera.sensor.pixel_pitch for s in shift), pixel_nodes=9)
+    truth = column_energies(
+        camera,
+        WAVELENGTH,
+        image_points(camera, points),
+        ISOLATED,
+        tuple(s * camera.sensor.pixel_pitch for s in shift),
+        pixel_nodes=9,
+    )
     assert errors(columns(camera, points, pixel_shift=shift), truth).max() <= 1e-4
 
 
-@pytest.mark.parametrize("change", [{}, {"main_lens__aperture_shape": "square"}, {"object__distance": 0.5, "lenslet_array__fill_factor": 0.7}], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"main_lens__aperture_shape": "square"},
+        {"object__distance": 0.5, "lenslet_array__fill_factor": 0.7},
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("f_number", [1.5, 3, 10])
 def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(f_number, change):
     pitch, pixels = 62e-6, 31
-    camera = fast_camera(f_number, lenslet_array__pitch=pitch, sensor__pixels_per_lenslet=(pixels, pixels),
-                         lenslet_array__focal_length=pitch * f_number, sensor__distance=pitch * f_number, **change)
-    plan = accuracy.plan_pif(camera, model="exact", accuracy=1e-7, superpixels=(1, 1), coherent_ring=0)
+    camera = fast_camera(
+        f_number,
+        lenslet_array__pitch=pitch,
+        sensor__pixels_per_lenslet=(pixels, pixels),
+        lenslet_array__focal_length=pitch * f_number,
+        sensor__distance=pitch * f_number,
+        **change,
+    )
+    plan = accuracy.plan_pif(
+        camera, model="exact", accuracy=1e-7, superpixels=(1, 1), coherent_ring=0
+    )
     assert 0 < plan.bands[0].sensor_count < 0.6 * pixels * plan.bands[0].pixel_nodes
-    found, true = (columns(camera, range(64), asked=1e-7, bands=[replace(plan.bands[0], sensor_count=count)]) for count in (plan.bands[0].sensor_count, 0))
+    found, true = (
+        columns(camera, range(64), asked=1e-7, bands=[replace(plan.bands[0], sensor_count=count)])
+        for count in (plan.bands[0].sensor_count, 0)
+    )
     assert errors(found, true).max() < 0.3e-7
 
 
 @pytest.mark.parametrize("place", [(0, 1), (-1, 1)], ids=str)
 def test_oblique_light_of_isolated_lenslets(place):
-    """The main lens so near that a lenslet's light comes to its superpixel at an angle as large as it has itself."""
-    camera = fast_camera(3.0, lenslet_array__pitch=42e-6, sensor__pixels_per_lenslet=(21, 21), lenslet_array__focal_length=126e-6, sensor__distance=126e-6,
-                         main_lens__focal_length=0.5e-3, object__distance=5e-3, lenslet_array__distance=0.5e-3 / 0.9, main_lens__aperture_diameter=0.5e-3 / 3)
+    """The main lens so near that a lenslet's light comes to its superpixel at an angle as
+    large as it has itself.
+    """
+    camera = fast_camera(
+        3.0,
+        lenslet_array__pitch=42e-6,
+        sensor__pixels_per_lenslet=(21, 21),
+        lenslet_array__focal_length=126e-6,
+        sensor__distance=126e-6,
+        main_lens__focal_length=0.5e-3,
+        object__distance=5e-3,
+        lenslet_array__distance=0.5e-3 / 0.9,
+        main_lens__aperture_diameter=0.5e-3 / 3,
+    )
     pitch, rows, points = geometry(camera, WAVELENGTH).superpixel_pitch, [2, 11], [0, 7, 27]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), [place], tuple(pitch * n for n in place), pixel_nodes=13, rows=rows)
-    own = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9)
+    truth = column_energies(
+        camera,
+        WAVELENGTH,
+        image_points(camera, points),
+        [place],
+        tuple(pitch * n for n in place),
+        pixel_nodes=13,
+        rows=rows,
+    )
+    own = column_energies(
+        camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=9
+    )
     for asked in (1e-2, 1e-4, 1e-6):
         (y, x), superpixels = place, (3, 3)
-        plan = accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=0)
+        plan = accuracy.plan_pif(
+            camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=0
+        )
         assert plan.bands[0].sensor_count or asked > 1e-4
-        found = columns(camera, points, superpixel=3 * (y + 1) + x + 1, superpixels=superpixels, asked=asked)
-        missed = np.sqrt(((found[:, rows] - truth) ** 2).sum(axis=(1, 2)) / (own**2).sum(axis=(1, 2)))
+        found = columns(
+            camera, points, superpixel=3 * (y + 1) + x + 1, superpixels=superpixels, asked=asked
+        )
+        missed = np.sqrt(
+            ((found[:, rows] - truth) ** 2).sum(axis=(1, 2)) / (own**2).sum(axis=(1, 2))
+        )
         assert missed.max() <= asked
 
 
-@pytest.mark.parametrize("shape, f_number, fill", [("square", 2.5, 0.6), ("circle", 2.5, 0.6), ("square", 4.0, 0.8)])
+@pytest.mark.parametrize(
+    "shape, f_number, fill", [("square", 2.5, 0.6), ("circle", 2.5, 0.6), ("square", 4.0, 0.8)]
+)
 def test_points_between_lenslets_hold_in_their_own_columns(shape, f_number, fill):
-    """The faintest column has 1e-4 to 2e-2 of the brightest one's light, and is as accurate as that."""
-    camera = fast_camera(f_number, lenslet_array__pitch=30e-6, sensor__pixels_per_lenslet=(15, 15), lenslet_array__focal_length=30e-6 * f_number,
-                         sensor__distance=30e-6 * f_number, main_lens__aperture_shape=shape, lenslet_array__fill_factor=fill)
+    """The faintest column has 1e-4 to 2e-2 of the brightest one's light, and is
+    as accurate as that.
+    """
+    camera = fast_camera(
+        f_number,
+        lenslet_array__pitch=30e-6,
+        sensor__pixels_per_lenslet=(15, 15),
+        lenslet_array__focal_length=30e-6 * f_number,
+        sensor__distance=30e-6 * f_number,
+        main_lens__aperture_shape=shape,
+        lenslet_array__fill_factor=fill,
+    )
     points, rows = [0, 3, 27], [0, 6, 7, 11]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), ISOLATED, (0, 0), pixel_nodes=11, rows=rows)
+    truth = column_energies(
+        camera,
+        WAVELENGTH,
+        image_points(camera, points),
+        ISOLATED,
+        (0, 0),
+        pixel_nodes=11,
+        rows=rows,
+    )
     light = truth.sum(axis=(1, 2))
     assert light[0] < 0.04 * light[2]
     for asked in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6):
@@ -166,7 +304,15 @@ def test_points_between_lenslets_hold_in_their_own_columns(shape, f_number, fill
 @pytest.mark.parametrize("profile", PROFILES)
 def test_neighbours_add_before_the_square(profile):
     camera, points = fast_camera(lenslet_array__profile=profile), [0, 4, 27]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), NEIGHBOURS, (0, 0), pixel_nodes=11, rows=ROWS)
+    truth = column_energies(
+        camera,
+        WAVELENGTH,
+        image_points(camera, points),
+        NEIGHBOURS,
+        (0, 0),
+        pixel_nodes=11,
+        rows=ROWS,
+    )
     for asked in (1e-2, 1e-4, 1e-6, 1e-7):
         assert errors(columns(camera, points, ring=1, asked=asked)[:, ROWS], truth).max() <= asked
     # the isolated lenslet is far off at the corner, so the sum of fields is what was tested
@@ -175,14 +321,33 @@ def test_neighbours_add_before_the_square(profile):
 
 @pytest.mark.parametrize("place", [(-1, 1), (-1, 0), (0, 0)], ids=str)
 def test_superpixels_beside_the_own_one(place):
-    """Light of 25 lenslets; the accuracy asked for is the whole column's, of which the superpixels beside hold a small part."""
+    """Light of 25 lenslets; the accuracy asked for is the whole column's, of which the
+    superpixels beside hold a small part.
+    """
     camera, points, rows = fast_camera(4.0), [0, 7, 58], [1, 6]
     pitch = geometry(camera, WAVELENGTH).superpixel_pitch
     lenslets = [(r, c) for r in range(-2, 3) for c in range(-2, 3)]
-    truth = column_energies(camera, WAVELENGTH, image_points(camera, points), lenslets, tuple(pitch * n for n in place), pixel_nodes=9, rows=rows)
-    whole = np.linalg.norm(columns(camera, points, superpixels=(1, 1), ring=1, asked=1e-3), axis=(1, 2))
+    truth = column_energies(
+        camera,
+        WAVELENGTH,
+        image_points(camera, points),
+        lenslets,
+        tuple(pitch * n for n in place),
+        pixel_nodes=9,
+        rows=rows,
+    )
+    whole = np.linalg.norm(
+        columns(camera, points, superpixels=(1, 1), ring=1, asked=1e-3), axis=(1, 2)
+    )
     for asked in (1e-2, 1e-4, 1e-6):
-        found = columns(camera, points, superpixel=4 + 3 * place[0] + place[1], superpixels=(3, 3), ring=1, asked=asked)[:, rows]
+        found = columns(
+            camera,
+            points,
+            superpixel=4 + 3 * place[0] + place[1],
+            superpixels=(3, 3),
+            ring=1,
+            asked=asked,
+        )[:, rows]
         assert (np.linalg.norm(found - truth, axis=(1, 2)) <= asked * whole).all()
 
 
@@ -190,20 +355,40 @@ def test_symmetry_changes_nothing(monkeypatch):
     camera, points = fast_camera(object__samples_per_lenslet=(5, 5)), np.arange(25)
     used = columns(camera, points, asked=1e-6)
     field = exact.separable_field
-    monkeypatch.setattr(exact, "separable_field", lambda *args: replace(field(*args), symmetry=(False, False, False), signs=None))
+    monkeypatch.setattr(
+        exact,
+        "separable_field",
+        lambda *args: replace(field(*args), symmetry=(False, False, False), signs=None),
+    )
     assert errors(columns(camera, points, asked=1e-6), used).max() < 1e-6
-    plan = accuracy.plan_pif(camera, model="exact", accuracy=1e-6, superpixels=(1, 1), coherent_ring=0)
+    plan = accuracy.plan_pif(
+        camera, model="exact", accuracy=1e-6, superpixels=(1, 1), coherent_ring=0
+    )
     assert PifBuilder(camera, WAVELENGTH, plan).symmetry == (False, False, False)
 
 
 def test_no_light_is_made_and_only_the_far_field_is_lost():
-    """What a window of pixels misses of the light that enters the lenslet is the edges' diffraction, which falls as one over its width."""
+    """What a window of pixels misses of the light that enters the lenslet is the edges'
+    diffraction, which falls as one over its width.
+    """
     missed, points, directions = [], [0, 27], pupil_directions(fast_camera(4.0))
     t, w = np.polynomial.legendre.leggauss(70)
-    enters = np.array([np.abs(field_on_array(fast_camera(4.0), WAVELENGTH, point, 9e-6 * t, 9e-6 * t, directions)) ** 2 @ w @ w * 9e-6**2
-                       for point in image_points(fast_camera(4.0), points)])
+    enters = np.array(
+        [
+            np.abs(
+                field_on_array(fast_camera(4.0), WAVELENGTH, point, 9e-6 * t, 9e-6 * t, directions)
+            )
+            ** 2
+            @ w
+            @ w
+            * 9e-6**2
+            for point in image_points(fast_camera(4.0), points)
+        ]
+    )
     for pixels in (27, 55):
-        seen = columns(fast_camera(4.0, sensor__pixels_per_lenslet=(pixels, pixels)), points).sum(axis=(1, 2))
+        seen = columns(fast_camera(4.0, sensor__pixels_per_lenslet=(pixels, pixels)), points).sum(
+            axis=(1, 2)
+        )
         missed.append(enters - seen)
     assert (np.array(missed) > 0).all() and (missed[1] < 0.03 * enters).all()
     assert np.allclose(missed[0] / missed[1], 55 / 27, rtol=0.15)
@@ -214,23 +399,45 @@ def test_slow_lenses_are_paraxial():
     found = []
     for f_number in (4, 8, 16):
         camera = fast_camera(f_number)
-        both = [accuracy.system_matrix(camera, model=model, accuracy=1e-7, superpixels=(1, 1), coherent_ring=0).A[0, 0] for model in ("fresnel", "exact")]
+        both = [
+            accuracy.system_matrix(
+                camera, model=model, accuracy=1e-7, superpixels=(1, 1), coherent_ring=0
+            ).A[0, 0]
+            for model in ("fresnel", "exact")
+        ]
         found.append(np.linalg.norm(both[0] - both[1]) / np.linalg.norm(both[1]))
     assert found[-1] < 2e-3
     assert all(4 < a / b < 6 for a, b in zip(found, found[1:]))
 
 
-@pytest.mark.parametrize("change", [{}, {"f_number": 8, "lenslet_array__profile": "parabolic"}, {"f_number": 4, "sensor__pixels_per_lenslet": (3, 3), "sensor__pixel_pitch": 6e-6}], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"f_number": 8, "lenslet_array__profile": "parabolic"},
+        {"f_number": 4, "sensor__pixels_per_lenslet": (3, 3), "sensor__pixel_pitch": 6e-6},
+    ],
+    ids=str,
+)
 def test_law_of_the_paraxial_error(change):
     camera = fast_camera(**change)
-    both = [accuracy.system_matrix(camera, model=model, accuracy=3e-4, superpixels=(1, 1), coherent_ring=0).A[0, 0] for model in ("fresnel", "exact")]
+    both = [
+        accuracy.system_matrix(
+            camera, model=model, accuracy=3e-4, superpixels=(1, 1), coherent_ring=0
+        ).A[0, 0]
+        for model in ("fresnel", "exact")
+    ]
     worst = (np.linalg.norm(both[0] - both[1], axis=0) / np.linalg.norm(both[1], axis=0)).max()
-    law = fresnel_model_error(geometry(camera, WAVELENGTH), camera.lenslet_array.profile == "parabolic")
+    law = fresnel_model_error(
+        geometry(camera, WAVELENGTH), camera.lenslet_array.profile == "parabolic"
+    )
     assert 0.8 * worst < law < 3 * worst
 
 
 def test_main_lens_against_spherical_waves():
-    """Point by point over an evenly lit exit pupil, distances exact: the direction cosines are the right coordinates."""
+    """Point by point over an evenly lit exit pupil, distances exact: the direction cosines are
+    the right coordinates.
+    """
     camera = fast_camera(4.0, main_lens__apodisation="uniform-pupil")
     y = np.linspace(-9e-6, 9e-6, 9)
     point = (3e-6, -4e-6)
@@ -250,7 +457,9 @@ def test_residual_functions_reproduce_the_kernel(place):
     left, right = residual.functions(0, v, y), residual.functions(1, u, x)
     found = np.tensordot(np.tensordot(left, residual.core, (0, 0)), right, 1)
     d, e = centre[0] + v[:, None] - y, centre[1] + u[:, None] - x
-    true = kappa(d[:, :, None, None], e, z, k, centre) * ell(y[None, :, None, None], x[None, None, None, :], z, k)
+    true = kappa(d[:, :, None, None], e, z, k, centre) * ell(
+        y[None, :, None, None], x[None, None, None, :], z, k
+    )
     assert np.abs(found - true).max() < 1e-5
 
 
@@ -260,10 +469,19 @@ def test_residual_is_what_the_paths_leave(centre):
     dy, dx = np.random.default_rng(4).uniform(-4e-5, 4e-5, (2, 50))
     side = np.sqrt(z * z + dy**2 + dx**2)
     kernel = z / (1j * WAVELENGTH * side**2) * (1 + 1j / (k * side)) * np.exp(1j * k * (side - z))
-    separable = np.exp(1j * k * (path(dy, z, *centre) + path(dx, z, *centre[::-1]))) / (1j * WAVELENGTH * z)
+    separable = np.exp(1j * k * (path(dy, z, *centre) + path(dx, z, *centre[::-1]))) / (
+        1j * WAVELENGTH * z
+    )
     assert np.allclose(kernel, separable * kappa(dy, dx, z, k, centre), rtol=1e-9)
     # nothing is left along the lines through the centre but the amplitude
-    assert np.allclose(np.angle(kappa(dy, centre[1], z, k, centre) / (1 + 1j / (k * np.sqrt(z * z + dy**2 + centre[1] ** 2)))), 0, atol=1e-9)
+    assert np.allclose(
+        np.angle(
+            kappa(dy, centre[1], z, k, centre)
+            / (1 + 1j / (k * np.sqrt(z * z + dy**2 + centre[1] ** 2)))
+        ),
+        0,
+        atol=1e-9,
+    )
     lens = np.exp(-1j * k * (np.sqrt(z * z + dy**2 + dx**2) - z))
     axes = np.exp(-1j * k * (np.sqrt(z * z + dy**2) - z + np.sqrt(z * z + dx**2) - z))
     assert np.allclose(lens, axes * ell(dy, dx, z, k), rtol=1e-9)
@@ -272,7 +490,9 @@ def test_residual_is_what_the_paths_leave(centre):
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_a_matrix_split_into_its_strong_parts(symmetric):
     rng = np.random.default_rng(8)
-    matrix = (rng.normal(size=(20, 20)) + 1j * rng.normal(size=(20, 20))) * np.exp(-0.7 * np.add.outer(np.arange(20), np.arange(20)))
+    matrix = (rng.normal(size=(20, 20)) + 1j * rng.normal(size=(20, 20))) * np.exp(
+        -0.7 * np.add.outer(np.arange(20), np.arange(20))
+    )
     matrix = matrix + matrix.T if symmetric else matrix
     left, core, right = split(matrix, 1e-3, symmetric)
     assert np.linalg.norm(left @ core @ right.T - matrix) < 1.5e-3 and len(core) < 15
@@ -281,7 +501,9 @@ def test_a_matrix_split_into_its_strong_parts(symmetric):
 
 def _random_product(rng, rows, terms, decay):
     weights = np.exp(-decay * np.arange(terms))
-    left, right = (rng.normal(size=(rows, terms)) + 1j * rng.normal(size=(rows, terms)) for _ in range(2))
+    left, right = (
+        rng.normal(size=(rows, terms)) + 1j * rng.normal(size=(rows, terms)) for _ in range(2)
+    )
     return left, right, np.diag(weights).astype(complex)
 
 
@@ -292,28 +514,41 @@ def test_compression_keeps_what_was_asked():
     full = left @ core @ right.T
     assert np.linalg.norm(high @ wide.T - full) < 1.5e-2
     singular = np.linalg.svd(full, compute_uv=False)
-    assert high.shape[1] <= np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > 1e-2) + 1
+    assert (
+        high.shape[1] <= np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > 1e-2) + 1
+    )
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
     rng = np.random.default_rng(7)
     left, right, core = _random_product(rng, 900, 400, 0.15)
-    left, right, core = (x.astype(np.complex64) for x in (left / np.sqrt(900), right / np.sqrt(900), core))
+    left, right, core = (
+        x.astype(np.complex64) for x in (left / np.sqrt(900), right / np.sqrt(900), core)
+    )
     right = left if symmetric else right
     cut = 1e-5 * np.linalg.norm(core)
     x, y, k = product.Product([left], [right], {(0, 0): core}, symmetric).narrowed(cut)
     full = left.astype(complex) @ core @ right.T.astype(complex)
-    terms = np.count_nonzero(np.sqrt(np.cumsum(np.linalg.svd(full, compute_uv=False)[::-1] ** 2))[::-1] > cut)
+    terms = np.count_nonzero(
+        np.sqrt(np.cumsum(np.linalg.svd(full, compute_uv=False)[::-1] ** 2))[::-1] > cut
+    )
     # single precision has 1e-7 of the whole; squares of what is small would be lost in it
     assert np.linalg.norm(x.astype(complex) @ k @ y.T - full) < 1.5 * cut
-    assert terms <= x.shape[1] < 1.4 * terms + 10 and np.allclose(x.conj().T @ x, np.eye(x.shape[1]), atol=1e-5)
+    assert terms <= x.shape[1] < 1.4 * terms + 10 and np.allclose(
+        x.conj().T @ x, np.eye(x.shape[1]), atol=1e-5
+    )
     assert (y is x) == symmetric
 
 
 def test_a_product_of_many_terms_is_left_as_it_is():
     left, right, core = _random_product(np.random.default_rng(8), 900, 300, 0.01)
-    assert product.Product([left], [right], {(0, 0): core}, False).narrowed(1e-3 * np.linalg.norm(core)) is None
+    assert (
+        product.Product([left], [right], {(0, 0): core}, False).narrowed(
+            1e-3 * np.linalg.norm(core)
+        )
+        is None
+    )
 
 
 def test_too_many_terms_are_refused(monkeypatch):
@@ -325,33 +560,65 @@ def test_too_many_terms_are_refused(monkeypatch):
 
 def test_refusals():
     with pytest.raises(NumericsError, match="square lenslets"):
-        accuracy.plan_pif(fast_camera(lenslet_array__aperture_shape="circle"), model="exact", accuracy=1e-3)
+        accuracy.plan_pif(
+            fast_camera(lenslet_array__aperture_shape="circle"), model="exact", accuracy=1e-3
+        )
     with pytest.raises(NumericsError, match="oblique"):
         accuracy.plan_pif(fast_camera(), model="exact", accuracy=1e-3, lenslet=(0, 1))
 
 
 def full_camera(name, profile):
     """52x52 pixels and 40x40 points: f/4.4 and f/8 with 250 um lenslets, f/8 with 104 um ones."""
-    f_number, pitch, pixel = {"f/4.4": (4.4, 250e-6, 4.808e-6), "f/8": (8, 250e-6, 4.808e-6), "f/8, 104 um": (8, 104e-6, 2e-6), "f/2.2": (2.2, 250e-6, 4.808e-6), "f/1.5": (1.5, 250e-6, 4.808e-6)}[name]
-    return fast_camera(main_lens__focal_length=0.1, main_lens__aperture_diameter=0.11 / f_number, object__distance=1.1, lenslet_array__distance=0.11,
-                       lenslet_array__pitch=pitch, lenslet_array__focal_length=pitch * f_number, lenslet_array__profile=profile,
-                       sensor__distance=pitch * f_number, sensor__pixel_pitch=pixel, sensor__pixels_per_lenslet=(52, 52), object__samples_per_lenslet=(40, 40))
+    f_number, pitch, pixel = {
+        "f/4.4": (4.4, 250e-6, 4.808e-6),
+        "f/8": (8, 250e-6, 4.808e-6),
+        "f/8, 104 um": (8, 104e-6, 2e-6),
+        "f/2.2": (2.2, 250e-6, 4.808e-6),
+        "f/1.5": (1.5, 250e-6, 4.808e-6),
+    }[name]
+    return fast_camera(
+        main_lens__focal_length=0.1,
+        main_lens__aperture_diameter=0.11 / f_number,
+        object__distance=1.1,
+        lenslet_array__distance=0.11,
+        lenslet_array__pitch=pitch,
+        lenslet_array__focal_length=pitch * f_number,
+        lenslet_array__profile=profile,
+        sensor__distance=pitch * f_number,
+        sensor__pixel_pitch=pixel,
+        sensor__pixels_per_lenslet=(52, 52),
+        object__samples_per_lenslet=(40, 40),
+    )
 
 
 def energies_by_products(camera, image_points, window, centre, lines, nodes=10):
-    """column_energies of all lenslets up to `window` beside the own one on `lines` of pixels, by the sum as products."""
+    """column_energies of all lenslets up to `window` beside the own one on `lines` of pixels, by
+    the sum as products.
+    """
     k, array, sensor = 2 * np.pi / WAVELENGTH, camera.lenslet_array, camera.sensor
-    (v, wv), (u, wu) = sensor_nodes(centre, sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch, nodes)
+    (v, wv), (u, wu) = sensor_nodes(
+        centre, sensor.pixels_per_lenslet, sensor.pixel_pitch, sensor.pixel_pitch, nodes
+    )
     some = (np.array(lines)[:, None] * nodes + np.arange(nodes)).ravel()
     half, reach, total = array.pitch / 2, np.abs(centre).max() + (window + 1) * array.pitch, 0
-    slope = reach / np.hypot(reach, sensor.distance) + array.pitch / (2 * array.focal_length) + camera.main_lens.aperture_diameter / (2 * array.distance)
-    (y, w), wave = rayleigh_nodes(-half, half, k * slope), main_lens_field(camera, (window + 1.5) * array.pitch)
+    slope = (
+        reach / np.hypot(reach, sensor.distance)
+        + array.pitch / (2 * array.focal_length)
+        + camera.main_lens.aperture_diameter / (2 * array.distance)
+    )
+    (y, w), wave = (
+        rayleigh_nodes(-half, half, k * slope),
+        main_lens_field(camera, (window + 1.5) * array.pitch),
+    )
     lens = lens_phase(array.profile, array.focal_length, y, y, k) * np.outer(w, w)
     for row in range(-window, window + 1):
         for column in range(-window, window + 1):
             down, right = y + row * array.pitch, y + column * array.pitch
             fields = np.array([wave(point, down, right) for point in image_points])
-            sums = [rayleigh_products(fields * lens, down, right, line, u, sensor.distance, k) for line in np.split(v[some], len(lines))]
+            sums = [
+                rayleigh_products(fields * lens, down, right, line, u, sensor.distance, k)
+                for line in np.split(v[some], len(lines))
+            ]
             total = total + np.concatenate(sums, axis=1)
     energy = np.abs(total) ** 2 * wv[some, None] * wu
     return energy.reshape(len(image_points), len(lines), nodes, -1, nodes).sum(axis=(2, 4))
@@ -361,7 +628,9 @@ def energies_by_products(camera, image_points, window, centre, lines, nodes=10):
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("name", ["f/4.4", "f/8", "f/8, 104 um"])
 def test_full_size(name, profile):
-    """On every sixth row of pixels: 1e-4 in single and 1e-6 in double precision, the corner's column as well."""
+    """On every sixth row of pixels: 1e-4 in single and 1e-6 in double precision, the
+    corner's column as well.
+    """
     camera, points, rows = full_camera(name, profile), [0, 19, 137, 412, 551, 820], range(0, 52, 6)
     nodes = {"f/4.4": 8, "f/8": 6, "f/8, 104 um": 5}[name]
     truth = energies_by_products(camera, image_points(camera, points), 0, (0, 0), rows, nodes)
@@ -371,29 +640,52 @@ def test_full_size(name, profile):
 
 @pytest.mark.slow
 def test_full_size_with_neighbours():
-    """3x3 superpixels at f/4.4 and 1e-3, as the dial has it: the corner's column and one inside, the light of 25 lenslets on lines of
-    pixels of the three kinds of superpixels. Each kind's error is scaled to all of its pixels; those left out mirror them."""
+    """3x3 superpixels at f/4.4 and 1e-3, as the dial has it: the corner's column and one inside,
+    the light of 25 lenslets on lines of pixels of the three kinds of superpixels. Each kind's error
+    is scaled to all of its pixels; those left out mirror them.
+    """
     camera, points, lines = full_camera("f/4.4", "hyperbolic"), [0, 410], [3, 20, 37]
     plan = accuracy.plan_pif(camera, accuracy=1e-3, superpixels=(3, 3))
     assert plan.model == "exact" and plan.bands[0].window == 2
     builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
-    found, pitch = builder.columns(points).transpose(2, 0, 1).reshape(2, 9, 52, 52), geometry(camera, WAVELENGTH).superpixel_pitch
+    found, pitch = (
+        builder.columns(points).transpose(2, 0, 1).reshape(2, 9, 52, 52),
+        geometry(camera, WAVELENGTH).superpixel_pitch,
+    )
     missed = np.zeros(2)
     for place, times in (((0, 0), 1), ((-1, 0), 2), ((-1, -1), 1)):
         own = found[:, 3 * (place[0] + 1) + place[1] + 1]
-        truth = energies_by_products(camera, image_points(camera, points), 2, tuple(pitch * n for n in place), lines)
+        truth = energies_by_products(
+            camera, image_points(camera, points), 2, tuple(pitch * n for n in place), lines
+        )
         missed += times * (errors(own[:, lines], truth) * np.linalg.norm(own, axis=(1, 2))) ** 2
     assert (np.sqrt(missed) <= 1e-3 * np.sqrt((found**2).sum(axis=(1, 2, 3)))).all()
 
 
-@pytest.mark.parametrize("name, wavelength, coarse", [
-    ("f/8", 550e-9, 5e-2), pytest.param("f/4.4", 400e-9, 1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name, wavelength, coarse",
+    [("f/8", 550e-9, 5e-2), pytest.param("f/4.4", 400e-9, 1e-2, marks=pytest.mark.slow)],
+)
 def test_whole_columns_hold_at_coarse_accuracies(name, wavelength, coarse):
-    """All pixels of all superpixels near a lenslet's corner, whose light is on four of them, each with its error, against the matrix at a fifth."""
-    camera = full_camera(name, "hyperbolic").replace(**{"light.wavelengths": (wavelength,), "light.design_wavelength": wavelength})
-    plans = [accuracy.plan_pif(camera, model="exact", accuracy=asked, superpixels=(3, 3), coherent_ring=1) for asked in (coarse, coarse / 5)]
-    found, fine = (PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(slice(0, 8)) for plan in plans)
-    assert (np.linalg.norm(found - fine, axis=(0, 1)) <= coarse * np.linalg.norm(fine, axis=(0, 1))).all()
+    """All pixels of all superpixels near a lenslet's corner, whose light is on four of them,
+    each with its error, against the matrix at a fifth.
+    """
+    camera = full_camera(name, "hyperbolic").replace(
+        **{"light.wavelengths": (wavelength,), "light.design_wavelength": wavelength}
+    )
+    plans = [
+        accuracy.plan_pif(
+            camera, model="exact", accuracy=asked, superpixels=(3, 3), coherent_ring=1
+        )
+        for asked in (coarse, coarse / 5)
+    ]
+    found, fine = (
+        PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(slice(0, 8))
+        for plan in plans
+    )
+    assert (
+        np.linalg.norm(found - fine, axis=(0, 1)) <= coarse * np.linalg.norm(fine, axis=(0, 1))
+    ).all()
 
 
 def test_too_many_terms_on_superpixels_beside_are_refused_in_the_plan():
@@ -411,18 +703,28 @@ def test_full_size_at_f_2_2():
 @pytest.mark.slow
 def test_pixels_that_hold_eight_fringes_of_a_lenslet_of_412_cells():
     """f/1.5 at 400 nm, beyond what the rule of the pixels' nodes was fitted to."""
-    camera, wavelength, points = full_camera("f/1.5", "hyperbolic").replace(**{"light.wavelengths": (400e-9,)}), 400e-9, [0, 820, 137, 20]
+    camera, wavelength, points = (
+        full_camera("f/1.5", "hyperbolic").replace(**{"light.wavelengths": (400e-9,)}),
+        400e-9,
+        [0, 820, 137, 20],
+    )
     found = []
     for asked in (1e-5, 1e-2, 1e-3):
-        plan = accuracy.plan_pif(camera, model="fresnel", accuracy=asked, superpixels=(1, 1), coherent_ring=0)
+        plan = accuracy.plan_pif(
+            camera, model="fresnel", accuracy=asked, superpixels=(1, 1), coherent_ring=0
+        )
         found.append(PifBuilder(camera, wavelength, plan, dtype=np.float64).columns(points)[0])
     for asked, other in zip((1e-2, 1e-3), found[1:]):
-        assert (np.linalg.norm(other - found[0], axis=0) <= asked * np.linalg.norm(found[0], axis=0)).all()
+        assert (
+            np.linalg.norm(other - found[0], axis=0) <= asked * np.linalg.norm(found[0], axis=0)
+        ).all()
 
 
 @pytest.mark.parametrize("superpixels", [(1, 1), (3, 3)])
 def test_a_shut_filter_lets_no_light_through(superpixels):
-    camera = small_camera(filter_array={"layout": (1, 1), "filters": [{"center": 300e-9, "fwhm": 1e-9}]})
+    camera = small_camera(
+        filter_array={"layout": (1, 1), "filters": [{"center": 300e-9, "fwhm": 1e-9}]}
+    )
     assert not columns(camera, [0, 5], superpixels=superpixels, model="exact").any()
 
 

@@ -5,15 +5,30 @@ import pytest
 from scipy.special import j0, j1
 
 from plenocli.base.errors import ConfigError
-from plenocli.forward.camera.glass import focal_length, refractive_index
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.propagation.fresnel.spread_function import sampled_field, separable_field
-from plenocli.forward.camera.pupil import filter_cells, filter_transmittance, noll_indices, pupil_rows, zernike
+from plenocli.forward.camera.glass import focal_length, refractive_index
+from plenocli.forward.camera.pupil import (
+    filter_cells,
+    filter_transmittance,
+    noll_indices,
+    pupil_rows,
+    zernike,
+)
 from plenocli.forward.camera.quadrature import cell_rows, disc_rows
+from plenocli.forward.propagation.fresnel.spread_function import sampled_field, separable_field
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 
 
-@pytest.mark.parametrize("glass, index", [("N-BK7", 1.51680), ("N-BAK4", 1.56883), ("N-F2", 1.62005), ("N-SF11", 1.78472), ("fused silica", 1.45846)])
+@pytest.mark.parametrize(
+    "glass, index",
+    [
+        ("N-BK7", 1.51680),
+        ("N-BAK4", 1.56883),
+        ("N-F2", 1.62005),
+        ("N-SF11", 1.78472),
+        ("fused silica", 1.45846),
+    ],
+)
 def test_index_at_the_helium_d_line(glass, index):
     assert refractive_index(glass, 587.5618e-9) == pytest.approx(index, abs=2e-5)
 
@@ -34,9 +49,18 @@ def test_unknown_glass_and_range():
 
 
 def test_wavelength_moves_both_focal_lengths():
-    camera = small_camera(main_lens__glass="N-BK7", lenslet_array__glass="fused silica", light__design_wavelength=550e-9)
+    camera = small_camera(
+        main_lens__glass="N-BK7",
+        lenslet_array__glass="fused silica",
+        light__design_wavelength=550e-9,
+    )
     view = geometry(camera, 650e-9)
-    assert view.f1 > 50e-3 and view.f2 > 208e-6 and view.eps > 0 and geometry(camera, 550e-9).eps == pytest.approx(0, abs=1e-12)
+    assert (
+        view.f1 > 50e-3
+        and view.f2 > 208e-6
+        and view.eps > 0
+        and geometry(camera, 550e-9).eps == pytest.approx(0, abs=1e-12)
+    )
     assert view.kappa == pytest.approx(1 / view.z2 + 1 / view.z3 - 1 / view.f2)
 
 
@@ -44,7 +68,11 @@ def test_wavelength_moves_both_focal_lengths():
 def test_lenslets_that_overlap_are_refused(lattice, shape):
     with pytest.raises(ValueError, match="overlap"):
         small_camera(lenslet_array__lattice=lattice, lenslet_array__aperture_shape=shape)
-    small_camera(lenslet_array__lattice=lattice, lenslet_array__aperture_shape=shape, lenslet_array__fill_factor=0.86)
+    small_camera(
+        lenslet_array__lattice=lattice,
+        lenslet_array__aperture_shape=shape,
+        lenslet_array__fill_factor=0.86,
+    )
 
 
 def test_disc_rows_give_the_airy_amplitude():
@@ -62,7 +90,19 @@ def test_cells_that_cover_a_disc_add_up_to_it():
 
 
 def test_noll_order_and_orthonormality():
-    assert [noll_indices(j) for j in range(1, 12)] == [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3), (3, 3), (4, 0)]
+    assert [noll_indices(j) for j in range(1, 12)] == [
+        (0, 0),
+        (1, 1),
+        (1, -1),
+        (2, 0),
+        (2, -2),
+        (2, 2),
+        (3, -1),
+        (3, 1),
+        (3, -3),
+        (3, 3),
+        (4, 0),
+    ]
     rows = disc_rows(1.0, 60.0)
     values = np.array([zernike(j, rows.y[:, None], rows.x) for j in range(1, 23)])
     gram = np.einsum("amn,bmn,mn->ab", values, values, rows.weight) / np.pi
@@ -70,7 +110,10 @@ def test_noll_order_and_orthonormality():
 
 
 def camera_with_filters(**changes):
-    cells = [dict(center=c, fwhm=20e-9, peak=0.8, blocking=1e-3) for c in (450e-9, 540e-9, 570e-9, 650e-9)]
+    cells = [
+        dict(center=c, fwhm=20e-9, peak=0.8, blocking=1e-3)
+        for c in (450e-9, 540e-9, 570e-9, 650e-9)
+    ]
     return small_camera(filter_array={"layout": (2, 2), "gap": 0.2e-3, "filters": cells}, **changes)
 
 
@@ -81,7 +124,10 @@ def test_filters_pass_intensity_and_gaps_nothing():
     assert filter_transmittance(camera.filter_array.filters[0], 460e-9) == pytest.approx(0.4 + 1e-3)
     side = (camera.filter_array.size - 0.2e-3) / 2
     view = geometry(camera, 450e-9)
-    passed = sum(np.sum(np.abs(r.weight) ** 2 / np.abs(r.weight / np.sqrt(0.801))) for r in pupil_rows(camera, view, 1.0)[:1])
+    passed = sum(
+        np.sum(np.abs(r.weight) ** 2 / np.abs(r.weight / np.sqrt(0.801)))
+        for r in pupil_rows(camera, view, 1.0)[:1]
+    )
     assert passed == pytest.approx(side**2 * 0.801**0.5 * 0.801**0.5, rel=1e-9)
 
 
@@ -98,12 +144,24 @@ def test_airy_pattern_and_encircled_energy():
     t, w = np.polynomial.legendre.leggauss(60)
     radius = edge * (t + 1) / 2
     ring = np.abs(sampled_field(camera, view, np.zeros(1), radius)[0]) ** 2
-    assert np.sum(w * edge / 2 * ring * 2 * np.pi * radius) == pytest.approx(1 - j0(3.8317060) ** 2 - j1(3.8317060) ** 2, abs=1e-9)
+    assert np.sum(w * edge / 2 * ring * 2 * np.pi * radius) == pytest.approx(
+        1 - j0(3.8317060) ** 2 - j1(3.8317060) ** 2, abs=1e-9
+    )
 
 
-@pytest.mark.parametrize("change", [{}, {"main_lens__aperture_shape": "square"}, {"main_lens__aperture_shape": "annulus", "main_lens__obscuration": 0.5}], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"main_lens__aperture_shape": "square"},
+        {"main_lens__aperture_shape": "annulus", "main_lens__obscuration": 0.5},
+    ],
+    ids=str,
+)
 def test_parseval(change):
-    """All light of the aperture reaches the plane of the array, but for the diffraction tail beyond three blur widths."""
+    """All light of the aperture reaches the plane of the array, but for the diffraction tail
+    beyond three blur widths.
+    """
     camera = small_camera(object__distance=0.5, **change)
     view = geometry(camera, WAVELENGTH)
     field = separable_field(camera, view, 3 * view.blur, 1e-3)
@@ -120,14 +178,22 @@ def test_filters_reduce_the_light_and_nothing_else_does():
     field = separable_field(camera, view, 3 * view.blur, 1e-3)
     t, w = np.polynomial.legendre.leggauss(300)
     a, b = (field.evaluate(3 * view.blur * t, axis) for axis in (0, 1))
-    energy = np.sum(((a.conj().T * (w * 3 * view.blur)) @ a) * ((b.conj().T * (w * 3 * view.blur)) @ b)).real
+    energy = np.sum(
+        ((a.conj().T * (w * 3 * view.blur)) @ a) * ((b.conj().T * (w * 3 * view.blur)) @ b)
+    ).real
     side = (camera.filter_array.size - 0.2e-3) / 2
-    passed = side**2 * sum(t for _, t in filter_cells(camera, 540e-9)) / (np.pi * camera.main_lens.aperture_diameter**2 / 4)
+    passed = (
+        side**2
+        * sum(t for _, t in filter_cells(camera, 540e-9))
+        / (np.pi * camera.main_lens.aperture_diameter**2 / 4)
+    )
     assert energy == pytest.approx(passed, rel=0.02) and energy < passed * (1 + 1e-6)
 
 
 def test_tilt_moves_the_image_by_z2_times_its_slope():
-    """Noll 2 is 2 x over the unit disc: coefficient c has slope 2 c / radius and moves the image towards +x."""
+    """Noll 2 is 2 x over the unit disc: coefficient c has slope 2 c / radius and moves
+    the image towards +x.
+    """
     slope = 2e-4
     camera = small_camera(main_lens__aberrations=(dict(noll=2, coefficient=slope * 6.875e-3 / 4),))
     view = geometry(camera, WAVELENGTH)
@@ -151,13 +217,25 @@ def test_defocus_as_wavefront_is_defocus_of_the_lens():
     assert np.abs(first - phase * second).max() < 1e-9 * np.abs(first).max()
 
 
-@pytest.mark.parametrize("change, symmetry", [
-    ({}, (True, True, True)),
-    ({"main_lens__aberrations": (dict(noll=7, coefficient=50e-9),)}, (False, True, False)),
-    ({"main_lens__aberrations": (dict(noll=8, coefficient=50e-9),)}, (True, False, False)),
-    ({"main_lens__aberrations": (dict(noll=5, coefficient=50e-9),)}, (False, False, True)),
-    ({"main_lens__aberrations": (dict(noll=9, coefficient=50e-9), dict(noll=4, coefficient=80e-9))}, (False, True, False)),
-], ids=str)
+@pytest.mark.parametrize(
+    "change, symmetry",
+    [
+        ({}, (True, True, True)),
+        ({"main_lens__aberrations": (dict(noll=7, coefficient=50e-9),)}, (False, True, False)),
+        ({"main_lens__aberrations": (dict(noll=8, coefficient=50e-9),)}, (True, False, False)),
+        ({"main_lens__aberrations": (dict(noll=5, coefficient=50e-9),)}, (False, False, True)),
+        (
+            {
+                "main_lens__aberrations": (
+                    dict(noll=9, coefficient=50e-9),
+                    dict(noll=4, coefficient=80e-9),
+                )
+            },
+            (False, True, False),
+        ),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-7])
 def test_separable_terms_reach_the_tolerance(change, symmetry, tolerance):
     camera = small_camera(**change)
@@ -167,13 +245,18 @@ def test_separable_terms_reach_the_tolerance(change, symmetry, tolerance):
     t, w = np.polynomial.legendre.leggauss(150)
     truth = sampled_field(camera, view, half * t, half * t)
     error = np.abs(field.evaluate(half * t, 0) @ field.evaluate(half * t, 1).T - truth) ** 2
-    assert np.sqrt(np.sum(error * np.outer(w, w)) * half**2) == pytest.approx(field.tail, rel=1e-3, abs=1e-9)
+    assert np.sqrt(np.sum(error * np.outer(w, w)) * half**2) == pytest.approx(
+        field.tail, rel=1e-3, abs=1e-9
+    )
     assert field.tail <= tolerance and field.symmetry == symmetry
 
 
 def test_fully_blocked_light_is_zero_not_an_error():
     camera = camera_with_filters()
-    dark = [f.model_dump() | {"peak": 1e-300, "blocking": 0.0, "center": 100e-6} for f in camera.filter_array.filters]
+    dark = [
+        f.model_dump() | {"peak": 1e-300, "blocking": 0.0, "center": 100e-6}
+        for f in camera.filter_array.filters
+    ]
     camera = small_camera(filter_array={"layout": (2, 2), "gap": 0.2e-3, "filters": dark})
     field = separable_field(camera, geometry(camera, WAVELENGTH), 1e-4, 1e-4)
     assert not field.evaluate(np.array([0.0, 1e-5]), 0).any()

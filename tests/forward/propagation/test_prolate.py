@@ -1,4 +1,6 @@
-"""Prolate functions against scipy's, the equation that defines them, and the waves they are to carry."""
+"""Prolate functions against scipy's, the equation that defines them, and the waves
+they are to carry.
+"""
 
 import numpy as np
 import pytest
@@ -13,15 +15,23 @@ def test_functions_are_scipys(c):
     found = prolate(t, c, 6)
     for n in range(6):
         theirs = np.array([pro_ang1(0, n, c, x)[0] for x in t])
-        ours = found[:, n] * np.sign(found[:, n] @ theirs) * np.linalg.norm(theirs) / np.linalg.norm(found[:, n])
+        ours = (
+            found[:, n]
+            * np.sign(found[:, n] @ theirs)
+            * np.linalg.norm(theirs)
+            / np.linalg.norm(found[:, n])
+        )
         assert np.abs(ours - theirs).max() < 1e-6 * np.abs(theirs).max()
 
 
-@pytest.mark.parametrize("c, count", [(0.01, 1), (0.01, 2), (8.0, 21), (60.0, 70), (169.0, 121), (700.0, 480)])
+@pytest.mark.parametrize(
+    "c, count", [(0.01, 1), (0.01, 2), (8.0, 21), (60.0, 70), (169.0, 121), (700.0, 480)]
+)
 def test_they_are_orthonormal_eigenfunctions_of_band_limiting(c, count):
     t, w = roots_legendre(int(c) + count + 60)
     values = prolate(t, c, count)
-    assert np.abs(values.T @ (w[:, None] * values) - np.eye(count)).max() < 1e-9  # the rule's own weights at 1240 nodes
+    # the rule's own weights at 1240 nodes
+    assert np.abs(values.T @ (w[:, None] * values) - np.eye(count)).max() < 1e-9
     limited = (c / np.pi * np.sinc(c / np.pi * (t[:, None] - t))) @ (w[:, None] * values)
     shares = np.einsum("ij,i,ij->j", values, w, limited)
     assert np.abs(limited - shares * values).max() < 1e-9 * np.abs(values).max()

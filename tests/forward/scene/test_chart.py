@@ -8,7 +8,12 @@ def test_patches_fill_their_share_and_sit_where_they_should():
     labels = chart.chart_labels(400, 600, gap=0.2)
     counts = np.bincount(labels.ravel(), minlength=25)
     np.testing.assert_array_equal(counts[1:], 80 * 80)
-    assert labels[50, 50] == 1 and labels[50, 550] == 6 and labels[350, 50] == 19 and labels[350, 550] == 24
+    assert (
+        labels[50, 50] == 1
+        and labels[50, 550] == 6
+        and labels[350, 50] == 19
+        and labels[350, 550] == 24
+    )
     assert not labels[0].any() and not labels[:, 100].any()
 
 
@@ -30,7 +35,11 @@ def test_scene_carries_the_table():
     table = tables.colorchecker(wavelengths)[2]
     assert cube.shape == (4, 40, 60) and cube.dtype == np.float32
     for label in range(1, 25):
-        np.testing.assert_allclose(cube[:, labels == label], np.repeat(table[label - 1][:, None], (labels == label).sum(), 1), rtol=1e-6)
+        np.testing.assert_allclose(
+            cube[:, labels == label],
+            np.repeat(table[label - 1][:, None], (labels == label).sum(), 1),
+            rtol=1e-6,
+        )
     np.testing.assert_allclose(cube[:, labels == 0], 0.03, rtol=1e-6)
     np.testing.assert_array_equal(labels[5::10, 5::10].ravel(), np.arange(1, 25))
 
@@ -43,6 +52,8 @@ def test_gap_is_checked():
 def test_radiance_statistics_are_those_of_the_radiances():
     reflectance = np.random.default_rng(4).random((200, 3))
     light = np.array([2.0, 5.0, 0.1])
-    mean, covariance = statistics.radiance_statistics(*statistics.reflectance_statistics(reflectance), light)
+    mean, covariance = statistics.radiance_statistics(
+        *statistics.reflectance_statistics(reflectance), light
+    )
     np.testing.assert_allclose(mean, (reflectance * light).mean(0))
     np.testing.assert_allclose(covariance, np.cov((reflectance * light).T, bias=True))

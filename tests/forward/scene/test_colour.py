@@ -17,7 +17,12 @@ def reference():
 
 @pytest.mark.parametrize("light", ["D65", "A", "D50"])
 def test_white_points_are_the_published_ones(light):
-    published = {"D65": (0.95047, 1, 1.08883), "A": (1.09850, 1, 0.35585), "D50": (0.96422, 1, 0.82521)}  # ASTM E308
+    # ASTM E308
+    published = {
+        "D65": (0.95047, 1, 1.08883),
+        "A": (1.09850, 1, 0.35585),
+        "D50": (0.96422, 1, 0.82521),
+    }
     np.testing.assert_allclose(colour.white_point(light), published[light], atol=3e-4)
 
 
@@ -36,7 +41,9 @@ def test_flat_surfaces_are_grey_for_any_number_of_bands():
     for bands in ([550], [450, 650], [450, 540, 570, 650], range(400, 701, 10)):
         cube = np.full((len(bands), 2, 3), 0.4)
         for light in ("A", "D65", "3200 K"):
-            np.testing.assert_allclose(colour.preview_rgb(np.array(bands) * 1e-9, cube, light), 0.4, rtol=1e-5)
+            np.testing.assert_allclose(
+                colour.preview_rgb(np.array(bands) * 1e-9, cube, light), 0.4, rtol=1e-5
+            )
 
 
 def test_four_bands_show_the_chart_in_recognisable_colours():
@@ -48,7 +55,9 @@ def test_four_bands_show_the_chart_in_recognisable_colours():
         colour.lab(colour.xyz(wavelengths, coarse), white), colour.lab(colour.xyz(own, fine), white)
     )
     assert np.median(error) < 6 and error.max() < 20
-    rgb = dict(zip(names, colour.preview_rgb(wavelengths, coarse.T[:, :, None])[..., 0].T, strict=True))
+    rgb = dict(
+        zip(names, colour.preview_rgb(wavelengths, coarse.T[:, :, None])[..., 0].T, strict=True)
+    )
     assert [int(np.argmax(rgb[n])) for n in ("red", "green", "blue")] == [0, 1, 2]
 
 
@@ -63,14 +72,18 @@ def test_linear_srgb_agrees_with_colour_science(reference):
     theirs = reference.XYZ_to_sRGB(values, apply_cctf_encoding=False)
     np.testing.assert_allclose(colour.linear_srgb(values), theirs, atol=2e-3)
     ramp = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(colour.encode_srgb(ramp), reference.models.eotf_inverse_sRGB(ramp), atol=1e-6)
+    np.testing.assert_allclose(
+        colour.encode_srgb(ramp), reference.models.eotf_inverse_sRGB(ramp), atol=1e-6
+    )
 
 
 def test_lab_agrees_with_colour_science(reference):
     values = np.vstack([np.random.default_rng(6).random((50, 3)), [[1e-4, 2e-4, 0]]])
     xy = np.array([0.3127, 0.3290])
     white = np.array([xy[0] / xy[1], 1, (1 - xy.sum()) / xy[1]])
-    np.testing.assert_allclose(colour.lab(values, white), reference.XYZ_to_Lab(values, xy), atol=1e-9)
+    np.testing.assert_allclose(
+        colour.lab(values, white), reference.XYZ_to_Lab(values, xy), atol=1e-9
+    )
 
 
 def test_delta_e_gives_the_published_test_pairs():
@@ -89,11 +102,17 @@ def test_delta_e_gives_the_published_test_pairs():
         (2.0776, 0.0795, -1.1350, 0.9033, -0.0636, -0.5514, 0.9082),
     ]
     table = np.array(pairs)
-    np.testing.assert_allclose(colour.delta_e_2000(table[:, :3], table[:, 3:6]), table[:, 6], atol=1e-4)
-    np.testing.assert_allclose(colour.delta_e_2000(table[:, 3:6], table[:, :3]), table[:, 6], atol=1e-4)
+    np.testing.assert_allclose(
+        colour.delta_e_2000(table[:, :3], table[:, 3:6]), table[:, 6], atol=1e-4
+    )
+    np.testing.assert_allclose(
+        colour.delta_e_2000(table[:, 3:6], table[:, :3]), table[:, 6], atol=1e-4
+    )
 
 
 def test_delta_e_agrees_with_colour_science(reference):
     rng = np.random.default_rng(7)
     first, second = ((rng.random((2000, 3)) * [100, 160, 160]) - [0, 80, 80] for _ in range(2))
-    np.testing.assert_allclose(colour.delta_e_2000(first, second), reference.delta_E(first, second, "CIE 2000"), atol=1e-9)
+    np.testing.assert_allclose(
+        colour.delta_e_2000(first, second), reference.delta_E(first, second, "CIE 2000"), atol=1e-9
+    )

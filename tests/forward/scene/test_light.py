@@ -1,10 +1,12 @@
-"""Shares of the light that system matrices at single wavelengths stand for, against the integral over all wavelengths."""
+"""Shares of the light that system matrices at single wavelengths stand for, against the integral
+over all wavelengths.
+"""
 
 import numpy as np
 import pytest
 
-from plenocli.files.config.camera_file import parse_camera
 from plenocli.base.errors import UsageError
+from plenocli.files.config.camera_file import parse_camera
 from plenocli.forward.camera.pupil import filter_transmittance
 from plenocli.forward.scene.light import band_weights, broadband
 
@@ -31,7 +33,9 @@ wavelengths = ["450 nm", "540 nm", "650 nm"]
 FILTERS = """
 [filter_array]
 layout = [2, 2]
-filters = [ { center = "450 nm", fwhm = "15 nm" }, { center = "540 nm", fwhm = "20 nm", peak = 0.6 }, { center = "650 nm", fwhm = "15 nm" },
+filters = [ { center = "450 nm", fwhm = "15 nm" },
+            { center = "540 nm", fwhm = "20 nm", peak = 0.6 },
+            { center = "650 nm", fwhm = "15 nm" },
             { center = "650 nm", fwhm = "15 nm" } ]
 """
 
@@ -47,10 +51,15 @@ def test_nodes_carry_a_spectrum_that_is_linear_between_the_bands():
     np.testing.assert_allclose(bands, [450e-9, 540e-9, 650e-9])
     values = np.array([0.2, 0.9, 0.4])
     matrices = np.random.default_rng(0).random((len(light.wavelengths), 5))
-    direct = sum(n * np.interp(w, bands, values) * a for n, w, a in zip(light.photons, light.wavelengths, matrices))
+    direct = sum(
+        n * np.interp(w, bands, values) * a
+        for n, w, a in zip(light.photons, light.wavelengths, matrices)
+    )
     np.testing.assert_allclose(values @ weights @ matrices, direct, rtol=1e-12)
     some = slice(3, -4)  # wavelengths without light were left out
-    np.testing.assert_allclose(band_weights(camera, light.wavelengths[some], power)[1], weights[:, some], rtol=1e-12)
+    np.testing.assert_allclose(
+        band_weights(camera, light.wavelengths[some], power)[1], weights[:, some], rtol=1e-12
+    )
 
 
 def test_one_wavelength_a_filter_stands_for_all_that_it_passes():
@@ -59,8 +68,12 @@ def test_one_wavelength_a_filter_stands_for_all_that_it_passes():
     bands, weights = band_weights(camera, [451e-9, 540e-9, 650e-9], power)
     np.testing.assert_allclose(bands, [451e-9, 540e-9, 650e-9])
     for k, (filter_, wavelength) in enumerate(zip(camera.filter_array.filters, bands)):
-        passed = sum(n * filter_transmittance(filter_, w) for n, w in zip(light.photons, light.wavelengths))
-        assert weights[k, k] * filter_transmittance(filter_, wavelength) == pytest.approx(passed, rel=1e-12)
+        passed = sum(
+            n * filter_transmittance(filter_, w) for n, w in zip(light.photons, light.wavelengths)
+        )
+        assert weights[k, k] * filter_transmittance(filter_, wavelength) == pytest.approx(
+            passed, rel=1e-12
+        )
     assert np.count_nonzero(weights) == 3
     twice = band_weights(camera, [445e-9, 455e-9, 540e-9, 650e-9], power)[1]
     assert twice[0, 0] == pytest.approx(twice[1, 1]) and twice[2, 2] == pytest.approx(weights[1, 1])

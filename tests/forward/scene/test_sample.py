@@ -16,10 +16,17 @@ def brute(values, count, start, stop):
     return out
 
 
-@pytest.mark.parametrize("count, start, stop", [(3, 0, 7), (7, 0, 7), (20, 0, 7), (1, 0, 7), (5, 0.3, 6.1), (2, 2.25, 2.5)])
+@pytest.mark.parametrize(
+    "count, start, stop",
+    [(3, 0, 7), (7, 0, 7), (20, 0, 7), (1, 0, 7), (5, 0.3, 6.1), (2, 2.25, 2.5)],
+)
 def test_area_average_is_the_overlap_sum(count, start, stop):
     values = np.random.default_rng(1).random((7, 2))
-    np.testing.assert_allclose(sample.area_average(values, count, 0, start, stop), brute(values, count, start, stop), atol=1e-13)
+    np.testing.assert_allclose(
+        sample.area_average(values, count, 0, start, stop),
+        brute(values, count, start, stop),
+        atol=1e-13,
+    )
 
 
 def test_sampling_keeps_the_mean_of_the_part_it_took():
@@ -38,7 +45,9 @@ def test_sampling_is_centred_and_upright():
 
 def test_crop_takes_native_pixels():
     picture = np.arange(512 * 512.0).reshape(512, 512)
-    np.testing.assert_array_equal(sample.sample_picture(picture, 440, 440, "crop"), picture[36:476, 36:476])
+    np.testing.assert_array_equal(
+        sample.sample_picture(picture, 440, 440, "crop"), picture[36:476, 36:476]
+    )
     with pytest.raises(InputError, match="smaller"):
         sample.sample_picture(picture, 600, 440, "crop")
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from pipelines.make_tables import collect
 from plenocli.base.errors import ConfigError
 from plenocli.forward.scene import tables
-from pipelines.make_tables import collect
 
 
 def test_the_frozen_file_equals_colour_science():

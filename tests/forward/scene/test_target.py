@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.scene.target import find_chart, outside, paper_field, patch_cores, project, upright
+from plenocli.forward.scene.target import (
+    find_chart,
+    outside,
+    paper_field,
+    patch_cores,
+    project,
+    upright,
+)
 from tests.reference.chart import CHART, SHAPE, label_map, light, place
 
 
@@ -12,8 +19,11 @@ def test_the_chart_is_found_from_its_patches():
     found = find_chart(label_map())
     corners = np.array([[0, 0], [0, 6], [4, 0], [4, 6], [2, 3]], float)
     truth = np.concatenate([corners, np.ones((5, 1))], axis=1) @ CHART.T
-    np.testing.assert_allclose(project(found, corners), truth[:, :2] / truth[:, 2:], atol=0.5)  # centroids of patches in perspective
-    np.testing.assert_allclose(project(np.linalg.inv(found), project(found, corners)), corners, atol=1e-9)
+    # centroids of patches in perspective
+    np.testing.assert_allclose(project(found, corners), truth[:, :2] / truth[:, 2:], atol=0.5)
+    np.testing.assert_allclose(
+        project(np.linalg.inv(found), project(found, corners)), corners, atol=1e-9
+    )
 
 
 def test_a_chart_needs_patches_that_are_not_in_a_line():
@@ -27,13 +37,19 @@ def test_a_chart_needs_patches_that_are_not_in_a_line():
 def test_cores_lose_their_edges():
     labels = np.zeros((30, 30), int)
     labels[5:25, 5:25] = 7
-    np.testing.assert_array_equal(np.argwhere(patch_cores(labels, 4) == 7), np.argwhere(np.pad(np.ones((12, 12)), 9)))
+    np.testing.assert_array_equal(
+        np.argwhere(patch_cores(labels, 4) == 7), np.argwhere(np.pad(np.ones((12, 12)), 9))
+    )
 
 
 @pytest.mark.parametrize("mosaic", ["all", "quarter", "chequered"])
 def test_upright_shows_a_slope_of_the_chart_as_it_is(mosaic):
     at = place()
-    sites = {"all": np.ones(SHAPE, bool), "quarter": np.zeros(SHAPE, bool), "chequered": np.add.outer(*(np.arange(n) for n in SHAPE)) % 2 == 0}[mosaic]
+    sites = {
+        "all": np.ones(SHAPE, bool),
+        "quarter": np.zeros(SHAPE, bool),
+        "chequered": np.add.outer(*(np.arange(n) for n in SHAPE)) % 2 == 0,
+    }[mosaic]
     sites[1::2, ::2] |= mosaic == "quarter"
     picture = np.where(sites, 1 + 0.2 * at[..., 0] + 0.1 * at[..., 1], 1e6)
     picture[sites & (np.arange(sites.size).reshape(SHAPE) % 97 == 0)] = np.nan
@@ -43,7 +59,12 @@ def test_upright_shows_a_slope_of_the_chart_as_it_is(mosaic):
 
 
 def test_the_light_on_the_chart_is_told_by_printed_paper_around_it():
-    truth = np.array([light(np.array(k)) for k in ([-0.1, -0.4, -0.05, 0.03, -0.1], [0.1, -0.2, 0.02, -0.05, -0.2])])
+    truth = np.array(
+        [
+            light(np.array(k))
+            for k in ([-0.1, -0.4, -0.05, 0.03, -0.1], [0.1, -0.2, 0.02, -0.05, -0.2])
+        ]
+    )
     rng = np.random.default_rng(2)
     where = outside(CHART, SHAPE)
     paper = np.where(rng.uniform(size=SHAPE) < 0.25, 0.2, 0.85)  # printed dots

@@ -8,7 +8,8 @@ from plenocli.forward.sensor.readout import Levels, Readout
 from plenocli.forward.sensor.superpixel import extract
 
 SHAPE, WINDOW, BLACK = (60, 70), (9, 8), np.array([[100.0, 102.0], [98.0, 101.0]])
-ORIGIN = np.array([[0, 0], [3, 11], [51, 62], [20, 7], [-1, 5], [52, 0]])  # the last two are not wholly on the sensor
+# the last two are not wholly on the sensor
+ORIGIN = np.array([[0, 0], [3, 11], [51, 62], [20, 7], [-1, 5], [52, 0]])
 
 
 def mosaic(seed=0):
@@ -16,7 +17,9 @@ def mosaic(seed=0):
 
 
 def whole(readout):
-    light = (np.asarray(readout.values, np.float32) - readout.dark.at(readout.seconds)) * np.float32(readout.scale) - np.float32(readout.offset)
+    light = (
+        np.asarray(readout.values, np.float32) - readout.dark.at(readout.seconds)
+    ) * np.float32(readout.scale) - np.float32(readout.offset)
     return np.where(saturated(readout.values, readout.black, readout.white), np.nan, light)
 
 
@@ -29,16 +32,28 @@ def test_windows_hold_what_the_whole_mosaic_holds(seconds, flat, black):
     dark = Dark(level + noise, black, 0.1, 2.0)
     assert dark.flat == flat
     readout = Readout(mosaic(), dark, seconds, black, 4095.0, 0.25) - 3.0
-    np.testing.assert_allclose(readout.cut(ORIGIN, WINDOW), extract(whole(readout), ORIGIN, WINDOW), rtol=1e-6, atol=1e-4)
-    np.testing.assert_array_equal(extract(readout, ORIGIN.reshape(2, 3, 2), WINDOW), readout.cut(ORIGIN, WINDOW).reshape(2, 3, -1))
+    np.testing.assert_allclose(
+        readout.cut(ORIGIN, WINDOW), extract(whole(readout), ORIGIN, WINDOW), rtol=1e-6, atol=1e-4
+    )
+    np.testing.assert_array_equal(
+        extract(readout, ORIGIN.reshape(2, 3, 2), WINDOW),
+        readout.cut(ORIGIN, WINDOW).reshape(2, 3, -1),
+    )
     assert np.isnan(readout.cut(ORIGIN, WINDOW)).any(axis=-1)[:4].any()  # saturated pixels
 
 
 def test_levels_cut_before_change_nothing():
-    dark = Dark(tiled(BLACK, SHAPE) + np.random.default_rng(1).normal(0, 2, SHAPE).astype(np.float32), BLACK, None, 2.0)
+    dark = Dark(
+        tiled(BLACK, SHAPE) + np.random.default_rng(1).normal(0, 2, SHAPE).astype(np.float32),
+        BLACK,
+        None,
+        2.0,
+    )
     origin = ORIGIN[:4]
     plain = Readout(mosaic(), dark, None, BLACK, np.inf)
     ready = Readout(mosaic(), dark, None, BLACK, np.inf, ready=Levels(dark, origin, WINDOW).keep())
     np.testing.assert_array_equal(ready.cut(origin, WINDOW), plain.cut(origin, WINDOW))
     np.testing.assert_array_equal(ready.cut(origin + 1, WINDOW), plain.cut(origin + 1, WINDOW))
-    np.testing.assert_array_equal(ready.cutter(origin, WINDOW)(np.array([2, 0])), plain.cut(origin[[2, 0]], WINDOW))
+    np.testing.assert_array_equal(
+        ready.cutter(origin, WINDOW)(np.array([2, 0])), plain.cut(origin[[2, 0]], WINDOW)
+    )

@@ -1,4 +1,6 @@
-"""Lenslet grids: synthetic arrays with known centres, published test pictures, real cameras, and pictures without a lattice."""
+"""Lenslet grids: synthetic arrays with known centres, published test pictures, real cameras, and
+pictures without a lattice.
+"""
 
 import time
 
@@ -12,10 +14,25 @@ from plenocli.inverse.grid.detect import find_grid
 from tests.reference.prototype import superpixels
 
 
-def make_white(kind, pitch, angle, shape, *, seed=0, vignetting=0.0, falloff=0.0, noise=0.0, spot="disc", bend=0.0, phase=(0.31, -0.17)):
-    """White image and true centres (N, 2): soft discs or bells at exact lattice points, 14 bit, optional cubic distortion.
+def make_white(
+    kind,
+    pitch,
+    angle,
+    shape,
+    *,
+    seed=0,
+    vignetting=0.0,
+    falloff=0.0,
+    noise=0.0,
+    spot="disc",
+    bend=0.0,
+    phase=(0.31, -0.17),
+):
+    """White image and true centres (N, 2): soft discs or bells at exact lattice points, 14 bit,
+    optional cubic distortion.
 
-    vignetting dims whole superpixels towards the corners, falloff dims the sensor continuously."""
+    vignetting dims whole superpixels towards the corners, falloff dims the sensor continuously.
+    """
     rng = np.random.default_rng(seed)
     turn = np.radians(angle)
     right = pitch * np.array([np.sin(turn), np.cos(turn)])
@@ -39,7 +56,11 @@ def make_white(kind, pitch, angle, shape, *, seed=0, vignetting=0.0, falloff=0.0
         y, x = np.ogrid[low[0] : high[0], low[1] : high[1]]
         far = np.hypot(y - centre[0], x - centre[1])
         soft = max(0.06 * pitch, 0.45)
-        value = 0.5 - 0.5 * np.tanh((far - 0.38 * pitch) / soft) if spot == "disc" else np.exp(-0.5 * (far / (0.2 * pitch)) ** 2)
+        value = (
+            0.5 - 0.5 * np.tanh((far - 0.38 * pitch) / soft)
+            if spot == "disc"
+            else np.exp(-0.5 * (far / (0.2 * pitch)) ** 2)
+        )
         fall = 1 - vignetting * (((centre - middle) / radius) ** 2).sum()
         image[low[0] : high[0], low[1] : high[1]] += value * fall
     y, x = np.ogrid[: shape[0], : shape[1]]
@@ -49,12 +70,23 @@ def make_white(kind, pitch, angle, shape, *, seed=0, vignetting=0.0, falloff=0.0
 
 
 def compare(grid, centres, shape, pitch):
-    """Root mean square distance, px, of the fitted centres from the truth over whole lenslets; each found exactly once."""
-    whole = ((centres >= pitch / 2 - 0.5) & (centres <= np.array(shape) - 0.5 - pitch / 2)).all(axis=1)
-    inner = ((centres >= pitch / 2 + 0.5) & (centres <= np.array(shape) - 1.5 - pitch / 2)).all(axis=1)
+    """Root mean square distance, px, of the fitted centres from the truth over whole lenslets;
+    each found exactly once.
+    """
+    whole = ((centres >= pitch / 2 - 0.5) & (centres <= np.array(shape) - 0.5 - pitch / 2)).all(
+        axis=1
+    )
+    inner = ((centres >= pitch / 2 + 0.5) & (centres <= np.array(shape) - 1.5 - pitch / 2)).all(
+        axis=1
+    )
     found = grid.centres[grid.valid]
     miss, which = cKDTree(found).query(centres[inner])
-    assert len(set(which)) == inner.sum() <= grid.valid.sum() <= whole.sum() + 2 * (whole.sum() - inner.sum()) + 1
+    assert (
+        len(set(which))
+        == inner.sum()
+        <= grid.valid.sum()
+        <= whole.sum() + 2 * (whole.sum() - inner.sum()) + 1
+    )
     return np.sqrt(np.mean(miss**2))
 
 
@@ -115,7 +147,9 @@ def test_cubic_distortion_is_followed_and_a_straight_grid_is_not_bent():
 def test_array_order_rows_down_columns_right():
     white, _ = make_white("hexagonal", 21.0, 2.0, (300, 360))
     centres = find_grid(white).centres
-    assert (np.diff(centres[..., 0], axis=0) > 0.7 * 21 * 0.8).all() and (np.diff(centres[..., 1], axis=1) > 0.9 * 21).all()
+    assert (np.diff(centres[..., 0], axis=0) > 0.7 * 21 * 0.8).all() and (
+        np.diff(centres[..., 1], axis=1) > 0.9 * 21
+    ).all()
     # offset rows: two rows down is straight down but for the rotation of 2 degrees
     step = centres[2:] - centres[:-2]
     np.testing.assert_allclose(step[..., 1], -21 * np.sqrt(3) * np.sin(np.radians(2.0)), atol=0.05)
@@ -137,10 +171,26 @@ def photograph(name):
     return image if image.ndim == 2 else image[..., 1]
 
 
-@pytest.mark.parametrize("image", [
-    np.random.default_rng(0).normal(100, 10, (500, 600)), np.random.default_rng(1).poisson(3.0, (80, 90)),
-    np.add.outer(np.arange(300.0), np.arange(400.0)), *map(photograph, ("camera", "astronaut", "coins", "brick", "grass", "coffee")),
-], ids=["noise", "few photons", "ramp", "camera", "astronaut", "coins", "brick", "grass", "coffee"])
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.random.default_rng(0).normal(100, 10, (500, 600)),
+        np.random.default_rng(1).poisson(3.0, (80, 90)),
+        np.add.outer(np.arange(300.0), np.arange(400.0)),
+        *map(photograph, ("camera", "astronaut", "coins", "brick", "grass", "coffee")),
+    ],
+    ids=[
+        "noise",
+        "few photons",
+        "ramp",
+        "camera",
+        "astronaut",
+        "coins",
+        "brick",
+        "grass",
+        "coffee",
+    ],
+)
 def test_pictures_without_a_lattice_are_refused_with_what_was_seen(image):
     with pytest.raises(NumericsError, match="no lenslet lattice in the image: .+") as error:
         find_grid(image)
@@ -156,7 +206,10 @@ def test_a_chart_of_patches_is_no_white_image(seed):
 
 
 def coded_white(gap, border, levels=(1.0, 0.8, 0.9, 0.6), pitch=24, count=(12, 15)):
-    """Superpixels of four quadrants (filters in a square pupil) that tile the frame; gap and border: brightness of the dark lines."""
+    """Superpixels of four quadrants (filters in a square pupil) that tile the frame;
+
+    gap and border: brightness of the dark lines.
+    """
     cell = np.kron(np.array(levels).reshape(2, 2), np.ones((pitch // 2, pitch // 2)))
     middle = slice(pitch // 2 - 1, pitch // 2 + 1)
     cell[middle] *= gap
@@ -176,7 +229,9 @@ def test_filters_in_the_pupil_do_not_split_superpixels(gap, border):
     np.testing.assert_allclose(grid.centres, 24 * index + 11.5, atol=0.8)
 
 
-@pytest.mark.parametrize("pitch, side, blur", [(15.0, 13.1, 0.6), (24.3, 21.0, 0.9), (52.0, 45.4, 2.0)])
+@pytest.mark.parametrize(
+    "pitch, side, blur", [(15.0, 13.1, 0.6), (24.3, 21.0, 0.9), (52.0, 45.4, 2.0)]
+)
 @pytest.mark.parametrize("light", [(0.4, 0.6, 1.0, 0.45), (1.0, 0.3, 0.5, 0.8)])
 def test_filters_of_unlike_brightness_do_not_draw_the_grid_to_the_dimmer(pitch, side, blur, light):
     count, window = (5, 7), int(pitch) + 8
@@ -184,9 +239,21 @@ def test_filters_of_unlike_brightness_do_not_draw_the_grid_to_the_dimmer(pitch, 
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1)
     centres = (index + 0.5) * pitch + 5.3
     for centre in centres.reshape(-1, 2):
-        first = np.rint(centre - (window - 1) / 2).astype(int).clip(0, np.array(mean.shape) - window)
-        cells = superpixels(centre - first - (window - 1) / 2, pixels=window, side=side, gap=0.05 * pitch, blur=blur, fall=0.1, pitch=pitch)
-        mean[first[0] : first[0] + window, first[1] : first[1] + window] += (3000 * cells @ light).reshape(window, window)
+        first = (
+            np.rint(centre - (window - 1) / 2).astype(int).clip(0, np.array(mean.shape) - window)
+        )
+        cells = superpixels(
+            centre - first - (window - 1) / 2,
+            pixels=window,
+            side=side,
+            gap=0.05 * pitch,
+            blur=blur,
+            fall=0.1,
+            pitch=pitch,
+        )
+        mean[first[0] : first[0] + window, first[1] : first[1] + window] += (
+            3000 * cells @ light
+        ).reshape(window, window)
     grid = find_grid(np.random.default_rng(1).poisson(mean))
     assert grid.valid.all() and grid.centres.shape == (*count, 2)
     np.testing.assert_allclose(grid.centres.mean(axis=(0, 1)), centres.mean(axis=(0, 1)), atol=0.06)
@@ -223,7 +290,10 @@ def seconds(call):
     return time.process_time() - start, result
 
 
-@pytest.mark.parametrize("name, kind, bound, centred", [("a", "square", 0.75, True), ("b", "hexagonal", 0.030, False), ("d", "square", 0.010, False)])
+@pytest.mark.parametrize(
+    "name, kind, bound, centred",
+    [("a", "square", 0.75, True), ("b", "hexagonal", 0.030, False), ("d", "square", 0.010, False)],
+)
 def test_published_spot_pictures(shared_data, name, kind, bound, centred):
     took, grid = seconds(lambda: find_grid(read(shared_data / f"grid/{name}.png")))
     truth = np.loadtxt(shared_data / f"grid/{name}.txt")
@@ -232,16 +302,42 @@ def test_published_spot_pictures(shared_data, name, kind, bound, centred):
     distance, which = cKDTree(grid.centres.reshape(-1, 2)).query(truth)
     miss = grid.centres.reshape(-1, 2)[which] - truth
     assert grid.kind == kind and len(set(which)) == len(truth) and grid.valid.ravel()[which].all()
-    assert np.sqrt(((miss - (miss.mean(axis=0) if centred else 0)) ** 2).sum(axis=1).mean()) <= bound
+    assert (
+        np.sqrt(((miss - (miss.mean(axis=0) if centred else 0)) ** 2).sum(axis=1).mean()) <= bound
+    )
     if name == "a":  # its first row and column are drawn a pixel off the lattice of the rest
         np.testing.assert_allclose(grid.pitch, 142.857143, rtol=5e-4)
     assert took < 4  # 2 s on an idle core
 
 
 REAL = {
-    "letters": ("plenoptic/letters/letters_ULF_M1_white.png", "plenoptic/letters/letters_ULF_M1_dark.png", (48.2, 48.2273), 0.05, 450, 0.06, ("affine",)),
-    "guv": ("plenoptic/lfm_guv/Radiometry_GUVExperim1.tif", "plenoptic/lfm_guv/DarkFrame_GUVExperim1.tif", (15.4, 15.4), 0.03, 784, 0.03, ("radial", "poly2", "poly3")),
-    "antleg": ("plenoptic/lfm_antleg/radiometry_frame.png", "plenoptic/lfm_antleg/dark_frame.tif", (27.56, 27.55), 0.02, 7180, 0.12, ("radial", "poly2", "poly3")),
+    "letters": (
+        "plenoptic/letters/letters_ULF_M1_white.png",
+        "plenoptic/letters/letters_ULF_M1_dark.png",
+        (48.2, 48.2273),
+        0.05,
+        450,
+        0.06,
+        ("affine",),
+    ),
+    "guv": (
+        "plenoptic/lfm_guv/Radiometry_GUVExperim1.tif",
+        "plenoptic/lfm_guv/DarkFrame_GUVExperim1.tif",
+        (15.4, 15.4),
+        0.03,
+        784,
+        0.03,
+        ("radial", "poly2", "poly3"),
+    ),
+    "antleg": (
+        "plenoptic/lfm_antleg/radiometry_frame.png",
+        "plenoptic/lfm_antleg/dark_frame.tif",
+        (27.56, 27.55),
+        0.02,
+        7180,
+        0.12,
+        ("radial", "poly2", "poly3"),
+    ),
 }
 
 
@@ -260,7 +356,15 @@ def test_real_cameras(shared_data, name):
 
 def test_a_real_chart_is_refused(shared_data):
     with pytest.raises(NumericsError, match="no lenslet lattice in the image: .+"):
-        find_grid(read(shared_data / "spectra/colorchecker_filtered/multispectral_images/d2_colorChecker30cm_dHyper_550nm.tif"))
+        find_grid(
+            read(
+                shared_data
+                / (
+                    "spectra/colorchecker_filtered/multispectral_images/d2_"
+                    "colorChecker30cm_dHyper_550nm.tif"
+                )
+            )
+        )
 
 
 def test_reduction_and_kind():
@@ -275,29 +379,41 @@ def test_reduction_and_kind():
 def test_array_indices_round_trip():
     index = np.stack(np.meshgrid(np.arange(-5, 6), np.arange(-7, 8), indexing="ij"), axis=-1)
     for kind in ("square", "hexagonal"):
-        np.testing.assert_array_equal(lattice.from_array(lattice.to_array(index, kind), kind), index)
+        np.testing.assert_array_equal(
+            lattice.from_array(lattice.to_array(index, kind), kind), index
+        )
 
 
 def test_maps_recover_exact_data_and_the_simplest_is_chosen():
     rng = np.random.default_rng(0)
-    index = np.stack(np.meshgrid(np.arange(20), np.arange(25), indexing="ij"), axis=-1).reshape(-1, 2)
+    index = np.stack(np.meshgrid(np.arange(20), np.arange(25), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     affine = index @ np.array([[10.0, 0.2], [-0.3, 9.8]]) + 40
     perspective = affine / (1 + index @ np.array([1e-4, -2e-4]))[:, None]
-    np.testing.assert_allclose(distortion.fit_model("homography", index, perspective).at(index), perspective, atol=1e-7)
+    np.testing.assert_allclose(
+        distortion.fit_model("homography", index, perspective).at(index), perspective, atol=1e-7
+    )
     spoilt = affine.copy()
     spoilt[::17] += 3.0
-    np.testing.assert_allclose(distortion.fit_model("affine", index, spoilt).at(index), affine, atol=1e-6)
+    np.testing.assert_allclose(
+        distortion.fit_model("affine", index, spoilt).at(index), affine, atol=1e-6
+    )
     noisy = rng.normal(0, 0.02, affine.shape)
     assert distortion.choose_model(index, affine + noisy)[0].kind == "affine"
     assert distortion.choose_model(index, perspective + noisy)[0].kind == "homography"
     away = perspective - perspective.mean(axis=0) - (5, -8)
     barrel = perspective + 1e-6 * (away**2).sum(axis=1, keepdims=True) * away
-    np.testing.assert_allclose(distortion.fit_model("radial", index, barrel).at(index), barrel, atol=2e-3)
+    np.testing.assert_allclose(
+        distortion.fit_model("radial", index, barrel).at(index), barrel, atol=2e-3
+    )
     assert distortion.choose_model(index, barrel + noisy)[0].kind == "radial"
 
 
 def test_a_border_row_off_the_lattice_does_not_bend_the_map():
-    index = np.stack(np.meshgrid(np.arange(9), np.arange(11), indexing="ij"), axis=-1).reshape(-1, 2)
+    index = np.stack(np.meshgrid(np.arange(9), np.arange(11), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     true = index @ np.array([[60.0, 1.0], [-1.0, 60.0]]) + 40
     seen = true + np.random.default_rng(0).normal(0, 0.02, true.shape)
     seen[index[:, 0] == 0] += (0.3, 0.0)

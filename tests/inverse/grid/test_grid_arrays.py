@@ -1,4 +1,6 @@
-"""The grid of rendered arrays whose centres are known: pitch within 1e-5, centres within 0.005 px (0.015 px from 40 px of pitch on)."""
+"""The grid of rendered arrays whose centres are known: pitch within 1e-5, centres within 0.005
+px (0.015 px from 40 px of pitch on).
+"""
 
 import numpy as np
 import pytest
@@ -16,14 +18,41 @@ def arrays():
     out = []
     for k, kind in enumerate(("square", "hexagonal")):
         for i, pitch in enumerate(PITCHES):
-            base = dict(kind=kind, pitch=pitch, sites=9 if pitch >= 200 else max(14, min(60, int(480 / pitch))))
+            base = dict(
+                kind=kind,
+                pitch=pitch,
+                sites=9 if pitch >= 200 else max(14, min(60, int(480 / pitch))),
+            )
             angle = [ANGLES[(i + 3 * j + k) % 8] for j in range(3)]
             seed = 100 * k + 10 * i
             out.append(Array(**base, angle=angle[0], vignetting=0.5, dead=1e-3, dust=2, seed=seed))
-            out.append(Array(**base, angle=angle[1], vignetting=0.5, falloff="lenslet", cubic=0.004 * (-1) ** i, perspective=0.003, dust=3,
-                             electrons=8000, read=0.004, seed=seed + 1))
-            out.append(Array(**base, angle=angle[2], vignetting=0.3, perspective=0.01, gains=(0.45, 1.0, 0.9, 0.3), dead=1e-3, dust=2,
-                             spot="bell" if pitch < 12 else "disc", seed=seed + 2))
+            out.append(
+                Array(
+                    **base,
+                    angle=angle[1],
+                    vignetting=0.5,
+                    falloff="lenslet",
+                    cubic=0.004 * (-1) ** i,
+                    perspective=0.003,
+                    dust=3,
+                    electrons=8000,
+                    read=0.004,
+                    seed=seed + 1,
+                )
+            )
+            out.append(
+                Array(
+                    **base,
+                    angle=angle[2],
+                    vignetting=0.3,
+                    perspective=0.01,
+                    gains=(0.45, 1.0, 0.9, 0.3),
+                    dead=1e-3,
+                    dust=2,
+                    spot="bell" if pitch < 12 else "disc",
+                    seed=seed + 2,
+                )
+            )
     return out
 
 
@@ -37,10 +66,19 @@ QUICK = [6, 10, 14, 15, 33, 37, 41, 45]
 
 
 def name(array):
-    return f"{array.kind}-{array.pitch:g}px-{array.angle:g}deg-{'cfa' if array.gains else array.falloff}"
+    return (
+        f"{array.kind}-{array.pitch:g}px-{array.angle:g}"
+        f"deg-{'cfa' if array.gains else array.falloff}"
+    )
 
 
-@pytest.mark.parametrize("array", [pytest.param(a, id=name(a), marks=() if n in QUICK else pytest.mark.slow) for n, a in enumerate(arrays())])
+@pytest.mark.parametrize(
+    "array",
+    [
+        pytest.param(a, id=name(a), marks=() if n in QUICK else pytest.mark.slow)
+        for n, a in enumerate(arrays())
+    ],
+)
 def test_every_lenslet_is_found_where_it_is(array):
     white, _ = render(array)
     index, centres = true_centres(array)
@@ -52,13 +90,17 @@ def test_every_lenslet_is_found_where_it_is(array):
     assert grid.kind == array.kind
     assert len(set(which)) == len(centres), "every whole lenslet once"
     assert np.sqrt(np.mean(miss**2)) <= (0.005 if array.pitch < 40 else 0.015)
-    np.testing.assert_allclose(mean_pitch(index, found[which]), mean_pitch(index, centres), rtol=1e-5)
+    np.testing.assert_allclose(
+        mean_pitch(index, found[which]), mean_pitch(index, centres), rtol=1e-5
+    )
     if not (array.perspective or array.cubic):
         np.testing.assert_allclose(grid.pitch, array.pitch, rtol=1e-5)
 
 
 def test_the_rendering_itself():
-    """The light of one disc is its area; its centroid is its centre; a pixel is the mean over its area."""
+    """The light of one disc is its area; its centroid is its centre; a pixel is the
+    mean over its area.
+    """
     array = Array("square", 30.0, sites=8, phase=(0.13, 0.21), electrons=1e9, read=0.0)
     white, centres = render(array)
     light = (white.astype(float) - 400) / 12000
@@ -69,4 +111,6 @@ def test_the_rendering_itself():
         part = light[low[0] : high[0], low[1] : high[1]] * near
         edge = 0.03 * 30.0
         assert part.sum() == pytest.approx(np.pi * ((0.42 * 30.0) ** 2 + edge**2), rel=4e-3)
-        np.testing.assert_allclose([(part * y).sum() / part.sum(), (part * x).sum() / part.sum()], centre, atol=0.02)
+        np.testing.assert_allclose(
+            [(part * y).sum() / part.sum(), (part * x).sum() / part.sum()], centre, atol=0.02
+        )

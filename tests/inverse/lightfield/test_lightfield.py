@@ -11,19 +11,31 @@ PIXEL = PITCH * (1 + GAP / IMAGE) / PITCH_PX
 
 
 def scene(x, y):
-    """Radiance on the plane of the lenslets' images, x and y in lenslet pitches: stripes and a blob."""
-    return 0.5 + 0.3 * np.sin(2 * np.pi * (0.11 * x + 0.07 * y)) * np.cos(2 * np.pi * 0.09 * y) + 0.2 * np.exp(-((x - 2) ** 2 + (y + 3) ** 2) / 8)
+    """Radiance on the plane of the lenslets' images, x and y in lenslet pitches:
+    stripes and a blob.
+    """
+    return (
+        0.5
+        + 0.3 * np.sin(2 * np.pi * (0.11 * x + 0.07 * y)) * np.cos(2 * np.pi * 0.09 * y)
+        + 0.2 * np.exp(-((x - 2) ** 2 + (y + 3) ** 2) / 8)
+    )
 
 
 def capture(distance, split=None):
-    """Mosaic of a flat scene at `distance` (m) by rays: pixel -> lenslet centre -> main lens -> object plane; split: another distance
-    for the right half of the object, or None. Written in lengths, not in slopes."""
+    """Mosaic of a flat scene at `distance` (m) by rays: pixel -> lenslet centre -> main
+    lens -> object plane;
+
+    split: another distance for the right half of the object, or None. Written in
+        lengths, not in slopes.
+    """
     side = COUNT * PITCH_PX
     place = (np.arange(side) - (side - 1) / 2) * PIXEL
     lenslet = (np.arange(side) // PITCH_PX - (COUNT - 1) / 2) * PITCH
 
     def on_object(z):
-        """Where the rays of a line of pixels meet the plane at z, m, as its image would stand on the array."""
+        """Where the rays of a line of pixels meet the plane at z, m, as its image would
+        stand on the array.
+        """
         lens = lenslet - (place - lenslet) * IMAGE / GAP  # on the main lens
         # thin lens: direction on the object's side for the ray that goes from `lens` to the lenslet
         image_side = (lenslet - lens) / IMAGE
@@ -43,11 +55,15 @@ def capture(distance, split=None):
 
 
 def samples(mosaic, noise=0.0):
-    centres = np.stack(np.meshgrid(*[(np.arange(COUNT) + 0.5) * PITCH_PX - 0.5] * 2, indexing="ij"), axis=-1)
+    centres = np.stack(
+        np.meshgrid(*[(np.arange(COUNT) + 0.5) * PITCH_PX - 0.5] * 2, indexing="ij"), axis=-1
+    )
     rows, columns = np.indices(mosaic.shape)
     inside = ((rows % PITCH_PX - 5) ** 2 + (columns % PITCH_PX - 5) ** 2 <= 25).astype(float)
     noisy = mosaic + noise * np.random.default_rng(0).normal(size=mosaic.shape)
-    return lightfield.collect(noisy * inside, inside, centres, np.ones((COUNT, COUNT), bool), PITCH_PX)
+    return lightfield.collect(
+        noisy * inside, inside, centres, np.ones((COUNT, COUNT), bool), PITCH_PX
+    )
 
 
 def slope(distance):
@@ -56,7 +72,9 @@ def slope(distance):
 
 @pytest.mark.parametrize("distance", [0.45, 0.52, 0.55, 0.58, 0.75, np.inf])
 def test_slopes_and_distances_are_each_others_inverse(distance):
-    assert lightfield.distance_of(slope(distance), FOCAL, IMAGE, GAP) == pytest.approx(distance, rel=1e-9)
+    assert lightfield.distance_of(slope(distance), FOCAL, IMAGE, GAP) == pytest.approx(
+        distance, rel=1e-9
+    )
     assert (slope(distance) > 0) == (distance < 0.55 - 1e-9)
 
 
@@ -71,9 +89,19 @@ def test_a_plane_is_sharpest_and_right_at_its_own_slope(distance):
     errors = {}
     for offset in (-1.6, -0.5, 0.0, 0.5, 1.6):
         picture, spread = lightfield.refocus(made, own + offset, (COUNT, COUNT))
-        errors[offset] = float(np.sqrt(np.mean((picture - true)[inner] ** 2))), float(np.mean(spread[inner]))
-    assert min(errors, key=lambda o: errors[o][0]) == 0 and min(errors, key=lambda o: errors[o][1]) == 0
-    assert errors[0.0][0] < 0.02 and errors[1.6][0] > 1.4 * errors[0.0][0] and errors[1.6][1] > 1.5 * errors[0.0][1]
+        errors[offset] = (
+            float(np.sqrt(np.mean((picture - true)[inner] ** 2))),
+            float(np.mean(spread[inner])),
+        )
+    assert (
+        min(errors, key=lambda o: errors[o][0]) == 0
+        and min(errors, key=lambda o: errors[o][1]) == 0
+    )
+    assert (
+        errors[0.0][0] < 0.02
+        and errors[1.6][0] > 1.4 * errors[0.0][0]
+        and errors[1.6][1] > 1.5 * errors[0.0][1]
+    )
 
 
 @pytest.mark.parametrize("far, near", [(0.556, 0.541), (0.6, 0.5), (0.75, 0.6)])
@@ -86,9 +114,15 @@ def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(n
     left, right = found[4:-4, 4:10], found[4:-4, 15:-4]
     sure_left, sure_right = inner[:, :6], inner[:, 11:]
     assert sure_left.mean() > 0.4 and sure_right.mean() > 0.4
-    assert abs(np.median(left[sure_left]) - slope(far)) < 0.1 and abs(np.median(right[sure_right]) - slope(near)) < 0.1
+    assert (
+        abs(np.median(left[sure_left]) - slope(far)) < 0.1
+        and abs(np.median(right[sure_right]) - slope(near)) < 0.1
+    )
     distances = lightfield.distance_of(right[sure_right], FOCAL, IMAGE, GAP)
-    limit = abs(lightfield.distance_of(slope(near) + 0.5, FOCAL, IMAGE, GAP) - lightfield.distance_of(slope(near) - 0.5, FOCAL, IMAGE, GAP))
+    limit = abs(
+        lightfield.distance_of(slope(near) + 0.5, FOCAL, IMAGE, GAP)
+        - lightfield.distance_of(slope(near) - 0.5, FOCAL, IMAGE, GAP)
+    )
     assert abs(np.median(distances) - near) < 0.2 * limit
 
 

@@ -6,9 +6,9 @@ from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
 from plenocli.evaluation.metrics.quality import psnr
+from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance, sample_picture
 from plenocli.inverse.picture import block_matching as denoise
-from plenocli.files.read.scenes import embedded_photograph
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,27 @@ def by_loops(picture, sigma, pilot):
     window = np.outer(np.kaiser(p, 2.0), np.kaiser(p, 2.0))
     for r in corners[0]:
         for c in corners[1]:
-            near = [(a, b) for a in range(max(0, r - denoise.WINDOW), min(picture.shape[0] - p, r + denoise.WINDOW) + 1)
-                    for b in range(max(0, c - denoise.WINDOW), min(picture.shape[1] - p, c + denoise.WINDOW) + 1)]
-            far = {(a, b): -1.0 if (a, b) == (r, c) else np.sum((guide[a : a + p, b : b + p] - guide[r : r + p, c : c + p]) ** 2) for a, b in near}
+            near = [
+                (a, b)
+                for a in range(
+                    max(0, r - denoise.WINDOW), min(picture.shape[0] - p, r + denoise.WINDOW) + 1
+                )
+                for b in range(
+                    max(0, c - denoise.WINDOW), min(picture.shape[1] - p, c + denoise.WINDOW) + 1
+                )
+            ]
+            far = {
+                (a, b): -1.0
+                if (a, b) == (r, c)
+                else np.sum((guide[a : a + p, b : b + p] - guide[r : r + p, c : c + p]) ** 2)
+                for a, b in near
+            }
             near = sorted(near, key=far.get)[:k]
-            transform = lambda x: np.tensordot(hadamard(k) / np.sqrt(k), np.stack([dctn(x[a : a + p, b : b + p], norm="ortho") for a, b in near]), 1)  # noqa: E731
+            transform = lambda x: np.tensordot(
+                hadamard(k) / np.sqrt(k),
+                np.stack([dctn(x[a : a + p, b : b + p], norm="ortho") for a, b in near]),
+                1,
+            )
             z = transform(picture)
             if pilot is None:
                 keep = np.abs(z) > denoise.THRESHOLD * sigma
@@ -51,7 +67,9 @@ def by_loops(picture, sigma, pilot):
 def test_it_is_the_plain_loop(noisy, with_pilot):
     truth, picture = noisy
     picture, pilot = picture[:22, :25], truth[:22, :25] if with_pilot else None
-    np.testing.assert_allclose(denoise.block_matching(picture, 0.05, pilot), by_loops(picture, 0.05, pilot), atol=2e-5)
+    np.testing.assert_allclose(
+        denoise.block_matching(picture, 0.05, pilot), by_loops(picture, 0.05, pilot), atol=2e-5
+    )
 
 
 def test_it_beats_total_variation_and_a_pilot_helps(noisy):
@@ -84,5 +102,7 @@ def test_the_unit_of_the_picture_does_not_matter(unit):
     picture = rng.random((20, 24))
     pilot = picture + 0.01 * rng.normal(size=picture.shape)
     for first, second in ((None, None), (pilot, unit * pilot)):
-        assert denoise.block_matching(unit * picture, unit * 0.1, second) == pytest.approx(unit * denoise.block_matching(picture, 0.1, first), rel=1e-4)
+        assert denoise.block_matching(unit * picture, unit * 0.1, second) == pytest.approx(
+            unit * denoise.block_matching(picture, 0.1, first), rel=1e-4
+        )
     assert not denoise.block_matching(np.zeros((9, 9)), 0.1).any()

@@ -18,11 +18,18 @@ def test_converged_is_optimal_and_unbeaten(problem):
     a, z = problem
     found = nnls.converged(a, z)
     g = a.T @ (a @ found.x - z)
-    assert found.x.min() >= 0 and np.any(found.x == 0) and g.min() > -1e-10 and np.abs(g[found.x > 0]).max() < 1e-10
+    assert (
+        found.x.min() >= 0
+        and np.any(found.x == 0)
+        and g.min() > -1e-10
+        and np.abs(g[found.x > 0]).max() < 1e-10
+    )
     rng = np.random.default_rng(1)
     for _ in range(50):
         other = np.maximum(found.x + 0.1 * rng.standard_normal(found.x.shape), 0)
-        assert np.all(np.sum((a @ other - z) ** 2, axis=0) >= np.sum((a @ found.x - z) ** 2, axis=0))
+        assert np.all(
+            np.sum((a @ other - z) ** 2, axis=0) >= np.sum((a @ found.x - z) ** 2, axis=0)
+        )
 
 
 def test_the_plain_solution_where_it_is_positive():
@@ -34,7 +41,9 @@ def test_the_plain_solution_where_it_is_positive():
 def test_gradient_steps_approach_the_converged_solution(problem):
     a, z = problem
     best = np.sum((a @ nnls.converged(a, z).x - z) ** 2)
-    excess = [np.sum((a @ nnls.projected_gradient(a, z, n).x - z) ** 2) - best for n in (10, 100, 5000)]
+    excess = [
+        np.sum((a @ nnls.projected_gradient(a, z, n).x - z) ** 2) - best for n in (10, 100, 5000)
+    ]
     assert excess[0] > excess[1] > excess[2] >= -1e-9 and excess[2] < 1e-2 * excess[0]
     assert nnls.projected_gradient(a, z, 10).iterations == 10
 

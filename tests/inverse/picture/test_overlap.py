@@ -1,12 +1,15 @@
-"""The joint LMMSE of plenocli.inverse.picture.overlap with statistics that were measured, of pictures that make poor ones, down to almost no noise."""
+"""The joint LMMSE of plenocli.inverse.picture.overlap with statistics that were measured, of
+pictures that make poor ones, down to almost no noise.
+"""
 
 import numpy as np
 import pytest
 
-from plenocli.forward.scene.sample import luminance
-from plenocli.inverse.picture import least_squares as linear, overlap
-from plenocli.inverse.prior import natural_images as natural
 from plenocli.files.read.scenes import embedded_photograph
+from plenocli.forward.scene.sample import luminance
+from plenocli.inverse.picture import least_squares as linear
+from plenocli.inverse.picture import overlap
+from plenocli.inverse.prior import natural_images as natural
 
 POINTS, RING = (4, 3), np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
 DRAWS = 5
@@ -16,7 +19,12 @@ def picture(name):
     y, x = np.mgrid[:60, :48]
     if name == "photograph":
         return np.asarray(luminance(embedded_photograph("chelsea")), float)[:60, :48]
-    return {"ramp": y / 60, "disc": 0.1 + 0.8 * (np.hypot(y - 25, x - 20) < 12), "point": (x == 20) * (y == 30) * 1.0, "stripes": 0.5 + 0.5 * np.sign(np.sin(x))}[name]
+    return {
+        "ramp": y / 60,
+        "disc": 0.1 + 0.8 * (np.hypot(y - 25, x - 20) < 12),
+        "point": (x == 20) * (y == 30) * 1.0,
+        "stripes": 0.5 + 0.5 * np.sign(np.sin(x)),
+    }[name]
 
 
 @pytest.mark.parametrize("name", ["photograph", "ramp", "disc", "point", "stripes"])
@@ -24,7 +32,9 @@ def test_what_is_measured_is_a_covariance(name):
     reach = 19
     raw = picture(name)
     mean, found = natural.autocovariance([raw], reach)
-    assert mean == pytest.approx(raw.mean()) and found[reach, reach] == pytest.approx(raw.var(), rel=1e-9)
+    assert mean == pytest.approx(raw.mean()) and found[reach, reach] == pytest.approx(
+        raw.var(), rel=1e-9
+    )
     np.testing.assert_allclose(found, found[::-1, ::-1], atol=1e-12 * found.max())
     r, c = np.divmod(np.arange(400), 20)  # any points with lags within reach
     cover = found[r[:, None] - r + reach, c[:, None] - c + reach]
@@ -34,31 +44,59 @@ def test_what_is_measured_is_a_covariance(name):
 @pytest.mark.parametrize("snr_db", [20, 60, 120, 200])
 @pytest.mark.parametrize("name", ["photograph", "ramp", "disc", "point"])
 def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
-    """Matrices whose directions fade as those of cameras do; at 120 dB only what rounding leaves is known."""
+    """Matrices whose directions fade as those of cameras do; at 120 dB only what
+    rounding leaves is known.
+    """
     rng = np.random.default_rng(6)
-    blocks = rng.random((9, 20, 12)) * np.where(np.any(RING != 0, axis=1), 0.03, 1)[:, None, None] * np.logspace(0, -6, 20)[:, None]
-    mean, found = natural.autocovariance([picture(name)], reach := overlap.needed_reach(POINTS, RING))
+    blocks = (
+        rng.random((9, 20, 12))
+        * np.where(np.any(RING != 0, axis=1), 0.03, 1)[:, None, None]
+        * np.logspace(0, -6, 20)[:, None]
+    )
+    mean, found = natural.autocovariance(
+        [picture(name)], reach := overlap.needed_reach(POINTS, RING)
+    )
     sigma = float(np.sqrt(np.mean((mean * blocks.sum(axis=(0, 2))) ** 2)) * 10 ** (-snr_db / 20))
-    joint = overlap.prepare_joint(linear.decompose(blocks[4]), blocks, RING, POINTS, mean, found, sigma)
-    lenslet, (r, c) = np.divmod(np.arange(25 * 12), 12)[0], np.divmod(np.arange(25 * 12) % 12, POINTS[1])
+    joint = overlap.prepare_joint(
+        linear.decompose(blocks[4]), blocks, RING, POINTS, mean, found, sigma
+    )
+    lenslet, (r, c) = (
+        np.divmod(np.arange(25 * 12), 12)[0],
+        np.divmod(np.arange(25 * 12) % 12, POINTS[1]),
+    )
     r, c = r + lenslet // 5 * POINTS[0], c + lenslet % 5 * POINTS[1]
     cover = found[r[:, None] - r + reach, c[:, None] - c + reach]
     matrix = np.zeros((9, 20, 25, 12))  # what the 3x3 lenslets in the middle of 5x5 see
     for k, (dr, dc) in enumerate(RING):
-        for block, (er, ec) in zip(blocks, RING):  # the light of the object of lenslet i falls on superpixel i + offset
+        # the light of the object of lenslet i falls on superpixel i + offset
+        for block, (er, ec) in zip(blocks, RING):
             matrix[k, :, (2 + dr - er) * 5 + 2 + dc - ec] += block
     matrix = matrix.reshape(180, 300)
     values, vectors = np.linalg.eigh(cover)
-    x = mean + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * rng.standard_normal((300, DRAWS)))
+    x = mean + vectors @ (
+        np.sqrt(np.maximum(values, 0))[:, None] * rng.standard_normal((300, DRAWS))
+    )
     y = matrix @ x + sigma * rng.standard_normal((180, DRAWS))
     own = np.s_[12 * 12 : 13 * 12]
     error, expected = np.empty((2, DRAWS, 12))
     for k in range(DRAWS):
         estimate, spread = joint.apply(y[:, k].reshape(3, 3, 20))
         error[k], expected[k] = estimate[1, 1] - x[own, k], spread[1, 1]
-    assert np.isfinite(error).all() and (expected <= np.sqrt(found[reach, reach]) * (1 + 1e-12)).all()
-    assert np.sqrt(np.mean(error**2)) < 2 * np.sqrt(np.mean(expected**2)) + 1e-6 * np.sqrt(found.max())
+    assert (
+        np.isfinite(error).all() and (expected <= np.sqrt(found[reach, reach]) * (1 + 1e-12)).all()
+    )
+    assert np.sqrt(np.mean(error**2)) < 2 * np.sqrt(np.mean(expected**2)) + 1e-6 * np.sqrt(
+        found.max()
+    )
     if snr_db <= 60:
-        seen = np.kron(np.eye(9), joint.analysis)  # light of the neighbours that the own block does not give is not looked at
-        gain = np.linalg.solve(seen @ matrix @ cover @ (seen @ matrix).T + sigma**2 * np.eye(len(seen)), seen @ matrix @ cover[:, own]).T
-        np.testing.assert_allclose(error.T, mean + gain @ seen @ (y - matrix.sum(axis=1, keepdims=True) * mean) - x[own], atol=1e-6 * np.sqrt(found.max()))
+        # light of the neighbours that the own block does not give is not looked at
+        seen = np.kron(np.eye(9), joint.analysis)
+        gain = np.linalg.solve(
+            seen @ matrix @ cover @ (seen @ matrix).T + sigma**2 * np.eye(len(seen)),
+            seen @ matrix @ cover[:, own],
+        ).T
+        np.testing.assert_allclose(
+            error.T,
+            mean + gain @ seen @ (y - matrix.sum(axis=1, keepdims=True) * mean) - x[own],
+            atol=1e-6 * np.sqrt(found.max()),
+        )

@@ -1,11 +1,14 @@
-"""The proximal step against dense linear algebra, total variation against a general minimiser, plug and play against closed forms."""
+"""The proximal step against dense linear algebra, total variation against a general minimiser,
+plug and play against closed forms.
+"""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from plenocli.base.tiling import to_blocks, to_plane
-from plenocli.inverse.picture import least_squares as linear, whole_sensor as wholesensor
+from plenocli.inverse.picture import least_squares as linear
+from plenocli.inverse.picture import whole_sensor as wholesensor
 
 N, PIXELS, COUNT, SIGMA = 4, 25, (3, 2), 0.02
 
@@ -24,8 +27,13 @@ def sensor():
 def test_proximal_is_the_normal_equations(sensor, tau):
     svd, matrix, y, truth = sensor
     v, alpha = np.random.default_rng(1).random(truth.shape), (SIGMA / tau) ** 2
-    expected = np.linalg.solve(matrix.T @ matrix + alpha * np.eye(matrix.shape[1]), matrix.T @ y.ravel() + alpha * v.ravel())
-    exact = wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e6).proximal(to_plane(v, (N, N)), tau)
+    expected = np.linalg.solve(
+        matrix.T @ matrix + alpha * np.eye(matrix.shape[1]),
+        matrix.T @ y.ravel() + alpha * v.ravel(),
+    )
+    exact = wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e6).proximal(
+        to_plane(v, (N, N)), tau
+    )
     np.testing.assert_allclose(to_blocks(exact, (N, N)).ravel(), expected, rtol=1e-6, atol=1e-8)
     short = wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=0.5)
     assert len(short.s) < N * N
@@ -45,7 +53,9 @@ def test_held_lenslets_stay_and_rounds_are_what_they_say(sensor):
         return x / (1 + tau)
 
     found = wholesensor.plug_and_play(term, start, shrink, [0.5, 0.2])
-    np.testing.assert_allclose(found, term.proximal(term.proximal(start / 1.5, 0.5) / 1.2, 0.2), atol=1e-12)
+    np.testing.assert_allclose(
+        found, term.proximal(term.proximal(start / 1.5, 0.5) / 1.2, 0.2), atol=1e-12
+    )
     np.testing.assert_array_equal(to_blocks(found, (N, N))[0, 1], truth[0, 1])
     assert taus == [0.5, 0.2]
 
@@ -85,9 +95,21 @@ def test_total_variation_is_the_minimum(sensor):
         grad[:, 1:] += right[:, :-1]
         return value, grad.ravel()
 
-    found = wholesensor.total_variation(wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e3), np.full((12, 8), 0.3), error, rounds=range(120))
+    found = wholesensor.total_variation(
+        wholesensor.DataTerm(svd, (N, N), y, SIGMA, contrast=1e3),
+        np.full((12, 8), 0.3),
+        error,
+        rounds=range(120),
+    )
     best = np.full(96, 0.3)
     for smooth in (1e-1, 1e-2, 1e-3, 1e-4):
-        best = minimize(objective, best, (smooth,), jac=True, method="L-BFGS-B", options={"maxiter": 1000, "maxfun": 1500, "ftol": 1e-14, "gtol": 1e-8}).x
+        best = minimize(
+            objective,
+            best,
+            (smooth,),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": 1000, "maxfun": 1500, "ftol": 1e-14, "gtol": 1e-8},
+        ).x
     assert objective(found.ravel()) < objective(best) * 1.005
     assert objective(found.ravel()) < 0.5 * objective(np.full(96, 0.3))

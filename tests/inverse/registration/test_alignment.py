@@ -1,30 +1,50 @@
-"""Responses that follow a motion, against superpixels painted where they went; patterns of stray light."""
+"""Responses that follow a motion, against superpixels painted where they went;
+patterns of stray light.
+"""
 
 import numpy as np
 import pytest
 
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import Dark
-from plenocli.inverse.registration.moved_response import Widened, even_light, widened
-from plenocli.inverse.registration.motion import Motion, own_pixels
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.registration.alignment import _moved
+from plenocli.inverse.registration.motion import Motion, own_pixels
+from plenocli.inverse.registration.moved_response import Widened, even_light, widened
 from plenocli.inverse.spectra.radiance import Response
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME = 3, 4, 40, 8
 SHAPE = ROWS * PITCH + 2 * FRAME, COLUMNS * PITCH + 2 * FRAME
-ORIGIN = FRAME + PITCH * np.stack(np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij"), axis=-1)
+ORIGIN = FRAME + PITCH * np.stack(
+    np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij"), axis=-1
+)
 CENTRES = ORIGIN + (PITCH - 1) / 2.0
-COLOURS = {"R": [0.04, 0.1, 0.2, 1.0], "G": [0.4, 1.0, 0.9, 0.15], "B": [1.0, 0.3, 0.1, 0.05], "Y": [1.0, 1.0, 1.0, 1.0]}
+COLOURS = {
+    "R": [0.04, 0.1, 0.2, 1.0],
+    "G": [0.4, 1.0, 0.9, 0.15],
+    "B": [1.0, 0.3, 0.1, 0.05],
+    "Y": [1.0, 1.0, 1.0, 1.0],
+}
 
 
 def painted(shift, origin, cfa):
-    """Response (..., pixel, 4) within windows at `origin` (..., 2) of lenslets whose light moved by `shift` (..., 2)."""
-    light = superpixels(np.asarray(shift, float) - (origin - ORIGIN[: len(origin), : origin.shape[1]]), pixels=PITCH, side=33.0)
+    """Response (..., pixel, 4) within windows at `origin` (..., 2) of lenslets whose light moved
+    by `shift` (..., 2).
+    """
+    light = superpixels(
+        np.asarray(shift, float) - (origin - ORIGIN[: len(origin), : origin.shape[1]]),
+        pixels=PITCH,
+        side=33.0,
+    )
     letters = cfa_map((2, 2), cfa)
     index = (origin[..., None, :] + np.stack(np.divmod(np.arange(PITCH**2), PITCH), axis=-1)) % 2
-    return light * np.array([[COLOURS[one] for one in row] for row in letters.tolist()])[index[..., 0], index[..., 1]]
+    return (
+        light
+        * np.array([[COLOURS[one] for one in row] for row in letters.tolist()])[
+            index[..., 0], index[..., 1]
+        ]
+    )
 
 
 def calibration(cfa, shared):
@@ -32,12 +52,39 @@ def calibration(cfa, shared):
     valid = np.ones((ROWS, COLUMNS), bool)
     valid[1, 2] = False
     dark = Dark(np.zeros(SHAPE, np.float32), np.zeros((2, 2)), None, None)
-    return Response(response[0, 0] if shared else response, None, np.array([450e-9, 540e-9, 570e-9, 650e-9]), ORIGIN, (PITCH, PITCH), CENTRES, valid, None,
-                    dark, cfa, "DN", np.inf, None, 0.25, 1.0)
+    return Response(
+        response[0, 0] if shared else response,
+        None,
+        np.array([450e-9, 540e-9, 570e-9, 650e-9]),
+        ORIGIN,
+        (PITCH, PITCH),
+        CENTRES,
+        valid,
+        None,
+        dark,
+        cfa,
+        "DN",
+        np.inf,
+        None,
+        0.25,
+        1.0,
+    )
 
 
 def motion(shift, turn=0.0):
-    return Motion(np.array(shift), np.array([[0.0, -turn], [turn, 0.0]]), CENTRES.mean(axis=(0, 1)), 0.0, 0.0, np.zeros(3), 0.0, 1.0, 1.0, 48, 1.0)
+    return Motion(
+        np.array(shift),
+        np.array([[0.0, -turn], [turn, 0.0]]),
+        CENTRES.mean(axis=(0, 1)),
+        0.0,
+        0.0,
+        np.zeros(3),
+        0.0,
+        1.0,
+        1.0,
+        48,
+        1.0,
+    )
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -47,7 +94,11 @@ def test_a_moved_response_is_that_of_the_moved_superpixel(shared, cfa, shift, tu
     c, move = calibration(cfa, shared), motion(shift, turn)
     found = _moved(c, move)
     assert found.shared == (shared and not turn)
-    response = np.broadcast_to(found.response, (*c.valid.shape, PITCH**2, 4))[c.sites] if found.shared else found.response[c.sites]
+    response = (
+        np.broadcast_to(found.response, (*c.valid.shape, PITCH**2, 4))[c.sites]
+        if found.shared
+        else found.response[c.sites]
+    )
     truth = painted(move.at(CENTRES), found.origin, cfa)[c.sites]
     known = np.isfinite(response).all(axis=-1)
     assert known.mean() > 0.75
@@ -61,9 +112,13 @@ def test_stray_light_is_even_within_each_colour(cfa):
     patterns, window = even_light((17, 20), cfa), (17, 20)
     origin = np.array([[[3, 5], [4, 4]], [[2, 7], [9, 6]]])
     letters = dict.fromkeys(cfa if cfa != "mono" else "Y")
-    whole = Widened(np.zeros((17 * 20, 0), np.float32), patterns, origin)[np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])]
+    whole = Widened(np.zeros((17 * 20, 0), np.float32), patterns, origin)[
+        np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    ]
     for k, letter in enumerate(letters):
-        expected = extract((cfa_map((40, 40), cfa) == letter).astype(np.float32), origin, window).reshape(4, -1)
+        expected = extract(
+            (cfa_map((40, 40), cfa) == letter).astype(np.float32), origin, window
+        ).reshape(4, -1)
         inner = own_pixels(window)
         np.testing.assert_array_equal(whole[:, inner, k], expected[:, inner])
         assert np.isnan(whole[:, ~inner, k]).all()

@@ -1,17 +1,28 @@
-"""Registration of captures whose lenslets moved, painted in closed form (tests/reference/prototype.py), never interpolated."""
+"""Registration of captures whose lenslets moved, painted in closed form
+(tests/reference/prototype.py), never interpolated.
+"""
 
 import numpy as np
 import pytest
 
-from plenocli.inverse.registration.motion import Reference, Smooth, motion_since, spline_matrix
 from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.registration.motion import Reference, Smooth, motion_since, spline_matrix
 from plenocli.inverse.spectra.demultiplex import demultiplex
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME, ELECTRONS, GAIN, READ = 6, 8, 40, 8, 12000, 0.25, 4.0
 SIZE = dict(pixels=PITCH, side=33.0, gap=1.5)
 NOISE = (GAIN, (GAIN * READ) ** 2 + 1 / 12)
-SIX = np.array([[0.9, 0.9, 0.9, 0.9], [0.03, 0.03, 0.03, 0.03], [0.05, 0.06, 0.08, 0.6], [0.1, 0.15, 0.35, 0.55], [0.07, 0.23, 0.18, 0.06], [0.25, 0.06, 0.05, 0.04]])
+SIX = np.array(
+    [
+        [0.9, 0.9, 0.9, 0.9],
+        [0.03, 0.03, 0.03, 0.03],
+        [0.05, 0.06, 0.08, 0.6],
+        [0.1, 0.15, 0.35, 0.55],
+        [0.07, 0.23, 0.18, 0.06],
+        [0.25, 0.06, 0.05, 0.04],
+    ]
+)
 COLOURS = {"R": [0.04, 0.1, 0.2, 1.0], "G": [0.4, 1.0, 0.9, 0.15], "B": [1.0, 0.3, 0.1, 0.05]}
 INDEX = np.stack(np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij"), axis=-1)
 ORIGIN = FRAME + PITCH * INDEX
@@ -30,18 +41,43 @@ def capture(radiance, shift, seed, *, cfa="mono", offset=0.0, exposure=1.0, fram
     response = superpixels(np.broadcast_to(shift, (ROWS, COLUMNS, 2)), **SIZE | kind) * colours(cfa)
     mean = ELECTRONS * exposure * np.einsum("rcpk,rck->rcp", response, radiance)
     rng = np.random.default_rng(seed)
-    values = np.mean([np.rint(GAIN * (rng.poisson(mean) + rng.normal(0, READ, mean.shape)) + offset) for _ in range(frames)], axis=0) / exposure
-    plane = values.reshape(ROWS, COLUMNS, PITCH, PITCH).swapaxes(1, 2).reshape(ROWS * PITCH, COLUMNS * PITCH)
+    values = (
+        np.mean(
+            [
+                np.rint(GAIN * (rng.poisson(mean) + rng.normal(0, READ, mean.shape)) + offset)
+                for _ in range(frames)
+            ],
+            axis=0,
+        )
+        / exposure
+    )
+    plane = (
+        values.reshape(ROWS, COLUMNS, PITCH, PITCH)
+        .swapaxes(1, 2)
+        .reshape(ROWS * PITCH, COLUMNS * PITCH)
+    )
     return np.pad(plane, FRAME)
 
 
 def calibrated(cfa="mono", **kind):
-    bands = [capture(np.broadcast_to(np.eye(4)[k], (ROWS, COLUMNS, 4)), 0.0, 100 + k, cfa=cfa, frames=8, **kind) for k in range(4)]
+    bands = [
+        capture(
+            np.broadcast_to(np.eye(4)[k], (ROWS, COLUMNS, 4)),
+            0.0,
+            100 + k,
+            cfa=cfa,
+            frames=8,
+            **kind,
+        )
+        for k in range(4)
+    ]
     return np.stack([extract(band, ORIGIN, (PITCH, PITCH)) for band in bands], axis=-1)
 
 
 def find_motion(signal, response, cfa="mono", noise=None):
-    return motion_since(Reference(response, ORIGIN, (PITCH, PITCH), CENTRES, cfa, signal.shape), signal, noise)
+    return motion_since(
+        Reference(response, ORIGIN, (PITCH, PITCH), CENTRES, cfa, signal.shape), signal, noise
+    )
 
 
 @pytest.fixture(scope="module", params=["mono", "GRBG"])
@@ -55,9 +91,13 @@ def error(signal, response, truth, motion=None, cfa="mono"):
     if motion is not None:
         shifts = motion.at(CENTRES)
         whole = np.rint(shifts).astype(int)
-        smooth = Smooth(response.reshape(-1, PITCH * PITCH, 4), ORIGIN.reshape(-1, 2), (PITCH, PITCH), cfa)
+        smooth = Smooth(
+            response.reshape(-1, PITCH * PITCH, 4), ORIGIN.reshape(-1, 2), (PITCH, PITCH), cfa
+        )
         origin = ORIGIN + whole
-        response = smooth.at(origin.reshape(-1, 2), (shifts - whole).reshape(-1, 2)).reshape(response.shape)
+        response = smooth.at(origin.reshape(-1, 2), (shifts - whole).reshape(-1, 2)).reshape(
+            response.shape
+        )
         signal = signal - motion.offset
     found, _ = demultiplex(response, extract(signal, origin, (PITCH, PITCH)))
     return np.sqrt(((found - truth) ** 2).mean())
@@ -89,7 +129,15 @@ def test_a_capture_that_did_not_move_is_left_alone(camera, truth):
 
 def test_standard_deviations_of_the_motion_are_what_repeated_captures_show(truth):
     response = calibrated()
-    found = [find_motion(capture(truth, 0.25, 20 + i, offset=3.0, exposure=0.1), response, "mono", (NOISE[0] / 0.1, NOISE[1] / 0.01)) for i in range(8)]
+    found = [
+        find_motion(
+            capture(truth, 0.25, 20 + i, offset=3.0, exposure=0.1),
+            response,
+            "mono",
+            (NOISE[0] / 0.1, NOISE[1] / 0.01),
+        )
+        for i in range(8)
+    ]
     for axis in (0, 1):
         values = np.array([m.shift[axis] for m in found])
         assert 0.4 < values.std(ddof=1) / np.mean([m.sigma[axis] for m in found]) < 1.8  # 8 draws
@@ -127,12 +175,16 @@ def test_darkness_tells_no_motion():
 
 def test_spline_matrices_move_polynomials_exactly_and_know_their_slope():
     x = np.arange(30.0)
-    f = ((x - 14.5) ** 2 - 14.5**2) ** 2 / 1e4  # slopes vanish at the middle only: the ends' mirror bends them
+    # slopes vanish at the middle only: the ends' mirror bends them
+    f = ((x - 14.5) ** 2 - 14.5**2) ** 2 / 1e4
     moved = spline_matrix(30, 0.3) @ f
     exact = ((x - 14.8) ** 2 - 14.5**2) ** 2 / 1e4
     np.testing.assert_allclose(moved[12:18], exact[12:18], atol=1e-4)
-    wave = np.cos(np.pi * (x + 0) / 29 * 3)  # mirror-symmetric at both ends: the spline's own boundary
-    np.testing.assert_allclose(spline_matrix(30, 0.4) @ wave, np.cos(np.pi * (x - 0.4) / 29 * 3), atol=3e-7)
+    # mirror-symmetric at both ends: the spline's own boundary
+    wave = np.cos(np.pi * (x + 0) / 29 * 3)
+    np.testing.assert_allclose(
+        spline_matrix(30, 0.4) @ wave, np.cos(np.pi * (x - 0.4) / 29 * 3), atol=3e-7
+    )
     step = 1e-5
     slope = (spline_matrix(30, 0.4 + step) - spline_matrix(30, 0.4 - step)) / (2 * step)
     np.testing.assert_allclose(spline_matrix(30, 0.4, derivative=True), slope, atol=1e-8)

@@ -5,8 +5,9 @@ import pytest
 from scipy.linalg import solve_sylvester
 
 from plenocli.inverse.picture import least_squares as linear
-from plenocli.inverse.sparse import dictionary, dictionary_step as refit
 from plenocli.inverse.prior.natural_images import draw_patches
+from plenocli.inverse.sparse import dictionary
+from plenocli.inverse.sparse import dictionary_step as refit
 
 SHAPE = (5, 6)
 
@@ -18,14 +19,22 @@ def setting():
     position, point = np.arange(42) * 29 / 41, np.arange(30)
     a = np.exp(-((position[:, None] - point[None, :]) ** 2) / 2)
     r, c = np.mgrid[:40, :44]
-    pictures = [0.5 + 0.4 * np.sin(0.9 * r * np.sin(k) + 0.9 * c * np.cos(k) + k) * rng.uniform(0.6, 1) for k in range(4)]
+    pictures = [
+        0.5 + 0.4 * np.sin(0.9 * r * np.sin(k) + 0.9 * c * np.cos(k) + k) * rng.uniform(0.6, 1)
+        for k in range(4)
+    ]
     return linear.decompose(a), pictures
 
 
 def learner(setting, **changes):
     svd, pictures = setting
-    options = dict(atoms=40, batch=120, lam=1e-4, delta=1e-3, snr_db=50.0, seed=3, validation=60) | changes
-    return dictionary.Learner(svd, SHAPE, pictures[:3], pictures[3:], dictionary.Settings(**options))
+    options = (
+        dict(atoms=40, batch=120, lam=1e-4, delta=1e-3, snr_db=50.0, seed=3, validation=60)
+        | changes
+    )
+    return dictionary.Learner(
+        svd, SHAPE, pictures[:3], pictures[3:], dictionary.Settings(**options)
+    )
 
 
 def run(machine, state, iterations):
@@ -42,7 +51,12 @@ def test_step_solves_the_sylvester_equation(delta):
     gram, right = c @ c.T / 50, x @ c.T / 50
     atoms, residual = refit.dictionary_step(energy, basis, gram, right, delta)
     ridge = 1e-6 * np.trace(gram) / 8
-    np.testing.assert_allclose(atoms, solve_sylvester(delta * a.T @ a, gram + ridge * np.eye(8), right), rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(
+        atoms,
+        solve_sylvester(delta * a.T @ a, gram + ridge * np.eye(8), right),
+        rtol=1e-7,
+        atol=1e-10,
+    )
     assert residual < 1e-10
 
 
@@ -52,7 +66,12 @@ def test_directions_without_energy_may_be_left_out():
     gram, right = c @ c.T / 50, x @ c.T / 50
     strength, basis = np.linalg.svd(a, full_matrices=False)[1:]
     atoms, residual = refit.dictionary_step(strength**2, basis.T, gram, right, 0.1)
-    np.testing.assert_allclose(atoms, solve_sylvester(0.1 * a.T @ a, gram + 1e-6 * np.trace(gram) / 8 * np.eye(8), right), rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(
+        atoms,
+        solve_sylvester(0.1 * a.T @ a, gram + 1e-6 * np.trace(gram) / 8 * np.eye(8), right),
+        rtol=1e-7,
+        atol=1e-10,
+    )
     assert residual < 1e-10
 
 
@@ -71,17 +90,29 @@ def test_gradient_steps_approach_the_closed_form(delta):
 
 def test_one_gradient_step_goes_down_the_slope():
     rng = np.random.default_rng(3)
-    a, c, x, phi = rng.random((20, 12)), rng.standard_normal((8, 50)), rng.standard_normal((12, 50)), rng.standard_normal((12, 8))
+    a, c, x, phi = (
+        rng.random((20, 12)),
+        rng.standard_normal((8, 50)),
+        rng.standard_normal((12, 50)),
+        rng.standard_normal((12, 8)),
+    )
 
     def objective(phi):
-        return np.sum((x - phi @ c) ** 2) / 50 + 0.1 * np.sum((a @ phi) ** 2) + 1e-6 * np.trace(c @ c.T / 50) / 8 * np.sum(phi**2)
+        return (
+            np.sum((x - phi @ c) ** 2) / 50
+            + 0.1 * np.sum((a @ phi) ** 2)
+            + 1e-6 * np.trace(c @ c.T / 50) / 8 * np.sum(phi**2)
+        )
 
     slope = np.empty_like(phi)
     for place in np.ndindex(phi.shape):
         nudge = np.zeros_like(phi)
         nudge[place] = 1e-4
         slope[place] = (objective(phi + nudge) - objective(phi - nudge)) / 2e-4
-    moved = refit.gradient_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1, phi, 1)[0] - phi
+    moved = (
+        refit.gradient_step(*np.linalg.eigh(a.T @ a), c @ c.T / 50, x @ c.T / 50, 0.1, phi, 1)[0]
+        - phi
+    )
     length = -np.sum(moved * slope) / np.sum(slope**2)
     np.testing.assert_allclose(moved, -length * slope, atol=1e-6 * np.abs(moved).max())
     assert objective(phi + moved) < objective(phi)
@@ -102,7 +133,9 @@ def test_step_lowers_its_objective():
 def test_unused_atoms_do_not_break_the_step():
     c = np.zeros((8, 50))
     c[:3] = np.random.default_rng(0).standard_normal((3, 50))
-    atoms, _ = refit.dictionary_step(np.zeros(12), np.eye(12), c @ c.T / 50, np.ones((12, 50)) @ c.T / 50, 0.0)
+    atoms, _ = refit.dictionary_step(
+        np.zeros(12), np.eye(12), c @ c.T / 50, np.ones((12, 50)) @ c.T / 50, 0.0
+    )
     assert np.all(np.isfinite(atoms)) and not np.any(np.abs(atoms[:, 3:]) > 1e-9)
 
 
@@ -119,14 +152,21 @@ def test_atoms_keep_their_form(setting):
     np.testing.assert_allclose(np.linalg.norm(state.atoms, axis=0), 1)
     np.testing.assert_allclose(state.atoms[:, 0], 1 / np.sqrt(30))
     assert np.abs(state.atoms[:, 1:].mean(axis=0)).max() < 1e-12
-    assert all(len(values) == 3 and np.all(np.isfinite(values)) for values in state.history.values())
+    assert all(
+        len(values) == 3 and np.all(np.isfinite(values)) for values in state.history.values()
+    )
     assert max(state.history["worst_gap"]) <= 1e-3 and max(state.history["step_residual"]) < 1e-10
 
 
 def test_gradient_steps_learn_too_and_say_how_far_they_got(setting):
-    exact, rough = (run(learner(setting, gradient_steps=n), learner(setting).start(), 2) for n in (0, 30))
+    exact, rough = (
+        run(learner(setting, gradient_steps=n), learner(setting).start(), 2) for n in (0, 30)
+    )
     assert rough.history["step_residual"][0] > 1e-6 > exact.history["step_residual"][0]
-    assert rough.history["validation_psnr"][-1] > learner(setting).validate(learner(setting).start().atoms)[1] - 1
+    assert (
+        rough.history["validation_psnr"][-1]
+        > learner(setting).validate(learner(setting).start().atoms)[1] - 1
+    )
 
 
 def test_directions_below_the_noise_are_left_out(setting):
@@ -134,7 +174,8 @@ def test_directions_below_the_noise_are_left_out(setting):
     assert 1 < len(loud.seen) < len(quiet.seen) < 42
     patches = quiet.validation
     power = np.mean((quiet.svd.s[:, None] / quiet.scale * (quiet.svd.vt @ patches)) ** 2, axis=1)
-    assert power[len(loud.seen) :].max() < 0.05 * loud.sigma**2  # what is left out is faint on other patches too
+    # what is left out is faint on other patches too
+    assert power[len(loud.seen) :].max() < 0.05 * loud.sigma**2
 
 
 def test_synthesis_is_the_regression_of_patches_on_their_codes(setting):
@@ -147,8 +188,13 @@ def test_synthesis_is_the_regression_of_patches_on_their_codes(setting):
         codes.append(machine.code(state.atoms, machine.measure(patches[-1], rng)[0]).c)
     x, c = np.concatenate(patches, axis=1), np.concatenate(codes, axis=1)
     pull = 4 * 40 * np.median(np.sum(c[1:] ** 2, axis=1)) / 400  # of all 400 patches together
-    stacked = np.concatenate([c, np.sqrt(pull) * np.eye(40)], axis=1), np.concatenate([x, np.sqrt(pull) * state.atoms], axis=1)
-    np.testing.assert_allclose(paint, np.linalg.lstsq(stacked[0].T, stacked[1].T, rcond=None)[0].T, atol=1e-8)
+    stacked = (
+        np.concatenate([c, np.sqrt(pull) * np.eye(40)], axis=1),
+        np.concatenate([x, np.sqrt(pull) * state.atoms], axis=1),
+    )
+    np.testing.assert_allclose(
+        paint, np.linalg.lstsq(stacked[0].T, stacked[1].T, rcond=None)[0].T, atol=1e-8
+    )
     assert np.sum((x - paint @ c) ** 2) < np.sum((x - state.atoms @ c) ** 2)
 
 
@@ -157,19 +203,28 @@ def test_path_of_lambda_is_what_single_values_give(setting):
     atoms = machine.start().atoms
     for lam, quality, nonzeros in machine.validate_path(atoms, [1e-5, 1e-3]):
         one = learner(setting, tol=1e-8, lam=lam).validate(atoms)
-        assert one[1] == pytest.approx(quality, abs=1e-3) and one[2] == pytest.approx(nonzeros, rel=0.02)
+        assert one[1] == pytest.approx(quality, abs=1e-3) and one[2] == pytest.approx(
+            nonzeros, rel=0.02
+        )
 
 
 def test_learning_beats_its_random_start(setting):
     machine = learner(setting, initial="random")
     start = machine.start()
-    before, after = machine.validate(start.atoms)[1], run(machine, start, 6).history["validation_psnr"][-1]
+    before, after = (
+        machine.validate(start.atoms)[1],
+        run(machine, start, 6).history["validation_psnr"][-1],
+    )
     assert after > before + 3
 
 
 @pytest.mark.parametrize("initial", ["patches", "pca", "random"])
 def test_starts_are_seeded_and_differ(setting, initial):
-    one, same, other = learner(setting, initial=initial).start(), learner(setting, initial=initial).start(), learner(setting, initial=initial, seed=4).start()
+    one, same, other = (
+        learner(setting, initial=initial).start(),
+        learner(setting, initial=initial).start(),
+        learner(setting, initial=initial, seed=4).start(),
+    )
     assert one.atoms.tobytes() == same.atoms.tobytes() != other.atoms.tobytes()
 
 
@@ -177,7 +232,12 @@ def test_scale_of_the_matrix_does_not_matter(setting):
     svd, pictures = setting
     # a power of two, so that rounding is the same too
     louder = linear.Svd(svd.u, 1024 * svd.s, svd.vt)
-    one, other = (learner((s, pictures), tol=1e-8).step(learner((s, pictures)).start()).history["validation_psnr"][0] for s in (svd, louder))
+    one, other = (
+        learner((s, pictures), tol=1e-8)
+        .step(learner((s, pictures)).start())
+        .history["validation_psnr"][0]
+        for s in (svd, louder)
+    )
     assert one == pytest.approx(other, abs=1e-3)
 
 
@@ -194,11 +254,15 @@ def test_mirror_images_are_the_symmetries_of_the_object(shape, count):
 def test_average_is_that_of_dictionaries_mirrored_one_by_one(setting):
     machine = learner(setting)
     state = run(machine, machine.start(), 2)
-    mean, gap, nonzeros = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE, tol=1e-9)
+    mean, gap, nonzeros = dictionary.averaged(
+        machine.seen, state.atoms, machine.measured, 1e-4, SHAPE, tol=1e-9
+    )
     grid, expected, count = state.atoms.reshape(*SHAPE, -1), [], []
     for axes in ((), (0,), (1,), (0, 1)):
         atoms = np.flip(grid, axes).reshape(30, -1)
-        c = dictionary.sparse_code(machine.seen @ atoms, machine.measured, 1e-4, free=[0], tol=1e-9).c
+        c = dictionary.sparse_code(
+            machine.seen @ atoms, machine.measured, 1e-4, free=[0], tol=1e-9
+        ).c
         expected.append(atoms @ c)
         count.append(np.count_nonzero(c[1:]) / c.shape[1])
     np.testing.assert_allclose(mean, np.mean(expected, axis=0), atol=1e-6)
@@ -209,7 +273,15 @@ def test_average_beats_the_typical_single_estimate(setting):
     """The error of a mean of equally good estimates is below their mean error."""
     machine = learner(setting)
     state = run(machine, machine.start(), 2)
-    single = [dictionary.psnr(state.atoms[i] @ dictionary.sparse_code(machine.seen @ state.atoms[i], machine.measured, 1e-4, free=[0]).c, machine.validation)
-              for i in dictionary.mirror_images(SHAPE)]
+    single = [
+        dictionary.psnr(
+            state.atoms[i]
+            @ dictionary.sparse_code(
+                machine.seen @ state.atoms[i], machine.measured, 1e-4, free=[0]
+            ).c,
+            machine.validation,
+        )
+        for i in dictionary.mirror_images(SHAPE)
+    ]
     mean, _, _ = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE)
     assert dictionary.psnr(mean, machine.validation) > np.mean(single) + 0.1

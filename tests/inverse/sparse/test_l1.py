@@ -1,4 +1,6 @@
-"""Sparse coding: every solution carries its certificate, and the compiled and the plain kernel agree."""
+"""Sparse coding: every solution carries its certificate, and the compiled and the
+plain kernel agree.
+"""
 
 import itertools
 import sys
@@ -11,7 +13,9 @@ from plenocli.inverse.sparse.l1.guess import guess
 
 
 def plenoptic_like(rows=30, atoms=40, signals=12, seed=0):
-    """A dictionary with singular values over four decades, as A Phi has, and signals of a few of its atoms plus noise."""
+    """A dictionary with singular values over four decades, as A Phi has, and signals of a few of
+    its atoms plus noise.
+    """
     rng = np.random.default_rng(seed)
     u, _ = np.linalg.qr(rng.standard_normal((rows, rows)))
     d = (u * np.logspace(0, -4, rows)) @ rng.standard_normal((rows, atoms))
@@ -32,7 +36,11 @@ def test_solution_meets_the_subgradient_conditions(lam):
     code = l1.sparse_code(d, y, lam, tol=1e-9)
     assert code.gap.max() <= 1e-8  # at the smallest lambda the Gram form has no more digits
     assert optimality(d, y, code.c, lam) < 1e-4
-    np.testing.assert_allclose(code.objective, np.sum((y - d @ code.c) ** 2, axis=0) + lam * np.abs(code.c).sum(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(
+        code.objective,
+        np.sum((y - d @ code.c) ** 2, axis=0) + lam * np.abs(code.c).sum(axis=0),
+        rtol=1e-6,
+    )
 
 
 def best_of_all_sign_patterns(d, y, lam):
@@ -55,7 +63,10 @@ def best_of_all_sign_patterns(d, y, lam):
 @pytest.mark.parametrize("lam", [0.02, 0.3, 2.0])
 def test_against_every_sign_pattern(lam):
     rng = np.random.default_rng(8)
-    d, y = rng.standard_normal((7, 6)) @ np.diag([1, 0.5, 1, 0.1, 1, 0.3]), rng.standard_normal((7, 5))
+    d, y = (
+        rng.standard_normal((7, 6)) @ np.diag([1, 0.5, 1, 0.1, 1, 0.3]),
+        rng.standard_normal((7, 5)),
+    )
     code = l1.sparse_code(d, y, lam, tol=1e-12)
     for k in range(5):
         best, where = best_of_all_sign_patterns(d, y[:, k], lam)
@@ -72,7 +83,10 @@ def test_small_lambda_goes_by_the_factored_form(lam):
     c, threshold = code.c.astype(np.longdouble), lam / 2
     residual = y - d @ c
     primal = np.sum(residual**2, axis=0) + lam * np.abs(c).sum(axis=0)
-    t = np.clip(np.sum(residual * y, axis=0) / np.sum(residual**2, axis=0), *(sign * threshold / np.abs(d.T @ residual).max(axis=0) for sign in (-1, 1)))
+    t = np.clip(
+        np.sum(residual * y, axis=0) / np.sum(residual**2, axis=0),
+        *(sign * threshold / np.abs(d.T @ residual).max(axis=0) for sign in (-1, 1)),
+    )
     gap = 1 - (2 * t * np.sum(residual * y, axis=0) - t**2 * np.sum(residual**2, axis=0)) / primal
     assert gap.max() <= 1e-6 and np.all(np.abs(gap - code.gap) < 3e-7)
     assert (code.factored > 0) == (lam < 1e-7)
@@ -83,7 +97,9 @@ def test_lambda_path_equals_single_solutions():
     found = list(l1.lambda_path(d, y, [1e-5, 1e-3, 1e-4], free=[0], tol=1e-9))
     assert [lam for lam, _ in found] == [1e-3, 1e-4, 1e-5]
     for lam, code in found:
-        np.testing.assert_allclose(code.objective, l1.sparse_code(d, y, lam, free=[0], tol=1e-9).objective, rtol=1e-8)
+        np.testing.assert_allclose(
+            code.objective, l1.sparse_code(d, y, lam, free=[0], tol=1e-9).objective, rtol=1e-8
+        )
 
 
 def test_a_warm_start_from_the_solution_has_nothing_to_do():
@@ -92,7 +108,9 @@ def test_a_warm_start_from_the_solution_has_nothing_to_do():
     again = l1.sparse_code(d, y, 1e-4, free=[3], tol=1e-8, start=code.c)
     assert not again.passes.any()
     np.testing.assert_allclose(again.c, code.c, rtol=1e-5, atol=1e-9)
-    far = l1.sparse_code(d, y, 1e-4, free=[3], tol=1e-9, start=np.random.default_rng(0).standard_normal(code.c.shape))
+    far = l1.sparse_code(
+        d, y, 1e-4, free=[3], tol=1e-9, start=np.random.default_rng(0).standard_normal(code.c.shape)
+    )
     np.testing.assert_allclose(far.objective, code.objective, rtol=1e-8)
 
 
@@ -101,8 +119,11 @@ def test_noise_is_coded_as_zero_at_the_noise_s_lambda():
     noise = 0.3 * np.random.default_rng(1).standard_normal((200, 400))
     lam = l1.noise_lambda(d, 0.3)
     assert lam == pytest.approx(2 * 0.3 * np.sqrt(2 * np.log(200)))
-    silent = [np.mean(~l1.sparse_code(d, noise, factor * lam).c.any(axis=0)) for factor in (1.2, 1.0, 0.6)]
-    assert silent[0] > 0.95 and silent[1] > 0.7 and silent[2] < 0.1  # normal theory: 0.99, 0.78, 0.01 for 200 atoms
+    silent = [
+        np.mean(~l1.sparse_code(d, noise, factor * lam).c.any(axis=0)) for factor in (1.2, 1.0, 0.6)
+    ]
+    # normal theory: 0.99, 0.78, 0.01 for 200 atoms
+    assert silent[0] > 0.95 and silent[1] > 0.7 and silent[2] < 0.1
 
 
 def test_large_active_sets_outgrow_the_first_workspace():
@@ -118,7 +139,7 @@ def test_factor_follows_atoms_that_come_and_go():
     rng = np.random.default_rng(4)
     columns = rng.standard_normal((40, 30))
     gram, held, factor, scratch = columns.T @ columns, [], np.full((30, 30), np.nan), np.empty(30)
-    for step in range(120):
+    for _ in range(120):
         n = len(held)
         if n and (n == 30 or rng.random() < 0.45):
             place = int(rng.integers(n))
@@ -144,7 +165,10 @@ def test_an_interior_point_method_agrees():
     from plenocli.inverse.sparse.l1.interior import interior_point
 
     d, y = plenoptic_like(signals=3)
-    inner, newton = interior_point(d, y, 1e-4, free=[0], tol=1e-8), l1.sparse_code(d, y, 1e-4, free=[0], tol=1e-10)
+    inner, newton = (
+        interior_point(d, y, 1e-4, free=[0], tol=1e-8),
+        l1.sparse_code(d, y, 1e-4, free=[0], tol=1e-10),
+    )
     assert inner.gap.max() < 1e-6
     np.testing.assert_allclose(inner.objective, newton.objective, rtol=1e-6)
 
@@ -165,7 +189,8 @@ def test_first_order_method_admits_that_it_has_not_converged():
 
 
 def test_one_atom_by_hand():
-    code = l1.sparse_code(np.array([[2.0]]), np.array([[3.0, -3.0, 0.1]]), 1.0)  # c = (d y - lam/2) / d^2, or 0
+    # c = (d y - lam/2) / d^2, or 0
+    code = l1.sparse_code(np.array([[2.0]]), np.array([[3.0, -3.0, 0.1]]), 1.0)
     np.testing.assert_allclose(code.c, [[5.5 / 4, -5.5 / 4, 0.0]])
 
 
@@ -177,15 +202,24 @@ def test_lambda_convention_has_no_half():
 
 
 def test_fista_with_the_same_certificate_agrees():
-    d, y = np.random.default_rng(3).standard_normal((30, 40)), np.random.default_rng(4).standard_normal((30, 5))
-    newton, first_order = l1.sparse_code(d, y, 3.0, tol=1e-10), l1.fista(d, y, 3.0, tol=1e-10, iterations=5000)
+    d, y = (
+        np.random.default_rng(3).standard_normal((30, 40)),
+        np.random.default_rng(4).standard_normal((30, 5)),
+    )
+    newton, first_order = (
+        l1.sparse_code(d, y, 3.0, tol=1e-10),
+        l1.fista(d, y, 3.0, tol=1e-10, iterations=5000),
+    )
     assert first_order.gap.max() <= 1e-10
     np.testing.assert_allclose(newton.c, first_order.c, atol=1e-4)
     np.testing.assert_allclose(newton.objective, first_order.objective, rtol=1e-9)
 
 
 def test_the_gap_bounds_the_distance_from_the_optimum():
-    d, y = np.random.default_rng(3).standard_normal((30, 40)), np.random.default_rng(4).standard_normal((30, 5))
+    d, y = (
+        np.random.default_rng(3).standard_normal((30, 40)),
+        np.random.default_rng(4).standard_normal((30, 5)),
+    )
     best = l1.sparse_code(d, y, 3.0, tol=1e-12).objective
     rough = l1.fista(d, y, 3.0, tol=0, iterations=20)
     assert np.all(rough.gap > 1e-8)
@@ -204,7 +238,11 @@ def test_free_atoms_are_not_penalised():
 def test_weights_scale_lambda():
     d, y = plenoptic_like()
     w = np.linspace(0.5, 2, d.shape[1])
-    np.testing.assert_allclose(l1.sparse_code(d, y, 1e-3, weights=w, tol=1e-10).c, l1.sparse_code(d / w, y, 1e-3, tol=1e-10).c / w[:, None], atol=1e-6)
+    np.testing.assert_allclose(
+        l1.sparse_code(d, y, 1e-3, weights=w, tol=1e-10).c,
+        l1.sparse_code(d / w, y, 1e-3, tol=1e-10).c / w[:, None],
+        atol=1e-6,
+    )
 
 
 def duplicate(d, y):
@@ -222,7 +260,9 @@ def rank_one(d, y):
 
 
 def few_directions(d, y):
-    """Many more atoms than directions, all active at once: rounding alone must not make the factor blow up."""
+    """Many more atoms than directions, all active at once: rounding alone must not make
+    the factor blow up.
+    """
     rng = np.random.default_rng(6)
     return rng.standard_normal((30, 8)) @ rng.standard_normal((8, 60)), y
 
@@ -236,7 +276,9 @@ def test_degenerate_dictionaries_keep_their_certificate(spoil):
 
 def test_workers_do_not_change_the_result():
     d, y = plenoptic_like()
-    np.testing.assert_array_equal(l1.sparse_code(d, y, 1e-4, workers=1).c, l1.sparse_code(d, y, 1e-4, workers=2).c)
+    np.testing.assert_array_equal(
+        l1.sparse_code(d, y, 1e-4, workers=1).c, l1.sparse_code(d, y, 1e-4, workers=2).c
+    )
 
 
 @pytest.mark.parametrize("spoil", [lambda d, y: (d, y), duplicate, zeros, few_directions])
@@ -249,7 +291,8 @@ def test_plain_numpy_gives_the_same(monkeypatch, spoil):
     plain = l1.sparse_code(d, y, 1e-5, tol=1e-9)
     assert plain.passes.sum() != compiled.passes.sum()  # another way to the same minimum
     np.testing.assert_allclose(plain.objective, compiled.objective, rtol=1e-8)
-    np.testing.assert_allclose(d @ plain.c, d @ compiled.c, atol=1e-7 * np.abs(y).max())  # unique, even where c is not
+    # unique, even where c is not
+    np.testing.assert_allclose(d @ plain.c, d @ compiled.c, atol=1e-7 * np.abs(y).max())
 
 
 def test_bad_arguments():

@@ -1,4 +1,6 @@
-"""Estimators against textbook formulas written out with explicit matrices, and against their own statistics."""
+"""Estimators against textbook formulas written out with explicit matrices, and against
+their own statistics.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ SIZE, BANDS = 36, 4
 
 @pytest.fixture(scope="module")
 def system():
-    """36 pixels in four 3x3 quadrants, 300 electrons a pixel at unit radiance, leak of about 5 % between quadrants."""
+    """36 pixels in four 3x3 quadrants, 300 electrons a pixel at unit radiance, leak of about 5 %
+    between quadrants.
+    """
     rng = np.random.default_rng(3)
     response = 300 * 0.05 * rng.uniform(0.5, 1.5, (SIZE, BANDS))
     row, column = np.divmod(np.arange(SIZE), 6)
@@ -34,7 +38,9 @@ def draws(system, count, seed=0):
 
 
 def formula(system, method):
-    """Covariance of the error by the closed formulas with explicit inverses (well conditioned here)."""
+    """Covariance of the error by the closed formulas with explicit inverses (well
+    conditioned here).
+    """
     response, _, covariance, variance = system
     inverse = np.linalg.inv
     weight = np.diag(1 / variance)
@@ -51,7 +57,9 @@ def formula(system, method):
 def test_predicted_error_is_the_formula_and_what_happens(system, method):
     response, mean, covariance, variance = system
     b, x = draws(system, 40000)
-    estimate, sigma = spectral.demultiplex(response, x, method, variance=variance, prior=(mean, covariance))
+    estimate, sigma = spectral.demultiplex(
+        response, x, method, variance=variance, prior=(mean, covariance)
+    )
     expected = formula(system, method)
     np.testing.assert_allclose(sigma[0] ** 2, np.diag(expected), rtol=1e-10)
     measured = np.cov((estimate - b).T)
@@ -66,8 +74,16 @@ def test_errors_are_ordered_and_single_pixel_pays_for_crosstalk(system):
     assert traces[0] < traces[1] < traces[2] < 1.1 * traces[0]
     b, x = draws(system, 20000, seed=1)
     pixels = spectral.choose_pixels(response)
-    estimate, sigma = spectral.demultiplex(response, x, "single-pixel", variance=variance, pixels=pixels)
-    bias = np.stack([sum(response[p, j] * b[:, j] for j in range(BANDS) if j != k) / response[p, k] for k, p in enumerate(pixels)], axis=1)
+    estimate, sigma = spectral.demultiplex(
+        response, x, "single-pixel", variance=variance, pixels=pixels
+    )
+    bias = np.stack(
+        [
+            sum(response[p, j] * b[:, j] for j in range(BANDS) if j != k) / response[p, k]
+            for k, p in enumerate(pixels)
+        ],
+        axis=1,
+    )
     np.testing.assert_allclose((estimate - b - bias).std(axis=0), sigma[0], rtol=0.02)
     assert ((estimate - b) ** 2).mean() > 20 * traces[2] / BANDS
 
@@ -102,7 +118,9 @@ def test_non_negative_agrees_with_scipy_on_the_full_matrix(system):
     root = 1 / np.sqrt(variance)
     for i in range(50):
         np.testing.assert_allclose(estimate[i], nnls(response, x[i])[0], atol=1e-9)
-        np.testing.assert_allclose(weighted[i], nnls(response * root[:, None], x[i] * root)[0], atol=1e-9)
+        np.testing.assert_allclose(
+            weighted[i], nnls(response * root[:, None], x[i] * root)[0], atol=1e-9
+        )
 
 
 def test_lenslets_with_their_own_response_and_masked_pixels(system):
@@ -121,7 +139,9 @@ def test_lenslets_with_their_own_response_and_masked_pixels(system):
         np.testing.assert_allclose(estimate, truth, rtol=1e-9)
     keep = np.delete(np.arange(SIZE), 4)
     part = own[0, 0][keep]
-    np.testing.assert_allclose(sigma[0, 0] ** 2, 4 * np.diag(np.linalg.inv(part.T @ part)), rtol=1e-9)
+    np.testing.assert_allclose(
+        sigma[0, 0] ** 2, 4 * np.diag(np.linalg.inv(part.T @ part)), rtol=1e-9
+    )
 
 
 def test_batches_do_not_change_the_answer(system, monkeypatch):
@@ -129,7 +149,9 @@ def test_batches_do_not_change_the_answer(system, monkeypatch):
     _, x = draws(system, 500)
     whole = spectral.demultiplex(response, x, "wls", variance=variance)
     monkeypatch.setattr(spectral, "BATCH_NUMBERS", 37 * SIZE * BANDS)
-    np.testing.assert_allclose(spectral.demultiplex(response, x, "wls", variance=variance), whole, rtol=1e-12)
+    np.testing.assert_allclose(
+        spectral.demultiplex(response, x, "wls", variance=variance), whole, rtol=1e-12
+    )
 
 
 def test_sigma_from_residual_where_noise_is_unknown(system):
@@ -170,7 +192,8 @@ def test_bias_of_a_noisy_calibration_is_the_one_of_repeated_calibrations(system)
     measured = found.mean(axis=0) - truth
     error = found.std(axis=0) / np.sqrt(len(found))
     assert (np.abs(bias) > 30 * error).sum() >= 2  # far from nothing
-    np.testing.assert_allclose(measured, bias, atol=0.2 * np.abs(bias).max())  # second order: the next one is 15 % here
+    # second order: the next one is 15 % here
+    np.testing.assert_allclose(measured, bias, atol=0.2 * np.abs(bias).max())
     few = response[[0, 5, 20, 35]]  # as many pixels as bands: no attenuation, amplification is left
     assert (np.diag(spectral.calibration_bias(few, variance[:4])) > 0).all()
 

@@ -1,11 +1,13 @@
-"""Superpixels in single precision over factored responses: the same answers as least squares in double, one by one."""
+"""Superpixels in single precision over factored responses: the same answers as least squares in
+double, one by one.
+"""
 
 import numpy as np
 import pytest
 
 import plenocli.inverse.spectra.factored as factored_module
-from plenocli.inverse.spectra.factored import answer, collect, factor, stream
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
+from plenocli.inverse.spectra.factored import answer, collect, factor, stream
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
 PRIOR = np.full(BANDS, 0.4), 0.04 * (0.6 * np.ones((BANDS, BANDS)) + 0.4 * np.eye(BANDS))
@@ -21,7 +23,9 @@ def engine(request, monkeypatch):
 
 @pytest.fixture(params=["shared", "each"])
 def case(request):
-    """(response, values, rng) of lenslets with one F or one each, some of whose pixels the calibration does not know."""
+    """(response, values, rng) of lenslets with one F or one each, some of whose pixels the
+    calibration does not know.
+    """
     rng = np.random.default_rng(3)
     response = 4000 * rng.uniform(0, 1, (PIXELS, BANDS)) ** 6
     response[rng.integers(PIXELS, size=5)] = np.nan
@@ -37,10 +41,22 @@ def case(request):
 def both(response, values, method, known=None, **settings):
     """(ours, the reference's) radiances and standard deviations."""
     factored = factor(response)
-    sums = collect(factored, lambda part: values[part].copy(), len(values), (GAIN, READ), known, sandwich=True, **settings)
+    sums = collect(
+        factored,
+        lambda part: values[part].copy(),
+        len(values),
+        (GAIN, READ),
+        known,
+        sandwich=True,
+        **settings,
+    )
     start = np.clip(np.nan_to_num(demultiplex(response, values)[0]), 0, None)
-    variance = np.maximum(noise_variance(response, settings.get("radiance", start), GAIN, READ, known), READ)
-    return answer(factored, sums, method, PRIOR), demultiplex(response, values, method, variance=variance, prior=PRIOR)
+    variance = np.maximum(
+        noise_variance(response, settings.get("radiance", start), GAIN, READ, known), READ
+    )
+    return answer(factored, sums, method, PRIOR), demultiplex(
+        response, values, method, variance=variance, prior=PRIOR
+    )
 
 
 @pytest.mark.parametrize("method", ["pinv", "wls", "lmmse", "nnls"])
@@ -88,7 +104,9 @@ def test_chi_is_the_weighted_residual(case, doubted):
     values[rng.uniform(size=values.shape) < 0.02] = np.nan
     known = rng.uniform(0, 2000, (PIXELS, BANDS))
     settings = dict(doubt=known) if doubted else dict(response_variance=known)
-    sums = collect(factor(response), lambda part: values[part].copy(), len(values), (GAIN, READ), **settings)
+    sums = collect(
+        factor(response), lambda part: values[part].copy(), len(values), (GAIN, READ), **settings
+    )
     b = demultiplex(response, values)[0]
     mean = (response @ b[..., None])[..., 0]
     variance = noise_variance(response, b, GAIN, READ, known)
@@ -101,7 +119,13 @@ def test_unknown_noise_comes_from_the_residual(case):
     response, values, rng = case
     values[rng.uniform(size=values.shape) < 0.02] = np.nan
     factored = factor(response)
-    found = answer(factored, collect(factored, lambda part: values[part].copy(), len(values)), "pinv", None, False)
+    found = answer(
+        factored,
+        collect(factored, lambda part: values[part].copy(), len(values)),
+        "pinv",
+        None,
+        False,
+    )
     np.testing.assert_allclose(found[0], demultiplex(response, values)[0], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found[1], demultiplex(response, values)[1], rtol=1e-3)
 
@@ -114,7 +138,9 @@ def test_factors_give_the_response_back(condition):
     factored = factor(f)
     q = np.swapaxes(factored.q, -1, -2).astype(float)
     np.testing.assert_allclose(q @ factored.r, f, atol=2e-7)
-    np.testing.assert_allclose(np.swapaxes(q, -1, -2) @ q, np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        np.swapaxes(q, -1, -2) @ q, np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-6
+    )
     assert factored.sound.all() and factored.used is None
 
 
@@ -143,9 +169,15 @@ def test_sums_made_in_passing_are_those_of_all_factors_at_once(case, monkeypatch
     settings = dict(noise=(GAIN, READ), sandwich=True, radiance=radiance)
     whole = factor(response)
     expected = collect(whole, lambda part: values[part].copy(), LENSLETS, **settings)
-    passing, sums = stream(response, (np.arange(LENSLETS),), lambda part: values[part].copy(), **settings)
+    passing, sums = stream(
+        response, (np.arange(LENSLETS),), lambda part: values[part].copy(), **settings
+    )
     for method in ("pinv", "wls", "lmmse"):
-        for ours, theirs in zip(answer(passing, sums, method, PRIOR), answer(whole, expected, method, PRIOR), strict=True):
+        for ours, theirs in zip(
+            answer(passing, sums, method, PRIOR),
+            answer(whole, expected, method, PRIOR),
+            strict=True,
+        ):
             np.testing.assert_allclose(ours, theirs, rtol=1e-6)
     np.testing.assert_array_equal(sums.count, expected.count)
     np.testing.assert_allclose(sums.chi, expected.chi, rtol=1e-6)

@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 
-from plenocli.inverse.spectra.low_rank import LEAST, low_rank
 from plenocli.inverse.spectra.demultiplex import demultiplex
+from plenocli.inverse.spectra.low_rank import LEAST, low_rank
 from tests.reference.prototype import superpixels
 
 PIXELS, FULL = 18, 12000.0
 
 
 def responses(count=150, seed=1):
-    """True responses (lenslet, pixel, band) of lenslets that lie anywhere within a pixel, with gains of 0.4 to 1."""
+    """True responses (lenslet, pixel, band) of lenslets that lie anywhere within a pixel, with
+    gains of 0.4 to 1.
+    """
     rng = np.random.default_rng(seed)
     shift = rng.uniform(-0.5, 0.5, (count, 2))
     return superpixels(shift, pixels=PIXELS, side=14, gap=2) * rng.uniform(0.4, 1, (count, 1, 1))
@@ -67,7 +69,11 @@ def test_dead_pixels_stay_dead_and_do_no_harm():
     noisy[dead] = np.nan
     noisy[:, 7] = np.nan
     clean, *_ = low_rank(noisy, variance)
-    assert np.isnan(clean[dead]).all() and np.isnan(clean[:, 7]).all() and np.isfinite(clean[~dead & (np.arange(truth.shape[1]) != 7)]).all()
+    assert (
+        np.isnan(clean[dead]).all()
+        and np.isnan(clean[:, 7]).all()
+        and np.isfinite(clean[~dead & (np.arange(truth.shape[1]) != 7)]).all()
+    )
     assert rmse(clean, truth) < 1.1 * rmse(whole, truth)
 
 

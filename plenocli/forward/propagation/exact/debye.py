@@ -1,25 +1,30 @@
-"""The field behind a main lens whose exit wave is a sphere, in direction cosines: what the exact rung has for h.
+"""The field behind a main lens whose exit wave is a sphere, in direction cosines: what the
+exact rung has for h.
 
-A well corrected lens sends a wave towards the image point that is spherical, not paraxially so. Expanded about the image
-point, what is left of the phase k(|xi - x| - |xi - xp|) from the pupil point xi is -k s.(x - xp) with the direction cosines
-s = xi/sqrt(z2^2 + |xi|^2) (Debye; Born and Wolf, section 8.8), so that
+A well corrected lens sends a wave towards the image point that is spherical, not paraxially so.
+Expanded about the image point, what is left of the phase k(|xi - x| - |xi - xp|) from the pupil
+point xi is -k s.(x - xp) with the direction cosines s = xi/sqrt(z2^2 + |xi|^2) (Debye; Born and
+Wolf, section 8.8), so that
 
-    h(d) = 1/(lambda N) * integral of P(xi) a(s) exp(-j k s.d) d^2 s,   N^2 = integral of a(s)^2 d^2 s over the aperture,
+    h(d) = 1/(lambda N) * integral of P(xi) a(s) exp(-j k s.d) d^2 s,
+    N^2 = integral of a(s)^2 d^2 s over the aperture,
 
-again a function of d = x - xp alone whose |h|^2 integrates to the share of the light that the filters pass. The amplitude a
-is a choice (`main_lens.apodisation`): 1/(1 - s^2) for an evenly lit plane pupil, (1 - s^2)^(-1/4) for a lens that keeps the
-sine condition, 1 for Airy's pattern. An object out of focus sends a sphere about its own image point, z2' behind the lens,
-1/z2' = 1/z2 - eps: that wave differs from the one towards the array by the path sqrt(z2^2 + r^2) - z2 - sqrt(z2'^2 + r^2) + z2'.
+again a function of d = x - xp alone whose |h|^2 integrates to the share of the light that the
+filters pass. The amplitude a is a choice (`main_lens.apodisation`): 1/(1 - s^2) for an evenly lit
+plane pupil, (1 - s^2)^(-1/4) for a lens that keeps the sine condition, 1 for Airy's pattern. An
+object out of focus sends a sphere about its own image point, z2' behind the lens, 1/z2' = 1/z2 -
+eps: that wave differs from the one towards the array by the path sqrt(z2^2 + r^2) - z2 -
+sqrt(z2'^2 + r^2) + z2'.
 """
 
 import math
 
 import numpy as np
 
-from plenocli.forward.propagation.fresnel.spread_function import mirrored
 from plenocli.forward.camera.pupil import pupil_rows, wavefront, wavefront_slope
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import hankel_series, is_radial, radial_field
+from plenocli.forward.propagation.fresnel.spread_function import mirrored
 
 APODISATION = {
     "uniform-pupil": lambda cos2: 1 / cos2,
@@ -31,8 +36,8 @@ SLAB = 1 << 21
 
 
 def spherical_field(camera, geometry, dy, dx):
-    """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: (len(dy), len(dx)), real where a radial pupil
-    makes it so.
+    """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: (len(dy),
+    len(dx)), real where a radial pupil makes it so.
 
     By quadrature over any pupil that pupil_rows knows; source: see the module.
     """
@@ -57,23 +62,41 @@ def spherical_profile(camera, geometry, reach):
     outer = lens.aperture_diameter / 2
     inner = outer * (lens.obscuration or 0.0)
     rate, half = g.k * reach, (outer - inner) / 2
-    t, w = gauss(nodes_for(half * (rate / g.z2 + g.k * (abs(g.eps) * outer + wavefront_slope(lens)))))
+    t, w = gauss(
+        nodes_for(half * (rate / g.z2 + g.k * (abs(g.eps) * outer + wavefront_slope(lens))))
+    )
     rho = inner + half * (t + 1)
     cos2 = g.z2**2 / (g.z2**2 + rho * rho)
     phase = g.k * (wavefront(lens, np.zeros_like(rho), rho) + defocus_path(g, rho * rho))
-    weight = half * w * rho * APODISATION[lens.apodisation](cos2) * cos2**2 / g.z2**2 * np.exp(1j * phase)
+    weight = (
+        half
+        * w
+        * rho
+        * APODISATION[lens.apodisation](cos2)
+        * cos2**2
+        / g.z2**2
+        * np.exp(1j * phase)
+    )
     sines = rho * np.sqrt(cos2) / g.z2
-    return hankel_series(rate * sines, weight, rate * outer / math.hypot(outer, g.z2)) * (2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g))))
+    return hankel_series(rate * sines, weight, rate * outer / math.hypot(outer, g.z2)) * (
+        2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
+    )
 
 
 def defocus_path(geometry, r2):
-    """Path (m) by which a wave towards the object's image is ahead of one towards the array at squared pupil radius r2 (m^2)."""
+    """Path (m) by which a wave towards the object's image is ahead of one towards the array at
+    squared pupil radius r2 (m^2).
+    """
     here, image = 1 / geometry.z2, 1 / geometry.z2 - geometry.eps
-    return r2 * (here / (1 + np.sqrt(1 + here * here * r2)) - image / (1 + np.sqrt(1 + image * image * r2)))
+    return r2 * (
+        here / (1 + np.sqrt(1 + here * here * r2)) - image / (1 + np.sqrt(1 + image * image * r2))
+    )
 
 
 def _transform(y, x, weight, rate, dy, dx):
-    """sum of weight exp(-j rate (y dy + x dx)) over one panel of the pupil, by parts even and odd in dy and dx."""
+    """sum of weight exp(-j rate (y dy + x dx)) over one panel of the pupil, by parts even
+    and odd in dy and dx.
+    """
     even_y, even_x = (mirrored(y, x, weight, axis) for axis in (0, 1))
     y, x = np.broadcast_to(y[:, None], x.shape), x
     for even, axis in ((even_y, 0), (even_x, 1)):
@@ -95,12 +118,17 @@ def _transform(y, x, weight, rate, dy, dx):
                 parts[i, j] += _times_transposed(a, b)
     (cc, cs), (sc, ss) = parts
     quadrants = [[cc - ss * (a * b) - 1j * (a * sc + b * cs) for b in (-1, 1)] for a in (-1, 1)]
-    quadrants = [[q[:: 1 if a else -1, :: 1 if b else -1] for b, q in enumerate(row)] for a, row in enumerate(quadrants)]
+    quadrants = [
+        [q[:: 1 if a else -1, :: 1 if b else -1] for b, q in enumerate(row)]
+        for a, row in enumerate(quadrants)
+    ]
     return np.block(quadrants)
 
 
 def _folded(a, axis, weight):
-    """The half of a mirror-symmetric array from its middle on; weights count twice but on the middle itself."""
+    """The half of a mirror-symmetric array from its middle on; weights count twice but on
+    the middle itself.
+    """
     count = a.shape[axis]
     half = np.take(a, range(count // 2, count), axis)
     if weight:
@@ -133,6 +161,9 @@ def _aperture_norm(lens, geometry):
     if lens.aperture_shape == "square":
         cos2 = geometry.z2**2 / (geometry.z2**2 + radius**2 * (t[:, None] ** 2 + t**2))
         return ((shade(cos2) * cos2) ** 2 * w * w[:, None]).sum() * (radius / geometry.z2) ** 2
-    low, high = ((r / geometry.z2) ** 2 / (1 + (r / geometry.z2) ** 2) for r in (radius * (lens.obscuration or 0.0), radius))
+    low, high = (
+        (r / geometry.z2) ** 2 / (1 + (r / geometry.z2) ** 2)
+        for r in (radius * (lens.obscuration or 0.0), radius)
+    )
     s2 = (low + high) / 2 + (high - low) / 2 * t
     return math.pi * (high - low) / 2 * (w * shade(1 - s2) ** 2).sum()

@@ -1,7 +1,9 @@
-"""The light of one lenslet on one superpixel by the exact kernel: an interval of each axis, and the product of two of them.
+"""The light of one lenslet on one superpixel by the exact kernel: an interval of each axis, and the
+product of two of them.
 
-With the kernel's and the lens's residual sum_rs P_r C_rs Q_s (optics.residual) and the main lens's field sum_ij e_i S_ij e'_j on
-the displacements from the object's points to the lenslet, the field on the superpixel is X (C (x) S) X'^T,
+With the kernel's and the lens's residual sum_rs P_r C_rs Q_s (optics.residual) and the main lens's
+field sum_ij e_i S_ij e'_j on the displacements from the object's points to the lenslet, the field
+on the superpixel is X (C (x) S) X'^T,
 
     X[(u, p), (r, i)] = integral of W(u, x) P_r(u, x) e_i(m D2 + x - p) dx   over the lenslet.
 
@@ -13,23 +15,34 @@ from functools import cached_property
 
 import numpy as np
 
-from plenocli.forward.propagation.exact.low_rank_product import thin
-from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 from plenocli.forward.camera.quadrature import gauss, nodes_for
+from plenocli.forward.propagation.exact.low_rank_product import thin
 from plenocli.forward.propagation.exact.residual import Residual, path, split
+from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
 SLAB = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
 
 
 class Way:
-    """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m, from its centre) and the roots of
-    their weights; points (m, on the array) that are computed, and their weights in what is left out; modes: (lines, nodes), what
-    the field on the nodes, weighted, is carried by, or None: the nodes themselves; faint: root of the faintest point's light over the
-    brightest's."""
+    """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m,
+    from its centre) and the roots of their weights;
+
+    points (m, on the array) that are computed, and their weights in what is left out;
+    modes: (lines, nodes), what the field on the nodes, weighted, is carried by, or None:
+        the nodes themselves;
+    faint: root of the faintest point's light over the brightest's.
+    """
 
     def __init__(self, u, root, points, emphasis, modes=None, faint=1.0):
-        self.u, self.root, self.points, self.emphasis, self.modes, self.faint = u, root, points, emphasis, modes, faint
+        self.u, self.root, self.points, self.emphasis, self.modes, self.faint = (
+            u,
+            root,
+            points,
+            emphasis,
+            modes,
+            faint,
+        )
 
     @property
     def lines(self):
@@ -39,13 +52,22 @@ class Way:
     def carry(self, wave):
         """A kernel (nodes, x), roots of weights folded in, as (lines, x)."""
         real = wave.real.dtype
-        return wave if self.modes is None else (self.modes.astype(real) @ wave.view(real)).view(wave.dtype)
+        return (
+            wave
+            if self.modes is None
+            else (self.modes.astype(real) @ wave.view(real)).view(wave.dtype)
+        )
 
 
 class Interval:
-    """From lenslet m to superpixel s along one axis. `place`: the lenslet's nodes x (m) from the axis; terms: LocalTerms there.
+    """From lenslet m to superpixel s along one axis.
 
-    f: focal length of a hyperbolic lenslet, None for a parabolic one; tolerance: root energy by which the field may miss."""
+    `place`: the lenslet's nodes x (m) from the axis;
+    terms: LocalTerms there.
+
+    f: focal length of a hyperbolic lenslet, None for a parabolic one;
+    tolerance: root energy by which the field may miss.
+    """
 
     def __init__(self, geometry, field, axis, s, m, way, parabolic, tolerance, dtype):
         self.geometry, self.way, self.parabolic, self.dtype = geometry, way, parabolic, dtype
@@ -56,28 +78,48 @@ class Interval:
         self.x, self.w = half * t, half * w
         self.place = m * g.D2 + self.x
         reach = half + np.abs(g.points(axis)).max()
-        self.terms = LocalTerms(field, axis, max(m * g.D2 - reach, -field.half), min(m * g.D2 + reach, field.half), tolerance)
+        self.terms = LocalTerms(
+            field,
+            axis,
+            max(m * g.D2 - reach, -field.half),
+            min(m * g.D2 + reach, field.half),
+            tolerance,
+        )
         values = self.terms.evaluate(self.place[:, None] - way.points) * way.emphasis[:, None]
         self.values = values.astype(dtype if np.iscomplexobj(values) else dtype.type().real.dtype)
 
     def _slope(self, middle, half):
-        """Largest slope (rad/m) of the integrand's phase: of the way to either end of the superpixel, the lens and the main lens's wave."""
+        """Largest slope (rad/m) of the integrand's phase: of the way to either end of the
+        superpixel, the lens and the main lens's wave.
+        """
         g, x = self.geometry, half * np.linspace(-1, 1, 17)
         d = self.offset + np.array([[self.way.u.min()], [self.way.u.max()]]) - x
         bend = x / g.f2 if self.parabolic else x / np.hypot(x, g.f2)
-        return g.k * (np.abs(d / np.hypot(d, g.z3) + bend - (middle + x) / g.z2).max() + g.D1 / (2 * g.z2))
+        return g.k * (
+            np.abs(d / np.hypot(d, g.z3) + bend - (middle + x) / g.z2).max() + g.D1 / (2 * g.z2)
+        )
 
     def wave(self, other):
         """W (u, x) towards superpixels displaced by `other` (m) along the other axis."""
         g, u = self.geometry, self.way.u
-        phase = path(self.offset + u[:, None] - self.x, g.z3, self.offset, other) - path(u, g.z3)[:, None] + self.place**2 / (2 * g.z2)
+        phase = (
+            path(self.offset + u[:, None] - self.x, g.z3, self.offset, other)
+            - path(u, g.z3)[:, None]
+            + self.place**2 / (2 * g.z2)
+        )
         phase = phase - (self.x**2 / (2 * g.f2) if self.parabolic else path(self.x, g.f2))
-        return (self.way.root[:, None] * self.w / math.sqrt(g.wavelength * g.z3)) * np.exp(1j * g.k * phase)
+        return (self.way.root[:, None] * self.w / math.sqrt(g.wavelength * g.z3)) * np.exp(
+            1j * g.k * phase
+        )
 
     @cached_property
     def gram(self):
-        """Overlaps, for a mean point, of what each term alone brings to the superpixel through the separable part: (term, term)."""
-        sheet = _times(self.way.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)).reshape(-1, self.values.shape[2])
+        """Overlaps, for a mean point, of what each term alone brings to the superpixel through
+        the separable part: (term, term).
+        """
+        sheet = _times(
+            self.way.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)
+        ).reshape(-1, self.values.shape[2])
         gram = (sheet.conj().T @ sheet).astype(complex) / len(self.way.points)
         return gram if np.iscomplexobj(self.values) else gram.real
 
@@ -88,22 +130,29 @@ class Interval:
         return np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
 
     def sheet(self, other, functions, mixing, kept):
-        """X for the pairs kept = (r, i) of `functions`(u, x) -> (r, u, x) and the columns i of `mixing`, terms of this interval:
-        (lines of the sensor x points, kept)."""
+        """X for the pairs kept = (r, i) of `functions`(u, x) -> (r, u, x) and the columns i of
+        `mixing`, terms of this interval: (lines of the sensor x points, kept).
+        """
         wave, (kept_r, kept_i) = self.wave(other), kept
-        values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(*self.values.shape[:2], -1)
+        values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(
+            *self.values.shape[:2], -1
+        )
         out = np.empty((self.way.lines, len(self.way.points), len(kept_r)), self.dtype)
         for r, term in enumerate(functions(self.way.u, self.x)):
             some = np.flatnonzero(kept_r == r)
             if len(some):
                 flat = values[:, :, kept_i[some]].reshape(len(self.x), -1)
-                out[:, :, some[0]:some[-1] + 1] = _times(self.way.carry((wave * term).astype(self.dtype)), flat).reshape(len(out), -1, len(some))
+                out[:, :, some[0] : some[-1] + 1] = _times(
+                    self.way.carry((wave * term).astype(self.dtype)), flat
+                ).reshape(len(out), -1, len(some))
         return out.reshape(len(out) * out.shape[1], -1)
 
 
 class Pair:
-    """Factors of what one lenslet, an Interval of each axis, brings to one superpixel. weight: root energy of a mean point's field there,
-    by the separable part alone."""
+    """Factors of what one lenslet, an Interval of each axis, brings to one superpixel.
+
+    weight: root energy of a mean point's field there, by the separable part alone.
+    """
 
     def __init__(self, row, column, symmetric):
         self.row, self.column, self.symmetric = row, column, symmetric
@@ -111,21 +160,42 @@ class Pair:
         self.weight = float(np.linalg.norm(row.weigh @ self._field @ column.weigh.T))
 
     def factors(self, reach, tolerance):
-        """(X, X', K) with the field X K X'^T up to about `tolerance` (root energy of a mean point); X' is X where symmetric.
+        """(X, X', K) with the field X K X'^T up to about `tolerance` (root energy of a mean point);
+        X' is X where symmetric.
 
         reach: half width (m) of the superpixel.
         """
         g = self.row.geometry
         left, field, right = self._terms(tolerance / 2)
-        residual = Residual((self.row.offset, self.column.offset), reach, g.lenslet_width / 2, g.z3, g.k, None if self.row.parabolic else g.f2,
-                            min(0.5, tolerance / (3 * self.weight)) if self.weight else 0.5, self.symmetric)
+        residual = Residual(
+            (self.row.offset, self.column.offset),
+            reach,
+            g.lenslet_width / 2,
+            g.z3,
+            g.k,
+            None if self.row.parabolic else g.f2,
+            min(0.5, tolerance / (3 * self.weight)) if self.weight else 0.5,
+            self.symmetric,
+        )
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
-        kept = [_strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15) for axis in (0, 1)]
+        kept = [
+            _strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15)
+            for axis in (0, 1)
+        ]
         coupling = _coupled(*(thin(a.astype(self.row.dtype)) for a in (residual.core, field)), kept)
-        x = self.row.sheet(self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0])
-        y = x if self.symmetric else self.column.sheet(self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1])
-        # now that it is seen what each term brings: residuals send light where the separable part does not
+        x = self.row.sheet(
+            self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0]
+        )
+        y = (
+            x
+            if self.symmetric
+            else self.column.sheet(
+                self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1]
+            )
+        )
+        # now that it is seen what each term brings: residuals send light where the
+        # separable part does not
         brings = [_energy(x) / len(self.row.way.points)]
         brings += brings if self.symmetric else [_energy(y) / len(self.column.way.points)]
         (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 4)
@@ -133,18 +203,26 @@ class Pair:
         return x, x if self.symmetric else y[:, some], coupling
 
     def _terms(self, tolerance):
-        """(A, K, B): A K B^T are the terms S of the main lens's field, but for what does not reach the superpixel."""
+        """(A, K, B): A K B^T are the terms S of the main lens's field, but for what does not
+        reach the superpixel.
+        """
         if self.symmetric:
             return split(self._field, tolerance * self.row.way.faint, symmetric=True)
         rows, columns = self.row.weigh, self.column.weigh
         u, s, v = split(rows @ self._field @ columns.T, tolerance)
         s = np.maximum(np.diag(s), np.finfo(float).tiny)  # no light passes a shut filter
         # S through the directions that reach it on either side: exact on these
-        return self._field @ columns.T @ v.conj() / s, np.diag(s), (u.conj().T @ rows @ self._field).T / s
+        return (
+            self._field @ columns.T @ v.conj() / s,
+            np.diag(s),
+            (u.conj().T @ rows @ self._field).T / s,
+        )
 
 
 def _coupled(core, field, kept):
-    """core[r, s] field[i, j] for the pairs kept = ((r, i), (s, j)): an array, or sparse where both are."""
+    """core[r, s] field[i, j] for the pairs kept = ((r, i), (s, j)): an array, or
+    sparse where both are.
+    """
     from scipy import sparse
 
     (r, i), (s, j) = kept
@@ -154,14 +232,14 @@ def _coupled(core, field, kept):
     core, field = (a.toarray() if sparse.issparse(a) else a for a in (core, field))
     out = core[r[:, None], s]
     for start in range(0, len(out), SLAB):  # the largest array there is, no second one beside it
-        out[start:start + SLAB] *= field[i[start:start + SLAB, None], j]
+        out[start : start + SLAB] *= field[i[start : start + SLAB, None], j]
     return out
 
 
 def _weighed(coupling, power):
     """|coupling|^2 @ power, with no second array of that size."""
     parts = range(0, coupling.shape[0], SLAB)
-    return np.concatenate([abs(coupling[start:start + SLAB]) ** 2 @ power for start in parts])
+    return np.concatenate([abs(coupling[start : start + SLAB]) ** 2 @ power for start in parts])
 
 
 def _norms(interval, mixing):
@@ -173,13 +251,15 @@ def _energy(columns):
     """Sum of squares of each column of a complex matrix: (columns,)."""
     total = np.zeros(2 * columns.shape[1])
     for start in range(0, len(columns), SLAB):
-        parts = columns[start:start + SLAB].view(columns.real.dtype)
+        parts = columns[start : start + SLAB].view(columns.real.dtype)
         total += np.einsum("ij,ij->j", parts, parts)
     return total.reshape(-1, 2).sum(axis=1)
 
 
 def _strong(power, tolerance):
-    """Indices (r, i) of all entries of `power` but the weakest, which together are at most tolerance^2."""
+    """Indices (r, i) of all entries of `power` but the weakest, which together are
+    at most tolerance^2.
+    """
     order = np.argsort(power, axis=None)
     keep = np.ones(power.size, bool)
     keep[order[np.cumsum(power.ravel()[order]) <= tolerance**2]] = False
@@ -188,20 +268,26 @@ def _strong(power, tolerance):
 
 
 class LocalTerms:
-    """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at `tolerance` of the whole field."""
+    """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at
+    `tolerance` of the whole field.
+    """
 
     def __init__(self, field, axis, low, high, tolerance):
         self.middle, self.half = (low + high) / 2, (high - low) / 2
-        count = max(8, int(len(field.rows) * (2 if field.even else 1) * self.half / field.half) + 24)
+        count = max(
+            8, int(len(field.rows) * (2 if field.even else 1) * self.half / field.half) + 24
+        )
         t, w = gauss(count)
         root = np.sqrt(self.half * w)[:, None]
         values = [root * field.evaluate(self.middle + self.half * t, a) for a in (0, 1)]
         # the partner of a term has the norm sqrt(s), which weighs it
         u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
-        basis = u[:, :terms_within(s, tolerance)]
+        basis = u[:, : terms_within(s, tolerance)]
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
-        self._series = ((legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (basis / root))
+        self._series = (legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (
+            basis / root
+        )
 
     def coefficients(self, axis):
         """(i, term): the terms of h along `axis` in this basis."""
@@ -217,7 +303,9 @@ def field_norms(field, axis):
     """Root energy of each term of h along one axis: (terms,)."""
     coefficients = field.columns if axis else field.rows
     degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
-    return np.sqrt((np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half)
+    return np.sqrt(
+        (np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half
+    )
 
 
 def _times(kernel, values):

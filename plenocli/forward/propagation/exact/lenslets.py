@@ -1,14 +1,17 @@
-"""Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first integral as low rank.
+"""Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first
+integral as low rank.
 
-The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor, or of an isolated lenslet as
-prolate functions across the superpixel (optics.prolate), which are fewer. The kernel's path along each axis, the lens and the
-curvature of h separate; the rest is the short sum of residual.Residuals, and so is h (debye.spherical_field), hence
+The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor,
+or of an isolated lenslet as prolate functions across the superpixel (optics.prolate), which are
+fewer. The kernel's path along each axis, the lens and the curvature of h separate; the rest is the
+short sum of residual.Residuals, and so is h (debye.spherical_field), hence
 
     M = sum over lenslets m, n of X_m (C_mn (x) S_mn) X_n^T,
     X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
 
-Terms (r, i) that all couplings leave too weak to matter are left out, and M is compressed to its own rank (optics.product):
-what is left are factor tables as the paraxial rung has them (optics.factors).
+Terms (r, i) that all couplings leave too weak to matter are left out, and M is compressed to its
+own rank (optics.product): what is left are factor tables as the paraxial rung has
+them (optics.factors).
 """
 
 import math
@@ -17,26 +20,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
-from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, Way
-from plenocli.forward.propagation.sampling import BandPlan, distinct, grid_of, is_symmetric, size_band
-from plenocli.forward.propagation.sampling import expected_terms as psf_terms
 from plenocli.forward.propagation.exact.low_rank_product import FILL, MAX_SKETCH, Product
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
-from plenocli.forward.propagation.fresnel.spread_function import edge_emphasis, psf_nodes, separable_field
-from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.fresnel.array_to_sensor import lit_lenslets, sensor_nodes
+from plenocli.forward.propagation.fresnel.separable_fields import Factors
+from plenocli.forward.propagation.fresnel.spread_function import (
+    edge_emphasis,
+    psf_nodes,
+    separable_field,
+)
+from plenocli.forward.propagation.sampling import (
+    BandPlan,
+    distinct,
+    grid_of,
+    is_symmetric,
+    size_band,
+)
+from plenocli.forward.propagation.sampling import expected_terms as psf_terms
 
 CUT, CUT_EFFECT = 0.42, 1.3
-"""Root-energy cut of the field over the accuracy asked for, and its effect on the worst column over itself (measured: 0.5 to 2.3)."""
+"""Root-energy cut of the field over the accuracy asked for, and its effect on the worst column
+over itself (measured: 0.5 to 2.3).
+"""
 
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
 
 FAINT, LEAST = 0.1, 1e-10
-"""Share of the brightest point's light below which a point's own light is what its column's error is measured by; least share, and cut of the
-main lens's field, that this is done for."""
+"""Share of the brightest point's light below which a point's own light is what its column's error
+is measured by; least share, and cut of the main lens's field, that this is done for.
+"""
 
 GAPS = 3.0
 """By how much finer fields are cut where lenslets leave gaps."""
@@ -47,37 +63,59 @@ COARSE = 5e-3
 
 @dataclass(frozen=True)
 class ExactBand(BandPlan):
-    """A BandPlan of the exact rung. cut: root-energy error of a mean point's field; sensor_count: prolate functions across
-    a superpixel that carry the field before it goes to the pixels' nodes, 0: the pixels' nodes serve."""
+    """A BandPlan of the exact rung.
+
+    cut: root-energy error of a mean point's field;
+    sensor_count: prolate functions across a superpixel that carry the field before it goes to the
+        pixels' nodes, 0: the pixels' nodes serve.
+    """
 
     cut: float = 1e-5
     sensor_count: int = 0
 
 
 def exact_band(view, grid, ring, accuracy, tolerance):
-    """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and accuracy as in size_band.
+    """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and
+    accuracy as in size_band.
 
     NumericsError where the field is expected to have far more terms than a sketch may hold.
     """
-    # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of what was asked from 3e-3 to 5e-2, on 3 cameras
+    # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of
+    # what was asked from 3e-3 to 5e-2, on 3 cameras
     finer = 1 + SIDES * min(1.0, max(0.0, math.log10(accuracy / 1e-3))) if ring else 1.0
     base = size_band(view, grid, ring, accuracy / finer, tolerance)
-    # light out of focus is spread over many superpixels, each of which is cut by itself; coarse cuts hurt corners more
+    # light out of focus is spread over many superpixels, each of which is cut by itself; coarse
+    # cuts hurt corners more
     share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
-    if view.lenslet_width < 0.999 * view.D2:  # points beside a lenslet: edges are all that their columns have
+    # points beside a lenslet: edges are all that their columns have
+    if view.lenslet_width < 0.999 * view.D2:
         cut /= GAPS
     count = prolate_count(_bandwidth(view, grid), cut / 100)
-    count = count if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape) else 0
+    count = (
+        count
+        if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape)
+        else 0
+    )
     _require_sketch(expected_terms(view, base.terms, cut, True))
-    return ExactBand(**vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)}, cut=cut, sensor_count=count)
+    return ExactBand(
+        **vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)},
+        cut=cut,
+        sensor_count=count,
+    )
 
 
 def _require_sketch(terms):
     """NumericsError where no sketch holds a field of about so many terms."""
     if terms > FILL * MAX_SKETCH:
-        raise NumericsError(f"the exact field has about {terms:.0f} separable terms, more than {int(FILL * MAX_SKETCH)}", "model",
-                            "ask for a looser accuracy or the paraxial model")
+        raise NumericsError(
+            (
+                f"the exact field has about {terms:.0f} separable terms, more than "
+                f"{int(FILL * MAX_SKETCH)}"
+            ),
+            "model",
+            "ask for a looser accuracy or the paraxial model",
+        )
 
 
 def _extent(view, pixels):
@@ -86,10 +124,15 @@ def _extent(view, pixels):
 
 
 def _bandwidth(view, grid):
-    """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that of its middle's path taken out, among `grid`
-    superpixels: steeper rays come from no point of the lenslet. Up to 5 % are added for slopes that change on the way: without them,
-    prolate functions fall short of waves that reach the band's end."""
-    reach, aside = _extent(view, max(view.pixel_shape)), (max(grid) - 1) / 2 * (view.superpixel_pitch - view.D2)
+    """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that
+    of its middle's path taken out, among `grid` superpixels: steeper rays come from no point of the
+    lenslet. Up to 5 % are added for slopes that change on the way: without them, prolate functions
+    fall short of waves that reach the band's end.
+    """
+    reach, aside = (
+        _extent(view, max(view.pixel_shape)),
+        (max(grid) - 1) / 2 * (view.superpixel_pitch - view.D2),
+    )
     source = view.lenslet_width / 2 + aside
     bent = 1.5 * ((source + reach) / (2 * view.z3)) ** 2
     return view.k * source * reach / view.z3 * (1 + min(0.05, bent))
@@ -99,26 +142,37 @@ def valid_for(camera, view):
     """None, or one sentence why this rung cannot serve `camera` at the Geometry `view`."""
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
-        return f"exact propagation is built for square lenslets on a square lattice, not for {array.aperture_shape} ones on a {array.lattice} lattice"
+        return (
+            "exact propagation is built for square lenslets on a square lattice, not for "
+            f"{array.aperture_shape} ones on a {array.lattice} lattice"
+        )
     if view.z3 < 10 * view.wavelength:
-        return "the sensor lies within ten wavelengths of the lenslets, where evanescent waves reach it"
+        return (
+            "the sensor lies within ten wavelengths of the lenslets, where "
+            "evanescent waves reach it"
+        )
     return None
 
 
 def fresnel_model_error(view, parabolic):
     """Estimated relative L2 error of the worst column of the paraxial model against the exact one.
 
-    Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P = D2/(2 f2) at the lenslet's,
-    a hyperbolic lenslet sends the ray through both 3/2 z3 T P (T + P) from where paraxial optics has it, a parabolic one
-    z3 P^3/2 more; sine against tangent at the main lens is a part of it. That is a share `moved` of the pupil image's half
-    width z3 T. A disc moved by it changes along its rim, which is one pixel or one diffraction cell wide: over the disc's norm
-    that is about moved sqrt(disc's width/rim's width). Points beside lenslets that leave gaps are dim, and what is moved weighs
-    more in their columns. Measured on 24 cameras (f/1.5 to f/64, 50 to 500 um, 0.4 to 10 um, 3 to 52 pixels, both profiles): between 0.9 and 2.5 times the
-    error found (docs/model.md, "Exact propagation").
+    Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P =
+    D2/(2 f2) at the lenslet's, a hyperbolic lenslet sends the ray through both 3/2 z3 T P (T + P)
+    from where paraxial optics has it, a parabolic one z3 P^3/2 more; sine against tangent at the
+    main lens is a part of it. That is a share `moved` of the pupil image's half width z3 T. A disc
+    moved by it changes along its rim, which is one pixel or one diffraction cell wide: over the
+    disc's norm that is about moved sqrt(disc's width/rim's width). Points beside lenslets that
+    leave gaps are dim, and what is moved weighs more in their columns. Measured on 24 cameras
+    (f/1.5 to f/64, 50 to 500 um, 0.4 to 10 um, 3 to 52 pixels, both profiles): between 0.9 and 2.5
+    times the error found (docs/model.md, "Exact propagation").
     """
     # where a lenslet has few cells, diffraction spreads light further than the pupil does
     spread = view.wavelength / (2 * view.D2)
-    pupil, lenslet = math.hypot(view.D1 / (2 * view.z2), spread), math.hypot(view.D2 / (2 * view.f2), spread)
+    pupil, lenslet = (
+        math.hypot(view.D1 / (2 * view.z2), spread),
+        math.hypot(view.D2 / (2 * view.f2), spread),
+    )
     moved = 1.5 * lenslet * (pupil + lenslet) + (lenslet**3 / (2 * pupil) if parabolic else 0.0)
     across = 2 * view.z3 * pupil / view.pixel_pitch
     dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
@@ -126,24 +180,39 @@ def fresnel_model_error(view, parabolic):
 
 
 def corner_phase(view):
-    """Phase (rad) of the kernel that does not separate, at the largest displacements along both axes within one superpixel."""
+    """Phase (rad) of the kernel that does not separate, at the largest displacements along both
+    axes within one superpixel.
+    """
     far = view.lenslet_width / 2 + max(view.pixel_shape) * view.pixel_pitch / 2
     return view.k * far**4 / (4 * view.z3**3)
 
 
 def expected_terms(view, terms, cut, parabolic):
-    """Terms of a lenslet's field whose spread function has `terms`: fitted to 144 cases (f/1.5 to f/64, cut 5e-3 to 5e-7), 8 % rms;
-    coarser cuts keep a fifth of them for every decade."""
+    """Terms of a lenslet's field whose spread function has `terms`: fitted to 144 cases (f/1.5 to
+    f/64, cut 5e-3 to 5e-7), 8 % rms; coarser cuts keep a fifth of them for every decade.
+    """
     phase, decades = corner_phase(view), math.log10(COARSE / cut)
     if decades < 0:
-        return max(2.0, 0.22**-decades * expected_terms(view, psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, COARSE / 0.9), COARSE, parabolic))
+        return max(
+            2.0,
+            0.22**-decades
+            * expected_terms(
+                view,
+                psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, COARSE / 0.9),
+                COARSE,
+                parabolic,
+            ),
+        )
     spread = (0.48 if parabolic else 0.73) * view.diffraction_cells**0.71 * (1 + 5 * phase) ** 0.33
     return max(2.0, terms * (0.75 + 0.23 * phase**0.45) + decades * spread)
 
 
 def expected_rank(view, band, parabolic, place=(0, 0)):
-    """Terms of the field on superpixel `place`. Coherent neighbours bring edge diffraction, which falls slowly: factors fitted to 88
-    tables of 8 cameras (8 to 100 diffraction cells, accuracy 1e-2 to 1e-6), within 0.55 to 1.3."""
+    """Terms of the field on superpixel `place`.
+
+    Coherent neighbours bring edge diffraction, which falls slowly: factors fitted to 88 tables of 8
+    cameras (8 to 100 diffraction cells, accuracy 1e-2 to 1e-6), within 0.55 to 1.3.
+    """
     own = expected_terms(view, _own_terms(view, band), band.cut, parabolic)
     if band.window is None:
         return own
@@ -152,52 +221,91 @@ def expected_rank(view, band, parabolic, place=(0, 0)):
 
 
 def expected_products(view, band, parabolic, place=(0, 0)):
-    """Pairs (r, i) of terms that the field on superpixel `place` is compressed from, all its lenslets together: fitted to 18 tables of
-    5 cameras (6 to 102 diffraction cells, 25 to 225 lenslets, accuracy 1e-3 to 1e-5), within 0.85 to 1.35."""
+    """Pairs (r, i) of terms that the field on superpixel `place` is compressed from, all its
+    lenslets together: fitted to 18 tables of 5 cameras (6 to 102 diffraction cells, 25 to 225
+    lenslets, accuracy 1e-3 to 1e-5), within 0.85 to 1.35.
+    """
     phase = corner_phase(view)
-    own = 1.27 * (1 if parabolic else 1.36) * (1 + phase) ** 0.22 * expected_rank(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)
+    own = (
+        1.27
+        * (1 if parabolic else 1.36)
+        * (1 + phase) ** 0.22
+        * expected_rank(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)
+    )
     if band.window is None:
         return own
     decades = max(0.0, math.log10(COARSE / band.cut))
     # what a lenslet beside the own one adds, on an average
-    share = min(0.85, 1.05 * decades * view.diffraction_cells**-0.4 * phase / (phase + 0.12)) * 1.19 ** sum(n != 0 for n in place)
+    share = min(
+        0.85, 1.05 * decades * view.diffraction_cells**-0.4 * phase / (phase + 0.12)
+    ) * 1.19 ** sum(n != 0 for n in place)
     return own * (1 + share * ((2 * band.window + 1) ** 2 - 1))
 
 
 def _own_terms(view, band):
     """Terms of the spread function on a lenslet's own field."""
-    return band.terms if band.window is None else psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, band.cut / 0.9)
+    return (
+        band.terms
+        if band.window is None
+        else psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, band.cut / 0.9)
+    )
 
 
 def cost(camera, view, band, shape, double):
-    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
-    seconds (what does not scale with them, one core) and bytes (beyond the result); fitted to process times (docs/model.md).
+    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength:
+    operations (real, in matrix products), seconds (what does not scale with them, one core) and
+    bytes (beyond the result); fitted to process times (docs/model.md).
 
-    NumericsError where the superpixels beside the lenslet's own are expected to have more terms than a sketch may hold.
+    NumericsError where the superpixels beside the lenslet's own are expected to have more terms
+    than a sketch may hold.
     """
-    parabolic, grid, even = camera.lenslet_array.profile == "parabolic", grid_of(shape[1]), is_symmetric(camera)
+    parabolic, grid, even = (
+        camera.lenslet_array.profile == "parabolic",
+        grid_of(shape[1]),
+        is_symmetric(camera),
+    )
     plain = 0.2 if even and camera.main_lens.aperture_shape == "square" else 1.0
     lit = 1 if band.window is None else 2 * band.window + 1
     points, lines = max(view.object_shape), band.pixel_nodes * max(view.pixel_shape)
     nodes, item = band.sensor_count or lines, 16 if double else 8
     beside = grid[0] // 2 if even else grid[0] - 1
     rows = [nodes * ((points + 1) // 2 if even else points), nodes * points, nodes * points]
-    # superpixels (row, column) that stand for all of their kind: on no axis of symmetry, on one or two, on a diagonal
-    kinds = {(0, 0): 1, (1, 0): beside, (1, 1): beside, (2, 1): beside * (beside - 1) // 2} if even else {(0, 0): 1, (1, 0): 2 * beside, (2, 1): beside**2}
+    # superpixels (row, column) that stand for all of their kind: on no axis of symmetry, on one or
+    # two, on a diagonal
+    kinds = (
+        {(0, 0): 1, (1, 0): beside, (1, 1): beside, (2, 1): beside * (beside - 1) // 2}
+        if even
+        else {(0, 0): 1, (1, 0): 2 * beside, (2, 1): beside**2}
+    )
     # as far as light comes: the lenslets beside the superpixel
     across = min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + 40)
     decades = max(0.0, math.log10(COARSE / band.cut))
     few = psf_nodes(view, view.lenslet_width / 2)
-    operations, largest = lit * band.terms * (rows[0] + beside * rows[1]) * (4 * across + 8 * band.terms), 0.0
+    operations, largest = (
+        lit * band.terms * (rows[0] + beside * rows[1]) * (4 * across + 8 * band.terms),
+        0.0,
+    )
     # by how many axes a superpixel lies aside
-    ranks = [plain * expected_rank(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
+    ranks = [
+        plain * expected_rank(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))
+    ]
     if band.window is not None:  # better now than after minutes of work
         _require_sketch(1.3 * ranks[sum(n > 1 for n in grid)])
         # fine fields take more of them than that (1.2 to 1.6 times at f/4.4 and 1e-5)
-        ranks = [rank * (1 + 0.35 * max(0.0, decades - 2) * math.sqrt(view.diffraction_cells / 100)) for rank in ranks]
-    pairs_of_terms = [plain * expected_products(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))]
-    begun = 0.01 + (0.008 if lit == 1 else 0.015) * sum(kinds.values())  # calls, whatever the precision
-    seconds = 2.4e-9 * band.psf_nodes**3 / (8 if even else 1) + 3e-10 * lit * points * few * band.psf_nodes * band.terms
+        ranks = [
+            rank * (1 + 0.35 * max(0.0, decades - 2) * math.sqrt(view.diffraction_cells / 100))
+            for rank in ranks
+        ]
+    pairs_of_terms = [
+        plain * expected_products(view, band, parabolic, place)
+        for place in ((0, 0), (0, 1), (1, 1))
+    ]
+    # calls, whatever the precision
+    begun = 0.01 + (0.008 if lit == 1 else 0.015) * sum(kinds.values())
+    seconds = (
+        2.4e-9 * band.psf_nodes**3 / (8 if even else 1)
+        + 3e-10 * lit * points * few * band.psf_nodes * band.terms
+    )
     for (a, b), count in kinds.items():
         if count == 0:
             continue
@@ -206,58 +314,105 @@ def cost(camera, view, band, shape, double):
         both = rows[a] + (0 if even and a == b else rows[b])
         sketch = 1.12 / FILL * rank + 8
         # of many lenslets each brings few terms, so that products are narrow and wait for memory
-        operations += count * (both * (products * ((16 if lit == 1 else 22) * sketch + 4 * across) + 40 * sketch**2) + 250 * sketch**3)
+        operations += count * (
+            both * (products * ((16 if lit == 1 else 22) * sketch + 4 * across) + 40 * sketch**2)
+            + 250 * sketch**3
+        )
         operations += count * 4 * both * lines * rank if band.sensor_count else 0
         # coarse cuts drop most lenslets
         sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
         seconds += count * (4e-9 if lit == 1 else 2.8e-8) * both * products
-        seconds += count * (0.007 * corner_phase(view) if lit == 1 else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across))
-        # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those expected, on 3 cameras
-        more = 0.0 if lit == 1 else (0.15 + 0.2 * aside) * max(0.0, decades - 1) * math.sqrt(view.diffraction_cells / 100)
+        seconds += count * (
+            0.007 * corner_phase(view)
+            if lit == 1
+            else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across)
+        )
+        # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those
+        # expected, on 3 cameras
+        more = (
+            0.0
+            if lit == 1
+            else (0.15 + 0.2 * aside)
+            * max(0.0, decades - 1)
+            * math.sqrt(view.diffraction_cells / 100)
+        )
         # fine fields have far fewer terms a lenslet than products, and are narrowed to them
         narrowed = 1.0 if lit == 1 else 1 - 0.35 * min(1.0, decades)
         largest = max(largest, item * (both * (narrowed * products * (1 + more) + 3 * sketch)))
-    # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from superpixels beside it: measured
-    # at f/2.2, 340 to 3500 of them
+    # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from
+    # superpixels beside it: measured at f/2.2, 340 to 3500 of them
     own = _own_terms(view, band)
-    coupling = item * ((1.12 if lit == 1 else 2.8) * plain * expected_products(view, replace(band, window=None, terms=own), parabolic)) ** 2
-    # what is there from first to last: the field on the array as it is decomposed, and its terms on all intervals
+    coupling = (
+        item
+        * (
+            (1.12 if lit == 1 else 2.8)
+            * plain
+            * expected_products(view, replace(band, window=None, terms=own), parabolic)
+        )
+        ** 2
+    )
+    # what is there from first to last: the field on the array as it is decomposed, and its
+    # terms on all intervals
     field = 60 * (band.psf_nodes / (2 if even else 1)) ** 2
     intervals = item / 2 * (beside + 1) * lit * across * points * 0.56 * own
-    pairs, fine = distinct(camera, view, shape)[1], view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2
+    pairs, fine = (
+        distinct(camera, view, shape)[1],
+        view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2,
+    )
     size = shape[1] * shape[2] * shape[3]
     tables = sum(kinds.values())
     mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
-    return {"operations": operations + 8.0 * 1.2 * fine * mean * pairs,
-            "seconds": begun + seconds * (2 if double else 1) + pairs * (4e-5 + fine * (4e-9 if double else 3e-9)) + size * (2e-8 if double else 7e-9),
-            "bytes": int(largest + coupling + field + intervals + item * 2 * tables * points * lines * mean) + (3 << 24)}
+    return {
+        "operations": operations + 8.0 * 1.2 * fine * mean * pairs,
+        "seconds": begun
+        + seconds * (2 if double else 1)
+        + pairs * (4e-5 + fine * (4e-9 if double else 3e-9))
+        + size * (2e-8 if double else 7e-9),
+        "bytes": int(
+            largest + coupling + field + intervals + item * 2 * tables * points * lines * mean
+        )
+        + (3 << 24),
+    }
 
 
 class ExactSquareLenslets:
-    """Sensor fields behind square lenslets by the exact kernel; see the module and optics.square.SquareLenslets."""
+    """Sensor fields behind square lenslets by the exact kernel; see the module
+    and optics.square.SquareLenslets.
+    """
 
     def __init__(self, camera, geometry, plan, band):
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
         self._illuminate(camera, band.cut / 2)
-        self._extent, self._bandwidth = [_extent(geometry, n) for n in geometry.pixel_shape], _bandwidth(geometry, plan.superpixels)
+        self._extent, self._bandwidth = (
+            [_extent(geometry, n) for n in geometry.pixel_shape],
+            _bandwidth(geometry, plan.superpixels),
+        )
         self._ways, self._intervals = {}, {}
         self._tables, counts = {}, []
         for sy, sx in self._pairs():
             self._tables[sy, sx], products = self._compressed(sy, sx)
             counts.append(products)
         self._intervals = {}
-        self.notes = {"separable_terms": max(t.high.shape[3] for t in self._tables.values()), "field_tail": self._field.tail,
-                      "psf_terms": self._field.terms, "products": max(counts)}
+        self.notes = {
+            "separable_terms": max(t.high.shape[3] for t in self._tables.values()),
+            "field_tail": self._field.tail,
+            "psf_terms": self._field.terms,
+            "products": max(counts),
+        }
 
     def _illuminate(self, camera, tolerance):
-        """The main lens's field, its symmetries, and the light of points that enters, down to that of the faintest point."""
+        """The main lens's field, its symmetries, and the light of points that enters, down to
+        that of the faintest point.
+        """
         g = self.geometry
         alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         while True:
             self._field = separable_field(camera, g, self.band.half, tolerance, spherical_field)
-            self.symmetry = tuple(a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels)))
+            self.symmetry = tuple(
+                a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels))
+            )
             self._turn = alike and self.symmetry[2]
             self._entering = self._light()
             brightest = self._entering.max()
@@ -266,7 +421,10 @@ class ExactSquareLenslets:
             if tolerance <= 1.01 * faint * self.band.cut / 2 or tolerance <= LEAST:
                 break
             # what is cut may itself be as bright as the faintest
-            tolerance = max(LEAST, tolerance / 30 if least < 100 * self._field.tail**2 else faint * self.band.cut / 2)
+            tolerance = max(
+                LEAST,
+                tolerance / 30 if least < 100 * self._field.tail**2 else faint * self.band.cut / 2,
+            )
         self._faint = faint
 
     # which lenslets light which superpixels
@@ -282,7 +440,9 @@ class ExactSquareLenslets:
     def _pairs(self):
         """Superpixels (rows, columns) whose tables are made; the others' follow by symmetry."""
         ry, rx = (self._reach(axis) for axis in (0, 1))
-        return sorted({self._canonical(sy, sx)[:2] for sy in range(-ry, ry + 1) for sx in range(-rx, rx + 1)})
+        return sorted(
+            {self._canonical(sy, sx)[:2] for sy in range(-ry, ry + 1) for sx in range(-rx, rx + 1)}
+        )
 
     def _canonical(self, sy, sx):
         sy, sx = abs(sy) if self.symmetry[0] else sy, abs(sx) if self.symmetry[1] else sx
@@ -292,7 +452,9 @@ class ExactSquareLenslets:
     # one axis
 
     def _points(self, s, axis):
-        """Object points (m, on the array) along one axis that are computed for superpixel s; the others mirror them."""
+        """Object points (m, on the array) along one axis that are computed for superpixel s; the
+        others mirror them.
+        """
         points = self.geometry.points(axis)
         return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
 
@@ -307,11 +469,14 @@ class ExactSquareLenslets:
                 modes = prolate(t, phase, count).T * np.sqrt(w)
                 u, w = self._extent[axis] * t, self._extent[axis] * w
             else:
-                u, w = (a.ravel() for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule))
+                u, w = (
+                    a.ravel()
+                    for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
+                )
             points = self._points(s, axis)
             emphasis = edge_emphasis(g, points)
             if self._faint < 1:
-                light = self._entering.max(axis=1 - axis)[:len(points)] / self._entering.max()
+                light = self._entering.max(axis=1 - axis)[: len(points)] / self._entering.max()
                 emphasis = np.maximum(emphasis, 1 / np.sqrt(np.maximum(light, LEAST)))
             self._ways[s, axis] = Way(u, np.sqrt(w), points, emphasis, modes, self._faint)
         return self._ways[s, axis]
@@ -319,12 +484,23 @@ class ExactSquareLenslets:
     def _interval(self, s, m, axis):
         axis = 0 if self._turn else axis
         if (s, m, axis) not in self._intervals:
-            self._intervals[s, m, axis] = Interval(self.geometry, self._field, axis, s, m, self._way(s, axis), self._parabolic,
-                                                   self.band.cut / 3 * self._faint, self.dtype)
+            self._intervals[s, m, axis] = Interval(
+                self.geometry,
+                self._field,
+                axis,
+                s,
+                m,
+                self._way(s, axis),
+                self._parabolic,
+                self.band.cut / 3 * self._faint,
+                self.dtype,
+            )
         return self._intervals[s, m, axis]
 
     def _light(self):
-        """Share of the light of a point (row, column) that enters the lenslets of the neighbourhood."""
+        """Share of the light of a point (row, column) that enters the lenslets of
+        the neighbourhood.
+        """
         rows, signs = self._gram(0), self._field.signs
         alike = self._turn and signs is not None and self.superpixels[0] == self.superpixels[1]
         columns = rows * np.outer(signs, signs) if alike else self._gram(1)
@@ -336,29 +512,47 @@ class ExactSquareLenslets:
         half = g.lenslet_width / 2
         t, w = gauss(psf_nodes(g, half))
         for m in lit_lenslets(self._reach(axis), self.band.window):
-            values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis).transpose(0, 2, 1)
+            values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis).transpose(
+                0, 2, 1
+            )
             total = total + (values * (half * w)) @ values.conj().transpose(0, 2, 1)
-        return np.concatenate([total, total[:len(g.points(axis)) - len(points)][::-1]])
+        return np.concatenate([total, total[: len(g.points(axis)) - len(points)][::-1]])
 
     # products of two axes
 
     def _compressed(self, sy, sx):
         """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
         cut, symmetric = self.band.cut, self._turn and sy == sx
-        pairs = {(m, n): Pair(self._interval(sy, m, 0), self._interval(sx, n, 1), symmetric and m == n == sy)
-                 for m in self._lenslets(sy, 0) for n in self._lenslets(sx, 1) if not symmetric or m <= n}
+        pairs = {
+            (m, n): Pair(
+                self._interval(sy, m, 0), self._interval(sx, n, 1), symmetric and m == n == sy
+            )
+            for m in self._lenslets(sy, 0)
+            for n in self._lenslets(sx, 1)
+            if not symmetric or m <= n
+        }
         order = sorted(pairs, key=lambda key: pairs[key].weight)
-        total = np.cumsum([pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order])
+        total = np.cumsum(
+            [pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order]
+        )
         kept = [key for key, power in zip(order, total) if power > (cut / 4) ** 2] or order[-1:]
-        left, right, couplings, guess = [], [], {}, int(1.12 / FILL * self._expected_rank(sy, sx)) + 8
+        left, right, couplings, guess = (
+            [],
+            [],
+            {},
+            int(1.12 / FILL * self._expected_rank(sy, sx)) + 8,
+        )
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         for m, n in kept:
             pair, first = pairs[m, n], len(left)
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
             x, y, coupling = pair.factors(max(self._extent), tolerance)
             if (m, n) != kept[-1]:  # its own rank may be far lower
-                x, y, coupling = Product([x], [y], {(0, 0): coupling}, pair.symmetric).narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
-            if symmetric and not pair.symmetric:  # the lenslet mirrored by the diagonal brings the transpose
+                x, y, coupling = Product([x], [y], {(0, 0): coupling}, pair.symmetric).narrowed(
+                    tolerance / 2 * math.sqrt(count)
+                ) or (x, y, coupling)
+            # the lenslet mirrored by the diagonal brings the transpose
+            if symmetric and not pair.symmetric:
                 left += [x, y]
                 half = coupling if m != n else coupling / 2
                 couplings |= {(first, first + 1): half, (first + 1, first): half.T}
@@ -369,7 +563,12 @@ class ExactSquareLenslets:
         product = Product(left, right, couplings, symmetric)
         high, wide = product.factors(cut * math.sqrt(count), guess)
         products = max(c.shape[0] for c in couplings.values())
-        return Factors(self._to_pixels(high, sy, 0)[None], self._to_pixels(wide, sx, 1)[None], self.geometry.pixel_shape, self.band.pixel_nodes), products
+        return Factors(
+            self._to_pixels(high, sy, 0)[None],
+            self._to_pixels(wide, sx, 1)[None],
+            self.geometry.pixel_shape,
+            self.band.pixel_nodes,
+        ), products
 
     def _expected_rank(self, sy, sx):
         return expected_rank(self.geometry, self.band, self._parabolic, (sy, sx))
@@ -382,14 +581,18 @@ class ExactSquareLenslets:
         factor = factor.view(real).transpose(1, 0, 2)
         if way.modes is not None:
             v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(v.ravel() / self._extent[axis], self._bandwidth, way.lines)
+            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(
+                v.ravel() / self._extent[axis], self._bandwidth, way.lines
+            )
             factor = matrix.astype(real) @ factor
         return np.ascontiguousarray(factor).view(self.dtype)
 
     # what the builder asks for
 
     def incident(self, rows, columns):
-        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
+        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
+        neighbourhood: (points,).
+        """
         # the cut, of weighted fields, may add as well as take
         return self._entering[rows, columns] * (1 + self.band.sampling)
 
@@ -400,18 +603,30 @@ class ExactSquareLenslets:
                 self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
 
     def superpixel(self, sy, sx, rows, columns, out):
-        """As Factors.superpixel; mirrored points and superpixels are computed as their mirror images."""
+        """As Factors.superpixel; mirrored points and superpixels are computed as
+        their mirror images.
+        """
         sy, sx = sy - self._reach(0), sx - self._reach(1)
         *table, turned = self._canonical(sy, sx)
         table, shape = self._tables[*table], self.geometry.object_shape
         if turned:
-            table = Factors(table.wide, table.high, self.geometry.pixel_shape, self.band.pixel_nodes)
+            table = Factors(
+                table.wide, table.high, self.geometry.pixel_shape, self.band.pixel_nodes
+            )
         # points whose own half of the lenslet has no table
-        far_y, far_x = (self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))
-                        for axis, s, index in ((0, sy, rows), (1, sx, columns)))
+        far_y, far_x = (
+            self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))
+            for axis, s, index in ((0, sy, rows), (1, sx, columns))
+        )
         for fy, fx in ((False, False), (False, True), (True, False), (True, True)):
             some = np.flatnonzero((far_y == fy) & (far_x == fx))
             if len(some):
                 images = np.empty((len(some), *self.geometry.pixel_shape), out.dtype)
-                table.superpixel(0, 0, shape[0] - 1 - rows[some] if fy else rows[some], shape[1] - 1 - columns[some] if fx else columns[some], images)
+                table.superpixel(
+                    0,
+                    0,
+                    shape[0] - 1 - rows[some] if fy else rows[some],
+                    shape[1] - 1 - columns[some] if fx else columns[some],
+                    images,
+                )
                 out[some] = images[:, :: -1 if fy else 1, :: -1 if fx else 1]

@@ -1,8 +1,10 @@
-"""A large product M = sum_ab X_a K_ab X_b^T of known factors, compressed to its own rank without being formed.
+"""A large product M = sum_ab X_a K_ab X_b^T of known factors, compressed to its own rank
+without being formed.
 
-The range is found by random combinations of M's columns (Halko, Martinsson, Tropp 2011), which cost as little as the factors
-have terms; what is seen of M through an orthonormal basis of it is a small core, whose singular values say where to cut. Where
-factors have many more terms than M, combinations of both rows and columns show first how many of them it takes, and which.
+The range is found by random combinations of M's columns (Halko, Martinsson, Tropp 2011), which cost
+as little as the factors have terms; what is seen of M through an orthonormal basis of it is a small
+core, whose singular values say where to cut. Where factors have many more terms than M,
+combinations of both rows and columns show first how many of them it takes, and which.
 """
 
 import numpy as np
@@ -13,7 +15,9 @@ from plenocli.forward.propagation.fresnel.spread_function import terms_within
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
 NARROW, OVER = 3, 2
-"""A product is narrowed where its terms fit a sketch of its factors' over the first; random combinations that this is told from, over that."""
+"""A product is narrowed where its terms fit a sketch of its factors' over the first; random
+combinations that this is told from, over that.
+"""
 SMALL = 150
 """Terms of factors that are not worth narrowing."""
 THIN = 1e-13
@@ -23,8 +27,10 @@ MAX_SKETCH = 2500
 
 
 class Product:
-    """left, right: lists of X_a (rows, terms) and X_b (columns, terms); couplings: {(a, b): K_ab}, at least one for each factor; symmetric: whether M^T = M,
-    with the same factors on both sides."""
+    """left, right: lists of X_a (rows, terms) and X_b (columns, terms);
+    couplings: {(a, b): K_ab}, at least one for each factor;
+    symmetric: whether M^T = M, with the same factors on both sides.
+    """
 
     def __init__(self, left, right, couplings, symmetric):
         self.left, self.right = left, right
@@ -33,13 +39,23 @@ class Product:
         self.rng = np.random.default_rng(20130701)
 
     def _through(self, side, blocks):
-        """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t) for this side's (0 left, 1 right)."""
+        """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t)
+        for this side's (0 left, 1 right).
+        """
         if side == 0:
-            return [sum(k @ blocks[b] for (i, b), k in self.couplings.items() if i == a) for a in range(len(self.left))]
-        return [sum(k.T @ blocks[a] for (a, i), k in self.couplings.items() if i == b) for b in range(len(self.right))]
+            return [
+                sum(k @ blocks[b] for (i, b), k in self.couplings.items() if i == a)
+                for a in range(len(self.left))
+            ]
+        return [
+            sum(k.T @ blocks[a] for (a, i), k in self.couplings.items() if i == b)
+            for b in range(len(self.right))
+        ]
 
     def _times(self, side, seen):
-        """M (side 0) or M^T (1) times combinations of its columns, given as what the other side's factors make of them: (rows, combinations)."""
+        """M (side 0) or M^T (1) times combinations of its columns, given as what the other
+        side's factors make of them: (rows, combinations).
+        """
         mine = self.right if side else self.left
         out = np.zeros((len(mine[0]), seen[0].shape[1]), mine[0].dtype)
         for x, y in zip(mine, self._through(side, seen)):
@@ -47,23 +63,32 @@ class Product:
         return out
 
     def _mixed(self, side, count):
-        """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of rows, every one of which goes into one of them."""
+        """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of
+        rows, every one of which goes into one of them.
+        """
         from scipy import sparse
 
         factors = self.right if side else self.left
         rows = len(factors[0])
-        order, signs = self.rng.permutation(rows), self.rng.choice(np.array([-1, 1], factors[0].real.dtype), rows)
+        order, signs = (
+            self.rng.permutation(rows),
+            self.rng.choice(np.array([-1, 1], factors[0].real.dtype), rows),
+        )
         combine = sparse.csr_array((signs, (np.arange(rows) % count, order)), (count, rows))
         return [(combine @ x).T for x in factors]
 
     def _through_basis(self, q):
-        """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is symmetric, else M^T q* alone."""
+        """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is
+        symmetric, else M^T q* alone.
+        """
         turned = q.conj()
         seen = [x.T @ turned for x in self.left]
         return seen if self.symmetric else [self._times(1, seen)]
 
     def _extend(self, q, seen, count):
-        """The basis q of M's range (None: not begun) with columns added up to `count`, and what is seen of M through it."""
+        """The basis q of M's range (None: not begun) with columns added up to `count`, and what
+        is seen of M through it.
+        """
         columns = self._times(0, self._mixed(1, count if q is None else count - q.shape[1]))
         if q is None:
             q = orthonormal(columns)
@@ -73,7 +98,9 @@ class Product:
         new = orthonormal(columns)
         # what was numerically nothing is no direction of its own
         new = orthonormal(new - q @ (q.conj().T @ new))
-        return np.hstack([q, new]), [np.hstack(pair) for pair in zip(seen, self._through_basis(new))]
+        return np.hstack([q, new]), [
+            np.hstack(pair) for pair in zip(seen, self._through_basis(new))
+        ]
 
     def _core(self, q, seen):
         """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
@@ -83,7 +110,8 @@ class Product:
         return p, triangle.T
 
     def factors(self, cut, count):
-        """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of `count` columns or more.
+        """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of
+        `count` columns or more.
 
         NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
@@ -96,17 +124,23 @@ class Product:
             terms = terms_within(s, cut)
             root = np.sqrt(s[:terms])
             u, v = u[:, :terms] * root, vh[:terms].T * root
-            if size >= self.limit or (terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut):
+            if size >= self.limit or (
+                terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut
+            ):
                 return q @ u, p @ v
             if size >= MAX_SKETCH:
                 raise NumericsError(
                     f"the exact field has more than {int(FILL * size)} separable terms",
-                    "model", "ask for a looser accuracy, fewer superpixels or the paraxial model")
+                    "model",
+                    "ask for a looser accuracy, fewer superpixels or the paraxial model",
+                )
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
 
     def narrowed(self, cut):
-        """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than M's factors have terms, X orthonormal and Y = X
-        where M is symmetric; or None: M does not have so few terms, or its factors have few enough."""
+        """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than
+        M's factors have terms, X orthonormal and Y = X where M is symmetric; or None: M does not
+        have so few terms, or its factors have few enough.
+        """
         given = sum(x.shape[1] for x in self.left)
         count = given // NARROW
         if given <= SMALL or count >= self.limit:
@@ -116,18 +150,24 @@ class Product:
             return None
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
-        y, core = self._core(x, seen) if self.symmetric else (seen[0], np.eye(x.shape[1], dtype=x.dtype))
+        y, core = (
+            self._core(x, seen) if self.symmetric else (seen[0], np.eye(x.shape[1], dtype=x.dtype))
+        )
         return (x, y, core) if self._missed(x, core, y) <= 2 * cut else None
 
     def _directions(self, cut, count):
-        """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each factor, and the terms that M has; no more than
-        `count` of either. Found where M is small: through random combinations of its rows and of its columns, OVER times as many."""
+        """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each
+        factor, and the terms that M has; no more than `count` of either. Found where M is small:
+        through random combinations of its rows and of its columns, OVER times as many.
+        """
         many = min(OVER * count, self.limit)
         right = self._mixed(1, many)
         left = right if self.symmetric else self._mixed(0, many)
         core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
         # a step of a power iteration, which parts large values from small ones
-        basis = orthonormal(core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, count)))
+        basis = orthonormal(
+            core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, count))
+        )
         basis = orthonormal(core.conj().T @ basis)
         image = core @ basis
         rest = np.linalg.norm(core - image @ basis.conj().T)
@@ -135,13 +175,16 @@ class Product:
         # the k largest also fit what is random here, so that less than all of the rest is seen
         share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
         terms = terms_within(s, cut * share, rest)
-        basis = basis @ vh[:int(terms / FILL) + 8].conj().T
+        basis = basis @ vh[: int(terms / FILL) + 8].conj().T
         return [m @ basis for m in right], terms
 
     def _missed(self, x, core, y):
         """Root sum of squares of M - X K Y^T, estimated on random entries."""
         rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
-        exact = sum(a[rows] @ c for a, c in zip(self.left, self._through(0, [b[columns].T for b in self.right])))
+        exact = sum(
+            a[rows] @ c
+            for a, c in zip(self.left, self._through(0, [b[columns].T for b in self.right]))
+        )
         difference = exact - x[rows] @ core @ y[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
 
@@ -158,14 +201,20 @@ def _add_product(out, x, y):
 
 
 def thin(matrix):
-    """The matrix with its entries below rounding left out, sparse where few are left: couplings of singular vectors are all but diagonal."""
+    """The matrix with its entries below rounding left out, sparse where few are left: couplings
+    of singular vectors are all but diagonal.
+    """
     from scipy import sparse
 
     if sparse.issparse(matrix):
         return matrix
     size = np.abs(matrix)
     keep = size > THIN * size.max()
-    return sparse.csr_array(np.where(keep, matrix, 0)) if np.count_nonzero(keep) < matrix.size / 16 else matrix
+    return (
+        sparse.csr_array(np.where(keep, matrix, 0))
+        if np.count_nonzero(keep) < matrix.size / 16
+        else matrix
+    )
 
 
 def orthonormal(columns):

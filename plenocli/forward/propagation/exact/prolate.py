@@ -1,9 +1,11 @@
-"""Band-limited functions on an interval: the fewest that carry waves of all directions up to a largest one.
+"""Band-limited functions on an interval: the fewest that carry waves of all directions
+up to a largest one.
 
-The prolate spheroidal functions of order 0 are the orthonormal functions on [-1, 1] that hold most of what exp(j a t), |a| <= c,
-puts there, one after the other (Slepian and Pollak, Bell System Technical Journal 40, 1961). It takes about 2 c/pi of them,
-where polynomials take c. Their Legendre coefficients are the eigenvectors of a tridiagonal matrix (Xiao, Rokhlin and Yarvin,
-Inverse Problems 17, 2001).
+The prolate spheroidal functions of order 0 are the orthonormal functions on [-1, 1] that hold most
+of what exp(j a t), |a| <= c, puts there, one after the other (Slepian and Pollak, Bell System
+Technical Journal 40, 1961). It takes about 2 c/pi of them, where polynomials take c. Their Legendre
+coefficients are the eigenvectors of a tridiagonal matrix (Xiao, Rokhlin and Yarvin, Inverse
+Problems 17, 2001).
 """
 
 import math
@@ -15,13 +17,19 @@ from plenocli.forward.propagation.fresnel.spread_function import legendre
 
 
 def prolate_count(c, error):
-    """How many prolate functions leave no more than about `error` (root mean square over t and over a) of exp(j a t), |a| <= c:
-    the law of Landau and Widom (Journal of Mathematical Analysis and Applications 77, 1980), fitted from c = 0.01 to 1000."""
-    return int(math.ceil(2 * c / math.pi + 2 / math.pi**2 * math.log(1 / error) * math.log(c + 8) + 1))
+    """How many prolate functions leave no more than about `error` (root mean square over t and over
+    a) of exp(j a t), |a| <= c: the law of Landau and Widom (Journal of Mathematical Analysis and
+    Applications 77, 1980), fitted from c = 0.01 to 1000.
+    """
+    return int(
+        math.ceil(2 * c / math.pi + 2 / math.pi**2 * math.log(1 / error) * math.log(c + 8) + 1)
+    )
 
 
 def prolate(t, c, count):
-    """The first `count` prolate functions of bandwidth c at t in [-1, 1]: (len(t), count), orthonormal over [-1, 1]."""
+    """The first `count` prolate functions of bandwidth c at t in [-1, 1]: (len(t), count),
+    orthonormal over [-1, 1].
+    """
     series = _series(c, count)
     return legendre(np.asarray(t, float), len(series), 1) @ series
 
@@ -37,7 +45,9 @@ def _series(c, count):
         k = np.arange(odd, degrees, 2.0)
         middle = k * (k + 1) + (2 * k * (k + 1) - 1) / ((2 * k + 3) * (2 * k - 1)) * c * c
         beside = (k + 1) * (k + 2) / ((2 * k + 3) * np.sqrt((2 * k + 1) * (2 * k + 5))) * c * c
-        _, vectors = eigh_tridiagonal(middle, beside[:-1], select="i", select_range=(0, (count + 1 - odd) // 2 - 1))
+        _, vectors = eigh_tridiagonal(
+            middle, beside[:-1], select="i", select_range=(0, (count + 1 - odd) // 2 - 1)
+        )
         series[odd::2, odd::2] = vectors * np.sqrt(k + 0.5)[:, None]
     series.flags.writeable = False
     return series

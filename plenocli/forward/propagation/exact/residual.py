@@ -1,37 +1,49 @@
 """What is left of an exact kernel when its separable part is taken out, as a short sum of products.
 
-Rayleigh and Sommerfeld's first kernel from the array to the sensor (docs/model.md, "Exact propagation") is
+Rayleigh and Sommerfeld's first kernel from the array to the sensor (docs/model.md,
+"Exact propagation") is
 
-    K = z/(j lambda R^2) (1 + j/(k R)) exp(j k (R - z)) = exp(j k phi(dy)) exp(j k phi'(dx)) kappa(dy, dx)/(j lambda z),
+    K = z/(j lambda R^2) (1 + j/(k R)) exp(j k (R - z)) = exp(j k phi(dy)) exp(j k phi'(dx))
+        kappa(dy, dx)/(j lambda z),
 
-R^2 = z^2 + dy^2 + dx^2. From a lenslet to a superpixel whose centre is displaced by (cy, cx) from the lenslet's, phi and phi' are
-the exact paths along the lines dx = cx and dy = cy (`path`), so that kappa has only what the two axes do together: about the
-phase k cy cx (dy - cy) (dx - cx)/R^3 between far ones and -k dx^2 dy^2/(4 z^3) to the lenslet's own superpixel. A lens of
-hyperbolic profile leaves an ell(y, x) of the same form. Their product on all displacements d = c + u - x is
+R^2 = z^2 + dy^2 + dx^2. From a lenslet to a superpixel whose centre is displaced by (cy, cx) from
+the lenslet's, phi and phi' are the exact paths along the lines dx = cx and dy = cy (`path`), so
+that kappa has only what the two axes do together: about the phase k cy cx (dy - cy) (dx - cx)/R^3
+between far ones and -k dx^2 dy^2/(4 z^3) to the lenslet's own superpixel. A lens of hyperbolic
+profile leaves an ell(y, x) of the same form. Their product on all displacements d = c + u - x is
 
     kappa(dy, dx) ell(y, x) = sum_rs P_r(u_y, y) C_rs Q_s(u_x, x).
 """
 
 import numpy as np
 
-from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 from plenocli.forward.camera.quadrature import gauss
+from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
 
 def path(d, z, own=0.0, other=0.0):
-    """One axis's part of R - z at displacements d (m) about the centre (own, other) of both axes, without cancellation.
+    """One axis's part of R - z at displacements d (m) about the centre (own, other) of both axes,
+    without cancellation.
 
-    path(dy, z, cy, cx) + path(dx, z, cx, cy) is R - z wherever dy = cy or dx = cx; about the centre 0 it is sqrt(z^2 + d^2) - z.
+    path(dy, z, cy, cx) + path(dx, z, cx, cy) is R - z wherever dy = cy or dx = cx; about the centre
+    0 it is sqrt(z^2 + d^2) - z.
     """
     middle = np.sqrt(z * z + own * own + other * other)
-    return (d * d - own * own) / (np.sqrt(z * z + d * d + other * other) + middle) + (own * own + other * other) / (2 * (middle + z))
+    return (d * d - own * own) / (np.sqrt(z * z + d * d + other * other) + middle) + (
+        own * own + other * other
+    ) / (2 * (middle + z))
 
 
 def kappa(dy, dx, z, k, centre=(0.0, 0.0)):
-    """The residual of the kernel at displacements dy, dx (m) over the distance z (m), about `centre`."""
+    """The residual of the kernel at displacements dy, dx (m) over the distance z
+    (m), about `centre`.
+    """
     cy, cx = centre
-    r, row, column, middle = (np.sqrt(z * z + a * a + b * b) for a, b in ((dy, dx), (dy, cx), (cy, dx), (cy, cx)))
-    # (R - R(dy, cx)) - (R(cy, dx) - R(cy, cx)): differences of squares, and of two numbers that differ much
+    r, row, column, middle = (
+        np.sqrt(z * z + a * a + b * b) for a, b in ((dy, dx), (dy, cx), (cy, dx), (cy, cx))
+    )
+    # (R - R(dy, cx)) - (R(cy, dx) - R(cy, cx)): differences of squares, and of two
+    # numbers that differ much
     psi = (dx * dx - cx * cx) * (1 / (r + row) - 1 / (column + middle))
     return np.exp(1j * k * psi) * (z / r) ** 2 * (1 + 1j / (k * r))
 
@@ -40,27 +52,44 @@ def ell(y, x, f, k):
     """The residual of a hyperbolic lens of focal length f (m) at (y, x) from its centre."""
     q = y * y + x * x
     r = np.sqrt(f * f + q) + f
-    psi = y * y * (1 / r - 1 / (np.sqrt(f * f + y * y) + f)) + x * x * (1 / r - 1 / (np.sqrt(f * f + x * x) + f))
+    psi = y * y * (1 / r - 1 / (np.sqrt(f * f + y * y) + f)) + x * x * (
+        1 / r - 1 / (np.sqrt(f * f + x * x) + f)
+    )
     return np.exp(-1j * k * psi)
 
 
 class Residual:
-    """kappa ell between a lenslet and the superpixel displaced by `centre` (rows, columns, m) from it.
+    """kappa ell between a lenslet and the superpixel displaced by `centre` (rows,
+    columns, m) from it.
 
-    reach_u, reach_x: half widths (m) of superpixel and lenslet; f: focal length of a hyperbolic lens, or None for a parabolic one,
-    which is separable; tolerance: root mean square of what may be left out; symmetric: one set of functions for both axes, which
-    takes a centre on the diagonal. core: C.
+    reach_u, reach_x: half widths (m) of superpixel and lenslet;
+    f: focal length of a hyperbolic lens, or None for a parabolic one, which is separable;
+    tolerance: root mean square of what may be left out;
+    symmetric: one set of functions for both axes, which takes a centre on the diagonal.
+    core: C.
     """
 
     def __init__(self, centre, reach_u, reach_x, z, k, f, tolerance, symmetric=False):
         self.centre, self.reach_u, self.reach_x = centre, reach_u, reach_x
         reach = reach_u + reach_x
         slopes = [_slope(a, b, reach, z, k) for a, b in (centre, centre[::-1])]
-        # nodes weigh alike, which favours the edges of the lenslet, where a point's column is most sensitive
+        # nodes weigh alike, which favours the edges of the lenslet, where a point's
+        # column is most sensitive
         t, s = (gauss(_nodes(slope))[0] for slope in slopes)
-        left, core, right = split(kappa(centre[0] + reach * t[:, None], centre[1] + reach * s, z, k, centre) / np.sqrt(len(t) * len(s)), tolerance / 4, symmetric)
+        left, core, right = split(
+            kappa(centre[0] + reach * t[:, None], centre[1] + reach * s, z, k, centre)
+            / np.sqrt(len(t) * len(s)),
+            tolerance / 4,
+            symmetric,
+        )
         lens_left, lens_core, lens_right, lens_slope = _lens_terms(reach_x, f, k, tolerance / 4)
-        self._grids = [(gauss(_nodes(slope * reach_u / reach))[0], gauss(_nodes(slope * reach_x / reach + lens_slope))[0]) for slope in slopes]
+        self._grids = [
+            (
+                gauss(_nodes(slope * reach_u / reach))[0],
+                gauss(_nodes(slope * reach_x / reach + lens_slope))[0],
+            )
+            for slope in slopes
+        ]
         products, roots = [], []
         for axis, (nodes, basis, lens) in enumerate(((t, left, lens_left), (s, right, lens_right))):
             if axis and symmetric:
@@ -68,26 +97,41 @@ class Residual:
                 break
             gu, gx = self._grids[axis]
             d = (reach_u * gu[:, None] - reach_x * gx) / reach
-            values = legendre(d.ravel(), len(nodes), 1) @ (_series(nodes) @ (basis * np.sqrt(len(nodes))))
+            values = legendre(d.ravel(), len(nodes), 1) @ (
+                _series(nodes) @ (basis * np.sqrt(len(nodes)))
+            )
             values = values.reshape(len(gu), len(gx), 1, -1) * lens(gx)[:, :, None]
             q, r = np.linalg.qr(values.reshape(len(gu) * len(gx), -1) / np.sqrt(len(gu) * len(gx)))
             products.append(q)
             roots.append(r)
-        left, self.core, right = split(roots[0] @ np.kron(lens_core, core) @ roots[1].T, tolerance, symmetric)
+        left, self.core, right = split(
+            roots[0] @ np.kron(lens_core, core) @ roots[1].T, tolerance, symmetric
+        )
         self._values = []
         for axis, basis in ((0, left), (1, right)):
             gu, gx = self._grids[axis]
-            self._values.append((products[axis] @ basis * np.sqrt(len(gu) * len(gx))).T.reshape(-1, len(gu), len(gx)))
+            self._values.append(
+                (products[axis] @ basis * np.sqrt(len(gu) * len(gx))).T.reshape(
+                    -1, len(gu), len(gx)
+                )
+            )
 
     def functions(self, axis, u, x):
-        """P_r (axis 0) or Q_s (1) at sensor positions u and lenslet positions x (m, from their centres): (terms, len(u), len(x))."""
-        rows, columns = (legendre(place / reach, len(grid), 1) @ _series(grid) for place, reach, grid in zip((u, x), (self.reach_u, self.reach_x), self._grids[axis]))
+        """P_r (axis 0) or Q_s (1) at sensor positions u and lenslet positions x (m, from their
+        centres): (terms, len(u), len(x)).
+        """
+        rows, columns = (
+            legendre(place / reach, len(grid), 1) @ _series(grid)
+            for place, reach, grid in zip((u, x), (self.reach_u, self.reach_x), self._grids[axis])
+        )
         return rows @ self._values[axis] @ columns.T
 
 
 def split(matrix, tolerance, symmetric=False):
-    """(A, K, B) with orthonormal columns and matrix = A K B^T up to `tolerance` (root sum of squares); K is diagonal, or where the
-    matrix is `symmetric` and A = B as nearly so as equal singular values allow."""
+    """(A, K, B) with orthonormal columns and matrix = A K B^T up to `tolerance` (root sum of
+    squares); K is diagonal, or where the matrix is `symmetric` and A = B as nearly so as equal
+    singular values allow.
+    """
     u, s, vh = np.linalg.svd(matrix, full_matrices=False)
     terms = terms_within(s, tolerance)
     u = u[:, :terms]
@@ -97,13 +141,17 @@ def split(matrix, tolerance, symmetric=False):
 
 
 def _lens_terms(reach_x, f, k, tolerance):
-    """The lens's functions of y and of x, their core, and the phase (rad) that they run through per half width."""
+    """The lens's functions of y and of x, their core, and the phase (rad) that they run
+    through per half width.
+    """
     if f is None:
         one = np.ones((1, 1))
         return (lambda x: np.ones((len(x), 1))), one, (lambda x: np.ones((len(x), 1))), 0.0
     slope = k * f * (reach_x / f) ** 4 / 2
     t, _ = gauss(_nodes(slope))
-    basis, core, _ = split(ell(reach_x * t[:, None], reach_x * t, f, k) / len(t), tolerance, symmetric=True)
+    basis, core, _ = split(
+        ell(reach_x * t[:, None], reach_x * t, f, k) / len(t), tolerance, symmetric=True
+    )
     series = _series(t) @ (basis * np.sqrt(len(t)))
 
     def functions(grid):
@@ -115,11 +163,19 @@ def _lens_terms(reach_x, f, k, tolerance):
 def _slope(own, other, reach, z, k):
     """Largest phase (rad) of kappa per half span along the axis with the centre `own`."""
     d, e = own + reach * np.linspace(-1, 1, 9)[:, None], other + reach * np.array([-1.0, 1.0])
-    return k * reach * np.abs(d / np.sqrt(z * z + d * d + e * e) - d / np.sqrt(z * z + d * d + other * other)).max()
+    return (
+        k
+        * reach
+        * np.abs(
+            d / np.sqrt(z * z + d * d + e * e) - d / np.sqrt(z * z + d * d + other * other)
+        ).max()
+    )
 
 
 def _nodes(slope):
-    """Gauss-Legendre nodes that carry a function whose phase changes by `slope` rad per half span."""
+    """Gauss-Legendre nodes that carry a function whose phase changes by `slope`
+    rad per half span.
+    """
     return int(np.ceil(slope + 5 * np.cbrt(slope) + 12))
 
 

@@ -1,14 +1,15 @@
 """From the field on the lenslet array to pixel energies: matrix transforms on quadrature nodes.
 
-In coordinates x' from a lenslet's centre and v from its superpixel's centre (which lies at D2 (1 + z3/z2) per lenslet),
-lenslet n of the neighbourhood contributes, per axis,
+In coordinates x' from a lenslet's centre and v from its superpixel's centre (which lies at D2 (1 +
+z3/z2) per lenslet), lenslet n of the neighbourhood contributes, per axis,
 
     exp(j k [n^2 D2^2/2 (1/z2 + 1/z3) - n D2 v/z3]) / sqrt(lambda z3)
-      * integral of h(n D2 + x' - xp) exp(j k kappa x'^2/2) exp(-j k x' (v - n D2 (1 + z3/z2))/z3) dx'
+      * integral of h(n D2 + x' - xp) exp(j k kappa x'^2/2) exp(-j k x' (v - n D2
+          (1 + z3/z2))/z3) dx'
 
-with kappa = 1/z2 + 1/z3 - 1/f2, the same for every lenslet. Fields of one object point add before the square is taken.
-Pixel energies are sums over `nodes` points per axis; sub-nodes run slowest, so that summing them is adding
-whole planes.
+with kappa = 1/z2 + 1/z3 - 1/f2, the same for every lenslet. Fields of one object point add before
+the square is taken. Pixel energies are sums over `nodes` points per axis; sub-nodes run slowest, so
+that summing them is adding whole planes.
 """
 
 import numpy as np
@@ -17,19 +18,25 @@ from plenocli.forward.camera.quadrature import band_rule
 
 
 def sensor_nodes(geometry, axis, count, place=0.0, rule=0):
-    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel along `axis`: (count, pixels).
+    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel
+    along `axis`: (count, pixels).
 
     rule: the step of quadrature.band_rule, 0 for Gauss-Legendre.
 
-    place: where the superpixel's centre lies along the axis, in superpixel pitches; it matters on a sensor's own raster only.
+    place: where the superpixel's centre lies along the axis, in superpixel pitches; it matters on a
+        sensor's own raster only.
     """
     t, w = band_rule(count, rule)
     half = geometry.pixel_active / 2
-    return half * t[:, None] + (geometry.pixels(axis) + geometry.window_shift(axis, place)), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
+    return half * t[:, None] + (
+        geometry.pixels(axis) + geometry.window_shift(axis, place)
+    ), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
 
 
 def lenslet_kernel(geometry, n, v, weight, x, dtype=complex):
-    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and lenslet nodes x: (v, x) of `dtype`."""
+    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and
+    lenslet nodes x: (v, x) of `dtype`.
+    """
     g = geometry
     relay = 1 / g.z2 + 1 / g.z3
     phase = n * n * g.D2**2 / 2 * relay - n * g.D2 / g.z3 * v
@@ -39,18 +46,23 @@ def lenslet_kernel(geometry, n, v, weight, x, dtype=complex):
     phase -= np.rint(phase)
     phase = (2 * np.pi * phase).astype(kernel.real.dtype)
     amplitude = np.sqrt(weight / (g.wavelength * g.z3))[:, None].astype(phase.dtype)
-    kernel.real, kernel.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)  # twice as fast as a complex exponential
+    # twice as fast as a complex exponential
+    kernel.real, kernel.imag = amplitude * np.cos(phase), amplitude * np.sin(phase)
     return kernel
 
 
 def lit_lenslets(reach, window):
-    """Lenslets (along one axis) whose light is followed: |m| <= window, or each superpixel's own where window is None."""
+    """Lenslets (along one axis) whose light is followed: |m| <= window, or each superpixel's own
+    where window is None.
+    """
     far = reach if window is None else window
     return range(-far, far + 1)
 
 
 def pixel_energy(field):
-    """Sum |field|^2 over the sub-nodes of each pixel: (points, p, rows, p, columns) complex, weights included, overwritten."""
+    """Sum |field|^2 over the sub-nodes of each pixel: (points, p, rows, p, columns) complex,
+    weights included, overwritten.
+    """
     count, p, py, _, px = field.shape
     parts = field.view(field.real.dtype).reshape(count, p, py, p, px, 2)
     np.multiply(parts, parts, out=parts)

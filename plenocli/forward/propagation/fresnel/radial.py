@@ -1,16 +1,24 @@
-"""The main lens's spread function where the pupil is rotationally symmetric: one Hankel integral instead of a surface integral.
+"""The main lens's spread function where the pupil is rotationally symmetric: one Hankel integral
+instead of a surface integral.
 
     h(d) = 2 pi/(lambda z2 sqrt(S)) * integral of P(rho) J0(k rho |d|/z2) rho d rho
 
-is an even function of |d| whose frequencies end at the pupil's rim, so a Chebyshev series in |d|^2 carries it from a few
-hundred radii to any number of points. Source: Born and Wolf, section 8.5; docs/model.md, "From a point to the lenslet array".
+is an even function of |d| whose frequencies end at the pupil's rim, so a Chebyshev series in |d|^2
+carries it from a few hundred radii to any number of points. Source: Born and Wolf, section 8.5;
+docs/model.md, "From a point to the lenslet array".
 """
 
 import math
 
 import numpy as np
 
-from plenocli.forward.camera.pupil import aperture_area, noll_indices, unit_radius, wavefront, wavefront_slope
+from plenocli.forward.camera.pupil import (
+    aperture_area,
+    noll_indices,
+    unit_radius,
+    wavefront,
+    wavefront_slope,
+)
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 
 SLAB = 1 << 13
@@ -20,25 +28,42 @@ SLAB = 1 << 13
 def is_radial(camera):
     """Whether the pupil, its filters and its wavefront error are the same in all directions."""
     lens = camera.main_lens
-    plain = lens.aperture_shape in ("circle", "annulus") and camera.filter_array is None and lens.wavefront is None
+    plain = (
+        lens.aperture_shape in ("circle", "annulus")
+        and camera.filter_array is None
+        and lens.wavefront is None
+    )
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 
 
 def profile(camera, geometry, reach):
-    """Chebyshev coefficients (terms,) of h (1/m) in 2 |d|^2/reach^2 - 1, |d| <= reach (m); real where h is."""
+    """Chebyshev coefficients (terms,) of h (1/m) in 2 |d|^2/reach^2 - 1, |d| <= reach
+    (m); real where h is.
+    """
     g, lens = geometry, camera.main_lens
     outer = g.D1 / 2
     inner = outer * (lens.obscuration or 0.0)
     rate = g.k * reach / g.z2
     half = (outer - inner) / 2
-    t, w = gauss(nodes_for(half * (rate + g.k * (abs(g.eps) * unit_radius(lens) + wavefront_slope(lens)))))
+    t, w = gauss(
+        nodes_for(half * (rate + g.k * (abs(g.eps) * unit_radius(lens) + wavefront_slope(lens))))
+    )
     rho = inner + half * (t + 1)
-    weight = half * w * rho * np.exp(1j * g.k * (wavefront(lens, np.zeros_like(rho), rho) + g.eps / 2 * rho * rho))
-    return hankel_series(rate * rho, weight, rate * outer) * (2 * np.pi / (g.wavelength * g.z2 * math.sqrt(aperture_area(lens))))
+    weight = (
+        half
+        * w
+        * rho
+        * np.exp(1j * g.k * (wavefront(lens, np.zeros_like(rho), rho) + g.eps / 2 * rho * rho))
+    )
+    return hankel_series(rate * rho, weight, rate * outer) * (
+        2 * np.pi / (g.wavelength * g.z2 * math.sqrt(aperture_area(lens)))
+    )
 
 
 def hankel_series(rates, weight, edge):
-    """Chebyshev coefficients in 2 t^2 - 1, 0 <= t <= 1, of the sum of weight J0(rates t); rates at most `edge`; real where it is."""
+    """Chebyshev coefficients in 2 t^2 - 1, 0 <= t <= 1, of the sum of weight J0(rates t); rates
+    at most `edge`; real where it is.
+    """
     from scipy.special import j0
 
     count = int(edge / 2 + 4 * np.cbrt(edge) + 12)
@@ -51,7 +76,9 @@ def hankel_series(rates, weight, edge):
 
 
 def radial_field(camera, geometry, dy, dx, profile=profile):
-    """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is. The pupil must be radial (is_radial).
+    """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is.
+
+    The pupil must be radial (is_radial).
 
     profile: what computes the series, this module's or debye.spherical_profile.
     """
@@ -61,7 +88,11 @@ def radial_field(camera, geometry, dy, dx, profile=profile):
     rows, back_y = np.unique(np.abs(dy), return_inverse=True)
     columns, back_x = np.unique(np.abs(dx), return_inverse=True)
     square = len(rows) == len(columns) and np.array_equal(rows, columns)
-    i, j = np.triu_indices(len(rows)) if square else (a.ravel() for a in np.indices((len(rows), len(columns))))
+    i, j = (
+        np.triu_indices(len(rows))
+        if square
+        else (a.ravel() for a in np.indices((len(rows), len(columns))))
+    )
     place = 2 * (rows[i] ** 2 + columns[j] ** 2) / reach**2 - 1
     field = np.empty((len(rows), len(columns)), series.dtype)
     values = _chebyshev(series.real, place)
@@ -77,7 +108,7 @@ def _chebyshev(series, t):
     """sum_n series[n] T_n(t) for a flat array t, by Clenshaw's recurrence slab by slab."""
     out = np.empty_like(t)
     for start in range(0, len(t), SLAB):
-        part = t[start:start + SLAB]
+        part = t[start : start + SLAB]
         twice = 2 * part
         one, two, work = np.zeros_like(part), np.zeros_like(part), np.empty_like(part)
         for coefficient in series[:0:-1].tolist():
@@ -85,5 +116,5 @@ def _chebyshev(series, t):
             np.subtract(work, two, out=two)
             two += coefficient
             one, two = two, one
-        out[start:start + SLAB] = part * one - two + series[0]
+        out[start : start + SLAB] = part * one - two + series[0]
     return out

@@ -1,45 +1,65 @@
-"""From factor tables to pixel energies: the inner loop of every rung whose sensor field is a short sum of products.
+"""From factor tables to pixel energies: the inner loop of every rung whose sensor field is a
+short sum of products.
 
 The field of the point (row r, column c) on superpixel (sy, sx) is
 
     U[v, u] = sum_j high[sy, r, v, j] wide[sx, c, u, j]
 
-on quadrature nodes v, u of the pixels, so all fields of an object column are one matrix product. The product is made in
-pieces that stay in the caches, real and imaginary parts side by side, and is squared and summed over the nodes of each
-pixel before it leaves it.
+on quadrature nodes v, u of the pixels, so all fields of an object column are one matrix product.
+The product is made in pieces that stay in the caches, real and imaginary parts side by side, and is
+squared and summed over the nodes of each pixel before it leaves it.
 """
 
 import numpy as np
 
 WORK_BYTES = 1 << 22
-"""Size of the product before it is squared: small beside the shared cache, large enough that the right-hand side is packed for several points."""
+"""Size of the product before it is squared: small beside the shared cache, large enough that the
+right-hand side is packed for several points.
+"""
 
 
 class Factors:
     """Pixel energies from factor tables.
 
-    high: (superpixel rows, point rows, nodes x pixel rows, terms), wide: (superpixel columns, point columns, nodes x pixel
-    columns, terms), both complex and of one type; the nodes of a pixel run slowest along v and u (as relay.sensor_nodes
-    orders them), square roots of the quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel
-    is the share of the light that it receives. pixel_shape: (rows, columns); pixel_nodes: nodes per axis; signs: (terms,)
-    of +-1 that multiply the terms, so that one table may serve as both.
+    high: (superpixel rows, point rows, nodes x pixel rows, terms), wide: (superpixel columns, point
+        columns, nodes x pixel columns, terms), both complex and of one type; the nodes of a pixel
+        run slowest along v and u (as relay.sensor_nodes orders them), square roots of the
+        quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel is the
+        share of the light that it receives.
+    pixel_shape: (rows, columns);
+    pixel_nodes: nodes per axis;
+    signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both.
     """
 
     def __init__(self, high, wide, pixel_shape, pixel_nodes, signs=None):
-        if high.shape[2] != pixel_nodes * pixel_shape[0] or wide.shape[2] != pixel_nodes * pixel_shape[1] or high.shape[3] != wide.shape[3]:
-            raise ValueError(f"tables {high.shape} and {wide.shape} do not fit {pixel_nodes} nodes in pixels {pixel_shape}")
-        self.high, self.wide = np.ascontiguousarray(high), np.ascontiguousarray(wide, dtype=high.dtype)
+        if (
+            high.shape[2] != pixel_nodes * pixel_shape[0]
+            or wide.shape[2] != pixel_nodes * pixel_shape[1]
+            or high.shape[3] != wide.shape[3]
+        ):
+            raise ValueError(
+                f"tables {high.shape} and {wide.shape} do not fit {pixel_nodes} nodes in "
+                f"pixels {pixel_shape}"
+            )
+        self.high, self.wide = (
+            np.ascontiguousarray(high),
+            np.ascontiguousarray(wide, dtype=high.dtype),
+        )
         self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
 
     def columns(self, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows, superpixel columns, pixel rows, pixel columns)."""
+        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows,
+        superpixel columns, pixel rows, pixel columns).
+        """
         for sy in range(len(self.high)):
             for sx in range(len(self.wide)):
                 self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
 
     def superpixel(self, sy, sx, rows, columns, out):
-        """Pixel energies on one superpixel, as counted in the tables, of points (rows[i], columns[i]) into out (points, pixel rows, pixel columns)."""
+        """Pixel energies on one superpixel, as counted in the tables, of points (rows[i],
+        columns[i]) into out (points, pixel rows, pixel columns).
+        """
         real = self.high.real.dtype
         lines, terms = self.high.shape[2:]
         step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
@@ -49,22 +69,27 @@ class Factors:
         for group in np.split(order, starts):
             right = self._right(self.wide[sx, columns[group[0]]])
             for start in range(0, len(group), step):
-                part = group[start:start + step]
+                part = group[start : start + step]
                 chosen = rows[part]
-                if len(chosen) == 1 or (np.diff(chosen) == 1).all():  # neighbours in order lie together: no copy
+                # neighbours in order lie together: no copy
+                if len(chosen) == 1 or (np.diff(chosen) == 1).all():
                     chosen = slice(chosen[0], chosen[-1] + 1)
                 left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
-                product = np.matmul(left, right, out=work[:len(left)])
+                product = np.matmul(left, right, out=work[: len(left)])
                 out[part] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
 
     def _energy(self, parts):
-        """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part, node, pixel column)) real."""
+        """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part,
+        node, pixel column)) real.
+        """
         (py, px), p = self.pixel_shape, self.pixel_nodes
         lines = np.einsum("nqk,nqk->nk", parts, parts)
         return np.einsum("nyqx->nyx", lines.reshape(len(parts), py, 2 * p, px))
 
     def _right(self, factor):
-        """(node, term) complex as the right-hand side of a real product: (term x (real, imaginary), (real, imaginary) x node)."""
+        """(node, term) complex as the right-hand side of a real product: (term x (real,
+        imaginary), (real, imaginary) x node).
+        """
         turned = factor.T if self.signs is None else factor.T * self.signs[:, None]
         right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
         right[:, 0, 0] = right[:, 1, 1] = turned.real

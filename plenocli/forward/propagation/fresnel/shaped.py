@@ -1,9 +1,11 @@
-"""Sensor fields behind lenslets of any convex mirror-symmetric shape by matrix triple products: the general Fresnel rung.
+"""Sensor fields behind lenslets of any convex mirror-symmetric shape by matrix triple products: the
+general Fresnel rung.
 
-The opening is cut into chords at quadrature nodes of one axis, the scan axis. A chord's integral is that over the next shorter
-chord plus two short panels at its ends, so that all chords together cost little more than one, and every integrand is
-smooth: spectral accuracy for circles and hexagons alike. Mirror images of a chord share it. Per object point remain two
-products: scan nodes x separable terms x sensor nodes, and sensor nodes x scan nodes x sensor nodes.
+The opening is cut into chords at quadrature nodes of one axis, the scan axis. A chord's integral is
+that over the next shorter chord plus two short panels at its ends, so that all chords together cost
+little more than one, and every integrand is smooth: spectral accuracy for circles and hexagons
+alike. Mirror images of a chord share it. Per object point remain two products: scan nodes x
+separable terms x sensor nodes, and sensor nodes x scan nodes x sensor nodes.
 """
 
 import math
@@ -11,15 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.forward.propagation.sampling import distinct, field_seconds, grid_of
-from plenocli.forward.propagation.fresnel.spread_function import separable_field
 from plenocli.forward.camera.quadrature import gauss, nodes_for, smooth_nodes
-from plenocli.forward.propagation.fresnel.array_to_sensor import lenslet_kernel, pixel_energy, sensor_nodes
+from plenocli.forward.propagation.fresnel.array_to_sensor import (
+    lenslet_kernel,
+    pixel_energy,
+    sensor_nodes,
+)
+from plenocli.forward.propagation.fresnel.spread_function import separable_field
+from plenocli.forward.propagation.sampling import distinct, field_seconds, grid_of
 
 SLAB = 1 << 20
 """Complex numbers in the work arrays of a few points: about what the last-level cache holds."""
 KEPT_BYTES = 1 << 26
-"""Values of terms along chords that are kept for the guard, which needs them a second time; as much again for kernels."""
+"""Values of terms along chords that are kept for the guard, which needs them a second time; as
+much again for kernels.
+"""
 PIECES = 6
 """Groups of short panels with a node count of their own."""
 
@@ -28,9 +36,10 @@ PIECES = 6
 class Chords:
     """Quadrature of a lenslet's opening, in metres from its centre.
 
-    axis: the scan axis (0 rows, 1 columns); at, weight: (chord, mirror) scan nodes, at[h, i] = -at[h, -1-i], chords ascending
-    in length; pieces: [(x, weight)], each (chord, node), in the chords' order: what a chord adds to the next shorter one, the
-    first its whole self.
+    axis: the scan axis (0 rows, 1 columns);
+    at, weight: (chord, mirror) scan nodes, at[h, i] = -at[h, -1-i], chords ascending in length;
+    pieces: [(x, weight)], each (chord, node), in the chords' order: what a chord adds to the next
+        shorter one, the first its whole self.
     """
 
     axis: int
@@ -40,7 +49,8 @@ class Chords:
 
 
 def chords(shape, width, slope, error=1e-10):
-    """Chords of a "square", "circle" or "hexagon" of `width` (m, across flat sides) for phases of up to `slope` rad/m.
+    """Chords of a "square", "circle" or "hexagon" of `width` (m, across flat sides) for phases of
+    up to `slope` rad/m.
 
     error: of the short panels. Hexagons have two flat sides facing +-x and are scanned across them.
     """
@@ -49,22 +59,36 @@ def chords(shape, width, slope, error=1e-10):
         t, w = gauss(2 * ((nodes_for(slope * half) + 1) // 2))
         return _chords(0, half * t[None], half * w[None], np.array([half]), slope, error)
     if shape == "circle":
-        # equidistant angles converge spectrally, since the integrand is periodic in them; slope runs along the rim
+        # equidistant angles converge spectrally, since the integrand is periodic in them; slope
+        # runs along the rim
         count = int(np.ceil(slope * half / 4 + 1.5 * np.cbrt(slope * half) + 3))
         theta = (np.arange(count) + 0.5) * np.pi / (2 * count) - np.pi / 2
-        at, weight, ends = half * np.sin(theta), np.pi / (2 * count) * half * np.cos(theta), half * np.cos(theta)
+        at, weight, ends = (
+            half * np.sin(theta),
+            np.pi / (2 * count) * half * np.cos(theta),
+            half * np.cos(theta),
+        )
     else:
         t, w = gauss(nodes_for(slope * 2 / math.sqrt(3) * half / 2))
         at, weight = -half / 2 * (1 - t), half / 2 * w
         ends = (2 * half + at) / math.sqrt(3)
-    return _chords(0 if shape == "circle" else 1, np.stack([at, -at], 1), np.stack([weight, weight], 1), ends, slope, error)
+    return _chords(
+        0 if shape == "circle" else 1,
+        np.stack([at, -at], 1),
+        np.stack([weight, weight], 1),
+        ends,
+        slope,
+        error,
+    )
 
 
 def _chords(axis, at, weight, ends, slope, error):
     t, w = gauss(2 * ((nodes_for(slope * ends[0]) + 1) // 2))
     pieces = [(ends[0] * t[None], ends[0] * w[None])]
     # panels differ in width and so in nodes
-    for part in np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1)) if len(ends) > 1 else ():
+    for part in (
+        np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1)) if len(ends) > 1 else ()
+    ):
         low, high = ends[part - 1][:, None], ends[part][:, None]
         t, w = gauss(smooth_nodes(slope * float(np.max(high - low)) / 2, error))
         x, wx = (low + high) / 2 + (high - low) / 2 * t, (high - low) / 2 * w
@@ -73,53 +97,92 @@ def _chords(axis, at, weight, ends, slope, error):
 
 
 class ShapedLenslets:
-    """Sensor fields behind lenslets of one shape on a square or hexagonal lattice, for any pupil of the main lens."""
+    """Sensor fields behind lenslets of one shape on a square or hexagonal lattice, for any
+    pupil of the main lens.
+    """
 
     def __init__(self, camera, geometry, plan, band):
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
-        self.pixel_nodes, self.pixel_rule, self.dtype = band.pixel_nodes, band.pixel_rule, np.complex128 if plan.double else np.complex64
+        self.pixel_nodes, self.pixel_rule, self.dtype = (
+            band.pixel_nodes,
+            band.pixel_rule,
+            np.complex128 if plan.double else np.complex64,
+        )
         self.field = separable_field(camera, geometry, band.half, plan.tolerance)
-        self.symmetry, self.notes = self.field.symmetry, {"separable_terms": self.field.terms, "field_tail": self.field.tail}
-        self.cut = chords(geometry.lenslet_shape, geometry.lenslet_width, _slope(camera, geometry, plan.superpixels, band.window), plan.tolerance / 30)
+        self.symmetry, self.notes = (
+            self.field.symmetry,
+            {"separable_terms": self.field.terms, "field_tail": self.field.tail},
+        )
+        self.cut = chords(
+            geometry.lenslet_shape,
+            geometry.lenslet_width,
+            _slope(camera, geometry, plan.superpixels, band.window),
+            plan.tolerance / 30,
+        )
         self.shared_axis = 1 - self.cut.axis
         self._sites = geometry.places(plan.superpixels)
         self._products = {} if self.window is None else {None: geometry.neighbourhood(self.window)}
         if self.window is None:
             self._products = {site: [([site[0]], [site[1]])] for site in self._sites}
         self._kept, self._hops = {}, {}
-        self._heights = {key: [self._rows(product[self.cut.axis]) for product in products] for key, products in self._products.items()}
+        self._heights = {
+            key: [self._rows(product[self.cut.axis]) for product in products]
+            for key, products in self._products.items()
+        }
 
     # the two tables of one set of lenslets
 
     def _rows(self, positions):
-        """Terms at the scan nodes of lenslets at `positions`, sums and differences of mirror images: (point, chord, node, term)."""
+        """Terms at the scan nodes of lenslets at `positions`, sums and differences of mirror
+        images: (point, chord, node, term).
+        """
         g, axis = self.geometry, self.cut.axis
         at = (self.cut.at[:, :, None] + np.asarray(positions) * g.D2).reshape(len(self.cut.at), -1)
         values = self.field.evaluate(at - g.points(axis)[:, None, None], axis)
         return np.ascontiguousarray(_folded(values, 2)).astype(self.dtype)
 
     def _across(self, positions, place):
-        """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by piece (chord, node, sensor node)."""
+        """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by
+        piece (chord, node, sensor node).
+        """
         axis = 1 - self.cut.axis
-        u, wu = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule))
+        u, wu = (
+            a.ravel()
+            for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule)
+        )
         parts = []
         for x, w in self.cut.pieces:
-            kernels = [(lenslet_kernel(self.geometry, n - place, u, wu, x.ravel()) * w.ravel()).reshape(len(u), *x.shape) for n in positions]
-            parts.append(np.ascontiguousarray(np.concatenate(kernels, axis=2).transpose(1, 2, 0)).astype(self.dtype))
+            kernels = [
+                (lenslet_kernel(self.geometry, n - place, u, wu, x.ravel()) * w.ravel()).reshape(
+                    len(u), *x.shape
+                )
+                for n in positions
+            ]
+            parts.append(
+                np.ascontiguousarray(np.concatenate(kernels, axis=2).transpose(1, 2, 0)).astype(
+                    self.dtype
+                )
+            )
         return parts
 
     def _along(self, positions, index):
-        """Terms at the chords' nodes of lenslets at `positions` for point `index` of the chord axis: by piece (chord, term, node)."""
+        """Terms at the chords' nodes of lenslets at `positions` for point `index` of the chord
+        axis: by piece (chord, term, node).
+        """
         key = tuple(positions), int(index)
         if key not in self._kept:
             g, axis = self.geometry, 1 - self.cut.axis
             shift = np.asarray(positions) * g.D2 - g.points(axis)[index]
-            nodes = np.concatenate([(x[:, None, :] + shift[:, None]).ravel() for x, _ in self.cut.pieces])
+            nodes = np.concatenate(
+                [(x[:, None, :] + shift[:, None]).ravel() for x, _ in self.cut.pieces]
+            )
             values = np.ascontiguousarray(self.field.evaluate(nodes, axis).astype(self.dtype).T)
             parts, start = [], 0
             for x, _ in self.cut.pieces:
                 stop = start + x.size * len(shift)
-                parts.append(values[:, start:stop].reshape(len(values), len(x), -1).transpose(1, 0, 2))
+                parts.append(
+                    values[:, start:stop].reshape(len(values), len(x), -1).transpose(1, 0, 2)
+                )
                 start = stop
             if sum(kept[0].base.nbytes for kept in self._kept.values()) > KEPT_BYTES:
                 self._kept.clear()
@@ -127,12 +190,24 @@ class ShapedLenslets:
         return self._kept[key]
 
     def _kernel(self, products, place):
-        """Kernel from the scan nodes of all products to the superpixel at `place`: (sensor node, sums of all, differences of all)."""
+        """Kernel from the scan nodes of all products to the superpixel at `place`: (sensor node,
+        sums of all, differences of all).
+        """
         axis = self.cut.axis
-        v, wv = (a.ravel() for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule))
+        v, wv = (
+            a.ravel()
+            for a in sensor_nodes(self.geometry, axis, self.pixel_nodes, place, self.pixel_rule)
+        )
         sums, differences = [], []
         for product in products:
-            kernels = np.stack([lenslet_kernel(self.geometry, n - place, v, wv, self.cut.at.ravel()) * self.cut.weight.ravel() for n in product[axis]], axis=-1)
+            kernels = np.stack(
+                [
+                    lenslet_kernel(self.geometry, n - place, v, wv, self.cut.at.ravel())
+                    * self.cut.weight.ravel()
+                    for n in product[axis]
+                ],
+                axis=-1,
+            )
             folded = _folded(kernels.reshape(len(v), len(self.cut.at), -1), 2) / 2
             half = folded.shape[2] // 2
             sums.append(folded[:, :, :half].reshape(len(v), -1))
@@ -142,20 +217,35 @@ class ShapedLenslets:
     # pixel energies
 
     def columns(self, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows, superpixel columns, pixel rows, pixel columns)."""
+        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows,
+        superpixel columns, pixel rows, pixel columns).
+        """
         points = (rows, columns)
         scan, chord = points[self.cut.axis], points[1 - self.cut.axis]
         order = np.argsort(chord, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(chord[order])) + 1)
         for key, place, sites in self._tasks():
             products = self._products[key]
-            across = self._once(("across", key, place), lambda: [self._across(product[1 - self.cut.axis], place) for product in products])
-            kernels = [(index, self._once(("scan", key, n), lambda n=n: self._kernel(products, n)), self._mirrored(products, n)) for index, n in sites]
+            across = self._once(
+                ("across", key, place),
+                lambda: [self._across(product[1 - self.cut.axis], place) for product in products],
+            )
+            kernels = [
+                (
+                    index,
+                    self._once(("scan", key, n), lambda n=n: self._kernel(products, n)),
+                    self._mirrored(products, n),
+                )
+                for index, n in sites
+            ]
             step = max(1, SLAB // max(a.size for _, a, _ in kernels))
             for group in groups:
-                spread = [self._spread(product, kernel, chord[group[0]]) for product, kernel in zip(products, across)]
+                spread = [
+                    self._spread(product, kernel, chord[group[0]])
+                    for product, kernel in zip(products, across)
+                ]
                 for start in range(0, len(group), step):
-                    part = group[start:start + step]
+                    part = group[start : start + step]
                     lines = self._lines(key, scan[part], spread)
                     for (sy, sx), kernel, mirrored in kernels:
                         energy = self._energy(kernel, lines, mirrored)
@@ -167,33 +257,55 @@ class ShapedLenslets:
             if sum(size for _, size in self._hops.values()) > KEPT_BYTES:
                 self._hops.clear()
             made = make()
-            self._hops[key] = made, sum(a.nbytes for part in made for a in part) if isinstance(made, list) else made.nbytes
+            self._hops[key] = (
+                made,
+                sum(a.nbytes for part in made for a in part)
+                if isinstance(made, list)
+                else made.nbytes,
+            )
         return self._hops[key][0]
 
     def _tasks(self):
-        """Superpixels that share their place along the chords: (key of the products, place, [(index in out, scan place)])."""
+        """Superpixels that share their place along the chords: (key of the products, place,
+        [(index in out, scan place)]).
+        """
         tasks = {}
         for site, index in self._sites.items():
             key = site if self.window is None else None
-            tasks.setdefault((key, site[1 - self.cut.axis]), []).append((index, site[self.cut.axis]))
+            tasks.setdefault((key, site[1 - self.cut.axis]), []).append(
+                (index, site[self.cut.axis])
+            )
         return [(key, place, sites) for (key, place), sites in tasks.items()]
 
     def _mirrored(self, products, place):
-        """Whether mirroring maps the scan nodes onto themselves as seen from the superpixel, so that sums and differences part."""
-        centred = all(np.allclose(np.asarray(p[self.cut.axis]) - place, place - np.asarray(p[self.cut.axis])[::-1], atol=1e-12) for p in products)
+        """Whether mirroring maps the scan nodes onto themselves as seen from the superpixel, so
+        that sums and differences part.
+        """
+        centred = all(
+            np.allclose(
+                np.asarray(p[self.cut.axis]) - place,
+                place - np.asarray(p[self.cut.axis])[::-1],
+                atol=1e-12,
+            )
+            for p in products
+        )
         return centred and self.geometry.window_shift(self.cut.axis, place) == 0
 
     def _spread(self, product, across, index):
-        """Terms carried along every chord to the sensor, for one point of the chord axis: (chord, term, sensor node)."""
+        """Terms carried along every chord to the sensor, for one point of the chord axis:
+        (chord, term, sensor node).
+        """
         out = np.empty((len(self.cut.at), self.field.terms, across[0].shape[2]), self.dtype)
         start = 0
         for values, kernel in zip(self._along(product[1 - self.cut.axis], index), across):
-            np.matmul(values, kernel, out=out[start:start + len(kernel)])
+            np.matmul(values, kernel, out=out[start : start + len(kernel)])
             start += len(kernel)
         return _accumulated(out)
 
     def _lines(self, key, scan, spread):
-        """Fields of points `scan` at the scan nodes, before the hop along the scan axis: (point, sums then differences, sensor node)."""
+        """Fields of points `scan` at the scan nodes, before the hop along the scan axis: (point,
+        sums then differences, sensor node).
+        """
         tables = self._heights[key]
         count = sum(t.shape[1] * t.shape[2] for t in tables)
         out = np.empty((len(scan), 2, count // 2, spread[0].shape[2]), self.dtype)
@@ -201,9 +313,13 @@ class ShapedLenslets:
         for table, terms in zip(tables, spread):
             chosen = table[scan].transpose(1, 0, 2, 3)
             chords, points, nodes, _ = chosen.shape
-            fields = (chosen.reshape(chords, points * nodes, -1) @ terms).reshape(chords, points, 2, nodes // 2, -1)
+            fields = (chosen.reshape(chords, points * nodes, -1) @ terms).reshape(
+                chords, points, 2, nodes // 2, -1
+            )
             stop = start + chords * nodes // 2
-            out[:, :, start:stop].reshape(points, 2, chords, nodes // 2, -1)[...] = fields.transpose(1, 2, 0, 3, 4)
+            out[:, :, start:stop].reshape(points, 2, chords, nodes // 2, -1)[...] = (
+                fields.transpose(1, 2, 0, 3, 4)
+            )
             start = stop
         return out.reshape(len(scan), count, -1)
 
@@ -216,12 +332,18 @@ class ShapedLenslets:
     # the guard
 
     def incident(self, rows, columns):
-        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the neighbourhood: (points,)."""
+        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
+        neighbourhood: (points,).
+        """
         scan, chord = (rows, columns) if self.cut.axis == 0 else (columns, rows)
         share = np.zeros(len(rows))
         for key, products in self._products.items():
             for number, product in enumerate(products):
-                weight = np.repeat(self.cut.weight[:, :self.cut.weight.shape[1] // 2], len(product[self.cut.axis]), axis=1)
+                weight = np.repeat(
+                    self.cut.weight[:, : self.cut.weight.shape[1] // 2],
+                    len(product[self.cut.axis]),
+                    axis=1,
+                )
                 weight = np.concatenate([weight, weight], axis=1) / 2
                 for index in np.unique(chord):
                     here = np.flatnonzero(chord == index)
@@ -229,11 +351,15 @@ class ShapedLenslets:
                     lines = heights.reshape(len(heights), -1, self.field.terms)
                     entered = (lines @ self._gram(product, index)).view(lines.real.dtype)
                     entered *= lines.view(lines.real.dtype)
-                    share[here] += np.einsum("hir,hr->i", entered.sum(axis=2).reshape(heights.shape[:3]), weight)
+                    share[here] += np.einsum(
+                        "hir,hr->i", entered.sum(axis=2).reshape(heights.shape[:3]), weight
+                    )
         return share
 
     def _gram(self, product, index):
-        """Gram matrices of the terms over every chord, for one point of the chord axis: (chord, term, term)."""
+        """Gram matrices of the terms over every chord, for one point of the chord axis:
+        (chord, term, term).
+        """
         positions, parts = product[1 - self.cut.axis], []
         for values, (_, w) in zip(self._along(positions, index), self.cut.pieces):
             weight = np.tile(w, len(positions)).astype(values.real.dtype)
@@ -242,7 +368,9 @@ class ShapedLenslets:
 
 
 def _accumulated(panels):
-    """Running sums over the first axis, in place: plane by plane, which is many times faster than cumsum."""
+    """Running sums over the first axis, in place: plane by plane, which is many times
+    faster than cumsum.
+    """
     for shorter, longer in zip(panels, panels[1:]):
         longer += shorter
     return panels
@@ -256,7 +384,9 @@ def _folded(values, axis):
 
 
 def _hop(kernel, lines):
-    """kernel @ lines for a kernel whose sums are even and whose differences are odd over the sensor nodes: half of the work."""
+    """kernel @ lines for a kernel whose sums are even and whose differences are odd over the
+    sensor nodes: half of the work.
+    """
     nodes, count = kernel.shape[0], kernel.shape[1] // 2
     top = (nodes + 1) // 2
     even, odd = kernel[:top, :count] @ lines[:, :count], kernel[:top, count:] @ lines[:, count:]
@@ -267,29 +397,50 @@ def _hop(kernel, lines):
 
 
 def _slope(camera, geometry, grid, window):
-    """Largest gradient (rad/m) of the phase on a lenslet: of the hop to the farthest pixel, of the pupil's rim, of kappa."""
+    """Largest gradient (rad/m) of the phase on a lenslet: of the hop to the farthest pixel, of
+    the pupil's rim, of kappa.
+    """
     g = geometry
     raster = 0.0 if g.pixel_shift is None else 0.5
     far = (0.0, 0.0) if window is None else np.add(g.reach(grid), g.reach(grid, window))
-    reach = math.hypot(*((n / 2 + raster) * g.pixel_pitch + f * g.superpixel_pitch for n, f in zip(g.pixel_shape, far)))
-    rim = g.D1 / 2 * (1 if camera.main_lens.aperture_shape in ("circle", "annulus") else math.sqrt(2))
+    reach = math.hypot(
+        *(
+            (n / 2 + raster) * g.pixel_pitch + f * g.superpixel_pitch
+            for n, f in zip(g.pixel_shape, far)
+        )
+    )
+    rim = (
+        g.D1 / 2 * (1 if camera.main_lens.aperture_shape in ("circle", "annulus") else math.sqrt(2))
+    )
     corner = math.hypot(*g.lenslet_extent) if g.lenslet_shape == "square" else max(g.lenslet_extent)
     return g.k * (reach / g.z3 + rim / g.z2 + abs(g.kappa) * corner)
 
 
 def valid_for(camera, view):
-    """None: every lenslet shape and lattice of a camera description, and every pupil, can be cut into chords."""
-    return None
+    """None: every lenslet shape and lattice of a camera description, and every pupil, can
+    be cut into chords.
+    """
+    return
 
 
 def _chord_counts(shape, width, slope, error):
-    """What `chords` will make: (axis, lines, nodes across the lines, nodes along all their pieces), without making them."""
+    """What `chords` will make: (axis, lines, nodes across the lines, nodes along all their
+    pieces), without making them.
+    """
     half = width / 2
 
     def pieces(ends):
         total = 2 * ((nodes_for(slope * ends[0]) + 1) // 2)
-        for part in np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1)) if len(ends) > 1 else ():
-            total += 2 * len(part) * smooth_nodes(slope * float(np.max(ends[part] - ends[part - 1])) / 2, error)
+        for part in (
+            np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1))
+            if len(ends) > 1
+            else ()
+        ):
+            total += (
+                2
+                * len(part)
+                * smooth_nodes(slope * float(np.max(ends[part] - ends[part - 1])) / 2, error)
+            )
         return total
 
     if shape == "square":
@@ -297,7 +448,12 @@ def _chord_counts(shape, width, slope, error):
         return 0, 1, count, pieces(np.array([half]))
     if shape == "circle":
         count = int(np.ceil(slope * half / 4 + 1.5 * np.cbrt(slope * half) + 3))
-        return 0, count, 2 * count, pieces(half * np.cos((np.arange(count) + 0.5) * np.pi / (2 * count) - np.pi / 2))
+        return (
+            0,
+            count,
+            2 * count,
+            pieces(half * np.cos((np.arange(count) + 0.5) * np.pi / (2 * count) - np.pi / 2)),
+        )
     count = nodes_for(slope * 2 / math.sqrt(3) * half / 2)
     # Gauss-Legendre nodes to a part in a million
     t = -np.cos(np.pi * (np.arange(count) + 0.75) / (count + 0.5))
@@ -305,32 +461,65 @@ def _chord_counts(shape, width, slope, error):
 
 
 def cost(camera, view, band, shape, double):
-    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength: operations (real, in matrix products),
-    seconds (what does not scale with them, one core) and bytes (beyond the result).
+    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength:
+    operations (real, in matrix products), seconds (what does not scale with them, one core) and
+    bytes (beyond the result).
 
-    Counted from the node rules, without the points that symmetry gives; factors fitted to process times, part by part
-    (docs/model.md, "The dial").
+    Counted from the node rules, without the points that symmetry gives; factors fitted to process
+    times, part by part (docs/model.md, "The dial").
     """
     grid = grid_of(shape[1])
-    axis, count, on_scan, on_chords = _chord_counts(view.lenslet_shape, view.lenslet_width, _slope(camera, view, grid, band.window), band.sampling / 60 or 1e-7)
+    axis, count, on_scan, on_chords = _chord_counts(
+        view.lenslet_shape,
+        view.lenslet_width,
+        _slope(camera, view, grid, band.window),
+        band.sampling / 60 or 1e-7,
+    )
     products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
     nodes, rough = [n * band.pixel_nodes for n in view.pixel_shape], 2 if double else 1
     points, across, along = distinct(camera, view, shape)[0], nodes[1 - axis], nodes[axis]
     # columns come in about eight blocks, at whose borders a line of points is begun anew
-    lanes = min(points, 8 + (view.object_shape[1 - axis] if points == shape[3] else (view.object_shape[1 - axis] + 1) // 2))
+    lanes = min(
+        points,
+        8
+        + (
+            view.object_shape[1 - axis]
+            if points == shape[3]
+            else (view.object_shape[1 - axis] + 1) // 2
+        ),
+    )
     scan = sum(on_scan * len(p[axis]) for p in products)
     chord = sum(on_chords * len(p[1 - axis]) for p in products)
     count, terms = count * len(products), band.terms
     places = view.lines(grid, 1 - axis) if band.window is not None else shape[1]
-    operations = 8.0 * (1.4 * lanes * places * chord * terms * across + points * places * scan * terms * across
-                        + 0.8 * points * scan * across * along * shape[1] + 0.3 * points * scan * terms**2)
-    passes = rough * (6.7e-9 * places * across * (lanes * count * terms + points * scan) + 2.6e-9 * points * shape[1] * across * along
-                      + 1.1e-8 * lanes * count * terms**2) + lanes * (2e-4 * places + 1.5e-4 * shape[1] + 4e-4)
-    tables = (lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms) + view.object_shape[axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
-              + 9e-8 * places * (chord * across + scan * along))
+    operations = 8.0 * (
+        1.4 * lanes * places * chord * terms * across
+        + points * places * scan * terms * across
+        + 0.8 * points * scan * across * along * shape[1]
+        + 0.3 * points * scan * terms**2
+    )
+    passes = rough * (
+        6.7e-9 * places * across * (lanes * count * terms + points * scan)
+        + 2.6e-9 * points * shape[1] * across * along
+        + 1.1e-8 * lanes * count * terms**2
+    ) + lanes * (2e-4 * places + 1.5e-4 * shape[1] + 4e-4)
+    tables = (
+        lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms)
+        + view.object_shape[axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
+        + 9e-8 * places * (chord * across + scan * along)
+    )
     written = math.prod(shape[1:]) * 3e-8
     size_ = 16 if double else 8
-    heights = size_ * view.object_shape[axis] * scan * terms * (1 if band.window is not None else shape[1])
+    heights = (
+        size_
+        * view.object_shape[axis]
+        * scan
+        * terms
+        * (1 if band.window is not None else shape[1])
+    )
     spread = size_ * count * terms * across
-    return {"operations": operations, "seconds": passes + tables + written + field_seconds(camera, view, band) + 0.015,
-            "bytes": int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25)}
+    return {
+        "operations": operations,
+        "seconds": passes + tables + written + field_seconds(camera, view, band) + 0.015,
+        "bytes": int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25),
+    }

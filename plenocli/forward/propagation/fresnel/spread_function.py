@@ -2,11 +2,13 @@
 
 A point imaged at xp has the field exp(j k |x|^2/(2 z2)) h(x - xp) on the array, with
 
-    h(d) = 1/(lambda z2 sqrt(S)) * integral of P(xi) exp(-j k xi.d/z2) over the pupil,   S the aperture's area,
+    h(d) = 1/(lambda z2 sqrt(S)) * integral of P(xi) exp(-j k xi.d/z2) over the pupil,
+    S the aperture's area,
 
-so h depends on x - xp only and the integral of |h|^2 over the plane is the share of the light that the filters pass.
-A singular value decomposition on Gauss-Legendre nodes turns h(dy, dx) into sum_j a_j(dy) b_j(dx); the a_j, b_j are
-band-limited (the pupil is finite), so their Legendre series carry them to any other point.
+so h depends on x - xp only and the integral of |h|^2 over the plane is the share of the light that
+the filters pass. A singular value decomposition on Gauss-Legendre nodes turns h(dy, dx) into sum_j
+a_j(dy) b_j(dx); the a_j, b_j are band-limited (the pupil is finite), so their Legendre series carry
+them to any other point.
 """
 
 import math
@@ -20,7 +22,9 @@ from plenocli.forward.camera.quadrature import Rows, gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import is_radial, radial_field
 
 MAX_NODES = 4000
-"""Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays answer the question."""
+"""Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays
+answer the question.
+"""
 EDGE = 2.0
 """Extra weight of points at a lenslet's edge in what is left out."""
 SLAB = 1 << 11
@@ -31,8 +35,10 @@ SLAB = 1 << 11
 class SeparableField:
     """h(dy, dx) = sum_j a_j(dy) b_j(dx) for |dy|, |dx| <= `half`.
 
-    `rows`, `columns`: Legendre coefficients (degrees, terms) of a_j and b_j, real where h is; `even`: only even degrees are stored.
-    `symmetry`: (flip rows, flip columns, transpose) under which h does not change; `tail`: root energy of what was cut;
+    `rows`, `columns`: Legendre coefficients (degrees, terms) of a_j and b_j, real where h is;
+    `even`: only even degrees are stored.
+    `symmetry`: (flip rows, flip columns, transpose) under which h does not change;
+    `tail`: root energy of what was cut;
     `signs`: (terms,) of +-1 where b_j is that times a_j, else None.
     """
 
@@ -50,14 +56,18 @@ class SeparableField:
         return self.rows.shape[1]
 
     def evaluate(self, d, axis):
-        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,), complex128, or float64 where h is real."""
+        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,),
+        complex128, or float64 where h is real.
+        """
         d = np.asarray(d, float)
         coefficients = np.ascontiguousarray(self.columns if axis else self.rows)
         t, parts = d.ravel() / self.half, coefficients.view(float)
         out = np.empty((len(t), parts.shape[1]))
         for start in range(0, len(t), SLAB):
             part = slice(start, start + SLAB)
-            np.matmul(legendre(t[part], len(coefficients), 2 if self.even else 1), parts, out=out[part])
+            np.matmul(
+                legendre(t[part], len(coefficients), 2 if self.even else 1), parts, out=out[part]
+            )
         return out.view(coefficients.dtype).reshape(*d.shape, -1)
 
 
@@ -77,18 +87,24 @@ def legendre(t, count, step):
 
 
 def psf_nodes(geometry, half):
-    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number; NumericsError for more than MAX_NODES."""
-    # the functions are interpolated, not only integrated: a few degrees more than the integration rule
+    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number;
+    NumericsError for more than MAX_NODES.
+    """
+    # the functions are interpolated, not only integrated: a few degrees more than
+    # the integration rule
     count = nodes_for(2 * geometry.k * geometry.D1 / 2 * half / geometry.z2) + 14
     if count > MAX_NODES:
         raise NumericsError(
             f"the field on the array needs {count} nodes per axis, more than {MAX_NODES}",
-            "main_lens and lenslet_array", "take fewer superpixels, a longer wavelength or a slower lens")
+            "main_lens and lenslet_array",
+            "take fewer superpixels, a longer wavelength or a slower lens",
+        )
     return count + count % 2
 
 
 def sampled_field(camera, geometry, dy, dx):
-    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: (len(dy), len(dx)), real where a radial pupil makes it so.
+    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: (len(dy), len(dx)), real where
+    a radial pupil makes it so.
 
     Source: see the module.
     """
@@ -101,28 +117,44 @@ def sampled_field(camera, geometry, dy, dx):
         half = len(rows.y) // 2
         if half and len(rows.y) % 2 == 0 and mirrored(rows.y, rows.x, rows.weight, 0):
             upper = Rows(rows.y[half:], rows.x[half:], rows.weight[half:])
-            total += (2 * np.cos(k / z2 * np.outer(dy, upper.y))) @ _row_transforms(upper, k / z2 * dx)
+            total += (2 * np.cos(k / z2 * np.outer(dy, upper.y))) @ _row_transforms(
+                upper, k / z2 * dx
+            )
         else:
-            total += np.exp(-1j * k / z2 * np.outer(dy, rows.y)) @ _row_transforms(rows, k / z2 * dx)
+            total += np.exp(-1j * k / z2 * np.outer(dy, rows.y)) @ _row_transforms(
+                rows, k / z2 * dx
+            )
     return total / (geometry.wavelength * z2 * math.sqrt(aperture_area(camera.main_lens)))
 
 
 def mirrored(y, x, weight, axis):
-    """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of its nodes (axis 1)."""
+    """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of
+    its nodes (axis 1).
+    """
     if axis == 0:
-        return np.allclose(y, -y[::-1], rtol=0, atol=1e-14 * np.abs(y).max()) and np.allclose(weight, weight[::-1], rtol=1e-12, atol=0)
-    return np.allclose(x, -x[:, ::-1], rtol=0, atol=1e-14 * np.abs(x).max()) and np.allclose(weight, weight[:, ::-1], rtol=1e-12, atol=0)
+        return np.allclose(y, -y[::-1], rtol=0, atol=1e-14 * np.abs(y).max()) and np.allclose(
+            weight, weight[::-1], rtol=1e-12, atol=0
+        )
+    return np.allclose(x, -x[:, ::-1], rtol=0, atol=1e-14 * np.abs(x).max()) and np.allclose(
+        weight, weight[:, ::-1], rtol=1e-12, atol=0
+    )
 
 
 def _row_transforms(rows, frequency):
-    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows and frequencies cost a quarter."""
+    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows
+    and frequencies cost a quarter.
+    """
     if rows.x.strides[0] == 0:  # a grid of nodes: one matrix product
         return rows.weight @ np.exp(-1j * np.outer(rows.x[0], frequency))
     count, nodes = len(frequency), rows.x.shape[1]
     paired = count % 2 == 0 and np.allclose(frequency, -frequency[::-1], rtol=1e-14, atol=0)
-    f = frequency[count // 2:] if paired else frequency
+    f = frequency[count // 2 :] if paired else frequency
     even = mirrored(rows.y, rows.x, rows.weight, 1)
-    x, weight = (rows.x[:, nodes // 2:], rows.weight[:, nodes // 2:] * 2) if even else (rows.x, rows.weight)
+    x, weight = (
+        (rows.x[:, nodes // 2 :], rows.weight[:, nodes // 2 :] * 2)
+        if even
+        else (rows.x, rows.weight)
+    )
     if even and nodes % 2:
         weight[:, 0] /= 2
     parts = np.stack([weight.real, weight.imag], -1)
@@ -139,16 +171,20 @@ def _row_transforms(rows, frequency):
 
 
 def edge_emphasis(geometry, points):
-    """Weights of `points` (m, on the array, along one axis) in what is left out: those at the lenslet's edge lose light and split it,
-    so that the same error would be a larger share of their columns."""
+    """Weights of `points` (m, on the array, along one axis) in what is left out: those at the
+    lenslet's edge lose light and split it, so that the same error would be a larger
+    share of their columns.
+    """
     g = geometry
     return 1 + EDGE * np.exp((np.abs(points) - g.D2 / 2) * g.D1 / (g.wavelength * g.z2))
 
 
 def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
-    """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of at most `tolerance`.
+    """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of
+    at most `tolerance`.
 
-    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field. NumericsError as psf_nodes.
+    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field.
+    NumericsError as psf_nodes.
     """
     count = psf_nodes(geometry, half)
     t, w = gauss(count)
@@ -160,7 +196,7 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     same = [np.abs(h - other).max() < 1e-10 * scale for other in (h[::-1], h[:, ::-1], h.T)]
     even = bool(same[0] and same[1])
     if even:
-        t, w, h = t[count // 2:], 2 * w[count // 2:], h[count // 2:, count // 2:]
+        t, w, h = t[count // 2 :], 2 * w[count // 2 :], h[count // 2 :, count // 2 :]
     if np.abs(h.imag).max() < 1e-13 * scale:
         h = h.real
     root = np.sqrt(w * half)
@@ -179,14 +215,18 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
 
 
 def terms_within(values, tolerance, rest=0.0):
-    """How many of the singular values `values`, the largest first, it takes to leave no more than `tolerance` (root sum of squares, with `rest`
-    that is left in any case), one at the least. A tolerance for each number of terms may be given."""
+    """How many of the singular values `values`, the largest first, it takes to leave no more than
+    `tolerance` (root sum of squares, with `rest` that is left in any case), one at the least. A
+    tolerance for each number of terms may be given.
+    """
     tails = np.sqrt(np.cumsum(values.astype(float)[::-1] ** 2)[::-1] + rest**2)
     return max(1, int(np.count_nonzero(tails > tolerance)))
 
 
 def _factors(matrix, symmetric):
-    """Singular value decomposition u, s, v of a square matrix; for a real symmetric one also the signs with v^T = u * signs."""
+    """Singular value decomposition u, s, v of a square matrix; for a real symmetric one also the
+    signs with v^T = u * signs.
+    """
     if not symmetric or np.iscomplexobj(matrix):
         return *np.linalg.svd(matrix), None
     values, u = np.linalg.eigh((matrix + matrix.T) / 2)

@@ -4,10 +4,14 @@ import numpy as np
 
 
 def duality_gap(d, y, c, threshold):
-    """(P, relative gap, q) of coefficients c (signal, atom): P and gap per signal, q = D^T (y - D c) as (signal, atom).
+    """(P, relative gap, q) of coefficients c (signal, atom): P and gap per signal, q = D^T (y - D
+    c) as (signal, atom).
 
-    d: (M, atom).  y: (M, signal).  threshold: lambda w / 2 (atom,).  The dual point is the residual scaled into
-    |D_j^T u| <= threshold_j. Everything comes from the residual itself: y^T y - 2 b^T c + c^T G c would cancel.
+    d: (M, atom).
+    y: (M, signal).
+    threshold: lambda w / 2 (atom,). The dual point is the residual scaled into |D_j^T u| <=
+        threshold_j. Everything comes from the residual itself: y^T y - 2 b^T c +
+        c^T G c would cancel.
     """
     residual = y - d @ c.T
     q = residual.T @ d
@@ -17,4 +21,8 @@ def duality_gap(d, y, c, threshold):
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.clip(along / energy, -limit, limit)
         gap = np.maximum(objective - (2 * t * along - t**2 * energy), 0) / objective
-    return objective, np.where((objective <= 0) | (energy <= 0), np.where(objective > energy, 1.0, 0.0), gap), q
+    return (
+        objective,
+        np.where((objective <= 0) | (energy <= 0), np.where(objective > energy, 1.0, 0.0), gap),
+        q,
+    )

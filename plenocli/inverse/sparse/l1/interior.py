@@ -1,17 +1,20 @@
-"""The l1 problem by an interior-point method, the other kind of solver that the paper names: for checking, not for work.
+"""The l1 problem by an interior-point method, the other kind of solver that the paper names: for
+checking, not for work.
 
-Clarabel (extra `bench`) solves the cone program  min r^T r + lambda w^T t,  D c + r = y,  -t <= c <= t,  signal by signal.
+Clarabel (extra `bench`) solves the cone program min r^T r + lambda w^T t, D c + r = y, -t <= c <=
+t, signal by signal.
 """
 
 import numpy as np
 
 
 def interior_point(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6):
-    """Arguments and result (SparseCode; passes are Newton steps) as in plenocli.inverse.sparse.l1.solve.sparse_code.
+    """Arguments and result (SparseCode; passes are Newton steps) as
+    in plenocli.inverse.sparse.l1.solve.sparse_code.
 
-    Its coefficients are small where they should be zero, never exactly zero. Each signal is solved twice: the solver's
-    tolerances are absolute as well as relative, so the second time everything is scaled by the first objective.
-    InputError without Clarabel.
+    Its coefficients are small where they should be zero, never exactly zero. Each signal is solved
+    twice: the solver's tolerances are absolute as well as relative, so the second time everything
+    is scaled by the first objective. InputError without Clarabel.
     """
     from plenocli.inverse.sparse.l1.certificate import duality_gap
     from plenocli.inverse.sparse.l1.solve import SparseCode, prepare
@@ -24,7 +27,9 @@ def interior_point(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6)
             if scale > 0:
                 found, used = _solve(problem.d, y / scale, problem.threshold / scale, tol)
                 c[i], steps[i] = scale * found, steps[i] + used
-                scale = np.sqrt(duality_gap(problem.d, y[:, None], c[i : i + 1], problem.threshold)[0][0])
+                scale = np.sqrt(
+                    duality_gap(problem.d, y[:, None], c[i : i + 1], problem.threshold)[0][0]
+                )
     objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
     return SparseCode(problem.restore(c), objective, gap, steps)
 
@@ -36,18 +41,24 @@ def _solve(d, y, threshold, tol):
     try:
         import clarabel
     except ImportError:
-        raise InputError("the interior-point method needs Clarabel", fix="pip install clarabel") from None
+        raise InputError(
+            "the interior-point method needs Clarabel", fix="pip install clarabel"
+        ) from None
     from scipy.sparse import block_array, csc_array, diags_array, eye_array
 
     rows, atoms = d.shape
     one, unit = eye_array(atoms), eye_array(rows)
     quadratic = csc_array(diags_array(np.concatenate([np.zeros(2 * atoms), np.full(rows, 2.0)])))
-    constraints = csc_array(block_array([[csc_array(d), None, unit], [one, -one, None], [-one, -one, None]]))
+    constraints = csc_array(
+        block_array([[csc_array(d), None, unit], [one, -one, None], [-one, -one, None]])
+    )
     linear = np.concatenate([np.zeros(atoms), 2 * threshold, np.zeros(rows)])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tol / 100
     cones = [clarabel.ZeroConeT(rows), clarabel.NonnegativeConeT(2 * atoms)]
-    solver = clarabel.DefaultSolver(quadratic, linear, constraints, np.concatenate([y, np.zeros(2 * atoms)]), cones, settings)
+    solver = clarabel.DefaultSolver(
+        quadratic, linear, constraints, np.concatenate([y, np.zeros(2 * atoms)]), cones, settings
+    )
     solution = solver.solve()
     return np.array(solution.x[:atoms]), solution.iterations

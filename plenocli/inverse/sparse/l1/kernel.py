@@ -1,12 +1,15 @@
-"""Active-set Newton method for l1 problems in Gram form, compiled by numba: one Cholesky factor a signal, updated, never rebuilt.
+"""Active-set Newton method for l1 problems in Gram form, compiled by numba: one Cholesky factor a
+signal, updated, never rebuilt.
 
-Imported late (by plenocli.inverse.sparse.l1.solve), because importing numba takes a second; without numba plenocli.inverse.sparse.l1.plain does
-the work. The problem of one signal is min c^T G c - 2 b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
+Imported late (by plenocli.inverse.sparse.l1.solve), because importing numba takes a second; without
+numba plenocli.inverse.sparse.l1.plain does the work. The problem of one signal is min c^T G c - 2
+b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
 
-Three nested sets of atoms keep the cost down: all (q from whole rows of G, a few times a signal), a working set of those
-with the largest |q| / threshold, which grows (its block of G is copied close together), and the active ones, where the factor lives. The
-first passes use a raised threshold, which finds most of the support while the active set is small. Loops run over slices
-that start at 0: a variable offset in an index keeps the compiler from vectorising.
+Three nested sets of atoms keep the cost down: all (q from whole rows of G, a few times a signal), a
+working set of those with the largest |q| / threshold, which grows (its block of G is copied close
+together), and the active ones, where the factor lives. The first passes use a raised threshold,
+which finds most of the support while the active set is small. Loops run over slices that start at
+0: a variable offset in an index keeps the compiler from vectorising.
 """
 
 from collections import namedtuple
@@ -15,8 +18,10 @@ import numba
 import numpy as np
 
 JITTER = 1e-12
-"""Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms cannot break the factor. They
-move far along the flat direction, and the line search stops them where one of them reaches zero and leaves."""
+"""Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms
+cannot break the factor. They move far along the flat direction, and the line search stops them
+where one of them reaches zero and leaves.
+"""
 
 JOINING = 48
 """Atoms that join the working set in a pass; at least half as many as are active."""
@@ -25,21 +30,36 @@ CAPACITY = 288
 """Of the first workspace; doubled when the working set outgrows it."""
 
 LOWERING = 0.1
-"""The threshold starts at this fraction of the largest |b|, and falls by as much from pass to pass until it is the true one."""
+"""The threshold starts at this fraction of the largest |b|, and falls by as much from pass to
+pass until it is the true one.
+"""
 
 _FLAGS = {"reassoc", "contract", "nsz"}
 _jit = numba.njit(cache=True, fastmath=_FLAGS, forceinline=True)
 
 Work = namedtuple("Work", "factor block x sign h d v crossing local active working")
-"""Scratch of one thread, `capacity` long or square. factor: upper triangular U with U^T U = G over the active atoms in the
-order of `local` (their places in the working set); its diagonal holds 1 / U_kk, since divisions would dominate.  block: G over
-`working`, the atoms of the working set.  h = q - threshold sign, over active atoms."""
+"""Scratch of one thread, `capacity` long or square. factor: upper triangular U with U^T U = G over
+the active atoms in the order of `local` (their places in the working set); its diagonal holds 1 /
+U_kk, since divisions would dominate. block: G over `working`, the atoms of the working set. h = q -
+threshold sign, over active atoms.
+"""
 
 
 @_jit
 def _workspace(capacity):
-    return Work(np.empty((capacity, capacity)), np.empty((capacity, capacity)), np.empty(capacity), np.empty(capacity), np.empty(capacity),
-                np.empty(capacity), np.empty(capacity), np.empty(capacity), np.empty(capacity, np.int64), np.empty(capacity, np.bool_), np.empty(capacity, np.int64))
+    return Work(
+        np.empty((capacity, capacity)),
+        np.empty((capacity, capacity)),
+        np.empty(capacity),
+        np.empty(capacity),
+        np.empty(capacity),
+        np.empty(capacity),
+        np.empty(capacity),
+        np.empty(capacity),
+        np.empty(capacity, np.int64),
+        np.empty(capacity, np.bool_),
+        np.empty(capacity, np.int64),
+    )
 
 
 @_jit
@@ -65,10 +85,17 @@ def _forward(factor, n, d):
         a0 = d[k] * factor[k, k]
         a1 = (d[k + 1] - a0 * factor[k, k + 1]) * factor[k + 1, k + 1]
         a2 = (d[k + 2] - a0 * factor[k, k + 2] - a1 * factor[k + 1, k + 2]) * factor[k + 2, k + 2]
-        a3 = (d[k + 3] - a0 * factor[k, k + 3] - a1 * factor[k + 1, k + 3] - a2 * factor[k + 2, k + 3]) * factor[k + 3, k + 3]
+        a3 = (
+            d[k + 3] - a0 * factor[k, k + 3] - a1 * factor[k + 1, k + 3] - a2 * factor[k + 2, k + 3]
+        ) * factor[k + 3, k + 3]
         d[k], d[k + 1], d[k + 2], d[k + 3] = a0, a1, a2, a3
         rest = d[k + 4 : n]
-        r0, r1, r2, r3 = factor[k, k + 4 : n], factor[k + 1, k + 4 : n], factor[k + 2, k + 4 : n], factor[k + 3, k + 4 : n]
+        r0, r1, r2, r3 = (
+            factor[k, k + 4 : n],
+            factor[k + 1, k + 4 : n],
+            factor[k + 2, k + 4 : n],
+            factor[k + 3, k + 4 : n],
+        )
         for i in range(n - k - 4):
             rest[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
         k += 4
@@ -86,7 +113,12 @@ def _backward(factor, n, d):
     while k >= 4:
         k -= 4
         rest = d[k + 4 : n]
-        r0, r1, r2, r3 = factor[k, k + 4 : n], factor[k + 1, k + 4 : n], factor[k + 2, k + 4 : n], factor[k + 3, k + 4 : n]
+        r0, r1, r2, r3 = (
+            factor[k, k + 4 : n],
+            factor[k + 1, k + 4 : n],
+            factor[k + 2, k + 4 : n],
+            factor[k + 3, k + 4 : n],
+        )
         t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
         for i in range(n - k - 4):
             value = rest[i]
@@ -96,8 +128,16 @@ def _backward(factor, n, d):
             t3 += r3[i] * value
         d[k + 3] = (d[k + 3] - t3) * factor[k + 3, k + 3]
         d[k + 2] = (d[k + 2] - t2 - factor[k + 2, k + 3] * d[k + 3]) * factor[k + 2, k + 2]
-        d[k + 1] = (d[k + 1] - t1 - factor[k + 1, k + 2] * d[k + 2] - factor[k + 1, k + 3] * d[k + 3]) * factor[k + 1, k + 1]
-        d[k] = (d[k] - t0 - factor[k, k + 1] * d[k + 1] - factor[k, k + 2] * d[k + 2] - factor[k, k + 3] * d[k + 3]) * factor[k, k]
+        d[k + 1] = (
+            d[k + 1] - t1 - factor[k + 1, k + 2] * d[k + 2] - factor[k + 1, k + 3] * d[k + 3]
+        ) * factor[k + 1, k + 1]
+        d[k] = (
+            d[k]
+            - t0
+            - factor[k, k + 1] * d[k + 1]
+            - factor[k, k + 2] * d[k + 2]
+            - factor[k, k + 3] * d[k + 3]
+        ) * factor[k, k]
     for back in range(k):
         r = k - 1 - back
         total = 0.0
@@ -108,7 +148,9 @@ def _backward(factor, n, d):
 
 @_jit
 def _append(factor, n, column, diagonal):
-    """One more atom at the end: `column` (overwritten) is G between it and the n others, `diagonal` its own entry."""
+    """One more atom at the end: `column` (overwritten) is G between it and the n others,
+    `diagonal` its own entry.
+    """
     _forward(factor, n, column)
     total = diagonal * (1.0 + JITTER)
     for k in range(n):
@@ -119,7 +161,9 @@ def _append(factor, n, column, diagonal):
 
 @_jit
 def _remove(factor, n, place, v):
-    """Atom `place` of n out: its column goes, and rotations work its row into those below (an update, so always stable)."""
+    """Atom `place` of n out: its column goes, and rotations work its row into those below (an
+    update, so always stable).
+    """
     below = n - 1 - place
     for i in range(place):
         row = factor[i, place:n]
@@ -129,7 +173,11 @@ def _remove(factor, n, place, v):
     for j in range(below):
         v[j] = last[j]
     for k in range(below):
-        row, target, rest = factor[place + 1 + k, place + 1 + k : n], factor[place + k, place + k : n], v[k:below]
+        row, target, rest = (
+            factor[place + 1 + k, place + 1 + k : n],
+            factor[place + k, place + k : n],
+            v[k:below],
+        )
         top = 1.0 / row[0]
         target[0] = 1.0 / np.sqrt(top * top + rest[0] * rest[0])
         cosine, sine = top * target[0], rest[0] * target[0]
@@ -145,7 +193,13 @@ def _drop(w, n, place):
     w.active[w.local[place]] = False
     _remove(w.factor, n, place, w.v)
     for k in range(place, n - 1):
-        w.local[k], w.x[k], w.sign[k], w.h[k], w.d[k] = w.local[k + 1], w.x[k + 1], w.sign[k + 1], w.h[k + 1], w.d[k + 1]
+        w.local[k], w.x[k], w.sign[k], w.h[k], w.d[k] = (
+            w.local[k + 1],
+            w.x[k + 1],
+            w.sign[k + 1],
+            w.h[k + 1],
+            w.d[k + 1],
+        )
 
 
 @_jit
@@ -169,8 +223,9 @@ def _subtract(q, x, n, gram, place):
 def relative_gap(b, q, x, index, signal_energy, threshold):
     """(P, gap / P) at c (values x at `index`), with the dual point that is the scaled residual.
 
-    b = D^T y, q = D^T (y - D c), signal_energy = y^T y, threshold = lambda w_j / 2 per atom.
-    P = |y - Dc|^2 + sum 2 threshold |c|;  u = t (y - Dc) with |D_j^T u| <= threshold_j;  dual = 2 t r^T y - t^2 r^T r.
+    b = D^T y, q = D^T (y - D c), signal_energy = y^T y, threshold = lambda w_j / 2 per atom. P =
+    |y - Dc|^2 + sum 2 threshold |c|; u = t (y - Dc) with |D_j^T u| <= threshold_j; dual = 2 t
+    r^T y - t^2 r^T r.
     """
     fit = 0.0
     slope = 0.0
@@ -192,8 +247,10 @@ def relative_gap(b, q, x, index, signal_energy, threshold):
 
 @_jit
 def _step_length(w, n, threshold):
-    """(alpha, zero): the minimum of the piecewise quadratic along x + alpha d, 0 < alpha <= 1; `zero` is the value that
-    lands on 0 there, or -1.  h = G d, so that the slope at alpha with the first signs is 2 (alpha - 1) d^T h."""
+    """(alpha, zero): the minimum of the piecewise quadratic along x + alpha d, 0 < alpha <= 1;
+    `zero` is the value that lands on 0 there, or -1. h = G d, so that the slope at alpha with the
+    first signs is 2 (alpha - 1) d^T h.
+    """
     curvature, left = 0.0, 0
     for i in range(n):
         curvature += w.d[i] * w.h[i]
@@ -219,7 +276,10 @@ def _step_length(w, n, threshold):
 
 @_jit
 def _settle(w, n, threshold, limit):
-    """Minimise over the n active atoms: Newton steps, exact line search, atoms at zero leave. Returns how many are left."""
+    """Minimise over the n active atoms: Newton steps, exact line search, atoms at zero leave.
+
+    Returns how many are left.
+    """
     for _ in range(limit):
         if n == 0:
             break
@@ -272,7 +332,10 @@ def _enter(w, n, q, threshold, newcomers):
 
 @_jit
 def _kth_largest(values, k):
-    """The k-th largest of `values` (k from 1), by quickselect on a copy. (np.partition would take the compiler ten seconds.)"""
+    """The k-th largest of `values` (k from 1), by quickselect on a copy.
+
+    (np.partition would take the compiler ten seconds.)
+    """
     a = values.copy()
     low, high, wanted = 0, a.shape[0] - 1, k - 1
     while low < high:
@@ -312,7 +375,10 @@ def _newcomers(w, size, q, threshold, most, tol):
 
 @_jit
 def _solve_working_set(w, n, b, q, threshold, tol):
-    """Solve the problem of the working set (slices of b, q, threshold) from the n active atoms. Returns how many there are."""
+    """Solve the problem of the working set (slices of b, q, threshold) from the n active atoms.
+
+    Returns how many there are.
+    """
     size = b.shape[0]
     for rounds in range(200):
         new = _newcomers(w, size, q, threshold, max(10, n // 10), tol)
@@ -359,10 +425,11 @@ def _resume(w, gram, index, value):
 
 @_jit
 def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
-    """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,), which are overwritten.
+    """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,),
+    which are overwritten.
 
-    Not finished: the workspace is too small for the working set; call again with a larger one. The last pass allowed is not judged:
-    objective and gap are those before it.
+    Not finished: the workspace is too small for the working set; call again with a larger one. The
+    last pass allowed is not judged: objective and gap are those before it.
     """
     index = np.flatnonzero(c)
     n = size = index.shape[0]
@@ -370,7 +437,8 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
     if size > w.x.shape[0]:
         return False, 0.0, 1.0, 0
     _resume(w, gram, index, c[index])
-    if n > 0:  # the coefficients given are a guess: make the best of its atoms before looking at others
+    # the coefficients given are a guess: make the best of its atoms before looking at others
+    if n > 0:
         near = b[index]
         _subtract(near, w.x, n, w.block, w.local)
         n = _solve_working_set(w, n, b[index], near, threshold[index], 0.25 * tol)
@@ -389,7 +457,9 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
         if more > 0:
             size = _extend(w, size, gram, np.abs(q) / threshold, more)
         working = w.working[:size]
-        n = _solve_working_set(w, n, b[working], q[working], raised * threshold[working], 0.25 * tol)
+        n = _solve_working_set(
+            w, n, b[working], q[working], raised * threshold[working], 0.25 * tol
+        )
         index = working[w.local[:n]]
         _spread(w.x, index, c)
         if passes == pass_limit:
@@ -406,11 +476,15 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
 
 @numba.njit(cache=True, fastmath=_FLAGS, nogil=True)
 def solve_signals(gram, b, signal_energy, threshold, tol, pass_limit, c, objective, gap, passes):
-    """solve_signal for every row of b and c (signal, atom), into c, objective, gap and passes (signal,); one thread, no lock held."""
+    """solve_signal for every row of b and c (signal, atom), into c, objective, gap and passes
+    (signal,); one thread, no lock held.
+    """
     w = _workspace(min(c.shape[1], CAPACITY))
     for i in range(b.shape[0]):
         while True:
-            finished, objective[i], gap[i], passes[i] = solve_signal(gram, b[i], signal_energy[i], threshold, tol, pass_limit, c[i], w)
+            finished, objective[i], gap[i], passes[i] = solve_signal(
+                gram, b[i], signal_energy[i], threshold, tol, pass_limit, c[i], w
+            )
             if finished:
                 break
             w = _workspace(min(c.shape[1], 2 * w.x.shape[0]))

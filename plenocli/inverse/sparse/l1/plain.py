@@ -1,24 +1,31 @@
-"""Active-set Newton method for one l1 problem in plain numpy: the whole solver where numba is missing, and the exact one elsewhere.
+"""Active-set Newton method for one l1 problem in plain numpy: the whole solver where numba is
+missing, and the exact one elsewhere.
 
-Residual and slopes always come from D itself. Newton steps come from the Gram matrix, or, where that has lost the digits that
-matter (small lambda: |y - Dc|^2 sinks below the rounding of y^T y, and the condition of D is squared), from a QR
-factorisation of the active columns: corrected semi-normal equations (Bjorck, Linear Algebra Appl. 88/89, 31 (1987)).
+Residual and slopes always come from D itself. Newton steps come from the Gram matrix, or, where
+that has lost the digits that matter (small lambda: |y - Dc|^2 sinks below the rounding of y^T y,
+and the condition of D is squared), from a QR factorisation of the active columns: corrected
+semi-normal equations (Bjorck, Linear Algebra Appl. 88/89, 31 (1987)).
 """
 
 import numpy as np
 
 JITTER = 1e-12
-"""Added to the Gram matrix's diagonal, relative to it: dependent atoms must not break the factor."""
+"""Added to the Gram matrix's diagonal, relative to it: dependent atoms must
+not break the factor.
+"""
 
 RIDGE = 1e-10
 """The same for the factored form, relative to the norm of each column."""
 
 
 def solve_signal(d, y, gram, threshold, tol, pass_limit, c):
-    """min |y - D c|^2 + sum_j 2 threshold_j |c_j| from the coefficients c (atom,), overwritten; returns the outer passes done.
+    """min |y - D c|^2 + sum_j 2 threshold_j |c_j| from the coefficients c (atom,), overwritten;
+    returns the outer passes done.
 
-    d: (row, atom).  y: (row,).  gram: D^T D, or None for the factored form.  Stops at relative duality gap `tol`, after
-    `pass_limit` passes, or after three that no longer lower the objective.
+    d: (row, atom).
+    y: (row,).
+    gram: D^T D, or None for the factored form. Stops at relative duality gap `tol`, after
+        `pass_limit` passes, or after three that no longer lower the objective.
     """
     from plenocli.inverse.sparse.l1.certificate import duality_gap
 
@@ -29,7 +36,11 @@ def solve_signal(d, y, gram, threshold, tol, pass_limit, c):
     while gap[0] > tol and passes < pass_limit and stalled < 3:
         passes += 1
         new = _newcomers(q[0], threshold, index, max(30, len(index) // 2))
-        index, x, sign = np.concatenate([index, new]), np.concatenate([x, np.zeros(len(new))]), np.concatenate([sign, np.sign(q[0, new])])
+        index, x, sign = (
+            np.concatenate([index, new]),
+            np.concatenate([x, np.zeros(len(new))]),
+            np.concatenate([sign, np.sign(q[0, new])]),
+        )
         index, x, sign = _settle(d, y, gram, threshold, index, x, sign)
         before = objective
         trial = np.zeros_like(c)
@@ -50,13 +61,18 @@ def _newcomers(q, threshold, active, most):
 
 
 def _settle(d, y, gram, threshold, index, x, sign, limit=1000):
-    """Minimise over the atoms `index` from x: Newton steps, exact line search, atoms at zero leave. Returns (index, x, sign)."""
+    """Minimise over the atoms `index` from x: Newton steps, exact line search, atoms at zero leave.
+
+    Returns (index, x, sign).
+    """
     for _ in range(limit):
         if not len(index):
             break
         columns = d[:, index]
         h = columns.T @ (y - columns @ x) - threshold[index] * sign
-        step = _from_columns(columns, h) if gram is None else _from_gram(gram[np.ix_(index, index)], h)
+        step = (
+            _from_columns(columns, h) if gram is None else _from_gram(gram[np.ix_(index, index)], h)
+        )
         keep = (x != 0) | (step * sign > 0)
         settled = False
         if keep.all():
@@ -77,11 +93,15 @@ def _from_gram(block, h):
 
     diagonal = np.diag(block).copy()
     np.fill_diagonal(block, diagonal * (1 + JITTER))
-    return cho_solve(cho_factor(block, lower=True, overwrite_a=True, check_finite=False), h, check_finite=False)
+    return cho_solve(
+        cho_factor(block, lower=True, overwrite_a=True, check_finite=False), h, check_finite=False
+    )
 
 
 def _from_columns(columns, h):
-    """G^-1 h with G = columns^T columns, from the triangular factor of the columns; one correction by G itself."""
+    """G^-1 h with G = columns^T columns, from the triangular factor of the columns; one
+    correction by G itself.
+    """
     from scipy.linalg import solve_triangular
 
     ridge = np.diag(RIDGE * np.linalg.norm(columns, axis=0))
@@ -96,8 +116,10 @@ def _from_columns(columns, h):
 
 
 def _step_length(x, step, h, threshold):
-    """(alpha, zero): the minimum of the piecewise quadratic along x + alpha step, 0 < alpha <= 1; `zero`, a list, is the value that
-    lands on 0 there, if one does. h = G step, so that the slope at alpha with the first signs is 2 (alpha - 1) step^T h."""
+    """(alpha, zero): the minimum of the piecewise quadratic along x + alpha step, 0 < alpha <= 1;
+    `zero`, a list, is the value that lands on 0 there, if one does. h = G step, so that the slope
+    at alpha with the first signs is 2 (alpha - 1) step^T h.
+    """
     curvature, jumps = step @ h, 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = np.where(x * step < 0, -x / step, np.inf)

@@ -1,10 +1,13 @@
-"""Sparse coding: min_c |y - D c|^2 + lambda sum_j w_j |c_j|, each signal with a certificate of how close it is.
+"""Sparse coding: min_c |y - D c|^2 + lambda sum_j w_j |c_j|, each signal with a certificate
+of how close it is.
 
-No factor 1/2: lambda is the paper's (Berkner et al. 2013, section 2-3-2); sklearn's and SPAMS's is lambda / 2, up to their
-1/M. A signal is certified by its relative duality gap (P - dual) / P, computed in float64. First-order methods are
-hopeless on a plenoptic system matrix (its Gram matrix spans more than ten decades), so the working solver is an active-set
-Newton method (after the feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time). `fista`, and
-`interior_point` of plenocli.inverse.sparse.l1.interior, the two kinds that the paper names, carry the same certificate.
+No factor 1/2: lambda is the paper's (Berkner et al. 2013, section 2-3-2); sklearn's and SPAMS's is
+lambda / 2, up to their 1/M. A signal is certified by its relative duality gap (P - dual) / P,
+computed in float64. First-order methods are hopeless on a plenoptic system matrix (its Gram matrix
+spans more than ten decades), so the working solver is an active-set Newton method (after the
+feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time). `fista`, and
+`interior_point` of plenocli.inverse.sparse.l1.interior, the two kinds that the paper names, carry
+the same certificate.
 """
 
 from dataclasses import dataclass
@@ -16,9 +19,12 @@ from plenocli.inverse.sparse.l1.certificate import duality_gap
 
 @dataclass(frozen=True)
 class SparseCode:
-    """c: (atom, signal) float64.  objective: P per signal, of the part of y outside the free atoms' span.
-    gap: relative duality gap per signal, in [0, 1], from the residual itself.  passes: outer passes (active set) or iterations
-    (FISTA) per signal.  factored: signals that needed the factored form."""
+    """c: (atom, signal) float64.
+    objective: P per signal, of the part of y outside the free atoms' span.
+    gap: relative duality gap per signal, in [0, 1], from the residual itself.
+    passes: outer passes (active set) or iterations (FISTA) per signal.
+    factored: signals that needed the factored form.
+    """
 
     c: np.ndarray
     objective: np.ndarray
@@ -27,33 +33,67 @@ class SparseCode:
     factored: int = 0
 
 
-def sparse_code(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6, passes=300, start=None, workers=None):
+def sparse_code(
+    dictionary,
+    signals,
+    lam,
+    *,
+    weights=None,
+    free=(),
+    tol=1e-6,
+    passes=300,
+    start=None,
+    workers=None,
+):
     """Solve the l1 problem for every column of `signals` by the active-set Newton method.
 
-    dictionary: D = A Phi, (M, L).  signals: Y, (M, B).  lam > 0.  weights: w_j > 0, (L,), default 1.
-    free: columns without penalty (they are projected out exactly, then solved for).  tol: relative duality gap to reach;
-    what was reached is in the result.  Zero columns get a zero coefficient.  start: coefficients (L, B) to begin with (default: guessed by a ridge regression where that pays).
-    workers: threads over signals (compiled code only; default all cores); the result does not depend on it.
+    dictionary: D = A Phi, (M, L).
+    signals: Y, (M, B).
+    lam > 0.
+    weights: w_j > 0, (L,), default 1.
+    free: columns without penalty (they are projected out exactly, then solved for).
+    tol: relative duality gap to reach; what was reached is in the result. Zero columns get
+        a zero coefficient.
+    start: coefficients (L, B) to begin with (default: guessed by a ridge
+        regression where that pays).
+    workers: threads over signals (compiled code only; default all cores); the result
+        does not depend on it.
     """
     problem = prepare(dictionary, signals, lam, weights, free)
-    return _active_set(problem, problem.d.T @ problem.d, problem.threshold, tol, passes, start, workers)
+    return _active_set(
+        problem, problem.d.T @ problem.d, problem.threshold, tol, passes, start, workers
+    )
 
 
-def lambda_path(dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, passes=300, workers=None):
-    """Yields (lambda, SparseCode) from the largest of `lams` down, each solved from the solution before; D^T D is formed once."""
+def lambda_path(
+    dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, passes=300, workers=None
+):
+    """Yields (lambda, SparseCode) from the largest of `lams` down, each solved from the solution
+    before; D^T D is formed once.
+    """
     problem = prepare(dictionary, signals, 1.0, weights, free)
     gram, code = problem.d.T @ problem.d, None
     for lam in sorted({float(lam) for lam in lams}, reverse=True):
         _check_lambda(lam)
-        code = _active_set(problem, gram, lam * problem.threshold, tol, passes, None if code is None else code.c, workers)
+        code = _active_set(
+            problem,
+            gram,
+            lam * problem.threshold,
+            tol,
+            passes,
+            None if code is None else code.c,
+            workers,
+        )
         yield lam, code
 
 
 def noise_lambda(dictionary, sigma, *, weights=None):
-    """2 sigma sqrt(2 ln L) max_j |D_j| / w_j: white noise of that standard deviation alone would, for most signals, be coded as zero.
+    """2 sigma sqrt(2 ln L) max_j |D_j| / w_j: white noise of that standard deviation alone would,
+    for most signals, be coded as zero.
 
-    The universal threshold (Chen, Donoho & Saunders 2001, section 5.2) in the scale without the factor 1/2. An upper guide: the best
-    reconstruction wants a smaller lambda, since bias costs more than a few false atoms.
+    The universal threshold (Chen, Donoho & Saunders 2001, section 5.2) in the scale without the
+    factor 1/2. An upper guide: the best reconstruction wants a smaller lambda, since bias costs
+    more than a few false atoms.
     """
     d = np.asarray(dictionary, float)
     norm = np.linalg.norm(d, axis=0) / (1 if weights is None else np.asarray(weights, float))
@@ -61,10 +101,12 @@ def noise_lambda(dictionary, sigma, *, weights=None):
 
 
 def fista(dictionary, signals, lam, *, weights=None, free=(), tol=1e-4, iterations=300):
-    """The same problem by accelerated proximal gradient with adaptive restart (Beck & Teboulle 2009; O'Donoghue & Candes 2015).
+    """The same problem by accelerated proximal gradient with adaptive restart (Beck & Teboulle
+    2009; O'Donoghue & Candes 2015).
 
-    Arguments and result as in `sparse_code`; stops when every signal's gap is <= tol or after `iterations`. On a plenoptic
-    system matrix the gap stays near 1 for thousands of iterations, and says so.
+    Arguments and result as in `sparse_code`; stops when every signal's gap is <= tol or after
+    `iterations`. On a plenoptic system matrix the gap stays near 1 for thousands of
+    iterations, and says so.
     """
     problem = prepare(dictionary, signals, lam, weights, free)
     gram = problem.d.T @ problem.d
@@ -91,33 +133,67 @@ BLOCK = 1024
 
 
 def _active_set(problem, gram, threshold, tol, passes, start, workers):
-    """SparseCode of a prepared problem: Gram form for all signals, then the factored form for those it could not certify."""
+    """SparseCode of a prepared problem: Gram form for all signals, then the factored form for
+    those it could not certify.
+    """
     from plenocli.inverse.sparse.l1 import plain as l1_plain
     from plenocli.inverse.sparse.l1.guess import guess
 
     count = len(problem.b)
-    c = guess(problem, threshold) if start is None else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T)
+    c = (
+        guess(problem, threshold)
+        if start is None
+        else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T)
+    )
     done, objective, gap = np.zeros(count, np.int64), np.empty(count), np.empty(count)
     everything = slice(0, count)
     try:
         from plenocli.inverse.sparse.l1 import kernel as l1_kernel
     except ImportError:  # no numba: many times slower, the same result
         for i in range(count):
-            done[i] = l1_plain.solve_signal(problem.d, problem.y[:, i], gram, threshold, tol, passes, c[i])
+            done[i] = l1_plain.solve_signal(
+                problem.d, problem.y[:, i], gram, threshold, tol, passes, c[i]
+            )
         _certify(problem, threshold, everything, c, objective, gap)
     else:
-        first = min(passes, 1) if c.any() else passes  # from a good start one pass nearly always does; the certificate tells, for less than the kernel's own
-        _compiled(l1_kernel.solve_signals, gram, problem, threshold, tol, first, everything, c, done, workers)
+        # from a good start one pass nearly always does; the certificate tells, for less
+        # than the kernel's own
+        first = min(passes, 1) if c.any() else passes
+        _compiled(
+            l1_kernel.solve_signals,
+            gram,
+            problem,
+            threshold,
+            tol,
+            first,
+            everything,
+            c,
+            done,
+            workers,
+        )
         _certify(problem, threshold, everything, c, objective, gap)
         again = np.flatnonzero(~(gap <= tol)) if first < passes else ()
         if len(again):
-            _compiled(l1_kernel.solve_signals, gram, problem, threshold, tol, passes - first, again, c, done, workers)
+            _compiled(
+                l1_kernel.solve_signals,
+                gram,
+                problem,
+                threshold,
+                tol,
+                passes - first,
+                again,
+                c,
+                done,
+                workers,
+            )
             _certify(problem, threshold, again, c, objective, gap)
     missed = np.flatnonzero(~(gap <= tol)) if passes > 0 else []
     for i in missed:
         if objective[i] > problem.y[:, i] @ problem.y[:, i]:
             c[i] = 0
-        done[i] += l1_plain.solve_signal(problem.d, problem.y[:, i], None, threshold, tol, passes, c[i])
+        done[i] += l1_plain.solve_signal(
+            problem.d, problem.y[:, i], None, threshold, tol, passes, c[i]
+        )
         _certify(problem, threshold, slice(i, i + 1), c, objective, gap)
     return SparseCode(problem.restore(c), objective, gap, done, len(missed))
 
@@ -127,17 +203,24 @@ def _certify(problem, threshold, which, c, objective, gap):
     which = np.arange(len(c))[which]
     for first in range(0, len(which), BLOCK):
         part = _span(which[first : first + BLOCK])
-        objective[part], gap[part], _ = duality_gap(problem.d, problem.y[:, part], c[part], threshold)
+        objective[part], gap[part], _ = duality_gap(
+            problem.d, problem.y[:, part], c[part], threshold
+        )
 
 
 def _span(index):
     """Rising indices as a slice where they leave none out: a view instead of a copy."""
-    return slice(index[0], index[-1] + 1) if len(index) and index[-1] - index[0] == len(index) - 1 else index
+    return (
+        slice(index[0], index[-1] + 1)
+        if len(index) and index[-1] - index[0] == len(index) - 1
+        else index
+    )
 
 
 def _compiled(solve_signals, gram, problem, threshold, tol, passes, which, c, done, workers):
-    """Into c and done of the signals `which` (a slice, or indices), in threads; each signal is solved by itself, so the result does
-    not depend on how they are dealt out."""
+    """Into c and done of the signals `which` (a slice, or indices), in threads; each signal is
+    solved by itself, so the result does not depend on how they are dealt out.
+    """
     import os
     from concurrent.futures import ThreadPoolExecutor
 
@@ -147,7 +230,18 @@ def _compiled(solve_signals, gram, problem, threshold, tol, passes, which, c, do
     before = steps.copy()
 
     def solve(part):
-        solve_signals(gram, b[part], energy[part], threshold, float(tol), int(passes), found[part], unused[0, part], unused[1, part], steps[part])
+        solve_signals(
+            gram,
+            b[part],
+            energy[part],
+            threshold,
+            float(tol),
+            int(passes),
+            found[part],
+            unused[0, part],
+            unused[1, part],
+            steps[part],
+        )
 
     workers = max(1, min(int(workers or os.cpu_count() or 1), count))
     size = max(1, min(64, -(-count // workers)))
@@ -160,7 +254,9 @@ def _compiled(solve_signals, gram, problem, threshold, tol, passes, which, c, do
 
 @dataclass
 class Problem:
-    """The problem without its free atoms: d (M, penalised atom) and y (M, signal) outside their span, b = y^T d, threshold = lambda w / 2."""
+    """The problem without its free atoms: d (M, penalised atom) and y (M, signal) outside their
+    span, b = y^T d, threshold = lambda w / 2.
+    """
 
     d: np.ndarray
     y: np.ndarray
@@ -174,11 +270,15 @@ class Problem:
     free_overlap: np.ndarray
 
     def restore(self, c):
-        """(signal, penalised atom) -> (atom, signal), with the free atoms' coefficients filled in."""
+        """(signal, penalised atom) -> (atom, signal), with the free atoms'
+        coefficients filled in.
+        """
         full = np.empty((len(c), len(self.penalised) + len(self.free)))
         full[:, _span(self.penalised)] = c
         if len(self.free):
-            full[:, self.free] = np.linalg.solve(self.free_factor, self.free_part - self.free_overlap @ c.T).T
+            full[:, self.free] = np.linalg.solve(
+                self.free_factor, self.free_part - self.free_overlap @ c.T
+            ).T
         return full.T
 
 
@@ -205,4 +305,6 @@ def prepare(dictionary, signals, lam, weights, free):
     part, overlap = basis.T @ y, basis.T @ rest
     rest, y = rest - basis @ overlap, y - basis @ part
     b = np.ascontiguousarray(y.T @ rest)
-    return Problem(rest, y, b, lam * w[penalised] / 2, penalised, free, basis, factor, part, overlap)
+    return Problem(
+        rest, y, b, lam * w[penalised] / 2, penalised, free, basis, factor, part, overlap
+    )

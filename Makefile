@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test extremes faults fuzz test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs clean
+.PHONY: help env demo test extremes faults fuzz test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -41,7 +41,7 @@ test: $(READY) ## all tests but the slow ones, one process a core
 
 extremes: $(READY) ## errors of the solvers against the condition of the matrix; cameras and captures at the edges
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/inverse/test_extremes.py tests/faults/test_cameras.py
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/solvers/test_extremes.py tests/faults/test_cameras.py
 
 faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults
@@ -99,6 +99,12 @@ bench-pif: $(READY) ## the system matrix beside prysm, poppy, hcipy and LightPip
 
 docs: $(READY) ## the pages of docs/ that come from the program: commands, file format
 	$(BIN)/python pipelines/pages.py docs
+
+# without build/, which keeps modules that have moved since
+wheel: $(READY) ## one file that installs without the repository: dist/plenocli-VERSION-py3-none-any.whl
+	rm -rf build
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation -w dist .
+	rm -rf build
 
 clean: ## remove results, keep the environment
 	rm -rf $(RUNS)

@@ -1,5 +1,3 @@
-"""plenocli: an end-to-end model of plenoptic (light-field) cameras as a chain of
-file-based commands.
-"""
+"""plenocli: an end-to-end model of plenoptic (light-field) cameras, as commands over files."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

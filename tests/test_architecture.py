@@ -119,7 +119,7 @@ def test_every_room_is_known_and_says_what_belongs_in_it():
     found = {
         path.name if path.is_dir() else path.stem
         for path in PACKAGE.iterdir()
-        if path.name[0] != "_" and (path.is_dir() or path.suffix == ".py")
+        if path.name[0] != "_" and ((path / "__init__.py").is_file() or path.suffix == ".py")
     }
     assert found <= set(ROOMS)
     for folder in {path.parent for path in modules()} - {PACKAGE}:

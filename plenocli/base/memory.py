@@ -9,7 +9,7 @@ import mmap
 import os
 import resource
 
-from plenocli.base.errors import NumericsError
+from plenocli.base.errors import InputError, NumericsError
 
 BASE, CORE = 384 << 20, 80 << 20
 """What a process takes beside its data, bytes, and for each core: the interpreter, the libraries
@@ -124,3 +124,21 @@ def size_text(count):
     value = count / 2**power
     step = 10.0 ** (math.floor(math.log10(max(value, 1))) - 2)
     return f"{math.ceil(value / step) * step:.6g}{unit}"
+
+
+def default_mem_limit():
+    """Half of the machine's memory, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+def require_room(path, needed, mem_limit=None):
+    """Raise InputError, before anything is read, if the data that a header declares (`needed`
+    bytes) exceed the limit.
+    """
+    limit = default_mem_limit() if mem_limit is None else mem_limit
+    if needed > limit:
+        raise InputError(
+            f"declares {size_text(needed)} of data, above the memory limit of {size_text(limit)}",
+            path,
+            f"raise --mem-limit to {size_text(1.05 * needed)} if the file is yours",
+        )

@@ -3,6 +3,7 @@
 import importlib
 
 COMMANDS = {
+    "init": "forward",
     "simulate-pif": "forward",
     "simulate-response": "forward",
     "capture-sim": "forward",

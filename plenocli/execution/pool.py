@@ -24,6 +24,7 @@ from pathlib import Path
 
 from plenocli import __version__
 from plenocli.base.errors import OutputError, PlenoError, UsageError
+from plenocli.base.extras import how_to_install
 from plenocli.base.progress import heard, note
 
 ATTEMPTS = 2
@@ -324,7 +325,7 @@ def _cluster(scheduler):
         from distributed import Client
     except ImportError as error:
         raise UsageError(
-            "--scheduler needs Dask, which is not installed", fix="pip install 'plenocli[cluster]'"
+            "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
         ) from error
     file = not str(scheduler).startswith(("tcp://", "tls://", "ucx://"))
     if file and not Path(scheduler).is_file():

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from plenocli.base.errors import UsageError
+from plenocli.base.extras import how_to_install
 
 #: Okabe and Ito's palette, told apart with any colour vision, in the order of use.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#555555")
@@ -77,7 +78,7 @@ def drawing(width, height, layout="constrained"):
         from matplotlib.figure import Figure
     except ImportError as error:
         raise UsageError(
-            "pictures need matplotlib, which is not installed", fix="pip install 'plenocli[plot]'"
+            "pictures need matplotlib, which is not installed", fix=how_to_install("plot")
         ) from error
     with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE}):
         made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout=layout))

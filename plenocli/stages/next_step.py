@@ -34,8 +34,8 @@ def next_step(folder):
     if cameras:
         return f"plenocli simulate-pif {cameras[0]} -o pif.h5"
     return (
-        "describe a camera (plenocli schema camera; examples are in sample_configs), then plenocli "
-        "simulate-pif camera.toml -o pif.h5; or measure yours: plenocli calibrate --help"
+        "plenocli init && make -C plenocli-start, which takes a sample camera through the chain; "
+        "or describe yours (plenocli schema camera), or measure it (plenocli calibrate --help)"
     )
 
 

@@ -13,7 +13,7 @@ TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
 
 def test_following_the_advice_leads_to_a_score(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert "sample_configs" in next_step(".")
+    assert next_step(".").startswith("plenocli init && make -C plenocli-start")
     (tmp_path / "camera.toml").write_text(TINY.read_text())
     (tmp_path / "notes.toml").write_text("x = 1")
     (tmp_path / "broken.h5").write_bytes(b"nothing")

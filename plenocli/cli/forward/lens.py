@@ -54,8 +54,7 @@ def command():
 @options.as_json
 def import_command(prescription, output, focal_length, overwrite, as_json):
     """Convert FILE, a Zemax .zmx, CODE V .seq or optiland .json prescription, into a lens file OUT
-    (.toml) with the dispersion of every glass written out. Needs optiland: pip
-    install "plenocli[lens]".
+    (.toml) with the dispersion of every glass written out. Needs optiland: the extra [lens].
 
     \b
     Examples:

@@ -20,9 +20,8 @@ import h5py
 import numpy as np
 
 from plenocli import __version__
-from plenocli.base.budget import default_mem_limit
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.memory import can_have, is_lack_of_memory, size_text
+from plenocli.base.memory import can_have, default_mem_limit, is_lack_of_memory, size_text
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance, require_file

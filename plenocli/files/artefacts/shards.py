@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.budget import default_mem_limit
 from plenocli.base.errors import InputError
-from plenocli.base.memory import size_text
+from plenocli.base.memory import default_mem_limit, size_text
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.artefacts.stream import streamed_artefact

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from plenocli import __version__
-from plenocli.base.budget import require_room
 from plenocli.base.errors import InputError, OutputError
+from plenocli.base.memory import require_room
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
 

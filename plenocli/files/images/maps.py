@@ -7,8 +7,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from plenocli.base.budget import require_room
 from plenocli.base.errors import InputError
+from plenocli.base.memory import require_room
 from plenocli.base.text import by
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.artefacts.structure import read_attribute, survey

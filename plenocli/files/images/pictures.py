@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.budget import require_room
 from plenocli.base.errors import InputError
+from plenocli.base.memory import require_room
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.images.exr import oiio_error
 

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.budget import default_mem_limit
 from plenocli.base.errors import InputError
-from plenocli.base.memory import size_text
+from plenocli.base.memory import default_mem_limit, size_text
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
 

@@ -391,8 +391,8 @@ _NEEDS = {
     "delta-e": "give a spectral result",
     "depth": "give planes of refocus --camera",
     "classification": (
-        "give a spectral result and its --patches, two or more; one of the two numbers needs "
-        "scikit-learn (plenocli[ml])"
+        "give a spectral result and its --patches, two or more; one of the two numbers "
+        "needs scikit-learn"
     ),
     "single-pixel": "give spectra of demux --method single-pixel among the results",
 }

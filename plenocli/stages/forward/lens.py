@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError, UsageError
+from plenocli.base.extras import how_to_install
 from plenocli.base.units import format_length
 from plenocli.files.config.lens_file import lens_toml, load_lens
 from plenocli.forward.camera.glass import AIR, GLASSES, Medium, medium
@@ -307,7 +308,7 @@ def _read(path):
         raise UsageError(
             f"importing a prescription needs optiland ({error})",
             path,
-            'install it with: pip install "plenocli[lens]"',
+            how_to_install("lens"),
         ) from None
     load = {
         ".zmx": fileio.load_zemax_file,

@@ -9,6 +9,7 @@ since results are kept, a run that was stopped is repeated from its journal up t
 import numpy as np
 
 from plenocli.base.errors import ConfigError, UsageError
+from plenocli.base.extras import how_to_install
 from plenocli.execution.pool import open_pool
 from plenocli.stages.sweep.space import open_space
 from plenocli.stages.sweep.store import open_store
@@ -72,7 +73,7 @@ def _study(objectives, seed):
         import optuna
     except ImportError as error:
         raise UsageError(
-            "optimise needs Optuna, which is not installed", fix="pip install 'plenocli[optimise]'"
+            "optimise needs Optuna, which is not installed", fix=how_to_install("optimise")
         ) from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     directions = ["maximize" if way == "max" else "minimize" for way in objectives.values()]

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from plenocli.base.errors import OutputError, PlenoError, UsageError
+from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost
 from plenocli.stages.sweep.point import refused, run_matrix, run_point
@@ -29,7 +30,7 @@ def open_store(output, plot, overwrite, inputs):
             raise UsageError(
                 "pictures need matplotlib, which is not installed",
                 "--plot",
-                "pip install 'plenocli[plot]', or leave it out",
+                f"{how_to_install('plot')}, or leave it out",
             )
         check_output(plot, overwrite=again, inputs=inputs, suffixes=(".png",))
     store = Store(folder, output, plot, overwrite, again)

@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test extremes faults fuzz test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,6 +38,10 @@ tiny: $(READY) ## every stage once on the smallest camera, in seconds
 
 test: $(READY) ## all tests but the slow ones, one process a core
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal
+
+lint: $(READY) ## layout, lint and types of the code
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
 
 extremes: $(READY) ## errors of the solvers against the condition of the matrix; cameras and captures at the edges
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes

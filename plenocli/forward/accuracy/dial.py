@@ -373,9 +373,9 @@ def _sized(request, rung, ring, split, nodes):
         sampling,
         double,
         bands,
-        max(nodes, 1) * sum(c["operations"] for c in costs),
-        max(nodes, 1) * sum(c["seconds"] for c in costs),
-        size + max(nodes, 1) * max(c["bytes"] for c in costs),
+        max(nodes, 1) * sum(c.operations for c in costs),
+        max(nodes, 1) * sum(c.seconds for c in costs),
+        size + max(nodes, 1) * max(c.bytes for c in costs),
         nodes,
     )
 

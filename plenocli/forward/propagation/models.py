@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from plenocli.forward.propagation import rays
+from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.fresnel import shaped
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
@@ -31,9 +32,7 @@ from plenocli.forward.propagation.sampling import (
 class Rung:
     """One way: `model` ray, fresnel or exact; `valid_for(camera, view)` None or why not;
     `error_bound(camera, view)` against the finest model; `size(view, grid, ring, sampling,
-    tolerance)` a BandPlan; `cost(camera, view, band, shape, double)` a dict of `operations` (real,
-    in products), `seconds` (what does not scale with the products, one core) and `bytes`
-    (beyond the result).
+    tolerance)` a BandPlan; `cost(camera, view, band, shape, double)` a Cost.
     """
 
     name: str
@@ -108,16 +107,15 @@ def _square_cost(camera, view, band, shape, double):
     if narrow:  # superpixels keep half to three quarters of the terms
         setup += 1.5e-9 * max(grid) * table / grid[0] * terms**0.5
         terms *= 0.65
-    return {
-        "operations": 8.0 * 1.2 * fine * terms,
-        "seconds": setup
+    return Cost(
+        operations=8.0 * 1.2 * fine * terms,
+        seconds=setup
         + pairs * 2.5e-5
         + fine * (4e-9 if double else 3e-9)
         + size * (2e-8 if double else 7e-9)
         + 0.005,
-        "bytes": int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2)
-        + (3 << 22),
-    }
+        bytes=int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (3 << 22),
+    )
 
 
 RUNGS = (

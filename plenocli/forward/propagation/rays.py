@@ -21,6 +21,7 @@ import numpy as np
 
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
+from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
 
 SLAB = 1 << 17
@@ -82,11 +83,7 @@ def cost(camera, view, band, shape, double):
     lighting = 1.0 if view.blur == 0 else 13 / (1 + 0.8 * view.blur / view.D2)
     across = (1 if band.window is None else 2 * band.window + 1) * sum(view.pixel_shape)
     each = view.pixel_shape[0] * view.pixel_shape[1] * cells * 1.3e-7 * lighting + across * 4e-8
-    return {
-        "operations": 0.0,
-        "seconds": distinct(camera, view, shape)[1] * each + 0.003,
-        "bytes": 8 * SLAB * 8,
-    }
+    return Cost(0.0, distinct(camera, view, shape)[1] * each + 0.003, 8 * SLAB * 8)
 
 
 class RayLenslets:

@@ -13,6 +13,7 @@ from plenocli.forward.accuracy import dial
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.accuracy.explain import _duration, candidates, expectation, explain
 from plenocli.forward.accuracy.needs import Needs, sensor_noise
+from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.models import Rung
 from plenocli.forward.propagation.sampling import size_band
 from tests.forward.propagation.cameras import small_camera
@@ -25,11 +26,9 @@ def rung(name, model, error, operations, reason=None):
         lambda camera, view: reason,
         lambda camera, view: error,
         size_band,
-        lambda camera, view, band, shape, double: {
-            "operations": operations * (2 if double else 1),
-            "seconds": 0.0,
-            "bytes": 1000,
-        },
+        lambda camera, view, band, shape, double: Cost(
+            operations * (2 if double else 1), 0.0, 1000
+        ),
     )
 
 

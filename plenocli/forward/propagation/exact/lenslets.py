@@ -21,6 +21,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for
+from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, Way
 from plenocli.forward.propagation.exact.low_rank_product import FILL, MAX_SKETCH, Product
@@ -362,17 +363,17 @@ def cost(camera, view, band, shape, double):
     size = shape[1] * shape[2] * shape[3]
     tables = sum(kinds.values())
     mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
-    return {
-        "operations": operations + 8.0 * 1.2 * fine * mean * pairs,
-        "seconds": begun
+    return Cost(
+        operations=operations + 8.0 * 1.2 * fine * mean * pairs,
+        seconds=begun
         + seconds * (2 if double else 1)
         + pairs * (4e-5 + fine * (4e-9 if double else 3e-9))
         + size * (2e-8 if double else 7e-9),
-        "bytes": int(
+        bytes=int(
             largest + coupling + field + intervals + item * 2 * tables * points * lines * mean
         )
         + (3 << 24),
-    }
+    )
 
 
 class ExactSquareLenslets:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, nodes_for, smooth_nodes
+from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.fresnel.array_to_sensor import (
     lenslet_kernel,
     pixel_energy,
@@ -518,8 +519,8 @@ def cost(camera, view, band, shape, double):
         * (1 if band.window is not None else shape[1])
     )
     spread = size_ * count * terms * across
-    return {
-        "operations": operations,
-        "seconds": passes + tables + written + field_seconds(camera, view, band) + 0.015,
-        "bytes": int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25),
-    }
+    return Cost(
+        operations,
+        passes + tables + written + field_seconds(camera, view, band) + 0.015,
+        int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25),
+    )

@@ -7,6 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from plenocli.forward.sensor.noise import Noise
+
 # of the way from black to the white level: averaging electronics saturate softly
 SATURATION = 0.985
 SAME_EXPOSURE = 0.01
@@ -116,12 +118,19 @@ def merge(frames, exposures, dark, white, reference):
         return np.where(time > 0, total / time, np.nan).astype(np.float32), time
 
 
-def photon_transfer(first, second, limit=np.inf, bins=24):
-    """Gain (DN per electron) and dark variance (DN^2) from two frames of one still scene.
+def photon_transfer(
+    first: np.ndarray, second: np.ndarray, limit: float = np.inf, bins: int = 24
+) -> Noise | None:
+    """The sensor's noise from two frames of one still scene.
 
-    Half the variance of the difference against the mean, by bins of the mean below `limit`; a
-    straight line through the bins (EMVA 1288, photon transfer method). Returns None where the
-    picture has no range of levels.
+    Half the variance of the difference against the mean, by bins of the mean; a straight line
+    through the bins.
+    first, second: (row, column) signals, DN.
+    limit: largest mean of the two that counts, DN.
+    bins: how many of about equal numbers of pixels.
+
+    Returns gain and read variance, None where the picture has no range of levels.
+    EMVA Standard 1288, photon transfer method.
     """
     first, second = np.asarray(first, float).ravel(), np.asarray(second, float).ravel()
     mean, half = (first + second) / 2, (first - second) ** 2 / 2
@@ -144,7 +153,7 @@ def photon_transfer(first, second, limit=np.inf, bins=24):
     slope, offset = np.linalg.lstsq(
         np.stack([x, np.ones_like(x)], axis=1) * weight[:, None], y * weight, rcond=None
     )[0]
-    return (float(slope), float(max(offset, 0.0))) if slope > 0 else None
+    return Noise(gain=float(slope), read_variance=float(max(offset, 0.0))) if slope > 0 else None
 
 
 def bad_pixels(white, dark, top, step):

@@ -366,7 +366,7 @@ def _detect(camera, light, whites, settings, scene):
     """From relative light to what the sensor reports: (capture dict, summary dict)."""
     from plenocli.base.tiling import to_plane
     from plenocli.forward.sensor.cfa import cfa_map
-    from plenocli.forward.sensor.noise import SensorModel, add_white_noise
+    from plenocli.forward.sensor.noise import Noise, SensorModel, add_white_noise
 
     letters, light = light
     sensor, shape = camera.sensor, camera.sensor.pixels_per_lenslet
@@ -387,20 +387,20 @@ def _detect(camera, light, whites, settings, scene):
     if settings.snr_db is not None or settings.noise == "none":
         # relative units: with one wavelength and no colour the mosaic is A x itself
         mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
-        sigma = 0.0
+        noise = Noise()
         if settings.snr_db is not None:
-            mosaic, sigma = add_white_noise(mosaic, settings.snr_db, rng)
+            mosaic, noise = add_white_noise(mosaic, settings.snr_db, rng)
         capture |= dict(
             mosaic=mosaic.astype(np.float64),
             units="relative",
             black=0.0,
             white=float("inf"),
             snr_db=settings.snr_db,
-            noise_sigma=float(sigma),
+            noise_sigma=noise.sigma,
         )
         return capture, {
             "units": "relative",
-            "noise_sigma": float(sigma),
+            "noise_sigma": noise.sigma,
             "peak": float(mosaic.max()),
         }
     exposure = settings.exposure or camera.light.white_exposure

@@ -413,7 +413,8 @@ def _ideal(camera, places, white, settings):
         "dark/mean": np.full(places.shape, sensor.black_level, np.float32),
     }
     exposure = settings.exposure or camera.light.white_exposure
-    read = float(np.sqrt((sensor.gain * sensor.read_noise) ** 2 + 1 / 12))
+    model = SensorModel.from_camera(camera)
+    read = model.noise.sigma
     noise = {"gain_e_per_dn": 1 / sensor.gain, "read_noise": read, "cfa": sensor.cfa}
     attrs = {
         "grid": dict(
@@ -429,7 +430,7 @@ def _ideal(camera, places, white, settings):
         | dict(
             exposure=exposure,
             black=[float(sensor.black_level)] * 4,
-            white=float(SensorModel.from_camera(camera).white_level),
+            white=float(model.white_level),
             notes="predicted",
         ),
         "dark": dict(exposure=exposure, sigma=read),

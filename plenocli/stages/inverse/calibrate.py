@@ -167,8 +167,8 @@ def _told_by(group, dark, noise):
             )
             if found:
                 return Noise(
-                    found[0] if noise.gain is None else noise.gain,
-                    found[1] if noise.read_variance is None else noise.read_variance,
+                    found.gain if noise.gain is None else noise.gain,
+                    found.read_variance if noise.read_variance is None else noise.read_variance,
                     "photon transfer of repeated frames",
                 )
     return noise

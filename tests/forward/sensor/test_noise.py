@@ -1,12 +1,14 @@
 """Sensor noise against the EMVA 1288 equations and against direct counts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.sensor.frames import photon_transfer
-from plenocli.forward.sensor.noise import SensorModel, add_white_noise
+from plenocli.forward.sensor.noise import Noise, SensorModel, add_white_noise
 
 MODEL = SensorModel(gain=0.25, read_noise=4.0, full_well=15000, bits=12, black_level=64)
 
@@ -20,7 +22,7 @@ def test_photon_transfer_slope_is_the_gain(count):
     assert slope == pytest.approx(MODEL.gain, rel=0.01)
     assert offset == pytest.approx(MODEL.gain**2 * MODEL.read_noise**2 + 1 / 12, rel=0.03)
     np.testing.assert_allclose(mean, 64 + 0.25 * levels, atol=0.5)
-    np.testing.assert_allclose(variance, MODEL.variance(levels), rtol=0.04)
+    np.testing.assert_allclose(variance, MODEL.noise.variance(MODEL.gain * levels), rtol=0.04)
     count(
         "photon transfer, slope against gain",
         off_by_parts_per_10000=round(1e4 * abs(slope / MODEL.gain - 1)),
@@ -69,7 +71,7 @@ def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of
                 z_scores(
                     values,
                     model.black_level + model.gain * mean,
-                    model.variance(mean),
+                    model.noise.variance(model.gain * mean),
                     model.gain**3 * mean,
                 )
             ),
@@ -83,20 +85,18 @@ def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of
             z_scores(
                 model.expose(np.full(size, 7507.5), rng).astype(float),
                 model.black_level + model.gain * 7500,
-                model.variance(7500),
+                model.noise.variance(model.gain * 7500),
                 0,
             )[0]
         )
         > 6
     )
-    noisier = SensorModel(
-        model.gain, 1.01 * model.read_noise, model.full_well, model.bits, model.black_level
-    )
+    noisier = replace(model, read_noise=1.01 * model.read_noise)
     assert (
         z_scores(
             noisier.expose(np.zeros(size), rng).astype(float),
             model.black_level,
-            model.variance(0),
+            model.noise.variance(0),
             0,
         )[1]
         > 4
@@ -113,9 +113,9 @@ def test_photon_transfer_of_two_frames_finds_gain_and_read_noise():
     rng = np.random.default_rng(5)
     scene = np.tile(np.linspace(0, 12000, 600), (500, 1))
     a, b = (MODEL.expose(scene, rng).astype(float) - 64 for _ in range(2))
-    gain, read = photon_transfer(a, b)
-    assert gain == pytest.approx(0.25, rel=0.02)
-    assert read == pytest.approx(1 + 1 / 12, rel=0.3)
+    found = photon_transfer(a, b)
+    assert found.gain == pytest.approx(0.25, rel=0.02)
+    assert found.read_variance == pytest.approx(1 + 1 / 12, rel=0.3)
     assert photon_transfer(np.full((90, 90), 5.0), np.full((90, 90), 5.0)) is None
 
 
@@ -149,9 +149,9 @@ def test_white_noise_has_the_ratio_to_the_mean_square():
     rng = np.random.default_rng(4)
     # mostly DC: definition by mean square and by variance differ by 25 dB
     signal = 5 + rng.uniform(0, 1, (400, 400))
-    noisy, sigma = add_white_noise(signal, 40.0, rng)
-    assert sigma**2 == pytest.approx((signal**2).mean() * 1e-4)
-    assert (noisy - signal).std() == pytest.approx(sigma, rel=0.01)
+    noisy, noise = add_white_noise(signal, 40.0, rng)
+    assert noise.white == pytest.approx((signal**2).mean() * 1e-4)
+    assert (noisy - signal).std() == pytest.approx(noise.sigma, rel=0.01)
     with pytest.raises(NumericsError):
         add_white_noise(np.zeros(5), 60, rng)
 
@@ -160,3 +160,19 @@ def test_the_same_seed_gives_the_same_frame():
     scene = np.linspace(0, 9000, 1000)
     one, two = (MODEL.expose(scene, np.random.default_rng(9)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
+
+
+def test_parts_of_the_variance_add_and_scale_with_the_signal():
+    noise = Noise(gain=0.5, read_variance=2.0, white=3.0, model=0.1)
+    signal = np.array([-5.0, 0.0, 100.0])
+    np.testing.assert_allclose(noise.variance(signal), [5.0, 5.0, 5.0 + 50.0 + 100.0])
+    np.testing.assert_allclose(
+        noise.scaled(3.0).variance(3.0 * signal), 9.0 * noise.variance(signal), rtol=1e-14
+    )
+    assert noise.without_signal == 5.0 and noise.sigma == np.sqrt(5.0)
+
+
+def test_a_standard_deviation_is_given_back_to_the_last_bit():
+    for sigma in np.random.default_rng(6).lognormal(0, 20, 1000):
+        assert Noise.of_sigma(sigma).sigma == sigma
+        assert Noise.of_sigma(sigma).is_white

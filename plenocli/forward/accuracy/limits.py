@@ -3,45 +3,66 @@ error of the model.
 """
 
 import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
 
-def what_limits(noise, matrix, capture=None, same=False):
-    """Compare a capture's noise with what is wrong with the matrix that explained it, both
-    relative to the capture.
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Noise against model error, both relative to the capture's root mean square.
 
-    noise: sigma over root mean square;
-    matrix, capture: accuracy records (dicts with "estimated" and "model_error", the error of the
-        model itself, and "model") of the matrix and of a simulated capture, None for a real one;
-    same: whether the capture was simulated with this very matrix.
-    Returns {"noise", "model_error", "limited_by": "noise" or "model", "reason"} or None where the
-    records do not say.
+    limited_by: "noise" or "model", whichever is larger;
+    reason: what the model error was taken against.
     """
-    if not noise or not matrix or "estimated" not in matrix:
+
+    noise: float
+    model_error: float
+    limited_by: str
+    reason: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return asdict(self)
+
+
+def what_limits(
+    noise: float | None,
+    matrix: AccuracyRecord | None,
+    capture: AccuracyRecord | None = None,
+    same: bool = False,
+) -> Limits | None:
+    """Compare a capture's noise with what is wrong with the matrix that explained it.
+
+    noise: sigma over root mean square of the capture;
+    matrix: how accurate the matrix is;
+    capture: how accurately the capture was simulated, None for a real one;
+    same: whether the capture was simulated with this very matrix.
+
+    Returns None where the records do not say.
+    """
+    if not noise or matrix is None or matrix.estimated is None:
         return None
     if same:
-        error, reason = (
-            0.0,
-            "the capture was simulated with this very matrix, so no model error shows",
-        )
-    elif capture and "estimated" in capture:
+        error = 0.0
+        reason = "the capture was simulated with this very matrix, so no model error shows"
+    elif capture is not None and capture.estimated is not None:
         models = (
             0.0
-            if capture.get("model") == matrix.get("model")
-            else max(matrix.get("model_error") or 0.0, capture.get("model_error") or 0.0)
+            if capture.model == matrix.model
+            else max(matrix.model_error or 0.0, capture.model_error or 0.0)
         )
-        error = math.hypot(matrix["estimated"], capture["estimated"], models)
+        error = math.hypot(matrix.estimated, capture.estimated, models)
         reason = (
-            f"capture simulated by the {capture.get('model')} model, explained by the "
-            f"{matrix.get('model')} one"
+            f"capture simulated by the {capture.model} model, explained by the {matrix.model} one"
         )
     else:
-        error, reason = (
-            math.hypot(matrix["estimated"], matrix.get("model_error") or 0.0),
-            "a real capture, against the finest model",
-        )
-    return {
-        "noise": float(noise),
-        "model_error": float(error),
-        "limited_by": "noise" if noise >= error else "model",
-        "reason": reason,
-    }
+        error = math.hypot(matrix.estimated, matrix.model_error or 0.0)
+        reason = "a real capture, against the finest model"
+    return Limits(
+        noise=float(noise),
+        model_error=float(error),
+        limited_by="noise" if noise >= error else "model",
+        reason=reason,
+    )

@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.pupil import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 
 FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
@@ -123,6 +124,20 @@ class PifPlan:
     def chosen(self):
         """The candidate that is carried out."""
         return next(c for c in self.candidates if c.why is None)
+
+    def accuracy_record(self) -> AccuracyRecord:
+        """What a result of this plan says of its accuracy."""
+        return AccuracyRecord(
+            asked=self.accuracy,
+            asked_by=self.asked_by,
+            estimated=self.estimated,
+            by_source=self.split,
+            model=self.model,
+            model_error=self.model_error,
+            rung=self.rung,
+            reasons=(*self.reasons, *self.warnings),
+            left_out=tuple(self.left_out),
+        )
 
 
 def window_error(view, grid, ring):

@@ -341,13 +341,12 @@ def _accuracy(camera, settings, wavelengths):
     """
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.accuracy.explain import expectation
-    from plenocli.stages.forward.simulate_pif import accuracy_record
 
     plan = plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(settings))
     expected = expectation(plan, times=len(wavelengths) * settings.refine**2)
     if expected:
         note(expected)
-    return accuracy_record(plan)
+    return plan.accuracy_record().as_json()
 
 
 def _truth(camera, scene, grid, refine):

@@ -85,7 +85,7 @@ def run_simulate_pif(
         describe_inputs(camera_files(camera_path, camera) | {"scene": scene}),
         None,
         to_toml(camera),
-        accuracy_record(plan),
+        plan.accuracy_record().as_json(),
     )
 
     def finish(pif, found):
@@ -117,23 +117,6 @@ def run_simulate_pif(
     return _summary(output, pif, found, plan)
 
 
-def accuracy_record(plan):
-    """What an artefact says of the accuracy it was made with, JSON-able: asked (and by whom),
-    estimated, by source, model, reasons.
-    """
-    return {
-        "asked": plan.accuracy,
-        "asked_by": plan.asked_by,
-        "estimated": plan.estimated,
-        "by_source": plan.split,
-        "model": plan.model,
-        "model_error": plan.model_error,
-        "rung": plan.rung,
-        "reasons": [*plan.reasons, *plan.warnings],
-        "left_out": list(plan.left_out),
-    }
-
-
 def _explained(plan, memory):
     from plenocli.forward.accuracy.explain import candidates, explain
 
@@ -141,7 +124,7 @@ def _explained(plan, memory):
     return {
         "plan": explain(plan, memory),
         "memory": memory,
-        "accuracy": accuracy_record(plan),
+        "accuracy": plan.accuracy_record().as_json(),
         "considered": considered,
         "seconds": next(c["seconds"] for c in considered if c["chosen"]),
         "bytes": plan.bytes,

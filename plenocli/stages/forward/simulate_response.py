@@ -332,13 +332,13 @@ class _Optics:
         return found | {"error": [float(np.hypot(WAVES_ERR, one)) for one in apart]}
 
     def record(self):
-        from plenocli.stages.forward.simulate_pif import accuracy_record
+        from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
-        return (
-            {"model": self.model, "rung": "closed form, even object"}
-            if self.closed
-            else accuracy_record(self.plan)
-        )
+        if self.closed:
+            record = AccuracyRecord(model=self.model, rung="closed form, even object")
+        else:
+            record = self.plan.accuracy_record()
+        return record.as_json()
 
 
 def _electrons(camera, source, optics, places, settings):

@@ -283,22 +283,23 @@ def _limits(data, estimators, report):
     """
     from plenocli.files.artefacts.provenance import file_digest
     from plenocli.forward.accuracy.limits import what_limits
+    from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
     sigma = report.get("noise_sigma") or data.sigma
     signal = float(np.sqrt(np.mean(np.square(data.y))))
     same = data.matrix is not None and data.matrix == file_digest(estimators.system.path)
     found = what_limits(
         sigma / signal if sigma and signal else None,
-        estimators.system.accuracy,
-        data.accuracy,
+        AccuracyRecord.from_json(estimators.system.accuracy),
+        AccuracyRecord.from_json(data.accuracy),
         same,
     )
     return (
         {}
         if found is None
         else {
-            "limits": found
-            | {"loss_at_most_db": estimators.loss_db(data, report, found["model_error"] * signal)}
+            "limits": found.as_json()
+            | {"loss_at_most_db": estimators.loss_db(data, report, found.model_error * signal)}
         }
     )
 

@@ -49,9 +49,9 @@ METHODS = {
 def system_of(config, shape):
     """stages.systems.System of one isolated lenslet of a configuration, square or circular."""
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.files.read.system_matrices import System
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.propagation.system_matrix import build_pif
+    from plenocli.inverse.picture.lenslet_model import LensletMatrix
 
     camera = load_camera(config)
     camera = camera.model_copy(
@@ -65,12 +65,12 @@ def system_of(config, shape):
         .A[0, :1]
         .astype(float)
     )
-    return System(
-        Path(config),
-        matrix,
-        np.zeros((1, 2), int),
-        camera.sensor.pixels_per_lenslet,
-        camera.object.samples_per_lenslet,
+    return LensletMatrix(
+        path=Path(config),
+        blocks=matrix,
+        offsets=np.zeros((1, 2), int),
+        pixel_shape=camera.sensor.pixels_per_lenslet,
+        object_shape=camera.object.samples_per_lenslet,
     ), camera.lenslet_array.count
 
 
@@ -82,21 +82,21 @@ def capture(system, count, scene, snr, seed):
         which are captured.
     """
     from plenocli.base.tiling import to_blocks
-    from plenocli.files.read.captures import Superpixels
-    from plenocli.files.read.training import _values
+    from plenocli.files.read.training import linear_values
     from plenocli.forward.scene.sample import luminance, sample_picture
+    from plenocli.inverse.picture.lenslet_model import Superpixels
 
     whole, kept = count
     rows, columns = (int(n) * m for n, m in zip(whole, system.object_shape))
     truth = to_blocks(
-        np.asarray(sample_picture(luminance(_values(scene)), rows, columns), float),
+        np.asarray(sample_picture(luminance(linear_values(scene)), rows, columns), float),
         system.object_shape,
     )
     truth = truth[tuple(slice((n - k) // 2, (n - k) // 2 + k) for n, k in zip(whole, kept))]
     y = truth @ system.own.T
     sigma = float(np.sqrt(np.mean(y**2)) * 10 ** (-snr / 20))
     return Superpixels(
-        y + sigma * np.random.default_rng(seed).standard_normal(y.shape), sigma, scene
+        y=y + sigma * np.random.default_rng(seed).standard_normal(y.shape), sigma=sigma, scene=scene
     ), truth
 
 
@@ -118,16 +118,29 @@ def measure(estimators, data, truth, options):
     }
 
 
+def estimators_of(system, settings):
+    """Estimators that train on the default pictures."""
+    from plenocli.files.read.dictionaries import read_dictionary
+    from plenocli.files.read.training import read_training
+    from plenocli.inverse.picture.estimators import Estimators
+
+    return Estimators(
+        system,
+        settings,
+        lambda scene: read_training((), system.object_shape, not_scene=scene),
+        settings.dictionary and (lambda: read_dictionary(settings.dictionary, system)),
+    )
+
+
 def compare(args):
     """[{"lenslets", "scene", "snr_db", "seed", "method", ...}], one a run."""
-    from plenocli.inverse.picture.estimators import Estimators
     from plenocli.stages.inverse.reconstruct import Settings
 
     rows = []
     dictionaries = dict(zip(args.lenslets, args.dictionary or []))
     for lenslets in args.lenslets:
         system, count = system_of(args.config, lenslets)
-        first = Estimators(system, Settings())
+        first = estimators_of(system, Settings())
         _ = first.svd
         for scene in args.scene:
             first.prior.pictures(scene)
@@ -141,7 +154,7 @@ def compare(args):
                         settings = {k: v for k, v in options.items() if k != "oracle"}
                         if options["method"] in ("dictionary", "auto") and lenslets in dictionaries:
                             settings["dictionary"] = Path(dictionaries[lenslets])
-                        one = Estimators(replace(system), Settings(seed=seed, **settings))
+                        one = estimators_of(replace(system), Settings(seed=seed, **settings))
                         one.svd, one.prior.pictures_of[scene] = (
                             first.svd,
                             first.prior.pictures_of[scene],

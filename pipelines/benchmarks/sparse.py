@@ -46,11 +46,11 @@ def problem(config, iterations, count, seed):
     validation table that chose it.
     """
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.files.read.training import at_scales, read_training, split_by_scene
+    from plenocli.files.read.training import read_training, split_by_scene
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.propagation.system_matrix import build_pif
-    from plenocli.inverse.picture.least_squares import decompose
-    from plenocli.inverse.prior.natural_images import draw_patches
+    from plenocli.inverse.picture.solvers.least_squares import decompose
+    from plenocli.inverse.prior.natural_images import at_scales, draw_patches
     from plenocli.inverse.sparse.dictionary import Learner, Settings
 
     camera = load_camera(config)
@@ -63,7 +63,9 @@ def problem(config, iterations, count, seed):
         [p for _, p in at_scales(part, shape)] for part in split_by_scene(read_training((), shape))
     )
     points = int(np.prod(shape))
-    settings = Settings(points, 4 * points, 1e-6, 1e-3, SNR_DB, seed=seed)
+    settings = Settings(
+        atoms=points, batch=4 * points, lam=1e-6, delta=1e-3, snr_db=SNR_DB, seed=seed
+    )
     learner = Learner(decompose(matrix), shape, training, held, settings, workers=1)
     state = learner.start()
     for k in range(iterations):

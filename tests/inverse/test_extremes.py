@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.picture import least_squares as linear
-from plenocli.inverse.picture import lmmse, nnls
+from plenocli.inverse.picture.solvers import least_squares as linear
+from plenocli.inverse.picture.solvers import lmmse, nnls
 from plenocli.inverse.sparse.l1.solve import sparse_code
 from plenocli.inverse.spectra import demultiplex as spectral
 from tests.reference import extremes

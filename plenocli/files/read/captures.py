@@ -2,7 +2,6 @@
 relative to white.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +10,14 @@ from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.tiling import to_blocks
 from plenocli.forward.sensor.frames import tiled
-
-
-@dataclass(frozen=True)
-class Superpixels:
-    """y (lenslet_row, lenslet_column, pixel) in units of A x;
-
-    sigma: known noise in these units, or None;
-    scene: its name or None;
-    accuracy, matrix: of a simulated capture the record of its accuracy and the SHA-256 of the
-        pif it was made with.
-    """
-
-    y: np.ndarray
-    sigma: float | None
-    scene: str | None
-    accuracy: dict | None = None
-    matrix: str | None = None
+from plenocli.inverse.picture.lenslet_model import Superpixels
 
 
 def read_superpixels(path, system, calibration=None, mem_limit=None):
     """Superpixels of a capture: tiled as its file says, or cut out along the lenslet grid of a
     calibration artefact.
 
-    system: stages.systems.System.
+    system: LensletMatrix.
     InputError where sizes disagree or the sensor is saturated beyond use.
     """
     from plenocli.files.images.mosaic import read_mosaic
@@ -59,7 +42,9 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
             )
         lit = np.all(np.isfinite(signal), axis=2)
         scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
-        return Superpixels(np.where(lit[:, :, None], signal, 0) * scale[:, :, None], None, None)
+        return Superpixels(
+            y=np.where(lit[:, :, None], signal, 0) * scale[:, :, None], sigma=None, scene=None
+        )
     light = mosaic.meta.get("illuminant")
     if system.illuminant and light and light != system.illuminant:
         note(
@@ -96,11 +81,11 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
         )
     sigma = mosaic.meta.get("noise_sigma")
     return Superpixels(
-        to_blocks(signal, shape) / unit,
-        None if sigma is None else float(sigma) / unit,
-        mosaic.meta.get("target"),
-        mosaic.meta.get("accuracy"),
-        mosaic.meta.get("inputs", {}).get("pif", {}).get("sha256"),
+        y=to_blocks(signal, shape) / unit,
+        sigma=None if sigma is None else float(sigma) / unit,
+        scene=mosaic.meta.get("target"),
+        accuracy=mosaic.meta.get("accuracy"),
+        matrix=mosaic.meta.get("inputs", {}).get("pif", {}).get("sha256"),
     )
 
 

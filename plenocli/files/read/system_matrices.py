@@ -1,60 +1,31 @@
-"""The system matrix as learn-dict and reconstruct use it: one matrix (superpixel, pixel,
-point) in float64.
+"""The system matrix as learn-dict and reconstruct use it: one matrix (superpixel, pixel, point)
+in float64.
 """
 
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
 
 
-@dataclass(frozen=True)
-class System:
-    """blocks (offset, pixel, point), points of several bands one band after the other;
+def read_lenslet_matrix(
+    path: Path, mem_limit: int | None = None, *, by_band: bool = False
+) -> LensletMatrix:
+    """The matrix of a pif artefact, its wavelengths averaged, as equal shares of the light.
 
-    offsets (offset, 2); shapes (rows, columns) of a superpixel and an object block;
-    accuracy: the record that simulate-pif left;
-    bands (band,): wavelengths (m) of the pictures that the object has, empty where it is one
-        picture without a colour;
-    illuminant: the light that the bands' shares are for.
-    """
+    path: of the pif.
+    by_band: wavelengths of a camera with filters in its pupil make an object with several bands
+        instead (plenocli.forward.scene.light.band_weights).
 
-    path: Path
-    blocks: np.ndarray
-    offsets: np.ndarray
-    pixel_shape: tuple
-    object_shape: tuple
-    accuracy: dict = field(default_factory=dict)
-    bands: tuple = ()
-    illuminant: str | None = None
-
-    @property
-    def own(self):
-        return self.blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]]
-
-    @cached_property
-    def even(self):
-        """The superpixel of an even object, (pixel, band): what light of one band makes of it."""
-        return self.own.reshape(len(self.own), max(1, len(self.bands)), -1).sum(axis=2)
-
-    def levels(self, y):
-        """Brightness of each band, (..., band), behind superpixels y (..., pixel), by least
-        squares on `even`.
-        """
-        return y @ np.linalg.pinv(self.even, rcond=1e-3).T
-
-
-def read_system(path, mem_limit=None, *, by_band=False):
-    """System of a pif artefact. InputError where it lacks (0, 0) or belongs to a hexagonal lattice.
-
-    Several wavelengths are averaged, as equal shares of the light;
-    by_band: those of a camera with filters in its pupil make an object with several
-        bands (sensor.light.band_weights).
+    Raises InputError where the pif lacks offset (0, 0) or belongs to a hexagonal lattice.
     """
     from plenocli.files.artefacts.shards import read_pif
 
@@ -104,12 +75,21 @@ def read_system(path, mem_limit=None, *, by_band=False):
         ],
         axis=2,
     )
-    return System(
-        Path(path), blocks, offsets, *shapes, artefact.provenance.accuracy, bands, illuminant
+    return LensletMatrix(
+        path=Path(path),
+        blocks=blocks,
+        offsets=offsets,
+        pixel_shape=shapes[0],
+        object_shape=shapes[1],
+        accuracy=artefact.provenance.accuracy,
+        bands=bands,
+        illuminant=illuminant,
     )
 
 
-def _bands(artefact, path):
+def _bands(
+    artefact: "Artefact", path: Path
+) -> tuple[tuple[float, ...], np.ndarray | None, str | None]:
     """(wavelengths of the bands, weights (band, wavelength), illuminant) of a pif whose camera
     has filters; ((), None, None) for others.
     """

@@ -1,5 +1,6 @@
 """Training pictures for dictionaries and for the statistics of natural images."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,8 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.files.read.scenes import EMBEDDED, embedded_photograph
+from plenocli.inverse.prior.natural_images import TrainingPicture
+from plenocli.inverse.prior.shelf import Shelf
 
 DEFAULT = (
     "skimage:camera",
@@ -22,54 +25,28 @@ DEFAULT = (
 )
 """Photographs that ship with scikit-image, but for the astronaut, which is the test picture."""
 
-SCALES = (1, 2, 4)
-
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".ppm", ".pgm", ".webp")
 """What is taken for a picture in a folder."""
 
-IN_MEMORY = 1 << 30
-"""Bytes of pictures that are held in memory; more go to a temporary file that is mapped, so that
-thousands of pictures stream.
-"""
 
+def read_training(
+    names: Sequence[str],
+    shape: tuple[int, int],
+    *,
+    not_scene: str | None = None,
+    limit: int | None = None,
+) -> list[TrainingPicture]:
+    """Linear luminance pictures for dictionaries and statistics, each with its name.
 
-class Shelf:
-    """Keeps float32 pictures: in memory up to `limit` bytes, the rest in a
-    nameless temporary file.
-    """
-
-    def __init__(self, limit=None):
-        self.limit, self.held, self.file = IN_MEMORY if limit is None else limit, 0, None
-
-    def keep(self, picture):
-        """The picture as float32, wherever it now lies."""
-        picture = np.asarray(picture, np.float32)
-        self.held += picture.nbytes
-        if self.held <= self.limit:
-            return picture
-        if self.file is None:
-            import tempfile
-            import weakref
-
-            self.file = tempfile.TemporaryFile()
-            weakref.finalize(self, self.file.close)  # the mapped pictures keep what they need
-        begin = self.file.seek(0, 2)
-        self.file.write(np.ascontiguousarray(picture).data)
-        self.file.flush()
-        return np.memmap(self.file, np.float32, "r", begin, picture.shape)
-
-
-def read_training(names, shape, *, not_scene=None, limit=None):
-    """Linear luminance pictures [(name, (row, column) float32)] of at least `shape`, from files,
-    folders or skimage:NAME; () means DEFAULT.
-
-    A folder stands for the pictures in it and below; what cannot be read there is left out with a
-    note. One picture is decoded at a time; beyond `limit` bytes (IN_MEMORY) they lie
-    in a temporary file.
-
+    names: files, folders or skimage:NAME; () means DEFAULT. A folder stands for the pictures in it
+        and below; what cannot be read there is left out with a note.
+    shape: (rows, columns) that a picture must have at least.
     not_scene: name of a test scene; a default picture of that name is left out with a note, one
         asked for is an error (statistics from the test picture would flatter every result).
-    InputError where nothing is left.
+    limit: bytes beyond which the pictures lie in a temporary file, decoded one at a time.
+
+    Returns [(name, (row, column) float32)].
+    Raises InputError where nothing is left.
     """
     from plenocli.forward.scene.sample import luminance
 
@@ -88,7 +65,7 @@ def read_training(names, shape, *, not_scene=None, limit=None):
             note(f"training leaves out {name}, which is the captured scene")
             continue
         try:
-            picture = np.asarray(luminance(_values(name)), float)
+            picture = np.asarray(luminance(linear_values(name)), float)
         except InputError as error:
             if asked:
                 raise
@@ -117,7 +94,9 @@ def read_training(names, shape, *, not_scene=None, limit=None):
     return pictures
 
 
-def split_by_scene(pictures):
+def split_by_scene(
+    pictures: list[TrainingPicture],
+) -> tuple[list[TrainingPicture], list[TrainingPicture]]:
     """(training, held out): every fifth picture, from the third on, judges; one picture
     alone has to do both.
     """
@@ -131,29 +110,7 @@ def split_by_scene(pictures):
     return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
 
 
-def at_scales(pictures, shape, *, limit=None):
-    """The (name, picture) pairs and their area averages by 2 and 4, as long as two blocks of
-    `shape` fit: scenes come in all sizes.
-    """
-    from plenocli.forward.scene.sample import block_mean
-
-    out, shelf = [], Shelf(limit)
-    for name, picture in pictures:
-        for k in SCALES:
-            rows, columns = (n // k * k for n in picture.shape)
-            if k == 1 or min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
-                out.append(
-                    (
-                        name,
-                        shelf.keep(block_mean(np.asarray(picture[:rows, :columns], float), (k, k)))
-                        if k > 1
-                        else picture,
-                    )
-                )
-    return out
-
-
-def _expand(names):
+def _expand(names: Sequence[str]) -> list[tuple[str, bool]]:
     """[(name, asked for by itself)], folders replaced by their pictures in order of their paths."""
     out = []
     for name in names:
@@ -167,7 +124,8 @@ def _expand(names):
     return out
 
 
-def _values(name):
+def linear_values(name: str) -> np.ndarray:
+    """Linear values of a file or of skimage:NAME, (row, column) or (row, column, channel)."""
     if str(name).startswith(EMBEDDED):
         return embedded_photograph(str(name).removeprefix(EMBEDDED))
     from plenocli.files.images.pictures import read_picture
@@ -175,6 +133,6 @@ def _values(name):
     return read_picture(name).values
 
 
-def files_of(names):
+def files_of(names: Sequence[str]) -> list[str] | None:
     """The paths among the names, folders as their pictures, for the provenance of an artefact."""
     return [str(n) for n, _ in _expand(names) if not str(n).startswith(EMBEDDED)] or None

@@ -11,7 +11,7 @@ from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.progress import bar, note
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import noise_level, per_lenslet, trial
-from plenocli.inverse.picture.overlap import by_lenslet
+from plenocli.inverse.picture.solvers.joint_lmmse import by_lenslet
 from plenocli.inverse.prior.scene_prior import ScenePrior
 
 NOISY = ("tikhonov", "tsvd", "lmmse", "dictionary")
@@ -29,35 +29,36 @@ INNER = (slice(1, -1), slice(1, -1))
 
 
 class Estimators:
-    """Solvers for one system matrix (stages.systems.System) under the options of the
+    """Solvers for one system matrix (LensletMatrix) under the options of the
     command (stages.reconstruct.Settings).
 
+    read_pictures: as in ScenePrior.
+    read_learnt: gives the Dictionary, None where there is none.
     threads: of compiled code, None for all cores.
     elsewhere: set to send batches of lenslets to other processes, see `in_batches`.
     """
 
     elsewhere = None
 
-    def __init__(self, system, settings, threads=None):
+    def __init__(self, system, settings, read_pictures, read_learnt=None, threads=None):
         self.system, self.settings, self.threads, self._trials = system, settings, threads, {}
+        self.read_pictures, self.read_learnt = read_pictures, read_learnt
         self.coupled = len(system.offsets) > 1
         self.overlap = settings.overlap or (3 if self.coupled else 1)
 
     @cached_property
     def svd(self):
-        from plenocli.inverse.picture.least_squares import decompose
+        from plenocli.inverse.picture.solvers.least_squares import decompose
 
         return decompose(self.system.own)
 
     @cached_property
     def prior(self):
-        return ScenePrior(self.system, self.svd, self.settings.training, self.settings.seed)
+        return ScenePrior(self.system, self.svd, self.read_pictures, self.settings.seed)
 
     @cached_property
     def learnt(self):
-        return per_lenslet.read_dictionary(
-            self.settings.dictionary, self.system, self.settings.mem_limit
-        )
+        return self.read_learnt()
 
     def solve(self, data, truth=None):
         """(x, sigma or None, report) of Superpixels: x (lenslet_row, lenslet_column, point), report
@@ -76,7 +77,7 @@ class Estimators:
         that stand above the noise, and whether an object and itself turned look alike.
         """
         from plenocli.forward.propagation.diagnosis import SYMMETRY_WARNING, symmetry_defect
-        from plenocli.inverse.picture.least_squares import resolution
+        from plenocli.inverse.picture.solvers.least_squares import resolution
 
         share = resolution(self.svd, sigma, CONTRAST).reshape(-1, *self.system.object_shape)
         report = {
@@ -100,11 +101,11 @@ class Estimators:
         one = Estimators(
             replace(self.system, blocks=self.system.own[None], offsets=np.zeros((1, 2), int)),
             replace(self.settings, noise_sigma=sigma, overlap=1),
+            self.read_pictures,
+            None if self.read_learnt is None else lambda: self.learnt,
             self.threads,
         )
         one.svd, one.prior = self.svd, self.prior
-        if self.settings.dictionary is not None:
-            one.learnt = self.learnt
         return one
 
     def run(self, method, data, truth, report):
@@ -324,7 +325,7 @@ class Estimators:
         known: (x, sigma) of the estimate that took the neighbours' light away: lenslets of the
             border stay what they are there.
         """
-        from plenocli.inverse.picture import whole_sensor as wholesensor
+        from plenocli.inverse.picture.solvers import whole_sensor as wholesensor
 
         shape, y = self.system.object_shape, data.y
         inner = np.s_[:, :] if known is None else INNER

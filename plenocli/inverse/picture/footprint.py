@@ -59,7 +59,7 @@ def require_reconstruction(camera, data, where):
     """NumericsError, before anything is worked out, where the Superpixels `data` do not fit the
     limit of `camera` (stages.estimators.Estimators).
     """
-    from plenocli.inverse.picture.overlap import MOST
+    from plenocli.inverse.picture.solvers.joint_lmmse import MOST
 
     settings, system = camera.settings, camera.system
     if settings.mem_limit is None:
@@ -68,7 +68,7 @@ def require_reconstruction(camera, data, where):
         joint=camera.overlap == 3
         and (camera.coupled or settings.method == "lmmse")
         and settings.method != "block-mean",
-        atoms=camera.learnt[0].shape[1] if settings.dictionary is not None else 0,
+        atoms=camera.learnt.atoms.shape[1] if settings.dictionary is not None else 0,
     )
     lenslets, most = data.y.shape[0] * data.y.shape[1], min(MOST, *system.own.shape)
     needed = reconstruction(system, lenslets, settings.method, most, **sizes)

@@ -26,7 +26,7 @@ def outside(svd, y, known):
     """Root mean square of what no object gives in superpixels y (.., pixel); None where the matrix
     reaches every direction and the noise is `known` anyway.
     """
-    from plenocli.inverse.picture.least_squares import estimate_noise
+    from plenocli.inverse.picture.solvers.least_squares import estimate_noise
 
     try:
         return estimate_noise(svd, y.reshape(-1, y.shape[-1]).T)

@@ -9,7 +9,6 @@ solved in batches, by a function of (camera, batch, ...) that other processes ca
 
 import numpy as np
 
-from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 
 SPLIT = ("nnls", "dictionary")
@@ -35,7 +34,7 @@ def block_mean(camera, y, sigma, truth, report):
 
 def tikhonov(camera, y, sigma, truth, report):
     """Weight given, by the discrepancy principle, or with hindsight."""
-    from plenocli.inverse.picture import least_squares as linear
+    from plenocli.inverse.picture.solvers import least_squares as linear
 
     svd, alpha, rule = camera.svd, camera.settings.alpha, "given"
     z = svd.compress(y)
@@ -51,7 +50,7 @@ def tikhonov(camera, y, sigma, truth, report):
 
 def tsvd(camera, y, sigma, truth, report):
     """Rank given, by the least estimated error, or with hindsight."""
-    from plenocli.inverse.picture import least_squares as linear
+    from plenocli.inverse.picture.solvers import least_squares as linear
 
     svd, rank, rule = camera.svd, camera.settings.rank, "given"
     z = svd.compress(y)
@@ -90,7 +89,7 @@ def nnls(camera, y, sigma, truth, report):
 
 def nnls_batch(camera, z):
     """(x (point, signal), worst violation of the optimality conditions) of compressed signals z."""
-    from plenocli.inverse.picture import nnls
+    from plenocli.inverse.picture.solvers import nnls
 
     matrix, steps = camera.svd.s[:, None] * camera.svd.vt, camera.settings.nnls_iterations
     found = (
@@ -103,18 +102,16 @@ def nnls_batch(camera, z):
 
 def dictionary(camera, y, sigma, truth, report):
     """The mean over the mirror images of a learnt dictionary."""
-    _, _, attrs = camera.learnt
-    svd, asked = camera.svd, camera.settings.lam
+    learnt, svd, asked = camera.learnt, camera.svd, camera.settings.lam
     scale = float(svd.s[0])
-    learnt = float(attrs["parameters"]["sigma"])
-    louder = max(1.0, sigma / scale / learnt) if learnt > 0 else 1.0
-    lam = asked if asked is not None else float(attrs["lambda"]) * louder**LOUDER_POWER
+    louder = max(1.0, sigma / scale / learnt.sigma) if learnt.sigma > 0 else 1.0
+    lam = asked if asked is not None else learnt.lam * louder**LOUDER_POWER
     if louder > TOO_LOUD:
         note(
             f"the dictionary was learnt for {louder:.3g} times less noise than this capture has: "
             "--method lmmse is as good or better here"
         )
-    kept = min(svd.rank(), attrs["parameters"].get("directions", len(svd.s)))
+    kept = min(svd.rank(), len(svd.s) if learnt.directions is None else learnt.directions)
     z = svd.compress(y)[:kept] / scale
     found = camera.in_batches(dictionary_batch, z, BATCH["dictionary"], lam)
     nonzeros = sum(n * part.shape[1] for part, _, n in found) / z.shape[1]
@@ -141,38 +138,16 @@ def dictionary_batch(camera, z, lam):
     """
     from plenocli.inverse.sparse.dictionary import averaged
 
-    atoms, paint, _ = camera.learnt
     svd, kept = camera.svd, len(z)
     seen = (svd.s[:kept, None] / float(svd.s[0])) * svd.vt[:kept]
     return averaged(
-        seen, atoms, z, lam, camera.system.object_shape, synthesis=paint, workers=camera.threads
-    )
-
-
-def read_dictionary(path, system, mem_limit=None):
-    """(atoms that code, atoms that paint, attributes) of a dictionary for `system`; a note where
-    it was learnt for another matrix.
-    """
-    from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.provenance import file_digest
-
-    artefact = read_artefact(path, "dictionary", mem_limit=mem_limit)
-    atoms = np.asarray(artefact.data["dictionary/atoms"], float)
-    if len(atoms) != system.own.shape[1]:
-        several = f" in {len(system.bands)} bands" if len(system.bands) > 1 else ""
-        raise InputError(
-            f"has atoms of {len(atoms)} points, the system matrix {system.own.shape[1]}{several}",
-            path,
-            "use another method: dictionaries have one band"
-            if several
-            else "learn it with this pif",
-        )
-    if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
-        note(f"the dictionary was learnt for another system matrix than {system.path.name}")
-    return (
-        atoms,
-        np.asarray(artefact.data.get("dictionary/synthesis", atoms), float),
-        artefact.attrs["dictionary"],
+        seen,
+        camera.learnt.atoms,
+        z,
+        lam,
+        camera.system.object_shape,
+        synthesis=camera.learnt.synthesis,
+        workers=camera.threads,
     )
 
 

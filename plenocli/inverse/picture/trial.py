@@ -7,7 +7,7 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
 from plenocli.base.tiling import to_blocks
-from plenocli.files.read.captures import Superpixels
+from plenocli.inverse.picture.lenslet_model import Superpixels
 
 TRIALS, SIDE = 5, 3
 """Pieces of training pictures, of so many lenslets a side, on which the candidates are tried."""
@@ -93,7 +93,7 @@ def _trial(camera, relative, contrast, scene):
         fresh = _compare(
             camera,
             ("lmmse", "dictionary"),
-            camera.learnt[2]["parameters"].get("training", ()),
+            camera.learnt.training,
             relative,
             contrast,
             scene,
@@ -135,7 +135,7 @@ def _compare(camera, candidates, without, relative, contrast, scene):
     y = truth @ camera.system.own.T
     sigma = relative * float(np.sqrt(np.mean(y**2)))
     y += sigma * rng.standard_normal(y.shape)
-    alone, data, quality = camera.alone(sigma), Superpixels(y, sigma, scene), {}
+    alone, data, quality = camera.alone(sigma), Superpixels(y=y, sigma=sigma, scene=scene), {}
     for method in candidates:
         error = (
             np.square(alone.run(method, data, None, {})[0] - truth)

@@ -2,17 +2,61 @@
 their autocovariance.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from plenocli.inverse.prior.shelf import Shelf
 
-def draw_patches(images, shape, count, rng, *, flips=True):
-    """`count` random patches as columns, (point, count) float64, points numbered row by row.
+TrainingPicture = tuple[str, np.ndarray]
+"""Name and linear luminance (row, column) in [0, 1]."""
 
-    images: 2-D arrays of linear luminance in [0, 1], each at least `shape` (rows, columns) large;
-        an image is drawn with probability proportional to the number of its patch positions, a
-        position uniformly.
+SCALES = (1, 2, 4)
+"""Scenes come in all sizes: training pictures are taken at these reductions."""
+
+
+def at_scales(
+    pictures: Sequence[TrainingPicture], shape: tuple[int, int], *, limit: int | None = None
+) -> list[TrainingPicture]:
+    """The pictures and their area averages by SCALES, as long as two blocks fit.
+
+    shape: (rows, columns) of a block.
+    limit: bytes beyond which the averages lie in a temporary file.
+    """
+    from plenocli.forward.scene.sample import block_mean
+
+    out, shelf = [], Shelf(limit)
+    for name, picture in pictures:
+        for k in SCALES:
+            rows, columns = (n // k * k for n in picture.shape)
+            if k == 1:
+                out.append((name, picture))
+            elif min(rows // k - 2 * shape[0], columns // k - 2 * shape[1]) >= 0:
+                reduced = block_mean(np.asarray(picture[:rows, :columns], float), (k, k))
+                out.append((name, shelf.keep(reduced)))
+    return out
+
+
+def draw_patches(
+    images: Sequence[np.ndarray],
+    shape: tuple[int, int],
+    count: int,
+    rng: np.random.Generator,
+    *,
+    flips: bool = True,
+) -> np.ndarray:
+    """Random patches of natural images, as columns.
+
+    images: arrays (row, column) of linear luminance in [0, 1]; one is drawn with probability
+        proportional to the number of its patch positions, a position uniformly.
+    shape: (rows, columns) of a patch, not more than those of an image.
+    count: of patches.
+    rng: the random stream.
     flips: mirror at random, which leaves the statistics of natural scenes alone and doubles what
         few photographs have to say.
+
+    Returns (point, count) float64, points numbered row by row.
+    Raises ValueError where an image is smaller than a patch.
     """
     rows, columns = shape
     room = [(i.shape[0] - rows + 1, i.shape[1] - columns + 1) for i in images]
@@ -34,16 +78,20 @@ def draw_patches(images, shape, count, rng, *, flips=True):
     return patches.reshape(count, -1).T
 
 
-def mean_covariance(patches):
+def mean_covariance(patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (point,) and covariance (point, point) of patches (point, count)."""
     mean = patches.mean(axis=1)
     centred = patches - mean[:, None]
     return mean, centred @ centred.T / max(patches.shape[1] - 1, 1)
 
 
-def autocovariance(images, reach):
-    """(mean, C) of the images taken as one stationary field: C[dr + reach, dc + reach], lags up
-    to `reach` each way.
+def autocovariance(images: Sequence[np.ndarray], reach: int) -> tuple[float, np.ndarray]:
+    """Mean and autocovariance of images taken as one stationary field.
+
+    images: arrays (row, column).
+    reach: largest lag (points) each way.
+
+    Returns (mean, C (row lag, column lag)), lag (dr, dc) at C[dr + reach, dc + reach].
 
     Each image's overlap-normalised autocovariance about the common mean, weighted by its pixels,
     made symmetric under reversal of either axis. Lags beyond half an image's side rest on few

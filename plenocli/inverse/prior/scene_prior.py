@@ -2,46 +2,60 @@
 estimators that rest on them.
 """
 
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from plenocli.base.random_streams import stream
-from plenocli.files.read.training import at_scales, read_training
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.solvers import joint_lmmse, lmmse
+from plenocli.inverse.picture.solvers.least_squares import Svd
+from plenocli.inverse.prior import natural_images
+from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales
 
 PATCHES_A_POINT = 6
 """Training patches for the LMMSE covariance, for each object point."""
-KEPT = 8
-"""Estimators that are held for captures to come."""
+KEPT = 4
+"""Estimators of each kind that are held for captures to come."""
+
+ReadPictures = Callable[[str | None], list[TrainingPicture]]
+"""Gives the training pictures without the scene of this name."""
+
+_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse)
 
 
 class ScenePrior:
-    """Training pictures and estimators for a System and its Svd, made when first
-    asked for and kept.
+    """Training pictures and the estimators that rest on them, made when first asked for and kept.
 
-    training: names of pictures, () for those of scikit-image. scene: name of a capture's scene,
-        which is left out.
+    A `scene` is the name of a capture's scene, which training leaves out, or None.
     """
 
-    def __init__(self, system, svd, training, seed):
-        self.system, self.svd, self.training, self.seed = system, svd, training, seed
-        self.pictures_of, self._statistics, self._estimators = {}, {}, {}
+    def __init__(
+        self, system: LensletMatrix, svd: Svd, read_pictures: ReadPictures, seed: int
+    ) -> None:
+        """svd: of the own block of `system`; read_pictures: called once a scene; seed: of the
+        patches drawn.
+        """
+        self.system, self.svd, self.read_pictures, self.seed = system, svd, read_pictures, seed
+        self.pictures_of: dict[str | None, list[TrainingPicture]] = {}
+        self._statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
+        self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
+        self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
 
-    def pictures(self, scene, without=()):
-        """Linear luminance pictures (row, column) at several scales;
+    def pictures(self, scene: str | None, without: Collection[str] = ()) -> list[np.ndarray]:
+        """Linear luminance pictures (row, column) at several scales.
 
         without: file names of those that are left out.
         """
         if scene not in self.pictures_of:
-            shape = self.system.object_shape
-            self.pictures_of[scene] = at_scales(
-                read_training(self.training, shape, not_scene=scene), shape
-            )
+            self.pictures_of[scene] = at_scales(self.read_pictures(scene), self.system.object_shape)
         return [
             picture for name, picture in self.pictures_of[scene] if Path(name).name not in without
         ]
 
-    def bands(self):
+    def bands(self) -> np.ndarray:
         """Covariance (band, band) of the system's bands at a point, its diagonal 1 on average:
         of the reflectance of surfaces.
         """
@@ -53,51 +67,53 @@ class ScenePrior:
         covariance = reflectance_statistics(surfaces(np.array(self.system.bands)))[1]
         return covariance / np.mean(np.diag(covariance)) + 1e-3 * np.eye(len(covariance))
 
-    def lmmse(self, sigma, scene):
-        """solvers.lmmse.Lmmse of a lenslet by itself, at noise sigma."""
-        from plenocli.inverse.picture import lmmse
-        from plenocli.inverse.prior import natural_images as natural
-
+    def lmmse(self, sigma: float, scene: str | None) -> lmmse.Lmmse:
+        """LMMSE of a lenslet by itself, at noise `sigma` of a pixel."""
         if scene not in self._statistics:
-            count = PATCHES_A_POINT * int(np.prod(self.system.object_shape))
-            patches = natural.draw_patches(
+            shape = self.system.object_shape
+            patches = natural_images.draw_patches(
                 self.pictures(scene),
-                self.system.object_shape,
-                count,
+                shape,
+                PATCHES_A_POINT * int(np.prod(shape)),
                 stream(self.seed, "reconstruct"),
             )
-            self._statistics[scene] = natural.mean_covariance(patches)
-        return self._kept(
-            ("own", sigma, scene),
-            lambda: lmmse.prepare(self.svd, *self._statistics[scene], sigma, self.bands()),
+            self._statistics[scene] = natural_images.mean_covariance(patches)
+        mean, covariance = self._statistics[scene]
+        return _kept(
+            self._own,
+            (sigma, scene),
+            lambda: lmmse.prepare(self.svd, mean, covariance, sigma, self.bands()),
         )
 
-    def joint(self, sigma, scene):
-        """solvers.overlap.JointLmmse of 3x3 lenslets, at noise sigma."""
-        from plenocli.inverse.picture import overlap
-        from plenocli.inverse.prior import natural_images as natural
-
+    def joint(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
+        """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel."""
         system = self.system
 
-        def make():
-            statistics = natural.autocovariance(
-                self.pictures(scene), overlap.needed_reach(system.object_shape, system.offsets)
-            )
-            return overlap.prepare_joint(
+        def make() -> joint_lmmse.JointLmmse:
+            reach = joint_lmmse.needed_reach(system.object_shape, system.offsets)
+            mean, autocovariance = natural_images.autocovariance(self.pictures(scene), reach)
+            return joint_lmmse.prepare_joint(
                 self.svd,
                 system.blocks,
                 system.offsets,
                 system.object_shape,
-                *statistics,
+                mean,
+                autocovariance,
                 sigma,
                 self.bands(),
             )
 
-        return self._kept(("joint", sigma, scene), make)
+        return _kept(self._joint, (sigma, scene), make)
 
-    def _kept(self, key, make):
-        if key not in self._estimators:
-            while len(self._estimators) >= KEPT:
-                self._estimators.pop(next(iter(self._estimators)))
-            self._estimators[key] = make()
-        return self._estimators[key]
+
+def _kept(
+    held: dict[tuple[float, str | None], _Estimator],
+    key: tuple[float, str | None],
+    make: Callable[[], _Estimator],
+) -> _Estimator:
+    """The estimator of this key, made where it is not held; the oldest makes room."""
+    if key not in held:
+        while len(held) >= KEPT:
+            held.pop(next(iter(held)))
+        held[key] = make()
+    return held[key]

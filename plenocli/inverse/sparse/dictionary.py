@@ -54,14 +54,39 @@ SYNTHESIS_WEIGHT = 4.0
 _DRAW_START, _DRAW_VALIDATION, _DRAW_ITERATION, _DRAW_POWER, _DRAW_SYNTHESIS = range(5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Dictionary:
+    """A learnt dictionary, with what its use needs to know of how it was learnt.
+
+    atoms: (point, atom) that code, the first constant.
+    synthesis: (point, atom) that paint what those code.
+    lam: weight of |c|_1 that it was learnt with, in the scaled problem.
+    sigma: noise of the measurements that it was learnt from, in the scaled problem.
+    directions: singular directions of the matrix that were coded, None for all.
+    training: file names of the training pictures.
+    """
+
+    atoms: np.ndarray
+    synthesis: np.ndarray
+    lam: float
+    sigma: float
+    directions: int | None
+    training: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """lam, delta: weights in the scaled problem (see `Learner`).
+    """What Algorithm 1 is run with.
+
+    atoms: number of atoms, the constant one included.
     batch: patches an iteration (the paper: at least 4 per atom).
+    lam, delta: weights in the scaled problem (see `Learner`).
     snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.
+    seed: of every random stream.
     initial: patches, random or pca.
-    gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form.
+    validation: patches on which progress is measured.
     tol: relative duality gap of the coding.
+    gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form.
     """
 
     atoms: int

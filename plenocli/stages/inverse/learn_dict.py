@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.errors import InputError, UsageError
+from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
-from plenocli.files.read.system_matrices import read_system
-from plenocli.files.read.training import at_scales, files_of, read_training, split_by_scene
+from plenocli.files.read.dictionaries import read_unfinished
+from plenocli.files.read.system_matrices import read_lenslet_matrix
+from plenocli.files.read.training import files_of, read_training, split_by_scene
 from plenocli.inverse.picture.footprint import require_learning
+from plenocli.inverse.prior.natural_images import at_scales
 
 LAMBDAS = np.logspace(-7, -4, 13)
 """Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
@@ -56,7 +58,7 @@ def run_learn_dict(
         there is one; removed at the end.
     """
     from plenocli.files.atomic import check_output
-    from plenocli.inverse.picture.least_squares import decompose
+    from plenocli.inverse.picture.solvers.least_squares import decompose
     from plenocli.inverse.sparse.dictionary import Learner
 
     files = files_of(images)
@@ -85,15 +87,15 @@ def run_learn_dict(
             suffixes=(".h5",),
         )
         resume = checkpoint if kept else resume
-    system = read_system(pif, settings.mem_limit)
+    system = read_lenslet_matrix(pif, settings.mem_limit)
     pictures = read_training(images, system.object_shape)
     training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))
-    earlier = _read_resume(resume, system) if resume else None
+    earlier = read_unfinished(resume, system) if resume else None
     chosen = _resolve(settings, system, earlier, same=kept)
     names = sorted({Path(n).name for n, _ in training})
-    if earlier and names != earlier[2]:
+    if earlier and names != list(earlier.training):
         raise UsageError(
-            f"the resumed dictionary was trained on {', '.join(earlier[2])}",
+            f"the resumed dictionary was trained on {', '.join(earlier.training)}",
             "--resume",
             "give the same pictures",
         )
@@ -113,7 +115,7 @@ def run_learn_dict(
     if not isinstance(chosen.lam, float):
         chosen = replace(chosen, lam=_choose_lambda(learner(1.0), chosen.lam))
     machine = learner(chosen.lam)
-    state = earlier[0] if earlier else machine.start()
+    state = earlier.state if earlier else machine.start()
     if state.iteration > settings.iterations:
         raise UsageError(
             (
@@ -163,7 +165,7 @@ def _resolve(settings, system, earlier, same=False):
 
     points = int(np.prod(system.object_shape))
     if earlier:
-        stored = dictionary.Settings(**earlier[1])
+        stored = earlier.settings
         wanted = {
             name: getattr(settings, name)
             for name in ("atoms", "batch", "lam")
@@ -190,47 +192,15 @@ def _resolve(settings, system, earlier, same=False):
         return stored
     atoms = settings.atoms or points
     return dictionary.Settings(
-        atoms,
-        settings.batch or 4 * atoms,
-        settings.lam,
-        settings.delta,
-        settings.snr_db,
-        settings.seed,
-        settings.initial,
+        atoms=atoms,
+        batch=settings.batch or 4 * atoms,
+        lam=settings.lam,
+        delta=settings.delta,
+        snr_db=settings.snr_db,
+        seed=settings.seed,
+        initial=settings.initial,
         gradient_steps=settings.gradient_steps,
     )
-
-
-def _read_resume(path, system):
-    """(State, Settings as a dict, names of the training pictures) of a dictionary artefact;
-    InputError where it belongs to another system matrix.
-    """
-    from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.provenance import file_digest
-    from plenocli.inverse.sparse.dictionary import State
-
-    artefact = read_artefact(path, "dictionary")
-    if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
-        raise InputError(
-            f"was learnt for another system matrix than {system.path.name}",
-            path,
-            "give the pif it was learnt with",
-        )
-    fields = {
-        k.removeprefix("dictionary/state/"): v
-        for k, v in artefact.data.items()
-        if k.startswith("dictionary/state/")
-    }
-    try:
-        return (
-            State.load(fields),
-            dict(artefact.attrs["dictionary"]["parameters"]["settings"]),
-            list(artefact.attrs["dictionary"]["parameters"]["training"]),
-        )
-    except KeyError as error:
-        raise InputError(
-            f"lacks {error}, which a resumed run needs", path, "start a new dictionary"
-        ) from None
 
 
 def _choose_lambda(machine, rule):
@@ -270,8 +240,8 @@ def _judge(machine, state, synthesis, svd, training, chosen):
     training pictures, a contrast for every patch; coherence.
     """
     from plenocli.evaluation.metrics.coherence import coherence
-    from plenocli.inverse.picture.least_squares import Svd
-    from plenocli.inverse.picture.lmmse import prepare
+    from plenocli.inverse.picture.solvers.least_squares import Svd
+    from plenocli.inverse.picture.solvers.lmmse import prepare
     from plenocli.inverse.prior.natural_images import draw_patches, mean_covariance
     from plenocli.inverse.prior.scene_prior import PATCHES_A_POINT
     from plenocli.inverse.sparse.dictionary import averaged, psnr

@@ -14,8 +14,9 @@ from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import Here, absolute, open_pool, run_all
 from plenocli.files.read.captures import calibrated, read_superpixels
-from plenocli.files.read.system_matrices import read_system
-from plenocli.files.read.training import files_of
+from plenocli.files.read.dictionaries import read_dictionary
+from plenocli.files.read.system_matrices import read_lenslet_matrix
+from plenocli.files.read.training import files_of, read_training
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.per_lenslet import SPLIT
@@ -149,7 +150,7 @@ def run_reconstruct(
 
     try:
         if pif:  # a broken one ends the run here, before any capture
-            _estimators(recipe) if split or not pooled else read_system(
+            _estimators(recipe) if split or not pooled else read_lenslet_matrix(
                 pif, settings.mem_limit, by_band=True
             )
         with open_pool(workers, scheduler) as pool:
@@ -167,9 +168,20 @@ def run_reconstruct(
 
 @lru_cache(maxsize=1)
 def _estimators(recipe):
+    settings = recipe.settings
+    system = read_lenslet_matrix(recipe.pif, settings.mem_limit, by_band=True)
+
+    def read_pictures(scene):
+        return read_training(settings.training, system.object_shape, not_scene=scene)
+
+    def read_learnt():
+        return read_dictionary(settings.dictionary, system, settings.mem_limit)
+
     return Estimators(
-        read_system(recipe.pif, recipe.settings.mem_limit, by_band=True),
-        recipe.settings,
+        system,
+        settings,
+        read_pictures,
+        None if settings.dictionary is None else read_learnt,
         recipe.threads,
     )
 

@@ -8,7 +8,7 @@ from scipy.linalg import hadamard
 from plenocli.evaluation.metrics.quality import psnr
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance, sample_picture
-from plenocli.inverse.picture import block_matching as denoise
+from plenocli.inverse.picture.solvers import block_matching as denoise
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockToeplitz
-from plenocli.inverse.picture import least_squares as linear
-from plenocli.inverse.picture import lmmse, overlap
+from plenocli.inverse.picture.solvers import joint_lmmse, lmmse
+from plenocli.inverse.picture.solvers import least_squares as linear
 from plenocli.inverse.prior import natural_images as natural
 
 
@@ -178,7 +178,7 @@ def neighbours(coupled):
 
 def test_joint_lmmse_needs_noise():
     with pytest.raises(NumericsError, match="positive noise level, not 0"):
-        overlap.prepare_joint(None, *neighbours(True), (N, N), 0.4, None, 0)
+        joint_lmmse.prepare_joint(None, *neighbours(True), (N, N), 0.4, None, 0)
 
 
 @pytest.mark.parametrize(
@@ -189,10 +189,10 @@ def test_joint_lmmse_is_the_full_covariance(coupled, bands):
     rng, count, sigma, n = np.random.default_rng(3), 3, 1e-2, len(bands)
     if n > 1:
         blocks = np.concatenate([blocks, blocks[:, ::-1] * np.linspace(0.5, 1, 9)[:, None]], axis=2)
-    reach = overlap.needed_reach((N, N), offsets)
+    reach = joint_lmmse.needed_reach((N, N), offsets)
     lag = np.arange(-reach, reach + 1)
     covariance_map = 0.05 * np.exp(-np.hypot(lag[:, None], lag[None, :]) / 6)
-    joint = overlap.prepare_joint(
+    joint = joint_lmmse.prepare_joint(
         linear.decompose(blocks[len(blocks) // 2]),
         blocks,
         offsets,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.picture import nnls
+from plenocli.inverse.picture.solvers import nnls
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import minimize
 
 from plenocli.base.tiling import to_blocks, to_plane
-from plenocli.inverse.picture import least_squares as linear
-from plenocli.inverse.picture import whole_sensor as wholesensor
+from plenocli.inverse.picture.solvers import least_squares as linear
+from plenocli.inverse.picture.solvers import whole_sensor as wholesensor
 
 N, PIXELS, COUNT, SIGMA = 4, 25, (3, 2), 0.02
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_sylvester
 
-from plenocli.inverse.picture import least_squares as linear
+from plenocli.inverse.picture.solvers import least_squares as linear
 from plenocli.inverse.prior.natural_images import draw_patches
 from plenocli.inverse.sparse import dictionary
 from plenocli.inverse.sparse import dictionary_step as refit

@@ -64,7 +64,7 @@ def denoiser(bands):
     covariance `bands` (band, band): these are turned into uncorrelated ones, most of them nearly
     flat, which leaves white noise white.
     """
-    from plenocli.inverse.picture.block_matching import block_matching
+    from plenocli.inverse.picture.solvers.block_matching import block_matching
 
     def denoise(picture, tau):
         if picture.ndim == 2:

@@ -1,5 +1,5 @@
-"""The joint LMMSE of plenocli.inverse.picture.overlap with statistics that were measured, of
-pictures that make poor ones, down to almost no noise.
+"""The joint LMMSE of picture.solvers.joint_lmmse with statistics that were measured, of pictures
+that make poor ones, down to almost no noise.
 """
 
 import numpy as np
@@ -7,8 +7,8 @@ import pytest
 
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance
-from plenocli.inverse.picture import least_squares as linear
-from plenocli.inverse.picture import overlap
+from plenocli.inverse.picture.solvers import joint_lmmse
+from plenocli.inverse.picture.solvers import least_squares as linear
 from plenocli.inverse.prior import natural_images as natural
 
 POINTS, RING = (4, 3), np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
@@ -54,10 +54,10 @@ def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
         * np.logspace(0, -6, 20)[:, None]
     )
     mean, found = natural.autocovariance(
-        [picture(name)], reach := overlap.needed_reach(POINTS, RING)
+        [picture(name)], reach := joint_lmmse.needed_reach(POINTS, RING)
     )
     sigma = float(np.sqrt(np.mean((mean * blocks.sum(axis=(0, 2))) ** 2)) * 10 ** (-snr_db / 20))
-    joint = overlap.prepare_joint(
+    joint = joint_lmmse.prepare_joint(
         linear.decompose(blocks[4]), blocks, RING, POINTS, mean, found, sigma
     )
     lenslet, (r, c) = (

@@ -1,0 +1,96 @@
+"""Dictionaries: as reconstruct uses them, and as learn-dict goes on with them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.base.errors import InputError
+from plenocli.base.progress import note
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.sparse.dictionary import Dictionary, Settings, State
+
+
+def read_dictionary(path: Path, system: LensletMatrix, mem_limit: int | None = None) -> Dictionary:
+    """The dictionary of an artefact, to be used with a system matrix; a note where it was learnt
+    for another one.
+
+    path: of the dictionary artefact.
+    system: the matrix that captures are explained by.
+
+    Raises InputError where the atoms have another number of points than the matrix.
+    """
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.provenance import file_digest
+
+    artefact = read_artefact(path, "dictionary", mem_limit=mem_limit)
+    atoms = np.asarray(artefact.data["dictionary/atoms"], float)
+    if len(atoms) != system.own.shape[1]:
+        several = f" in {len(system.bands)} bands" if len(system.bands) > 1 else ""
+        raise InputError(
+            f"has atoms of {len(atoms)} points, the system matrix {system.own.shape[1]}{several}",
+            path,
+            "use another method: dictionaries have one band"
+            if several
+            else "learn it with this pif",
+        )
+    if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
+        note(f"the dictionary was learnt for another system matrix than {system.path.name}")
+    attrs = artefact.attrs["dictionary"]
+    parameters = attrs["parameters"]
+    directions = parameters.get("directions")
+    return Dictionary(
+        atoms=atoms,
+        synthesis=np.asarray(artefact.data.get("dictionary/synthesis", atoms), float),
+        lam=float(attrs["lambda"]),
+        sigma=float(parameters["sigma"]),
+        directions=None if directions is None else int(directions),
+        training=tuple(parameters.get("training", ())),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unfinished:
+    """A dictionary as learning goes on with it.
+
+    state: after the iterations done.
+    settings: that it was learnt with.
+    training: file names of the training pictures, sorted.
+    """
+
+    state: State
+    settings: Settings
+    training: tuple[str, ...]
+
+
+def read_unfinished(path: Path, system: LensletMatrix) -> Unfinished:
+    """What learning goes on from.
+
+    path: of a dictionary artefact.
+    system: the matrix that it is learnt for.
+
+    Raises InputError where it belongs to another system matrix, or lacks what a resumed run needs.
+    """
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.provenance import file_digest
+
+    artefact = read_artefact(path, "dictionary")
+    if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
+        raise InputError(
+            f"was learnt for another system matrix than {system.path.name}",
+            path,
+            "give the pif it was learnt with",
+        )
+    prefix = "dictionary/state/"
+    fields = {k.removeprefix(prefix): v for k, v in artefact.data.items() if k.startswith(prefix)}
+    try:
+        parameters = artefact.attrs["dictionary"]["parameters"]
+        return Unfinished(
+            state=State.load(fields),
+            settings=Settings(**parameters["settings"]),
+            training=tuple(parameters["training"]),
+        )
+    except KeyError as error:
+        raise InputError(
+            f"lacks {error}, which a resumed run needs", path, "start a new dictionary"
+        ) from None

@@ -1,0 +1,69 @@
+"""The model that pictures are estimated from, y = A x + noise: its matrix, and captures in its
+units.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensletMatrix:
+    """What superpixels see of objects, the wavelengths of a pif gathered into its bands.
+
+    path: the pif, for messages.
+    blocks: (offset, pixel, point), points of several bands one band after the other.
+    offsets: (offset, 2) lenslets (rows, columns) from the object to the superpixel.
+    pixel_shape: (rows, columns) of a superpixel.
+    object_shape: (rows, columns) of an object block in one band.
+    accuracy: the record that simulate-pif left, {} where there is none.
+    bands: (band,) wavelengths (m) of the pictures that the object has, () where it is one picture
+        without a colour.
+    illuminant: the light that the bands' shares are for.
+    """
+
+    path: Path
+    blocks: np.ndarray
+    offsets: np.ndarray
+    pixel_shape: tuple[int, int]
+    object_shape: tuple[int, int]
+    accuracy: dict[str, Any] = field(default_factory=dict)
+    bands: tuple[float, ...] = ()
+    illuminant: str | None = None
+
+    @property
+    def own(self) -> np.ndarray:
+        """(pixel, point) of the superpixel behind the object itself."""
+        return self.blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]]
+
+    @cached_property
+    def even(self) -> np.ndarray:
+        """The superpixel of an even object, (pixel, band): what light of one band makes of it."""
+        return self.own.reshape(len(self.own), max(1, len(self.bands)), -1).sum(axis=2)
+
+    def levels(self, y: np.ndarray) -> np.ndarray:
+        """Brightness of each band, (.., band), behind superpixels y (.., pixel), by least squares
+        on `even`.
+        """
+        return y @ np.linalg.pinv(self.even, rcond=1e-3).T
+
+
+@dataclass(frozen=True, kw_only=True)
+class Superpixels:
+    """A capture as the estimators take it.
+
+    y: (lenslet_row, lenslet_column, pixel) in units of A x.
+    sigma: standard deviation of the known noise in these units, or None.
+    scene: name of what was captured, or None.
+    accuracy: of a simulated capture the record of its accuracy.
+    matrix: SHA-256 of the pif that a simulated capture was made with.
+    """
+
+    y: np.ndarray
+    sigma: float | None
+    scene: str | None
+    accuracy: dict[str, Any] | None = None
+    matrix: str | None = None

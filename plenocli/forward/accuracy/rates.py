@@ -18,9 +18,12 @@ precision, for choosing.
 
 
 @lru_cache(maxsize=2)
-def product_rate(double):
-    """Real operations (8 for a complex multiply-add) a second of one core in products of the
-    shape that the field needs.
+def product_rate(double: bool) -> float:
+    """Speed of one core in products of the shape that the field needs.
+
+    double: of double precision, else single.
+
+    Returns real operations a second, 8 for a complex multiply-add.
     """
     from threadpoolctl import threadpool_limits
 

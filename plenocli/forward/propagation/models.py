@@ -11,21 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
 from plenocli.forward.propagation import rays
-from plenocli.forward.propagation.costs import Cost
+from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
-from plenocli.forward.propagation.fresnel import shaped
-from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
-from plenocli.forward.propagation.fresnel.square import narrows
-from plenocli.forward.propagation.sampling import (
-    distinct,
-    field_seconds,
-    grid_of,
-    is_symmetric,
-    size_band,
-)
+from plenocli.forward.propagation.fresnel import shaped, square_cost
+from plenocli.forward.propagation.sampling import size_band
 
 
 @dataclass(frozen=True)
@@ -50,17 +40,6 @@ def _square_only(camera, view):
     return None
 
 
-def is_separable(camera):
-    """Whether the spread function is a single product: a plain square pupil."""
-    lens = camera.main_lens
-    return (
-        lens.aperture_shape == "square"
-        and camera.filter_array is None
-        and lens.wavefront is None
-        and not lens.aberrations
-    )
-
-
 def _ray_error(camera, view):
     # a law within 2.5 of what was measured promises only what its double is
     return min(2.0, math.hypot(2 * rays.error_bound(camera, view), _paraxial_error(camera, view)))
@@ -74,50 +53,6 @@ def _no_error(camera, view):
     return 0.0
 
 
-def _square_cost(camera, view, band, shape, double):
-    """Counted from the tables that SquareLenslets fills; the factors are fitted to process
-    times (docs/model.md).
-    """
-    grid = grid_of(shape[1])
-    terms, even = 1 if is_separable(camera) else band.terms, is_symmetric(camera)
-    real = even and view.blur == 0
-    (own, pairs), pixels, lines = (
-        distinct(camera, view, shape),
-        view.pixel_shape[0] * view.pixel_shape[1],
-        view.pixel_shape[0] * band.pixel_nodes,
-    )
-    narrow = narrows(view, band, grid, double)
-    beside = band.beside[0] if narrow and band.beside else band.pixel_nodes
-    # of all columns on all superpixels: nodes of the sensor
-    fine = pixels * (own * band.pixel_nodes**2 + (pairs - own) * beside**2)
-    item, axes = (16 if double else 8), (1 if real else 2)
-    lit = grid[0] if band.window is None else 2 * band.window + 1
-    few = lit * min(psf_nodes(view, view.lenslet_width / 2), band.lenslet_nodes)
-    half = band.psf_nodes / 2 if even else band.psf_nodes
-    points = (view.object_shape[0] + 1) // 2 if even else view.object_shape[0]
-    carried = points * grid[0] * lines * terms * (few if band.window is not None else few / lit)
-    table = view.object_shape[0] * grid[0] * lines * terms
-    setup = field_seconds(camera, view, band) + axes * (
-        1.6e-8 * points * few * half
-        + 8e-8 * (2 * lit - 1) * lines * band.lenslet_nodes
-        + 1e-8 * table
-        + 2.5e-11 * (1 if real else 2) * carried * (2 if double else 1)
-    )
-    size = int(np.prod(shape[1:]))
-    if narrow:  # superpixels keep half to three quarters of the terms
-        setup += 1.5e-9 * max(grid) * table / grid[0] * terms**0.5
-        terms *= 0.65
-    return Cost(
-        operations=8.0 * 1.2 * fine * terms,
-        seconds=setup
-        + pairs * 2.5e-5
-        + fine * (4e-9 if double else 3e-9)
-        + size * (2e-8 if double else 7e-9)
-        + 0.005,
-        bytes=int(item * axes * (table + (2 * lit - 1) * lines * few) + 60 * half**2) + (3 << 22),
-    )
-
-
 RUNGS = (
     Rung("rays", "ray", rays.valid_for, _ray_error, rays.size_band, rays.cost),
     Rung(
@@ -126,7 +61,7 @@ RUNGS = (
         _square_only,
         _paraxial_error,
         partial(size_band, dim=True),
-        _square_cost,
+        square_cost.cost,
     ),
     Rung(
         "fresnel, triple product",
@@ -136,6 +71,6 @@ RUNGS = (
         size_band,
         shaped.cost,
     ),
-    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, exact.cost),
+    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, cost_law.cost),
 )
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""

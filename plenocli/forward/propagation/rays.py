@@ -15,14 +15,21 @@ of a lenslet meet in one point, which belongs to one pixel; pixels and lenslets 
 their lower edges.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
-from plenocli.forward.propagation.costs import Cost
+from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
 
 SLAB = 1 << 17
 """Corners of rectangles in a work array: about what a second-level cache holds."""
@@ -73,17 +80,27 @@ def error_bound(camera, view):
     return min(2.0, max(focused, blurred))
 
 
-def cost(camera, view, band, shape, double):
-    """Seconds of one core and bytes of work for a matrix of `shape`: 130 ns a pixel and lenslet
-    that lights it, measured.
-    """
+def cost(
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
+) -> Cost:
+    """The Cost of a matrix of `shape` (band, superpixel, pixel, point)."""
+    return law("rays").cost(features(camera, geometry, band, shape, double))
+
+
+def features(
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
+) -> Features:
+    """What a matrix of `shape` (band, superpixel, pixel, point) consists of."""
+    columns = distinct(camera, geometry, shape)[1]
     cells = 1 if camera.filter_array is None else len(camera.filter_array.filters)
+    pixels = columns * math.prod(geometry.pixel_shape) * cells
+    lenslets = 1 if band.window is None else 2 * band.window + 1
     # in focus one lenslet lights a superpixel; out of focus so do slivers of its neighbours, the
     # fewer the wider the blur
-    lighting = 1.0 if view.blur == 0 else 13 / (1 + 0.8 * view.blur / view.D2)
-    across = (1 if band.window is None else 2 * band.window + 1) * sum(view.pixel_shape)
-    each = view.pixel_shape[0] * view.pixel_shape[1] * cells * 1.3e-7 * lighting + across * 4e-8
-    return Cost(0.0, distinct(camera, view, shape)[1] * each + 0.003, 8 * SLAB * 8)
+    slivers = 1 + law("rays").counts["blur_weight"] * geometry.blur / geometry.D2
+    lit = {"pixels_focused": pixels} if geometry.blur == 0 else {"pixels_blurred": pixels / slivers}
+    edges = columns * lenslets * sum(geometry.pixel_shape)
+    return Features({}, {"process": 1.0, "edges": edges, **lit}, ({"corners": 8.0 * SLAB},))
 
 
 class RayLenslets:

@@ -3,9 +3,12 @@
 Chosen before any work (plenocli.forward.accuracy).
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +17,10 @@ from plenocli.forward.camera.pupil import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
 
 FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
 """Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N the lenslet's
@@ -268,14 +275,15 @@ def is_symmetric(camera):
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 
 
-def field_seconds(camera, view, band):
-    """Seconds of one core to bring the spread function into separable terms:
-    fitted to process times.
+def field_features(camera: Camera, geometry: Geometry, band: BandPlan) -> dict[str, float]:
+    """What bringing the spread function into separable terms consists of: the square and the
+    cube of its nodes along an axis, of a real or a complex function.
     """
-    half = band.psf_nodes / 2 if is_symmetric(camera) else band.psf_nodes
-    return (1.2e-9 * half**3 + 6e-7 * half**2) * (
-        1 if is_symmetric(camera) and view.blur == 0 else 3
-    )
+    even = is_symmetric(camera)
+    nodes = band.psf_nodes / 2 if even else band.psf_nodes
+    if even and geometry.blur == 0:
+        return {"field_cubed_real": nodes**3, "field_squared_real": nodes**2}
+    return {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
 
 
 def grid_of(count):

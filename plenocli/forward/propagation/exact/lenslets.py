@@ -15,17 +15,21 @@ them (optics.factors).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for
-from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, Way
-from plenocli.forward.propagation.exact.low_rank_product import FILL, MAX_SKETCH, Product
+from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
+from plenocli.forward.propagation.exact.term_counts import (
+    field_rank,
+    field_terms,
+    require_sketch,
+    sketch_size,
+)
 from plenocli.forward.propagation.fresnel.array_to_sensor import lit_lenslets, sensor_nodes
 from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.fresnel.spread_function import (
@@ -33,14 +37,7 @@ from plenocli.forward.propagation.fresnel.spread_function import (
     psf_nodes,
     separable_field,
 )
-from plenocli.forward.propagation.sampling import (
-    BandPlan,
-    distinct,
-    grid_of,
-    is_symmetric,
-    size_band,
-)
-from plenocli.forward.propagation.sampling import expected_terms as psf_terms
+from plenocli.forward.propagation.sampling import BandPlan, size_band
 
 CUT, CUT_EFFECT = 0.42, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column
@@ -57,9 +54,6 @@ is measured by; least share, and cut of the main lens's field, that this is done
 
 GAPS = 3.0
 """By how much finer fields are cut where lenslets leave gaps."""
-
-COARSE = 5e-3
-"""The coarsest cut at which terms were counted."""
 
 
 @dataclass(frozen=True)
@@ -98,25 +92,12 @@ def exact_band(view, grid, ring, accuracy, tolerance):
         if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape)
         else 0
     )
-    _require_sketch(expected_terms(view, base.terms, cut, True))
+    require_sketch(field_terms(view, base.terms, cut, True))
     return ExactBand(
         **vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)},
         cut=cut,
         sensor_count=count,
     )
-
-
-def _require_sketch(terms):
-    """NumericsError where no sketch holds a field of about so many terms."""
-    if terms > FILL * MAX_SKETCH:
-        raise NumericsError(
-            (
-                f"the exact field has about {terms:.0f} separable terms, more than "
-                f"{int(FILL * MAX_SKETCH)}"
-            ),
-            "model",
-            "ask for a looser accuracy or the paraxial model",
-        )
 
 
 def _extent(view, pixels):
@@ -178,202 +159,6 @@ def fresnel_model_error(view, parabolic):
     across = 2 * view.z3 * pupil / view.pixel_pitch
     dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
     return min(1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, view.diffraction_cells))) * dim)
-
-
-def corner_phase(view):
-    """Phase (rad) of the kernel that does not separate, at the largest displacements along both
-    axes within one superpixel.
-    """
-    far = view.lenslet_width / 2 + max(view.pixel_shape) * view.pixel_pitch / 2
-    return view.k * far**4 / (4 * view.z3**3)
-
-
-def expected_terms(view, terms, cut, parabolic):
-    """Terms of a lenslet's field whose spread function has `terms`: fitted to 144 cases (f/1.5 to
-    f/64, cut 5e-3 to 5e-7), 8 % rms; coarser cuts keep a fifth of them for every decade.
-    """
-    phase, decades = corner_phase(view), math.log10(COARSE / cut)
-    if decades < 0:
-        return max(
-            2.0,
-            0.22**-decades
-            * expected_terms(
-                view,
-                psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, COARSE / 0.9),
-                COARSE,
-                parabolic,
-            ),
-        )
-    spread = (0.48 if parabolic else 0.73) * view.diffraction_cells**0.71 * (1 + 5 * phase) ** 0.33
-    return max(2.0, terms * (0.75 + 0.23 * phase**0.45) + decades * spread)
-
-
-def expected_rank(view, band, parabolic, place=(0, 0)):
-    """Terms of the field on superpixel `place`.
-
-    Coherent neighbours bring edge diffraction, which falls slowly: factors fitted to 88 tables of 8
-    cameras (8 to 100 diffraction cells, accuracy 1e-2 to 1e-6), within 0.55 to 1.3.
-    """
-    own = expected_terms(view, _own_terms(view, band), band.cut, parabolic)
-    if band.window is None:
-        return own
-    edges = max(0.0, math.log10(COARSE / band.cut)) * (50 / view.diffraction_cells) ** 0.2
-    return own * (1.1 + 0.25 * edges) * (1 + (0.13 + 0.13 * edges) * sum(n != 0 for n in place))
-
-
-def expected_products(view, band, parabolic, place=(0, 0)):
-    """Pairs (r, i) of terms that the field on superpixel `place` is compressed from, all its
-    lenslets together: fitted to 18 tables of 5 cameras (6 to 102 diffraction cells, 25 to 225
-    lenslets, accuracy 1e-3 to 1e-5), within 0.85 to 1.35.
-    """
-    phase = corner_phase(view)
-    own = (
-        1.27
-        * (1 if parabolic else 1.36)
-        * (1 + phase) ** 0.22
-        * expected_rank(view, replace(band, window=None, terms=_own_terms(view, band)), parabolic)
-    )
-    if band.window is None:
-        return own
-    decades = max(0.0, math.log10(COARSE / band.cut))
-    # what a lenslet beside the own one adds, on an average
-    share = min(
-        0.85, 1.05 * decades * view.diffraction_cells**-0.4 * phase / (phase + 0.12)
-    ) * 1.19 ** sum(n != 0 for n in place)
-    return own * (1 + share * ((2 * band.window + 1) ** 2 - 1))
-
-
-def _own_terms(view, band):
-    """Terms of the spread function on a lenslet's own field."""
-    return (
-        band.terms
-        if band.window is None
-        else psf_terms(view.k * view.D1 / 2 * view.D2 / view.z2, band.cut / 0.9)
-    )
-
-
-def cost(camera, view, band, shape, double):
-    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength:
-    operations (real, in matrix products), seconds (what does not scale with them, one core) and
-    bytes (beyond the result); fitted to process times (docs/model.md).
-
-    NumericsError where the superpixels beside the lenslet's own are expected to have more terms
-    than a sketch may hold.
-    """
-    parabolic, grid, even = (
-        camera.lenslet_array.profile == "parabolic",
-        grid_of(shape[1]),
-        is_symmetric(camera),
-    )
-    plain = 0.2 if even and camera.main_lens.aperture_shape == "square" else 1.0
-    lit = 1 if band.window is None else 2 * band.window + 1
-    points, lines = max(view.object_shape), band.pixel_nodes * max(view.pixel_shape)
-    nodes, item = band.sensor_count or lines, 16 if double else 8
-    beside = grid[0] // 2 if even else grid[0] - 1
-    rows = [nodes * ((points + 1) // 2 if even else points), nodes * points, nodes * points]
-    # superpixels (row, column) that stand for all of their kind: on no axis of symmetry, on one or
-    # two, on a diagonal
-    kinds = (
-        {(0, 0): 1, (1, 0): beside, (1, 1): beside, (2, 1): beside * (beside - 1) // 2}
-        if even
-        else {(0, 0): 1, (1, 0): 2 * beside, (2, 1): beside**2}
-    )
-    # as far as light comes: the lenslets beside the superpixel
-    across = min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + 40)
-    decades = max(0.0, math.log10(COARSE / band.cut))
-    few = psf_nodes(view, view.lenslet_width / 2)
-    operations, largest = (
-        lit * band.terms * (rows[0] + beside * rows[1]) * (4 * across + 8 * band.terms),
-        0.0,
-    )
-    # by how many axes a superpixel lies aside
-    ranks = [
-        plain * expected_rank(view, band, parabolic, place) for place in ((0, 0), (0, 1), (1, 1))
-    ]
-    if band.window is not None:  # better now than after minutes of work
-        _require_sketch(1.3 * ranks[sum(n > 1 for n in grid)])
-        # fine fields take more of them than that (1.2 to 1.6 times at f/4.4 and 1e-5)
-        ranks = [
-            rank * (1 + 0.35 * max(0.0, decades - 2) * math.sqrt(view.diffraction_cells / 100))
-            for rank in ranks
-        ]
-    pairs_of_terms = [
-        plain * expected_products(view, band, parabolic, place)
-        for place in ((0, 0), (0, 1), (1, 1))
-    ]
-    # calls, whatever the precision
-    begun = 0.01 + (0.008 if lit == 1 else 0.015) * sum(kinds.values())
-    seconds = (
-        2.4e-9 * band.psf_nodes**3 / (8 if even else 1)
-        + 3e-10 * lit * points * few * band.psf_nodes * band.terms
-    )
-    for (a, b), count in kinds.items():
-        if count == 0:
-            continue
-        aside = (a != 0) + (b != 0)
-        rank, products = ranks[aside], pairs_of_terms[aside]
-        both = rows[a] + (0 if even and a == b else rows[b])
-        sketch = 1.12 / FILL * rank + 8
-        # of many lenslets each brings few terms, so that products are narrow and wait for memory
-        operations += count * (
-            both * (products * ((16 if lit == 1 else 22) * sketch + 4 * across) + 40 * sketch**2)
-            + 250 * sketch**3
-        )
-        operations += count * 4 * both * lines * rank if band.sensor_count else 0
-        # coarse cuts drop most lenslets
-        sheets = lit**2 * (1 if even and a == b else 2) * min(1.0, 0.3 + 0.25 * decades)
-        seconds += count * (4e-9 if lit == 1 else 2.8e-8) * both * products
-        seconds += count * (
-            0.007 * corner_phase(view)
-            if lit == 1
-            else sheets * (0.0034 + 0.0009 * corner_phase(view) + 3e-7 * nodes * across)
-        )
-        # terms that neighbours' edges bring at fine accuracies: measured up to 2.2 times those
-        # expected, on 3 cameras
-        more = (
-            0.0
-            if lit == 1
-            else (0.15 + 0.2 * aside)
-            * max(0.0, decades - 1)
-            * math.sqrt(view.diffraction_cells / 100)
-        )
-        # fine fields have far fewer terms a lenslet than products, and are narrowed to them
-        narrowed = 1.0 if lit == 1 else 1 - 0.35 * min(1.0, decades)
-        largest = max(largest, item * (both * (narrowed * products * (1 + more) + 3 * sketch)))
-    # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from
-    # superpixels beside it: measured at f/2.2, 340 to 3500 of them
-    own = _own_terms(view, band)
-    coupling = (
-        item
-        * (
-            (1.12 if lit == 1 else 2.8)
-            * plain
-            * expected_products(view, replace(band, window=None, terms=own), parabolic)
-        )
-        ** 2
-    )
-    # what is there from first to last: the field on the array as it is decomposed, and its
-    # terms on all intervals
-    field = 60 * (band.psf_nodes / (2 if even else 1)) ** 2
-    intervals = item / 2 * (beside + 1) * lit * across * points * 0.56 * own
-    pairs, fine = (
-        distinct(camera, view, shape)[1],
-        view.pixel_shape[0] * view.pixel_shape[1] * band.pixel_nodes**2,
-    )
-    size = shape[1] * shape[2] * shape[3]
-    tables = sum(kinds.values())
-    mean = sum(count * ranks[(a != 0) + (b != 0)] for (a, b), count in kinds.items()) / tables
-    return Cost(
-        operations=operations + 8.0 * 1.2 * fine * mean * pairs,
-        seconds=begun
-        + seconds * (2 if double else 1)
-        + pairs * (4e-5 + fine * (4e-9 if double else 3e-9))
-        + size * (2e-8 if double else 7e-9),
-        bytes=int(
-            largest + coupling + field + intervals + item * 2 * tables * points * lines * mean
-        )
-        + (3 << 24),
-    )
 
 
 class ExactSquareLenslets:
@@ -541,7 +326,7 @@ class ExactSquareLenslets:
             [],
             [],
             {},
-            int(1.12 / FILL * self._expected_rank(sy, sx)) + 8,
+            int(sketch_size(self._expected_rank(sy, sx))),
         )
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         for m, n in kept:
@@ -572,7 +357,7 @@ class ExactSquareLenslets:
         ), products
 
     def _expected_rank(self, sy, sx):
-        return expected_rank(self.geometry, self.band, self._parabolic, (sy, sx))
+        return field_rank(self.geometry, self.band, self._parabolic, (sy != 0) + (sx != 0))
 
     def _to_pixels(self, factor, s, axis):
         """(lines of the sensor x points, terms) to (points, pixel nodes, terms)."""

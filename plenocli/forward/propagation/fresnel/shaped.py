@@ -8,20 +8,27 @@ alike. Mirror images of a chord share it. Per object point remain two products: 
 separable terms x sensor nodes, and sensor nodes x scan nodes x sensor nodes.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, nodes_for, smooth_nodes
-from plenocli.forward.propagation.costs import Cost
+from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.fresnel.array_to_sensor import (
     lenslet_kernel,
     pixel_energy,
     sensor_nodes,
 )
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
-from plenocli.forward.propagation.sampling import distinct, field_seconds, grid_of
+from plenocli.forward.propagation.sampling import BandPlan, distinct, field_features, grid_of
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
 
 SLAB = 1 << 20
 """Complex numbers in the work arrays of a few points: about what the last-level cache holds."""
@@ -31,6 +38,8 @@ much again for kernels.
 """
 PIECES = 6
 """Groups of short panels with a node count of their own."""
+BLOCKS = 8
+"""Blocks that columns come in, about."""
 
 
 @dataclass(frozen=True)
@@ -461,66 +470,73 @@ def _chord_counts(shape, width, slope, error):
     return 1, count, 2 * count, pieces((2 * half - half / 2 * (1 - t)) / math.sqrt(3))
 
 
-def cost(camera, view, band, shape, double):
-    """What the matrix of `shape` (band, superpixel, pixel, point) costs at one wavelength:
-    operations (real, in matrix products), seconds (what does not scale with them, one core) and
-    bytes (beyond the result).
+def cost(
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
+) -> Cost:
+    """The Cost of a matrix.
 
-    Counted from the node rules, without the points that symmetry gives; factors fitted to process
-    times, part by part (docs/model.md, "The dial").
+    shape: (band, superpixel, pixel, point) of it;
+    double: whether its fields have double precision.
     """
-    grid = grid_of(shape[1])
+    return law("fresnel, triple product").cost(features(camera, geometry, band, shape, double))
+
+
+def features(
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
+) -> Features:
+    """What a matrix consists of, as `cost`: counted from the node rules, without the points that
+    symmetry gives.
+    """
+    grid, superpixels, item = grid_of(shape[1]), shape[1], 16 if double else 8
     axis, count, on_scan, on_chords = _chord_counts(
-        view.lenslet_shape,
-        view.lenslet_width,
-        _slope(camera, view, grid, band.window),
+        geometry.lenslet_shape,
+        geometry.lenslet_width,
+        _slope(camera, geometry, grid, band.window),
         band.sampling / 60 or 1e-7,
     )
-    products = [([0.0], [0.0])] if band.window is None else view.neighbourhood(band.window)
-    nodes, rough = [n * band.pixel_nodes for n in view.pixel_shape], 2 if double else 1
-    points, across, along = distinct(camera, view, shape)[0], nodes[1 - axis], nodes[axis]
-    # columns come in about eight blocks, at whose borders a line of points is begun anew
-    lanes = min(
-        points,
-        8
-        + (
-            view.object_shape[1 - axis]
-            if points == shape[3]
-            else (view.object_shape[1 - axis] + 1) // 2
-        ),
-    )
+    products = [([0.0], [0.0])] if band.window is None else geometry.neighbourhood(band.window)
+    nodes = [n * band.pixel_nodes for n in geometry.pixel_shape]
+    across, along = nodes[1 - axis], nodes[axis]
+    points, of_axis = distinct(camera, geometry, shape)[0], geometry.object_shape[1 - axis]
+    # at the blocks' borders a line of points is begun anew
+    lanes = min(points, BLOCKS + (of_axis if points == shape[3] else (of_axis + 1) // 2))
     scan = sum(on_scan * len(p[axis]) for p in products)
     chord = sum(on_chords * len(p[1 - axis]) for p in products)
     count, terms = count * len(products), band.terms
-    places = view.lines(grid, 1 - axis) if band.window is not None else shape[1]
-    operations = 8.0 * (
-        1.4 * lanes * places * chord * terms * across
-        + points * places * scan * terms * across
-        + 0.8 * points * scan * across * along * shape[1]
-        + 0.3 * points * scan * terms**2
-    )
-    passes = rough * (
-        6.7e-9 * places * across * (lanes * count * terms + points * scan)
-        + 2.6e-9 * points * shape[1] * across * along
-        + 1.1e-8 * lanes * count * terms**2
-    ) + lanes * (2e-4 * places + 1.5e-4 * shape[1] + 4e-4)
-    tables = (
-        lanes * chord * band.psf_nodes * (6e-9 + 2e-11 * terms)
-        + view.object_shape[axis] * scan * band.psf_nodes * (8e-9 + 6e-11 * terms)
-        + 9e-8 * places * (chord * across + scan * along)
-    )
-    written = math.prod(shape[1:]) * 3e-8
-    size_ = 16 if double else 8
-    heights = (
-        size_
-        * view.object_shape[axis]
-        * scan
-        * terms
-        * (1 if band.window is not None else shape[1])
-    )
-    spread = size_ * count * terms * across
-    return Cost(
-        operations,
-        passes + tables + written + field_seconds(camera, view, band) + 0.015,
-        int(heights + 2 * spread) + 2 * KEPT_BYTES + (1 << 25),
+    places = geometry.lines(grid, 1 - axis) if band.window is not None else superpixels
+    wide = item / 8  # what is twice as long takes twice the time
+    chord_values = lanes * chord * band.psf_nodes
+    scan_values = geometry.object_shape[axis] * scan * band.psf_nodes
+    heights = geometry.object_shape[axis] * scan * terms
+    return Features(
+        {
+            "chords_to_sensor": 8.0 * lanes * places * chord * terms * across,
+            "scan_lines": 8.0 * points * places * scan * terms * across,
+            "hop": 8.0 * points * scan * across * along * superpixels,
+            "guard": 8.0 * points * scan * terms**2,
+        },
+        {
+            "process": 1.0,
+            "line_values": wide * places * across * (lanes * count * terms + points * scan),
+            "sensor_values": wide * points * superpixels * across * along,
+            "guard_values": wide * lanes * count * terms**2,
+            "lines_of_points": lanes,
+            "line_places": lanes * places,
+            "line_superpixels": lanes * superpixels,
+            "chord_values": chord_values,
+            "chord_term_values": chord_values * terms,
+            "scan_values": scan_values,
+            "scan_term_values": scan_values * terms,
+            "kernel_values": places * (chord * across + scan * along),
+            "written": math.prod(shape[1:]),
+            **field_features(camera, geometry, band),
+        },
+        (
+            {
+                "heights": item * heights * (1 if band.window is not None else superpixels),
+                "spread": item * count * terms * across,
+                "kept": KEPT_BYTES,
+                "process": 1.0,
+            },
+        ),
     )

@@ -1,0 +1,260 @@
+"""What an exact matrix consists of, counted before it is computed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from plenocli.forward.propagation.costs import Cost, Features, law, summed
+from plenocli.forward.propagation.exact.term_counts import (
+    MANY_CELLS,
+    TermLaw,
+    corner_phase,
+    field_products,
+    field_rank,
+    fine_rank,
+    own_products,
+    own_terms,
+    require_sketch,
+    sketch_size,
+    term_law,
+)
+from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
+from plenocli.forward.propagation.sampling import distinct, grid_of, is_symmetric
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.exact.lenslets import ExactBand
+
+CAUTION = 1.3
+"""By how much more terms than expected a field is refused at once rather than after minutes."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Superpixels that need tables of the same size.
+
+    count: how many;
+    aside: by how many axes they lie beside the object's own;
+    rows: columns of both factors together (sensor nodes times points);
+    halves: 1 where one factor serves both axes, else 2.
+    """
+
+    count: int
+    aside: int
+    rows: int
+    halves: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sizes:
+    """Sizes of the computation.
+
+    lit: lenslets along one axis that light a superpixel;
+    points, lines, nodes: of the object, of the pixels' nodes and of the factors along one axis;
+    beside: superpixels of an axis beside the own one whose tables are computed;
+    across: nodes of one lenslet along one axis;
+    few: nodes of the spread function on one lenslet;
+    decades: as TermLaw.decades;
+    phase: corner_phase;
+    ranks, products: expected of a superpixel, by the number of axes that it lies aside;
+    kinds: superpixels by the size of their tables.
+    """
+
+    lit: int
+    points: int
+    lines: int
+    nodes: int
+    rows: int
+    beside: int
+    across: float
+    few: int
+    decades: float
+    phase: float
+    ranks: list[float]
+    products: list[float]
+    kinds: list[_Kind]
+
+    @property
+    def tables(self) -> int:
+        """Superpixels whose tables are computed."""
+        return sum(kind.count for kind in self.kinds)
+
+
+def cost(
+    camera: Camera, geometry: Geometry, band: ExactBand, shape: tuple[int, ...], double: bool
+) -> Cost:
+    """The Cost of a matrix.
+
+    shape: (band, superpixel, pixel, point) of it;
+    double: whether its fields have double precision.
+
+    Raises NumericsError where the superpixels beside the lenslet's own are expected to have more
+    terms than a sketch may hold.
+    """
+    return law("exact, low rank").cost(features(camera, geometry, band, shape, double))
+
+
+def features(
+    camera: Camera,
+    geometry: Geometry,
+    band: ExactBand,
+    shape: tuple[int, ...],
+    double: bool,
+    numbers: TermLaw | None = None,
+) -> Features:
+    """What a matrix consists of, as `cost`; `numbers` of the laws of terms instead of the usual
+    ones.
+    """
+    n = numbers or term_law()
+    even, item = is_symmetric(camera), 16 if double else 8
+    sizes = _sizes(camera, geometry, band, grid_of(shape[1]), n)
+    written, columns = math.prod(shape[1:]), distinct(camera, geometry, shape)[1]
+    fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
+    mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
+    rows = sizes.lit * band.terms * sizes.rows
+    operations = {
+        "interval_values": 4 * rows * sizes.across,
+        "interval_terms": 8 * rows * band.terms,
+        "sensor": 8.0 * fine * mean * columns,
+    }
+    wide = item / 8  # what is twice as long takes twice the time
+    seconds = {
+        "process": 1.0,
+        "field_cubed": wide * band.psf_nodes**3 / (8 if even else 1),
+        "spread_values": wide
+        * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * band.terms),
+        "columns": columns,
+        "sensor_values_double" if double else "sensor_values_single": columns * fine,
+        "written_double" if double else "written_single": written,
+    }
+    # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from
+    # superpixels beside it
+    own = _pupil_share(camera, n) * own_products(geometry, band, _parabolic(camera), n)
+    held = {
+        "own_coupling_isolated" if sizes.lit == 1 else "own_coupling_joined": item * own**2,
+        "field_squared": (band.psf_nodes / (2 if even else 1)) ** 2,
+        "intervals": item
+        * (sizes.beside + 1)
+        * (sizes.lit * sizes.across * sizes.points)
+        * own_terms(geometry, band, band.cut),
+        "factors": item * sizes.tables * sizes.points * sizes.lines * mean,
+        "process": 1.0,
+    }
+    lenslets = min(1.0, n.lenslets_coarse + n.lenslets_a_decade * sizes.decades)
+    return Features(
+        summed([operations, *(_table_operations(kind, sizes, band) for kind in sizes.kinds)]),
+        summed([seconds, *(_table_seconds(kind, sizes, wide, lenslets) for kind in sizes.kinds)]),
+        tuple(held | _table_bytes(kind, sizes, geometry, item) for kind in sizes.kinds),
+    )
+
+
+def _parabolic(camera: Camera) -> bool:
+    return camera.lenslet_array.profile == "parabolic"
+
+
+def _pupil_share(camera: Camera, n: TermLaw) -> float:
+    """Share of terms that the shape of the pupil leaves."""
+    square = is_symmetric(camera) and camera.main_lens.aperture_shape == "square"
+    return n.separable_pupil if square else 1.0
+
+
+def _sizes(
+    camera: Camera, geometry: Geometry, band: ExactBand, grid: tuple[int, int], n: TermLaw
+) -> _Sizes:
+    parabolic, even, plain = _parabolic(camera), is_symmetric(camera), _pupil_share(camera, n)
+    lit = 1 if band.window is None else 2 * band.window + 1
+    points, lines = max(geometry.object_shape), band.pixel_nodes * max(geometry.pixel_shape)
+    nodes = band.sensor_count or lines
+    beside = grid[0] // 2 if even else grid[0] - 1
+    ranks = [plain * field_rank(geometry, band, parabolic, aside, n) for aside in range(3)]
+    if band.window is not None:
+        require_sketch(CAUTION * ranks[sum(count > 1 for count in grid)])
+        more = fine_rank(geometry, band, n)
+        ranks = [rank * more for rank in ranks]
+    # on an axis of symmetry half of the points are computed
+    own, other = nodes * ((points + 1) // 2 if even else points), nodes * points
+    kinds = (
+        [
+            _Kind(1, 0, own, 1),
+            _Kind(beside, 1, own + other, 2),
+            _Kind(beside, 2, other, 1),
+            _Kind(beside * (beside - 1) // 2, 2, 2 * other, 2),
+        ]
+        if even
+        else [
+            _Kind(1, 0, 2 * own, 2),
+            _Kind(2 * beside, 1, own + other, 2),
+            _Kind(beside**2, 2, 2 * other, 2),
+        ]
+    )
+    return _Sizes(
+        lit=lit,
+        points=points,
+        lines=lines,
+        nodes=nodes,
+        rows=own + beside * other,
+        beside=beside,
+        # as far as light comes: the lenslets beside the superpixel
+        across=min(band.lenslet_nodes, band.lenslet_nodes * (2 / (lit + 1)) + n.nodes_beside),
+        few=psf_nodes(geometry, geometry.lenslet_width / 2),
+        decades=n.decades(band.cut),
+        phase=corner_phase(geometry),
+        ranks=ranks,
+        products=[
+            plain * field_products(geometry, band, parabolic, aside, n) for aside in range(3)
+        ],
+        kinds=[kind for kind in kinds if kind.count],
+    )
+
+
+def _table_operations(kind: _Kind, sizes: _Sizes, band: ExactBand) -> dict[str, float]:
+    rank, products = sizes.ranks[kind.aside], sizes.products[kind.aside]
+    sketch, rows = sketch_size(rank), kind.count * kind.rows
+    # of many lenslets each brings few terms, so that products are narrow and wait for memory
+    return {
+        "sketch_isolated" if sizes.lit == 1 else "sketch_joined": rows * products * sketch,
+        "intervals_applied": rows * products * sizes.across,
+        "basis": rows * sketch**2,
+        "coupling": kind.count * sketch**3,
+        "prolate": rows * sizes.lines * rank if band.sensor_count else 0.0,
+    }
+
+
+def _table_seconds(kind: _Kind, sizes: _Sizes, wide: float, lenslets: float) -> dict[str, float]:
+    products = wide * kind.count * kind.rows * sizes.products[kind.aside]
+    if sizes.lit == 1:
+        return {
+            "tables_isolated": kind.count,
+            "products_isolated": products,
+            "phase_isolated": wide * kind.count * sizes.phase,
+        }
+    # coarse cuts drop most lenslets
+    kept = wide * kind.count * sizes.lit**2 * kind.halves * lenslets
+    return {
+        "tables_joined": kind.count,
+        "products_joined": products,
+        "lenslets": kept,
+        "lenslet_phase": kept * sizes.phase,
+        "lenslet_values": kept * sizes.nodes * sizes.across,
+    }
+
+
+def _table_bytes(kind: _Kind, sizes: _Sizes, geometry: Geometry, item: int) -> dict[str, float]:
+    """What is held while a table of this kind is compressed."""
+    columns = item * kind.rows * sizes.products[kind.aside]
+    found = {"sketch": item * kind.rows * sketch_size(sizes.ranks[kind.aside])}
+    if sizes.lit == 1:
+        return found | {"columns_isolated": columns}
+    # fine fields have far fewer terms a lenslet than products, and are narrowed to them; terms
+    # that neighbours' edges bring come on top
+    fine = min(1.0, sizes.decades)
+    edges = max(0.0, sizes.decades - 1) * math.sqrt(geometry.diffraction_cells / MANY_CELLS)
+    return found | {
+        "columns_coarse": columns * (1 - fine),
+        "columns_fine": columns * fine,
+        "columns_of_edges": columns * edges,
+        "columns_of_edges_aside": columns * edges * kind.aside,
+    }

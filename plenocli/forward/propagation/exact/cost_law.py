@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from plenocli.forward.propagation.costs import Cost, Features, law, summed
 from plenocli.forward.propagation.exact.term_counts import (
     MANY_CELLS,
+    ExactBand,
     TermLaw,
     corner_phase,
     field_products,
@@ -26,7 +27,6 @@ from plenocli.forward.propagation.sampling import distinct, grid_of, is_symmetri
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.propagation.exact.lenslets import ExactBand
 
 CAUTION = 1.3
 """By how much more terms than expected a field is refused at once rather than after minutes."""

@@ -15,7 +15,6 @@ them (optics.factors).
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, Wa
 from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
+    ExactBand,
     field_rank,
     field_terms,
     require_sketch,
@@ -37,7 +37,7 @@ from plenocli.forward.propagation.fresnel.spread_function import (
     psf_nodes,
     separable_field,
 )
-from plenocli.forward.propagation.sampling import BandPlan, size_band
+from plenocli.forward.propagation.sampling import size_band
 
 CUT, CUT_EFFECT = 0.42, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column
@@ -54,19 +54,6 @@ is measured by; least share, and cut of the main lens's field, that this is done
 
 GAPS = 3.0
 """By how much finer fields are cut where lenslets leave gaps."""
-
-
-@dataclass(frozen=True)
-class ExactBand(BandPlan):
-    """A BandPlan of the exact rung.
-
-    cut: root-energy error of a mean point's field;
-    sensor_count: prolate functions across a superpixel that carry the field before it goes to the
-        pixels' nodes, 0: the pixels' nodes serve.
-    """
-
-    cut: float = 1e-5
-    sensor_count: int = 0
 
 
 def exact_band(view, grid, ring, accuracy, tolerance):

@@ -18,7 +18,6 @@ from plenocli.forward.propagation.sampling import BandPlan, expected_terms
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.propagation.exact.lenslets import ExactBand
 
 MANY_CELLS, EDGE_CELLS = 100.0, 50.0
 """Diffraction cells of a lenslet that the effects of fine cuts and of edges are stated for."""
@@ -26,6 +25,19 @@ MARGIN = 1.12
 """How many more terms than expected the first sketch of a field holds."""
 FINE_DECADES = 2.0
 """Decades below the coarsest cut from which on fields with neighbours take more terms."""
+
+
+@dataclass(frozen=True)
+class ExactBand(BandPlan):
+    """A BandPlan of the exact rung.
+
+    cut: root-energy error of a mean point's field;
+    sensor_count: prolate functions across a superpixel that carry the field before it goes to the
+        pixels' nodes, 0: the pixels' nodes serve.
+    """
+
+    cut: float = 1e-5
+    sensor_count: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

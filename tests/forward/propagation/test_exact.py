@@ -13,6 +13,7 @@ from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.bands import spectral_nodes
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact import low_rank_product as product
+from plenocli.forward.propagation.exact import term_counts
 from plenocli.forward.propagation.exact.lenslets import fresnel_model_error
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
 from plenocli.forward.propagation.system_matrix import PifBuilder
@@ -729,6 +730,6 @@ def test_a_shut_filter_lets_no_light_through(superpixels):
 
 
 def test_a_field_of_too_many_terms_is_refused_before_it_is_computed(monkeypatch):
-    monkeypatch.setattr(exact, "MAX_SKETCH", 9)
+    monkeypatch.setattr(term_counts, "MAX_SKETCH", 9)
     with pytest.raises(NumericsError, match="about .* separable terms, more than"):
         exact.exact_band(geometry(small_camera(), WAVELENGTH), (1, 1), 0, 1e-4, 1e-4)

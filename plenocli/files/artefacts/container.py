@@ -26,7 +26,7 @@ from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance, require_file
 from plenocli.files.artefacts.sparse import SparseFile
-from plenocli.files.artefacts.structure import attribute_names, read_attribute, survey
+from plenocli.files.artefacts.structure import EMPTY_AXIS, attribute_names, read_attribute, survey
 from plenocli.files.atomic import replacement, reserve, write_at
 
 MAGIC = b"plenocli artefact 1\n"
@@ -292,7 +292,27 @@ def _frame(schema, data, apart, stored):
             target = file[where or "/"]
             for name, value in stored[where].items():
                 _put_attribute(target, name, value)
+        declared = apart | {path: (values.shape, values.dtype) for path, values in data.items()}
+        _name_axes(file, tables.axis_names(schema, declared))
     return memory, offsets
+
+
+def _name_axes(file, names):
+    """Attach HDF5 dimension scales, by which xarray, MATLAB and silx name the axes.
+
+    An axis without values of its own gets a dataset that holds none, as netCDF-4 keeps such axes.
+    """
+    for path in sorted(names):
+        group = path.rpartition("/")[0]
+        for axis, (name, size) in enumerate(zip(names[path], file[path].shape)):
+            where = f"{group}/{name}"
+            if where not in file:
+                file.create_dataset(where, shape=(size,), dtype="i1", track_times=False)
+                file[where].make_scale(f"{EMPTY_AXIS}{size:10d}")
+            elif not file[where].is_scale:
+                file[where].make_scale(name)
+            if where != path:
+                file[path].dims[axis].attach_scale(file[where])
 
 
 def _reserve_dataset(file, path, shape, dtype):

@@ -723,7 +723,11 @@ LIGHTFIELD = Schema(
             _NOTES,
         )
     },
-    plots={"refocus": ("value", ())},
+    plots={
+        "refocus": ("value", ()),
+        "depth": ("slope", ("distance", "confidence")),
+        "views": ("value", ()),
+    },
     default=("refocus",),
 )
 

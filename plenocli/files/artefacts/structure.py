@@ -4,7 +4,7 @@ the rest declares.
 
 import h5py
 import numpy as np
-from h5py import h5d, h5l, h5t, h5z
+from h5py import h5d, h5ds, h5l, h5t, h5z
 
 from plenocli.base.errors import InputError
 from plenocli.base.memory import size_text
@@ -15,6 +15,10 @@ _FIX = (
 )
 _FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 _LINKS = {h5l.TYPE_SOFT: "a soft", h5l.TYPE_EXTERNAL: "an external"}
+EMPTY_AXIS = "This is a netCDF dimension but not a netCDF variable. "
+"""How the name of a dimension scale begins that holds no values."""
+_AXIS_ATTRIBUTES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"}
+"""What HDF5 keeps of dimension scales; nothing here follows the references in them."""
 _ATTRIBUTE_BYTES = 8 << 20
 _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
@@ -51,8 +55,10 @@ def survey(path, file, limit):
             elif info.type == h5py.h5o.TYPE_DATASET:
                 dataset = h5d.open(group, link)
                 _check_attributes(path, dataset, f"/{child}")
-                declared[child] = _declaration(path, dataset, child)
-                shape, dtype = declared[child]
+                shape, dtype = _declaration(path, dataset, child)
+                if _is_empty_axis(dataset):
+                    continue
+                declared[child] = shape, dtype
                 total += int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
@@ -123,15 +129,36 @@ def _check_attributes(path, target, where):
     for position in range(h5py.h5a.get_num_attrs(target)):
         attribute = h5py.h5a.open(target, index=position)
         label = f"{where}@{_text(path, attribute.name)}"
-        _check_type(path, attribute.get_type(), label)
+        if not _is_axis_list(attribute):
+            _check_type(path, attribute.get_type(), label)
         count = attribute.get_space().get_simple_extent_npoints()
         if count * attribute.get_type().get_size() > _ATTRIBUTE_BYTES:
             raise InputError(f"'{label}' is larger than {_ATTRIBUTE_BYTES >> 20} MiB", path, _FIX)
 
 
+def _is_axis_list(attribute):
+    """Whether an attribute holds the references of dimension scales, of just the type that HDF5
+    gives them.
+    """
+    kind = attribute.get_type()
+    if attribute.name == b"DIMENSION_LIST":
+        return kind.get_class() == h5t.VLEN and kind.get_super().get_class() == h5t.REFERENCE
+    if attribute.name == b"REFERENCE_LIST" and kind.get_class() == h5t.COMPOUND:
+        members = [kind.get_member_class(n) for n in range(kind.get_nmembers())]
+        return members == [h5t.REFERENCE, h5t.INTEGER]
+    return False
+
+
+def _is_empty_axis(dataset):
+    """Whether a dataset only gives an axis its name; its values are never read."""
+    if not (h5ds.is_scale(dataset) and dataset.get_space().get_simple_extent_ndims() == 1):
+        return False
+    return h5ds.get_scale_name(dataset).startswith(EMPTY_AXIS.encode())
+
+
 def attribute_names(target):
-    """Names of the attributes of an h5py group or dataset, sorted."""
-    return sorted(target.attrs)
+    """Names of the attributes of an h5py group or dataset but those of dimension scales, sorted."""
+    return sorted(set(target.attrs) - _AXIS_ATTRIBUTES)
 
 
 def read_attribute(path, target, name):

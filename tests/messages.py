@@ -9,7 +9,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"
 MAKERS = re.compile(
     r"(\w+\.)?(UsageError|ConfigError|InputError|OutputError|NumericsError|BadParameter|"
-    r"fail|require_memory)"
+    r"fail|require|require_reading|require_declared)"
 )
 
 

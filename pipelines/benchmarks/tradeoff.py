@@ -39,7 +39,6 @@ from plenocli.files.config.camera_file import to_toml  # noqa: E402
 from plenocli.forward.accuracy import dial  # noqa: E402
 from plenocli.forward.accuracy.dial import plan_pif  # noqa: E402
 from plenocli.forward.propagation.system_matrix import build_pif  # noqa: E402
-from plenocli.stages.forward.simulate_pif import Settings  # noqa: E402
 
 ACCURACIES = [10.0**-n for n in range(1, 9)]
 SUITES = [(model, scope) for model in ("fresnel", "auto") for scope in ("isolated", "neighbours")]
@@ -75,7 +74,7 @@ def plan_case(model, scope, name, accuracy):
         start = time.process_time()
         plan = plan_pif(camera_of(name), accuracy=accuracy, **request_of(model, scope))
         case["plan_seconds"] = time.process_time() - start
-        pif_pieces.layout(plan, Settings.mem_limit, name)
+        pif_pieces.layout(plan, name)
     except NumericsError as error:
         return case | {"refused": str(error)}
     chosen = plan.chosen

@@ -9,8 +9,6 @@ import mmap
 import os
 import resource
 
-from plenocli.base.errors import InputError, NumericsError
-
 BASE, CORE = 384 << 20, 80 << 20
 """What a process takes beside its data, bytes, and for each core: the interpreter, the libraries
 and the room that they set aside.
@@ -29,8 +27,8 @@ def base_memory():
     return BASE + CORE * (os.cpu_count() or 1)
 
 
-def hold(mem_limit):
-    """From now on this process gets MemoryError instead of more than `mem_limit` bytes of data
+def hold(memory):
+    """From now on this process gets MemoryError instead of more than `memory` bytes of data
     and the base; only on Linux.
     """
     table = "/proc/self/status"
@@ -38,7 +36,7 @@ def hold(mem_limit):
         with open(table) as lines:
             used = next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData"))
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        most = used + mem_limit + base_memory() - _CODE
+        most = used + memory + base_memory() - _CODE
         resource.setrlimit(
             resource.RLIMIT_DATA,
             (most if hard == resource.RLIM_INFINITY else min(most, hard), hard),
@@ -68,21 +66,6 @@ def require_start():
     """MemoryError where the limits of the shell or of a queue leave less than ROOM."""
     if not can_have(ROOM):
         raise MemoryError(f"less than {size_text(ROOM)} can be had")
-
-
-def require_memory(needed, mem_limit, what, where=None, fewer="take less of it"):
-    """NumericsError, before a long computation, if `what` needs more bytes than the limit; it
-    says how much would do.
-    """
-    if mem_limit is not None and needed > mem_limit:
-        raise NumericsError(
-            (
-                f"{what} needs about {size_text(needed)}, more than the limit of "
-                f"{size_text(mem_limit)}"
-            ),
-            where,
-            f"{fewer}, or raise --mem-limit to {size_text(1.05 * needed)}",
-        )
 
 
 def is_lack_of_memory(error):
@@ -124,21 +107,3 @@ def size_text(count):
     value = count / 2**power
     step = 10.0 ** (math.floor(math.log10(max(value, 1))) - 2)
     return f"{math.ceil(value / step) * step:.6g}{unit}"
-
-
-def default_mem_limit():
-    """Half of the machine's memory, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-
-
-def require_room(path, needed, mem_limit=None):
-    """Raise InputError, before anything is read, if the data that a header declares (`needed`
-    bytes) exceed the limit.
-    """
-    limit = default_mem_limit() if mem_limit is None else mem_limit
-    if needed > limit:
-        raise InputError(
-            f"declares {size_text(needed)} of data, above the memory limit of {size_text(limit)}",
-            path,
-            f"raise --mem-limit to {size_text(1.05 * needed)} if the file is yours",
-        )

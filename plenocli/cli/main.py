@@ -12,6 +12,7 @@ from functools import partial
 import click
 
 from plenocli import __version__
+from plenocli.base.budget import within
 from plenocli.base.errors import PlenoError
 from plenocli.base.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
 from plenocli.cli.commands import COMMANDS, load_command
@@ -107,7 +108,7 @@ def run(argv=None):
     """Run the command line with `argv` (default: the process's own) and return the exit code."""
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
     try:
-        with limits_restored():
+        with limits_restored(), within():
             require_start()
             code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
         sys.stdout.flush()

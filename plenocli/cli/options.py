@@ -275,22 +275,26 @@ scheduler = click.option(
 )
 
 
-def _held(ctx, param, value):
+def _grant(ctx, param, value):
+    """What --mem-limit says holds for this process from now on."""
+    from dataclasses import replace
+
+    from plenocli.base.budget import budget, machine_budget, set_budget
     from plenocli.base.memory import hold
 
-    hold(value)
-    return value
+    memory = machine_budget().memory if value is None else int(value)
+    set_budget(replace(budget(), memory=memory))
+    hold(memory)
 
 
 mem_limit = click.option(
     "--mem-limit",
     type=BYTES,
-    default="8GiB",
-    show_default=True,
-    callback=_held,
+    expose_value=False,
+    callback=_grant,
     help=(
-        "Memory for data, such as 4GiB; a plan that needs more is refused, and nobody gets more. "
-        "Interpreter and libraries come on top: 384 MiB, and 80 MiB a core."
+        "Memory for data, such as 4GiB; default half of the machine's. What needs more is refused, "
+        "and nobody gets more. Interpreter and libraries come on top: 384 MiB, and 80 MiB a core."
     ),
 )
 

@@ -7,7 +7,7 @@ import numpy as np
 from plenocli.base.errors import InputError, UsageError
 
 
-def score_lightfield(path, truth, mem_limit=None):
+def score_lightfield(path, truth):
     """Metrics of the light-field artefact `path` (from refocus --camera) against a plane: `truth`
     is its distance as text, such as 620mm, or the simulated capture, whose camera says it.
     UsageError, InputError.
@@ -15,14 +15,14 @@ def score_lightfield(path, truth, mem_limit=None):
     from plenocli.evaluation.metrics.depth import counted, score_depth
     from plenocli.files.artefacts.container import read_artefact
 
-    data = read_artefact(path, "lightfield", mem_limit=mem_limit).data
+    data = read_artefact(path, "lightfield").data
     if "depth/distance" not in data:
         raise InputError(
             "holds no distances" if "depth/slope" in data else "holds no depth map",
             path,
             "refocus three planes or more with --camera",
         )
-    distance, known = _distance(truth, path, mem_limit), np.isfinite(data["refocus/distance"])
+    distance, known = _distance(truth, path), np.isfinite(data["refocus/distance"])
     if known.sum() < 2:
         raise InputError(
             "holds fewer than two planes at known distances", path, "refocus more of them"
@@ -47,7 +47,7 @@ def score_lightfield(path, truth, mem_limit=None):
     }
 
 
-def _distance(truth, path, mem_limit):
+def _distance(truth, path):
     from plenocli.base.units import UnitError, parse_length
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.config.camera_file import parse_camera
@@ -67,7 +67,7 @@ def _distance(truth, path, mem_limit):
                 "--truth",
                 "write for example 620mm, or name the simulated capture",
             ) from None
-    config = read_artefact(truth, "capture", mem_limit=mem_limit).provenance.config
+    config = read_artefact(truth, "capture").provenance.config
     if not config:
         raise InputError(
             "does not say from how far it was taken",

@@ -6,7 +6,7 @@ from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
 
 
-def score_calibration(path, truth, mem_limit=None):
+def score_calibration(path, truth):
     """(wavelengths (band,) m, metrics) of the response of calibration `path` against that of
     calibration `truth`.
     """
@@ -16,18 +16,18 @@ def score_calibration(path, truth, mem_limit=None):
         raise UsageError(
             "the truth is missing", path, "name with --truth the calibration to compare with"
         )
-    response, other, wavelengths, _ = paired_responses(path, truth, mem_limit)
+    response, other, wavelengths, _ = paired_responses(path, truth)
     return wavelengths, score_response(response, other)
 
 
-def paired_responses(path, truth, mem_limit=None):
+def paired_responses(path, truth):
     """Responses (lenslet, pixel, band) of two calibrations over the lenslets and bands of both;
     (first, second, wavelengths, window).
 
     Where one of them is shared by all lenslets, it stands beside every lenslet of the other that
     has neighbours on all sides (the others lack light). InputError where windows or bands differ.
     """
-    first, second = (_read(name, mem_limit) for name in (path, truth))
+    first, second = (_read(name) for name in (path, truth))
     if first["window"] != second["window"]:
         raise InputError(
             f"has windows of {by(first['window'])} px, {truth} of {by(second['window'])}",
@@ -67,10 +67,10 @@ def paired_responses(path, truth, mem_limit=None):
     return a, b, first["wavelength"][ours], first["window"]
 
 
-def _read(path, mem_limit):
+def _read(path):
     from plenocli.files.artefacts.container import read_artefact
 
-    data = read_artefact(path, "calibration", mem_limit=mem_limit).data
+    data = read_artefact(path, "calibration").data
     if "response/F" not in data:
         raise InputError(
             "holds no response F, only the lenslet grid", path, "calibrate with --band captures"

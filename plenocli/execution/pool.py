@@ -23,6 +23,7 @@ from concurrent.futures import (
 from pathlib import Path
 
 from plenocli import __version__
+from plenocli.base.budget import budget, set_budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import heard, note
@@ -121,8 +122,10 @@ def attempt(function, *task):
         return error
 
 
-def _remotely(version, function, task):
-    """(result or PlenoError, what it said) of a task in a process that runs nothing but tasks."""
+def _remotely(version, granted, function, task):
+    """(result or PlenoError, what it said) of a task in a process that runs nothing but tasks,
+    within the Budget `granted`.
+    """
     if version != __version__:
         return UsageError(
             f"a worker runs plenocli {__version__}, this is {version}",
@@ -131,7 +134,9 @@ def _remotely(version, function, task):
     import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    threadpool_limits(1, "blas")  # for good: other tasks may run beside this one
+    # both for good: other tasks may run beside this one
+    threadpool_limits(1, "blas")
+    set_budget(granted)
     with heard() as said:
         return attempt(function, task), said
 
@@ -195,7 +200,9 @@ class _Executing:
     def submit(self, token, function, task):
         """Hand in a task."""
         call = (
-            (self._call, function, task) if self._call else (_remotely, __version__, function, task)
+            (self._call, function, task)
+            if self._call
+            else (_remotely, __version__, budget(), function, task)
         )
         try:
             self._running[self._executor.submit(*call)] = (token, function, task)

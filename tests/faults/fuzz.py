@@ -44,21 +44,21 @@ def sealed(path, data):
     image = data[HEADER_BYTES:]
     head = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
     path.write_bytes(head.ljust(HEADER_BYTES, b"\0") + image)
-    read_artefact(path, mem_limit=1 << 28)
+    read_artefact(path)
 
 
 def exr(path, data):
     from plenocli.files.images.exr import read_exr
 
     path.write_bytes(data)
-    read_exr(path, mem_limit=1 << 28)
+    read_exr(path)
 
 
 def photograph(path, data):
     from plenocli.files.images.pictures import read_picture
 
     path.write_bytes(data)
-    read_picture(path, mem_limit=1 << 28)
+    read_picture(path)
 
 
 def notes(path, data):

@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from plenocli.base.errors import InputError
+from plenocli.base.budget import Budget, within
+from plenocli.base.errors import InputError, NumericsError
 from plenocli.files.artefacts.container import (
     HEADER_BYTES,
     MAGIC,
@@ -374,10 +375,13 @@ def test_memory_limit_holds_for_the_file_and_for_what_it_declares(tmp_path):
     zeros.data["spectra/sigma"][:] = 0
     write_artefact(tmp_path / "x.h5", zeros)
     assert (tmp_path / "x.h5").stat().st_size < 50_000
-    with pytest.raises(InputError, match="declares .* above the memory limit"):
-        read_artefact(tmp_path / "x.h5", mem_limit=100_000)
-    with pytest.raises(InputError, match="times that, above the memory limit"):
-        read_artefact(tmp_path / "x.h5", mem_limit=100)
+    for memory in (150_000, 100):  # what it declares, and the file itself
+        with within(Budget(memory)), pytest.raises(NumericsError, match="to be read, more than"):
+            read_artefact(tmp_path / "x.h5")
+    whole = (tmp_path / "x.h5").read_bytes()
+    (tmp_path / "x.h5").write_bytes(whole[:-1])  # damage is damage, however little memory there is
+    with within(Budget(100)), pytest.raises(InputError, match="truncated"):
+        read_artefact(tmp_path / "x.h5")
 
 
 @pytest.mark.parametrize("make", [spectra, pif])

@@ -9,7 +9,8 @@ import warnings
 import numpy as np
 import pytest
 
-from plenocli.base.errors import InputError, OutputError, UsageError
+from plenocli.base.budget import Budget, within
+from plenocli.base.errors import InputError, NumericsError, OutputError, UsageError
 from plenocli.files.images.exr import read_exr, write_exr
 from plenocli.files.images.pictures import read_picture
 from plenocli.files.images.spectral_exr import (
@@ -102,7 +103,7 @@ def test_no_damage_to_our_exr_is_read_as_data(tmp_path):
             bad[at : at + 4] = b"\xff\xff\xff\x7f"[: len(bad[at : at + 4])]
         (tmp_path / "x.exr").write_bytes(bad)
         try:
-            channels, attrs = read_exr(tmp_path / "x.exr", mem_limit=1 << 20)
+            channels, attrs = read_exr(tmp_path / "x.exr")
         except InputError as error:
             assert str(tmp_path) in str(error)
             continue
@@ -115,8 +116,10 @@ def test_no_damage_to_our_exr_is_read_as_data(tmp_path):
 
 def test_header_that_declares_too_much_is_refused_before_reading(tmp_path):
     write_exr(tmp_path / "x.exr", {"Y": np.zeros((1000, 1000))})
-    with pytest.raises(InputError, match="above the memory limit"):
-        read_exr(tmp_path / "x.exr", mem_limit=1_000_000)
+    with within(Budget(1_000_000)), pytest.raises(NumericsError, match="needs about .* to be read"):
+        read_exr(tmp_path / "x.exr")
+    with pytest.raises(InputError, match="more than 1e\\+06|more than 977KiB"):
+        read_exr(tmp_path / "x.exr", most=1_000_000)
 
 
 def test_missing_empty_foreign_and_folder(tmp_path):

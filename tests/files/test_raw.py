@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, OutputError
 from plenocli.files.images import raw as raw_module
 from plenocli.files.images.dng import read_notes, write_dng
@@ -198,8 +199,8 @@ def test_too_little_time_or_memory_becomes_an_input_error(tmp_path, monkeypatch)
     with pytest.raises(InputError, match="did not finish"):
         read_raw(tmp_path / "x.dng", timeout_s=0.01)
     monkeypatch.setattr(raw_module, "_BASE_BYTES", 0)
-    with pytest.raises(InputError):
-        read_raw(tmp_path / "x.dng", mem_limit=50_000_000)
+    with within(Budget(50_000_000)), pytest.raises(InputError):
+        read_raw(tmp_path / "x.dng")
 
 
 HOSTILE = {  # what a file might make LibRaw do, after the child has bound itself
@@ -231,7 +232,7 @@ def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(
 
     write_dng(tmp_path / "x.dng", mosaic((30, 30)), cfa="RGGB", black=0, white=16383)
     source = raw_module.CHILD.read_text()
-    call = "        found, pixels = read(path)\n"
+    call = "        found, pixels = read(path, memory)\n"
     assert call in source
     child = tmp_path / "child.py"
     child.write_text(
@@ -243,8 +244,8 @@ def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(
         with pytest.raises(InputError, match=HOSTILE[deed][1]):
             read_raw(tmp_path / "x.dng", timeout_s=1.0)
         return
-    with pytest.raises(InputError, match=HOSTILE[deed][1]):
-        read_raw(tmp_path / "x.dng", mem_limit=1 << 30)
+    with within(Budget(1 << 30)), pytest.raises(InputError, match=HOSTILE[deed][1]):
+        read_raw(tmp_path / "x.dng")
     assert run(["inspect", str(tmp_path / "x.dng")]) == 3
     said = capsys.readouterr().err
     assert "x.dng" in said and "Traceback" not in said

@@ -43,7 +43,7 @@ def size(path):
     ],
 )
 def test_every_kind_is_drawn(folder, tmp_path, names, kinds, figures):
-    made = run_show([folder / n for n in names], tmp_path / "p.png", mem_limit=2**30)
+    made = run_show([folder / n for n in names], tmp_path / "p.png")
     assert made["kinds"] == kinds and len(made["captions"]) == figures
     width, height = size(tmp_path / "p.png")
     assert width > 500 and height > 280 * figures

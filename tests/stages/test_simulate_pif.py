@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plenocli.base.budget import Budget, within
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import read_artefact
 from tests.peak import PEAK
@@ -336,14 +337,15 @@ def test_layouts_follow_the_memory_limit():
             shape=(bands, superpixels, 2704, 1600), bytes=size, memory=size + (64 << 20)
         )
 
-    MiB = 1 << 20
-    assert layout(plan(1), 512 * MiB, "x") == Layout(False)
-    assert layout(plan(9), 512 * MiB, "x") == Layout(True)
-    sharded = layout(plan(25), 512 * MiB, "x").groups
+    with within(Budget(512 << 20)):
+        assert layout(plan(1), "x") == Layout(False)
+        assert layout(plan(9), "x") == Layout(True)
+        sharded = layout(plan(25), "x").groups
     assert [n for group in sharded for n in group] == list(range(25)) and max(
         map(len, sharded)
     ) * 17 < 64
-    assert layout(plan(25), 8192 * MiB, "x") == Layout(True)
+    with within(Budget(8 << 30)):
+        assert layout(plan(25), "x") == Layout(True)
 
 
 @pytest.mark.slow

@@ -45,6 +45,7 @@ from plenocli.cli import options
     type=options.FILE,
     help="Spectrometer's table (.csv) of patches and filters; default the one in FOLDER.",
 )
+@options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context

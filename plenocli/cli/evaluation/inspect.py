@@ -9,7 +9,7 @@ from plenocli.cli import options
 @options.input_path("file", metavar="FILE")
 @options.mem_limit
 @options.as_json
-def command(file, mem_limit, as_json):
+def command(file, as_json):
     """Verify FILE as a stage would and show what it holds: any artefact (.h5), EXR, camera RAW or
     DNG, PNG, TIFF or JPEG.
 
@@ -24,5 +24,5 @@ def command(file, mem_limit, as_json):
     """
     from plenocli.stages.evaluation.inspect import describe, run_inspect
 
-    report = run_inspect(file, mem_limit=mem_limit)
+    report = run_inspect(file)
     options.summary(report, as_json, describe(report))

@@ -11,6 +11,7 @@ from plenocli.cli import options
 @options.input_path("run_folder")
 @options.output
 @click.option("--title", help="Title of the page; default the name of the folder.")
+@options.mem_limit
 @options.overwrite
 @options.as_json
 def command(run_folder, output, title, overwrite, as_json):

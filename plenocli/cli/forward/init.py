@@ -10,6 +10,7 @@ from plenocli.cli import options
 
 @click.command("init", short_help="Write sample cameras and a Makefile that runs the chain.")
 @click.argument("folder", type=options.FILE, default=Path("plenocli-start"), metavar="[FOLDER]")
+@options.mem_limit
 @click.option("--overwrite", is_flag=True, help="Replace files that exist (refused by default).")
 @options.as_json
 def command(folder: Path, overwrite: bool, as_json: bool) -> None:

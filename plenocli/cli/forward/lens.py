@@ -50,6 +50,7 @@ def command():
     type=options.DISTANCE,
     help="Scale the lens to this focal length, such as 50mm.",
 )
+@options.mem_limit
 @options.overwrite
 @options.as_json
 def import_command(prescription, output, focal_length, overwrite, as_json):
@@ -95,6 +96,7 @@ def import_command(prescription, output, focal_length, overwrite, as_json):
         "where it names none."
     ),
 )
+@options.mem_limit
 @options.as_json
 def show_command(lens, wavelengths, fields, object_distance, as_json):
     """Trace the lens of LENS (a .toml file) and print focal length, back focus, pupils and focal

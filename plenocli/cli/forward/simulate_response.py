@@ -74,6 +74,7 @@ from plenocli.cli import options
     default=None,
     help="Relative error of that system matrix; default: what the sensor's noise lets be seen.",
 )
+@options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context

@@ -89,6 +89,7 @@ from plenocli.cli import options
     ),
 )
 @options.output
+@options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context

@@ -49,6 +49,7 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 @options.output
 @options.workers
 @options.scheduler
+@options.mem_limit
 @options.overwrite
 @options.as_json
 @click.pass_context

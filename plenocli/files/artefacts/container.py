@@ -20,11 +20,12 @@ import h5py
 import numpy as np
 
 from plenocli import __version__
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.memory import can_have, default_mem_limit, is_lack_of_memory, size_text
+from plenocli.base.memory import can_have
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
-from plenocli.files.artefacts.provenance import Provenance, require_file
+from plenocli.files.artefacts.provenance import Provenance, first_bytes, require_file
 from plenocli.files.artefacts.sparse import SparseFile
 from plenocli.files.artefacts.structure import EMPTY_AXIS, attribute_names, read_attribute, survey
 from plenocli.files.atomic import replacement, reserve, write_at
@@ -79,25 +80,24 @@ def write_artefact(path, artefact, *, overwrite=False):
         seal(descriptor, frame.size)
 
 
-def read_artefact(path, kind=None, *, mem_limit=None, skip=()):
+def read_artefact(path, kind=None, *, skip=()):
     """Read and verify the artefact at `path`.
 
     kind: the kind due, or a tuple of kinds, or None for any.
-    mem_limit: bytes, default half of the machine's memory.
     skip: datasets that are not wanted; their bytes are verified, their values are not looked at.
     Raises InputError for a file that is missing, not an artefact, damaged, too large, of another
     kind, or breaks its table.
     """
     path = Path(path)
-    limit = default_mem_limit() if mem_limit is None else int(mem_limit)
     try:
         # which keeps a copy: ours goes
-        with h5py.File(_open_image(_verified_bytes(path, limit)), "r") as file:
-            return _parse(path, file, kind, limit, skip)
+        with h5py.File(_open_image(_verified_bytes(path)), "r") as file:
+            return _parse(path, file, kind, skip)
     except (PlenoError, MemoryError):
         raise
     except Exception as error:  # h5py raises half a dozen types for a malformed file
-        if is_lack_of_memory(error) and not can_have(READING * path.stat().st_size + (1 << 20)):
+        # HDF5 does not say when it got no memory, and the digest said that the file is whole
+        if not can_have(READING * path.stat().st_size + (1 << 20)):
             raise MemoryError(str(error)) from error
         raise InputError(
             f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again"
@@ -371,47 +371,53 @@ of them while it opens, then the values.
 # --- reading --------------------------------------------------------------------------------------
 
 
-def _verified_bytes(path, limit):
+def _verified_bytes(path):
     """The HDF5 part of the file at `path`, read once, its digest and length verified."""
     size = require_file(path)
-    if READING * size > limit:
-        raise InputError(
-            (
-                f"is {size_text(size)}, and reading takes {READING} times that, above the memory "
-                f"limit of {size_text(limit)}"
-            ),
-            path,
-            f"raise --mem-limit to {size_text(READING * size)}",
-        )
+    if READING * size > budget().memory:
+        _require_whole(path, first_bytes(path, 4096), size)
+        budget().require_reading(path, READING * size)
     try:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(
             f"cannot be read ({error.strerror})", path, "check the file and its permissions"
         ) from error
-    if not content.startswith(MAGIC):
-        if content.startswith(HDF5_SIGNATURE) or HDF5_SIGNATURE in content[:4096]:
+    digest = _require_whole(path, content[:4096], len(content))
+    image = memoryview(content)[HEADER_BYTES:]
+    if hashlib.sha256(image).hexdigest() != digest:
+        raise InputError(
+            "is damaged: its SHA-256 is not the one it was written with", path, "make it again"
+        )
+    return image
+
+
+def _require_whole(path, head, size):
+    """The digest that an artefact was written with; InputError where the first bytes of the file,
+    or its size, are not those of one.
+
+    head: at least the digest block.
+    size: bytes of the file.
+    """
+    if not head.startswith(MAGIC):
+        if HDF5_SIGNATURE in head:
             raise InputError(
                 "is an HDF5 file, but not one that plenocli wrote (no digest block)",
                 path,
                 "give the result of a plenocli stage",
             )
         raise InputError("is not a plenocli artefact", path, "give the result of a plenocli stage")
-    header = _HEADER.fullmatch(content[:HEADER_BYTES])
-    if header is None or len(content) < HEADER_BYTES:
+    header = _HEADER.fullmatch(head[:HEADER_BYTES])
+    if header is None or size < HEADER_BYTES:
         raise InputError("has a damaged digest block", path, "make it again")
-    image = memoryview(content)[HEADER_BYTES:]
-    if len(image) != int(header[2]):
+    if size - HEADER_BYTES != int(header[2]):
         raise InputError(
-            f"is truncated or has grown: {len(image)} bytes where {int(header[2])} were written",
+            f"is truncated or has grown: {size - HEADER_BYTES} bytes where {int(header[2])} were "
+            "written",
             path,
             "make it again",
         )
-    if hashlib.sha256(image).hexdigest() != header[1].decode():
-        raise InputError(
-            "is damaged: its SHA-256 is not the one it was written with", path, "make it again"
-        )
-    return image
+    return header[1].decode()
 
 
 def _open_image(image):
@@ -426,8 +432,8 @@ def _open_image(image):
     return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
-def _parse(path, file, kind, limit, skip):
-    declared = survey(path, file, limit)
+def _parse(path, file, kind, skip):
+    declared = survey(path, file)
     root = {
         name: read_attribute(path, file, name)
         for name in tables.ROOT_ATTRIBUTES

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.base.memory import require_memory
+from plenocli.base.budget import budget
 from plenocli.files.artefacts.container import READING
 
 WHOLE_BYTES = 1 << 27
@@ -25,33 +25,31 @@ class Layout:
     groups: tuple | None = None
 
 
-def cost(plan, mem_limit):
+def cost(plan):
     """(whether it is written in pieces, bytes of memory) of a PifPlan's matrix
-    under a memory limit.
+    within the budget of this process.
     """
     bands, superpixels = plan.shape[:2]
     slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
-    streamed = plan.bytes > min(WHOLE_BYTES, mem_limit // 4)
+    streamed = plan.bytes > min(WHOLE_BYTES, budget().memory // 4)
     return streamed, (5 * slab if streamed else plan.bytes) + work
 
 
-def layout(plan, mem_limit, where):
-    """The Layout of a PifPlan's matrix under a memory limit (bytes).
+def layout(plan, where):
+    """The Layout of a PifPlan's matrix within the budget of this process.
 
     NumericsError where not even one superpixel's part fits.
 
-    Held whole up to WHOLE_BYTES and a quarter of the limit; one file where another stage can read
-    it under the same limit; else shards of an eighth of it.
+    Held whole up to WHOLE_BYTES and a quarter of the memory; one file where another stage can read
+    it within the same budget; else shards of an eighth of it.
     """
     bands, superpixels = plan.shape[:2]
     slab = plan.bytes // (bands * superpixels)
-    streamed, needed = cost(plan, mem_limit)
-    require_memory(
-        needed, mem_limit, "the matrix", where, "take fewer superpixels, points or wavelengths"
-    )
-    if READING * plan.bytes <= mem_limit or superpixels == 1:
+    streamed, needed = cost(plan)
+    budget().require(needed, "the matrix", where, "take fewer superpixels, points or wavelengths")
+    if READING * plan.bytes <= budget().memory or superpixels == 1:
         return Layout(streamed)
-    size = max(1, mem_limit // 8 // (bands * slab))
+    size = max(1, budget().memory // 8 // (bands * slab))
     return Layout(
         True,
         tuple(

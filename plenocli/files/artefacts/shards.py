@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.memory import default_mem_limit, size_text
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.artefacts.stream import streamed_artefact
@@ -132,26 +132,20 @@ def writing_pif(path, shape, dtype, *, groups=None, overwrite=False):
         raise
 
 
-def read_pif(path, mem_limit=None):
+def read_pif(path):
     """The Artefact of kind pif at `path`; that of an index with its shards put together.
 
     Errors as read_artefact.
     """
-    artefact = read_artefact(path, ("pif", "pif-index"), mem_limit=mem_limit)
+    artefact = read_artefact(path, ("pif", "pif-index"))
     if artefact.kind == "pif":
         return artefact
-    limit = default_mem_limit() if mem_limit is None else mem_limit
     A = None
-    for lenslets, part in pif_parts(path, artefact, mem_limit):
+    for lenslets, part in pif_parts(path, artefact):
         if A is None:
             shape = (part.shape[0], len(artefact.data["pif/lenslet_offset"]), *part.shape[2:])
             size = int(np.prod(shape)) * part.itemsize
-            if size > limit:
-                raise InputError(
-                    f"holds {size_text(size)} in all, above the memory limit of {size_text(limit)}",
-                    path,
-                    f"raise --mem-limit to {size_text(1.4 * size)}",
-                )
+            budget().require_reading(path, size)
             A = np.empty(shape, part.dtype)
         A[:, lenslets] = part
     attrs = {name: value for name, value in artefact.attrs["pif"].items() if name != "shards"}
@@ -159,14 +153,14 @@ def read_pif(path, mem_limit=None):
     return Artefact("pif", data | {"pif/A": A}, {"pif": attrs}, artefact.provenance)
 
 
-def pif_parts(path, artefact=None, mem_limit=None):
+def pif_parts(path, artefact=None):
     """The matrix of a pif or pif-index shard by shard: yields (lenslet numbers, A of these (band,
     lenslet, pixel, point)).
 
     One shard is in memory at a time; each is verified against the index. Errors as read_artefact.
     """
     path = Path(path)
-    artefact = artefact or read_artefact(path, ("pif", "pif-index"), mem_limit=mem_limit)
+    artefact = artefact or read_artefact(path, ("pif", "pif-index"))
     if artefact.kind == "pif":
         yield np.arange(artefact.data["pif/A"].shape[1]), artefact.data["pif/A"]
         return
@@ -190,7 +184,7 @@ def pif_parts(path, artefact=None, mem_limit=None):
             raise InputError(
                 f"is not the file that {path.name} was written with", file, "make both again"
             )
-        part = read_artefact(file, "pif", mem_limit=mem_limit)
+        part = read_artefact(file, "pif")
         if not np.array_equal(part.data["pif/lenslet_offset"], offsets[lenslets]):
             raise InputError(
                 f"holds other superpixels than {path.name} says", file, "make both again"

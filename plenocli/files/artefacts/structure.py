@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 from h5py import h5d, h5ds, h5l, h5t, h5z
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.memory import size_text
 
 _FIX = (
     "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length "
@@ -24,13 +24,13 @@ _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
 
 
-def survey(path, file, limit):
+def survey(path, file):
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
     Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
     object linked twice, external or virtual storage, unknown filters, any type but plain integers,
-    floats, true/false and fixed-length text, and declared data of more than `limit` bytes in
-    all. Reads no dataset.
+    floats, true/false and fixed-length text, and what does not fit the
+    memory of this process, as Budget.require_declared. Reads no dataset.
     """
     declared, seen, total = {}, set(), 0
     stack = [
@@ -62,15 +62,7 @@ def survey(path, file, limit):
                 total += int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
-            if total > limit:
-                raise InputError(
-                    (
-                        f"declares {size_text(total)} of data up to '/{child}', above the memory "
-                        f"limit of {size_text(limit)}"
-                    ),
-                    path,
-                    "raise --mem-limit if the file is yours",
-                )
+            budget().require_declared(path, total, total, f" up to '/{child}'")
     return dict(sorted(declared.items()))
 
 

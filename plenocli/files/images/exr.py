@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from plenocli import __version__
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, OutputError
-from plenocli.base.memory import require_room
+from plenocli.base.memory import size_text
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
 
@@ -59,15 +60,16 @@ def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip")
         _verify(path, partial, pixels, names, attrs, compression)
 
 
-def read_exr(path, *, mem_limit=None):
+def read_exr(path, *, most=None):
     """Channels (name -> (row, column) float32) and text attributes (name -> str) of an EXR file.
 
-    Raises InputError for a file that is missing, damaged, too large, deep, in several parts, or
+    most: bytes of pixels above which the file is refused, whatever memory there is.
+    Raises InputError for a file that is missing, damaged, above `most`, deep, in several parts, or
     holds integer channels.
     """
     with _opened(path) as source:
         spec = source.spec()
-        _check_header(path, source, spec, mem_limit)
+        _check_header(path, source, spec, most)
         pixels = source.read_image("float")
         if pixels is None:
             raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
@@ -232,12 +234,14 @@ def _opened(path):
         oiio_error(source)  # an error never fetched is printed when the process ends
 
 
-def _check_header(path, source, spec, mem_limit):
+def _check_header(path, source, spec, most):
     import OpenImageIO as oiio
 
     if spec.deep:
         raise InputError("is a deep EXR", path, "flatten it first")
-    require_room(path, spec.width * spec.height * spec.nchannels * 4, mem_limit)
+    declared = spec.width * spec.height * spec.nchannels * 4
+    require_at_most(path, declared, most)
+    budget().require_declared(path, declared, declared)
     formats = spec.channelformats or (spec.format,) * spec.nchannels
     if any(f.basetype not in (oiio.FLOAT, oiio.HALF) for f in formats):
         raise InputError(
@@ -247,6 +251,16 @@ def _check_header(path, source, spec, mem_limit):
         raise InputError("holds several parts", path, "split it into one file a part")
     oiio_error(source)
     source.seek_subimage(0, 0)
+
+
+def require_at_most(path, declared, most):
+    """InputError where a file declares more bytes of values than `most`, unless that is None."""
+    if most is not None and declared > most:
+        raise InputError(
+            f"declares {size_text(declared)} of data, more than {size_text(most)}",
+            path,
+            "give a grid of at most 1024 x 1024 values",
+        )
 
 
 def oiio_error(handle):

@@ -8,11 +8,10 @@ import h5py
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.base.memory import require_room
 from plenocli.base.text import by
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.artefacts.structure import read_attribute, survey
-from plenocli.files.images.exr import read_exr
+from plenocli.files.images.exr import read_exr, require_at_most
 from plenocli.files.images.pictures import file_type, read_stored
 
 MAX_BYTES = 64 << 20
@@ -33,7 +32,7 @@ def read_transmittance(path):
         return _one_channel(path)
     if kind != "png":
         raise InputError("is neither PNG nor EXR", path, "give the transmittance as .png or .exr")
-    stored, names, bits = read_stored(path, kind, MAX_BYTES)
+    stored, names, bits = read_stored(path, kind, most=MAX_BYTES)
     colours = stored[..., [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]]
     if np.any(colours != colours[..., :1]):
         raise InputError(
@@ -73,7 +72,7 @@ def _require_small(path):
 
 
 def _one_channel(path):
-    channels, _ = read_exr(path, mem_limit=MAX_BYTES)
+    channels, _ = read_exr(path, most=MAX_BYTES)
     if len(channels) != 1 and "Y" not in channels:
         raise InputError(
             f"has the channels {', '.join(list(channels)[:8])}",
@@ -89,7 +88,7 @@ def _from_hdf5(path, content):
     access.set_file_image(content)
     try:
         with h5py.File(h5py.h5f.open(b"wavefront", h5py.h5f.ACC_RDONLY, access)) as file:
-            declared = survey(path, file, MAX_BYTES)
+            declared = survey(path, file)
             if "wavefront" not in declared:
                 raise InputError(
                     f"has no dataset wavefront, only {', '.join(list(declared)[:8]) or 'none'}",
@@ -103,7 +102,7 @@ def _from_hdf5(path, content):
                     path,
                     "store a square grid of floats",
                 )
-            require_room(path, 8 * int(np.prod(shape)), MAX_BYTES)
+            require_at_most(path, 8 * int(shape[0]) * int(shape[1]), MAX_BYTES)
             dataset = file["wavefront"]
             units = read_attribute(path, dataset, "units") if "units" in dataset.attrs else "m"
             if units != "m":

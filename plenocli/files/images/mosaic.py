@@ -46,7 +46,7 @@ class Mosaic:
     meta: dict = field(default_factory=dict)
 
 
-def read_mosaic(path, *, cfa=None, mem_limit=None):
+def read_mosaic(path, *, cfa=None):
     """Read the mosaic at `path`, never demosaiced.
 
     cfa: colour filter array of a PNG or TIFF, which cannot say it (default mono); for other files
@@ -56,9 +56,9 @@ def read_mosaic(path, *, cfa=None, mem_limit=None):
     path = Path(path)
     kind = file_type(path)
     if kind == "exr":
-        found = _from_exr(path, mem_limit)
+        found = _from_exr(path)
     elif kind == "png" or (kind == "tiff" and path.suffix.lower() in (".tif", ".tiff")):
-        found = _from_image(path, kind, mem_limit)
+        found = _from_image(path, kind)
         found.cfa = cfa or "mono"
     elif kind == "jpeg":
         raise InputError(
@@ -67,10 +67,10 @@ def read_mosaic(path, *, cfa=None, mem_limit=None):
             "give the RAW, a PNG or a TIFF of the sensor",
         )
     elif is_hdf5(path):
-        found = _from_capture(path, mem_limit)
+        found = _from_capture(path)
     else:
         found = Mosaic(
-            **read_raw(path, mem_limit=mem_limit),
+            **read_raw(path),
             source="dng" if kind == "tiff" and path.suffix.lower() == ".dng" else "raw",
         )
     if cfa is not None and found.cfa != cfa:
@@ -113,10 +113,10 @@ def is_hdf5(path):
     return head.startswith(MAGIC) or HDF5_SIGNATURE in head
 
 
-def _from_capture(path, mem_limit):
+def _from_capture(path):
     from plenocli.files.artefacts.container import cfa_text, read_artefact
 
-    artefact = read_artefact(path, "capture", mem_limit=mem_limit)
+    artefact = read_artefact(path, "capture")
     attrs = dict(artefact.attrs.get("capture", {}))
     found = _described(
         path,
@@ -131,8 +131,8 @@ def _from_capture(path, mem_limit):
     return found
 
 
-def _from_exr(path, mem_limit):
-    channels, attrs = read_exr(path, mem_limit=mem_limit)
+def _from_exr(path):
+    channels, attrs = read_exr(path)
     if set(channels) != {"Y"} and len(channels) != 1:
         raise InputError(
             f"has {len(channels)} channels ({', '.join(list(channels)[:6])}), a mosaic has one",
@@ -175,8 +175,8 @@ def _described(path, values, description, source):
     return found
 
 
-def _from_image(path, kind, mem_limit):
-    values, names, bits = read_stored(path, kind, mem_limit)
+def _from_image(path, kind):
+    values, names, bits = read_stored(path, kind)
     keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     values, meta = values[..., keep], {"bits": bits, "verified": False}
     if values.dtype.kind not in "uf":

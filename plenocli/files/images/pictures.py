@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.memory import require_room
 from plenocli.files.artefacts.provenance import first_bytes
-from plenocli.files.images.exr import oiio_error
+from plenocli.files.images.exr import oiio_error, require_at_most
 
 _MAGIC = (
     (b"\x89PNG\r\n\x1a\n", "png"),
@@ -32,7 +32,7 @@ class Picture:
     wavelengths: np.ndarray | None = None
 
 
-def read_picture(path, *, mem_limit=None):
+def read_picture(path):
     """Read a photograph (PNG, JPEG, TIFF) or an EXR as linear values with one channel, or R,
     G, B, or one a band.
 
@@ -41,7 +41,7 @@ def read_picture(path, *, mem_limit=None):
     """
     kind = file_type(path)
     if kind == "exr":
-        return _from_exr(path, mem_limit)
+        return _from_exr(path)
     if kind is None:
         raise InputError("is no PNG, JPEG, TIFF or EXR", path, "convert it to one of them")
     if kind == "tiff" and Path(path).suffix.lower() not in (".tif", ".tiff"):
@@ -50,7 +50,7 @@ def read_picture(path, *, mem_limit=None):
             path,
             "develop it, or name it .tif if it is a picture",
         )
-    stored, names, _ = read_stored(path, kind, mem_limit)
+    stored, names, _ = read_stored(path, kind)
     colours = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     if len(colours) not in (1, 3):
         raise InputError(
@@ -84,11 +84,12 @@ def file_type(path):
     return next((kind for magic, kind in _MAGIC if head.startswith(magic)), None)
 
 
-def read_stored(path, kind, mem_limit=None):
+def read_stored(path, kind, *, most=None):
     """(values (row, column, channel) as stored, channel names, bits) of a PNG, JPEG or TIFF.
     Raises InputError.
 
-    Values of odd bit depths (10, 12, 14) come back unscaled in uint16.
+    most: bytes above which it is refused, whatever memory there is. Values of odd bit depths (10,
+    12, 14) come back unscaled in uint16.
     """
     import OpenImageIO as oiio
 
@@ -107,9 +108,10 @@ def read_stored(path, kind, mem_limit=None):
                 path,
                 "give a flat picture",
             )
-        require_room(
-            path, spec.width * spec.height * spec.nchannels * (spec.format.size() + 4), mem_limit
-        )
+        count = spec.width * spec.height * spec.nchannels
+        needed = count * (spec.format.size() + 4)
+        require_at_most(path, needed, most)
+        budget().require_declared(path, count * spec.format.size(), needed)
         values = source.read_image(spec.format)
         trouble = oiio_error(source)
         if values is None or trouble:
@@ -126,18 +128,18 @@ def read_stored(path, kind, mem_limit=None):
         oiio_error(source)
 
 
-def _from_exr(path, mem_limit):
+def _from_exr(path):
     from plenocli.files.images.exr import read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
     if is_spectral(path):
-        spectral = read_spectral_exr(path, mem_limit=mem_limit)
+        spectral = read_spectral_exr(path)
         return Picture(
             _finite(path, np.ascontiguousarray(np.moveaxis(spectral.values, 0, -1))),
             True,
             spectral.wavelengths,
         )
-    channels, _ = read_exr(path, mem_limit=mem_limit)
+    channels, _ = read_exr(path)
     for names in (("R", "G", "B"), ("Y",), tuple(channels) if len(channels) == 1 else ("Y",)):
         if set(names) <= set(channels):
             return Picture(_finite(path, np.stack([channels[name] for name in names], axis=-1)))

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.memory import default_mem_limit, size_text
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
 
@@ -34,7 +34,7 @@ _REASONS = {
 }
 
 
-def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
+def read_raw(path, *, timeout_s=TIMEOUT_S):
     """Read a RAW file as a dict: values (row, column) uint16 without masked borders, cfa ("mono" or
     four letters), black (2, 2) DN by position, white DN, exposure_s or None, gain (DN/e) or None,
     band_m or None, meta.
@@ -44,14 +44,10 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
     """
     path = Path(path)
     size = require_file(path)
-    limit = default_mem_limit() if mem_limit is None else int(mem_limit)
-    if size > limit:
-        raise InputError(
-            f"is {size_text(size)}, above the memory limit of {size_text(limit)}",
-            path,
-            "raise --mem-limit",
-        )
-    found, pixels = _from_child(path, limit, timeout_s)
+    budget().require_reading(path, size)
+    found, pixels = _from_child(path, timeout_s)
+    if "declared" in found:
+        budget().require_declared(path, found["declared"], found["needed"])
     if "refused" in found:
         raise InputError(_reason(found, size), path, _FIX)
     values = np.frombuffer(pixels, dtype="<u2")
@@ -94,7 +90,7 @@ def read_raw(path, *, mem_limit=None, timeout_s=TIMEOUT_S):
     }
 
 
-def _from_child(path, limit, timeout_s):
+def _from_child(path, timeout_s):
     """(description, mosaic bytes) from the child process; a crash there becomes
     an InputError here.
     """
@@ -103,7 +99,8 @@ def _from_child(path, limit, timeout_s):
         "-P",
         str(CHILD),
         str(path.resolve()),
-        str(limit + _BASE_BYTES),
+        str(budget().memory),
+        str(_BASE_BYTES),
         str(_CPU_S),
     ]
     # threads map memory

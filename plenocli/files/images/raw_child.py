@@ -1,8 +1,10 @@
 """Reads one RAW file in a process of its own, with limits, because LibRaw has to survive files that
 nobody can vouch for.
 
-Run by `raw.py` as a script: python -P raw_child.py FILE ADDRESS_SPACE_BYTES CPU_SECONDS stdout: one
-line of JSON, then the mosaic as little-endian uint16, row by row. Nothing is written to disk.
+Run by `raw.py` as a script: python -P raw_child.py FILE MEMORY_BYTES BASE_BYTES CPU_SECONDS
+
+stdout: one line of JSON, then the mosaic as little-endian uint16, row by row. Nothing is written to
+disk.
 """
 
 import json
@@ -10,6 +12,9 @@ import logging
 import os
 import resource
 import sys
+
+COPIES = 4
+"""Of a mosaic that exist at the same time while it is read, in this process and the other."""
 
 
 def limit(address_space, cpu_seconds):
@@ -25,13 +30,20 @@ def limit(address_space, cpu_seconds):
         resource.setrlimit(kind, (value, value))
 
 
-def read(path):
+def read(path, memory):
     """(description, mosaic bytes) of a RAW file; the description has "refused" with the reason
-    where it holds no mosaic.
+    where it holds no mosaic, "declared" and "needed" bytes where these are more than `memory`.
     """
     import rawpy
 
     with rawpy.imread(path) as raw:
+        declared = 2 * raw.sizes.raw_width * raw.sizes.raw_height
+        if COPIES * declared > memory:
+            return {
+                "refused": "is too large",
+                "declared": declared,
+                "needed": COPIES * declared,
+            }, b""
         if raw.raw_type != rawpy.RawType.Flat:
             return {
                 "refused": (
@@ -92,13 +104,13 @@ def main():
     """Read sys.argv and answer on stdout, as said above; every failure becomes an
     answer with "refused".
     """
-    path, address_space, cpu_seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    path, memory, base, cpu_seconds = sys.argv[1], *map(int, sys.argv[2:])
     channel = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not mix with the answer
-    limit(address_space, cpu_seconds)
+    limit(memory + base, cpu_seconds)
     pixels = b""
     try:
-        found, pixels = read(path)
+        found, pixels = read(path, memory)
         found["exif"] = exif(path)
     except MemoryError:
         found = {"refused": "needs more memory than the limit allows"}

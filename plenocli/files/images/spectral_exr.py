@@ -111,12 +111,12 @@ def is_spectral(path):
     return any(_band(name) for name in channel_names(path))
 
 
-def read_spectral_exr(path, quantity=None, *, mem_limit=None):
+def read_spectral_exr(path, quantity=None):
     """Read a spectral picture; `quantity` chooses where a file holds both radiance and reflectance.
 
     Polarised (S1 to S3) and bispectral channels are left out. Raises InputError.
     """
-    channels, attrs = read_exr(path, mem_limit=mem_limit)
+    channels, attrs = read_exr(path)
     bands = {}
     for name in channels:
         found = _band(name)

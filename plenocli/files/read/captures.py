@@ -13,7 +13,7 @@ from plenocli.forward.sensor.frames import tiled
 from plenocli.inverse.picture.lenslet_model import Superpixels
 
 
-def read_superpixels(path, system, calibration=None, mem_limit=None):
+def read_superpixels(path, system, calibration=None):
     """Superpixels of a capture: tiled as its file says, or cut out along the lenslet grid of a
     calibration artefact.
 
@@ -22,7 +22,7 @@ def read_superpixels(path, system, calibration=None, mem_limit=None):
     """
     from plenocli.files.images.mosaic import read_mosaic
 
-    mosaic = read_mosaic(path, mem_limit=mem_limit)
+    mosaic = read_mosaic(path)
     if mosaic.cfa != "mono":
         raise InputError(
             f"has the colour filter array {mosaic.cfa}; the system matrix knows none",

@@ -11,7 +11,7 @@ from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.sparse.dictionary import Dictionary, Settings, State
 
 
-def read_dictionary(path: Path, system: LensletMatrix, mem_limit: int | None = None) -> Dictionary:
+def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
     """The dictionary of an artefact, to be used with a system matrix; a note where it was learnt
     for another one.
 
@@ -23,7 +23,7 @@ def read_dictionary(path: Path, system: LensletMatrix, mem_limit: int | None = N
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
 
-    artefact = read_artefact(path, "dictionary", mem_limit=mem_limit)
+    artefact = read_artefact(path, "dictionary")
     atoms = np.asarray(artefact.data["dictionary/atoms"], float)
     if len(atoms) != system.own.shape[1]:
         several = f" in {len(system.bands)} bands" if len(system.bands) > 1 else ""

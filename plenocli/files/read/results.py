@@ -41,21 +41,21 @@ class Result:
         return self.values.shape[-2:]
 
 
-def read_result(path, kinds=("image", "spectra", "dictionary"), mem_limit=None):
+def read_result(path, kinds=("image", "spectra", "dictionary")):
     """A result from an artefact .h5 or an EXR picture (spectral or not).
 
     InputError for anything else.
     """
     path = Path(path)
     if path.suffix == ".h5":
-        return _from_artefact(path, kinds, mem_limit)
+        return _from_artefact(path, kinds)
     if path.suffix.lower() != ".exr":
         raise InputError(
             f"is {path.suffix or 'a file without a suffix'}, not a result",
             path,
             "give an image, spectra or dictionary as .h5, or an .exr",
         )
-    found = _from_exr(path, mem_limit)
+    found = _from_exr(path)
     if found.kind not in kinds:
         raise InputError(
             f"is a picture without wavelengths where {' or '.join(kinds)} are due",
@@ -65,10 +65,10 @@ def read_result(path, kinds=("image", "spectra", "dictionary"), mem_limit=None):
     return found
 
 
-def _from_artefact(path, kinds, mem_limit):
+def _from_artefact(path, kinds):
     from plenocli.files.artefacts.container import read_artefact
 
-    artefact = read_artefact(path, kinds, mem_limit=mem_limit)
+    artefact = read_artefact(path, kinds)
     attrs = artefact.attrs.get(artefact.kind, {})
     if artefact.kind == "dictionary":
         return Result(path.stem, "dictionary", artefact.data["dictionary/atoms"], attrs=attrs)
@@ -92,12 +92,12 @@ def _from_artefact(path, kinds, mem_limit):
     )
 
 
-def _from_exr(path, mem_limit):
+def _from_exr(path):
     from plenocli.files.images.exr import read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
     if is_spectral(path):
-        spectral = read_spectral_exr(path, mem_limit=mem_limit)
+        spectral = read_spectral_exr(path)
         values = np.asarray(spectral.values, dtype=np.float64)
         return Result(
             path.stem,
@@ -108,7 +108,7 @@ def _from_exr(path, mem_limit):
             spectral.quantity,
             dict(spectral.attrs),
         )
-    channels, attrs = read_exr(path, mem_limit=mem_limit)
+    channels, attrs = read_exr(path)
     if "Y" not in channels and len(channels) != 1:
         raise InputError(
             f"has the channels {', '.join(channels)} and no wavelengths",
@@ -351,13 +351,13 @@ def block_of(result, truth, pif=None):
     return None
 
 
-def read_whites(paths, mem_limit=None):
+def read_whites(paths):
     """Spectra of white targets by method: dict method -> (values (frame, band, row, column),
     sigma of the first or None).
     """
     groups = {}
     for path in paths:
-        frame = read_result(path, ("spectra",), mem_limit)
+        frame = read_result(path, ("spectra",))
         group = groups.setdefault(frame.method, [])
         if group and frame.values.shape != group[0].values.shape:
             raise UsageError(

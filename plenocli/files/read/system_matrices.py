@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
 
 
-def read_lenslet_matrix(
-    path: Path, mem_limit: int | None = None, *, by_band: bool = False
-) -> LensletMatrix:
+def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
     """The matrix of a pif artefact, its wavelengths averaged, as equal shares of the light.
 
     path: of the pif.
@@ -29,7 +27,7 @@ def read_lenslet_matrix(
     """
     from plenocli.files.artefacts.shards import read_pif
 
-    artefact = read_pif(path, mem_limit)
+    artefact = read_pif(path)
     if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError(
             (

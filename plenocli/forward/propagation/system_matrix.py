@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from plenocli.base.budget import one_thread, spread
 from plenocli.base.errors import NumericsError
-from plenocli.base.threads import one_thread, spread
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.propagation.bands import combined

@@ -5,7 +5,7 @@ bytes a number that are held at the same time, measured where a library makes th
 
 import numpy as np
 
-from plenocli.base.memory import require_memory
+from plenocli.base.budget import budget
 
 NUMBER = 8
 
@@ -57,13 +57,11 @@ def reconstruction(system, lenslets, method, directions, *, joint=False, atoms=0
 
 def require_reconstruction(camera, data, where):
     """NumericsError, before anything is worked out, where the Superpixels `data` do not fit the
-    limit of `camera` (stages.estimators.Estimators).
+    memory of this process.
     """
     from plenocli.inverse.picture.solvers.joint_lmmse import MOST
 
     settings, system = camera.settings, camera.system
-    if settings.mem_limit is None:
-        return
     sizes = dict(
         joint=camera.overlap == 3
         and (camera.coupled or settings.method == "lmmse")
@@ -73,7 +71,7 @@ def require_reconstruction(camera, data, where):
     lenslets, most = data.y.shape[0] * data.y.shape[1], min(MOST, *system.own.shape)
     needed = reconstruction(system, lenslets, settings.method, most, **sizes)
     # what stands above the noise decides, and may be much less
-    if needed > settings.mem_limit > 3 * NUMBER * system.own.size:
+    if needed > budget().memory > 3 * NUMBER * system.own.size:
         needed = reconstruction(
             system,
             lenslets,
@@ -81,9 +79,8 @@ def require_reconstruction(camera, data, where):
             min(most, _directions(system.own, settings.noise_sigma or data.sigma or 0.0)),
             **sizes,
         )
-    require_memory(
+    budget().require(
         needed,
-        settings.mem_limit,
         "the reconstruction",
         where,
         "take fewer lenslets or points, or another --method",
@@ -121,14 +118,13 @@ def learning(shape, offsets, atoms, batch, synthesis):
 
 def require_learning(system, chosen, settings, where):
     """NumericsError, before the decomposition, where learn-dict with solvers.dictionary.Settings
-    `chosen` does not fit settings.mem_limit.
+    `chosen` does not fit the memory of this process.
     """
     needed = learning(
         system.own.shape, len(system.blocks), chosen.atoms, chosen.batch, settings.synthesis
     )
-    require_memory(
+    budget().require(
         needed,
-        settings.mem_limit,
         "learning",
         where,
         "take a smaller --batch, fewer --atoms or points",

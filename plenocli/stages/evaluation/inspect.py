@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 
-def run_inspect(path, *, mem_limit=None):
+def run_inspect(path):
     """Read and verify the file at `path` and describe it as a JSON-able dict with "file", "bytes",
     "type" and what it holds.
 
@@ -19,19 +19,19 @@ def run_inspect(path, *, mem_limit=None):
     report = {"file": path.name, "bytes": require_file(path)}
     kind = file_type(path)
     if is_hdf5(path):
-        return report | _artefact(path, mem_limit)
+        return report | _artefact(path)
     if kind == "exr":
-        return report | _exr(path, mem_limit)
+        return report | _exr(path)
     if kind in ("png", "jpeg") or (kind == "tiff" and path.suffix.lower() in (".tif", ".tiff")):
-        return report | _picture(path, kind, mem_limit)
-    return report | _raw(path, mem_limit)
+        return report | _picture(path, kind)
+    return report | _raw(path)
 
 
-def _artefact(path, mem_limit):
+def _artefact(path):
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.kinds import SCHEMAS
 
-    artefact = read_artefact(path, mem_limit=mem_limit)
+    artefact = read_artefact(path)
     schema, origin = SCHEMAS[artefact.kind], artefact.provenance
     datasets = {}
     for name, values in artefact.data.items():
@@ -66,11 +66,11 @@ def _artefact(path, mem_limit):
     }
 
 
-def _exr(path, mem_limit):
+def _exr(path):
     from plenocli.files.images.exr import DIGEST, read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
-    channels, attrs = read_exr(path, mem_limit=mem_limit)
+    channels, attrs = read_exr(path)
     rows, columns = next(iter(channels.values())).shape
     report = {
         "type": "exr",
@@ -81,7 +81,7 @@ def _exr(path, mem_limit):
         "attributes": attrs,
     }
     if is_spectral(path):
-        spectral = read_spectral_exr(path, mem_limit=mem_limit)
+        spectral = read_spectral_exr(path)
         report |= {
             "type": "spectral exr",
             "quantity": spectral.quantity,
@@ -91,10 +91,10 @@ def _exr(path, mem_limit):
     return report
 
 
-def _picture(path, kind, mem_limit):
+def _picture(path, kind):
     from plenocli.files.images.pictures import read_stored
 
-    values, names, bits = read_stored(path, kind, mem_limit)
+    values, names, bits = read_stored(path, kind)
     return {
         "type": kind,
         "rows": values.shape[0],
@@ -106,10 +106,10 @@ def _picture(path, kind, mem_limit):
     }
 
 
-def _raw(path, mem_limit):
+def _raw(path):
     from plenocli.files.images.mosaic import read_mosaic
 
-    mosaic = read_mosaic(path, mem_limit=mem_limit)
+    mosaic = read_mosaic(path)
     values, meta = mosaic.values, dict(mosaic.meta)
     camera = " ".join(str(meta.pop(name)) for name in ("make", "model") if meta.get(name)) or None
     positions = {

@@ -102,7 +102,6 @@ def run_score(
     light="D65",
     camera=None,
     overwrite=False,
-    mem_limit=None,
     command="",
 ):
     """Score every result, write `output` (JSON) and perhaps `report` (HTML); returns the JSON
@@ -129,10 +128,8 @@ def run_score(
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
-    system = read_pif(pif, mem_limit) if pif else None
-    context = _Context(
-        truth, whites, patches, system, capture, block, sampling, light, camera, mem_limit
-    )
+    system = read_pif(pif) if pif else None
+    context = _Context(truth, whites, patches, system, capture, block, sampling, light, camera)
     scored, pictures, errors = [], [], []
     for path in results:
         try:
@@ -205,9 +202,7 @@ def _failed(path, error, errors):
 class _Context:
     """Everything a result is scored with; files are read once."""
 
-    def __init__(
-        self, truth, whites, patches, system, capture, block, sampling, light, camera, mem_limit
-    ):
+    def __init__(self, truth, whites, patches, system, capture, block, sampling, light, camera):
         from plenocli.files.read.cameras import read_camera
         from plenocli.forward.scene.tables import illuminant
 
@@ -215,10 +210,10 @@ class _Context:
         if patches is None and str(truth) == CHART:
             patches = CHART
         self.truth, self.patches, self.system, self.block = truth, patches, system, block
-        self.sampling, self.light, self.mem_limit = sampling, light, mem_limit
-        self.whites = read_whites(whites, mem_limit)
+        self.sampling, self.light = sampling, light
+        self.whites = read_whites(whites)
         self.camera = read_camera(camera) if camera else None
-        self.sensor_snr = _sensor_snr(capture, mem_limit) if capture else None
+        self.sensor_snr = _sensor_snr(capture) if capture else None
 
 
 POINT_BYTES = 128
@@ -227,17 +222,15 @@ POINT_BYTES = 128
 
 def _score_one(path, context):
     """(JSON-able entry, what the report draws) of one result."""
-    from plenocli.base.memory import require_memory
+    from plenocli.base.budget import budget
 
-    result = read_result(
-        path, ("image", "spectra", "dictionary", "calibration", "lightfield"), context.mem_limit
-    )
+    result = read_result(path, ("image", "spectra", "dictionary", "calibration", "lightfield"))
     entry = {"name": Path(path).name, "kind": result.kind}
     if result.kind == "calibration":
-        wavelengths, entry["metrics"] = score_calibration(path, context.truth, context.mem_limit)
+        wavelengths, entry["metrics"] = score_calibration(path, context.truth)
         return entry | {"wavelengths_nm": [round(float(w) * 1e9, 6) for w in wavelengths]}, None
     if result.kind == "lightfield":
-        entry["metrics"] = score_lightfield(path, context.truth, context.mem_limit)
+        entry["metrics"] = score_lightfield(path, context.truth)
         return entry, None
     if result.method:
         entry["method"] = result.method
@@ -258,9 +251,8 @@ def _score_one(path, context):
         raise InputError("holds no finite value", context.truth, "name a truth that has values")
     picture = {"result": result, "truth": truth}
     if result.wavelengths is None:
-        require_memory(
+        budget().require(
             POINT_BYTES * truth.size,
-            context.mem_limit,
             "the comparison",
             path,
             "score a part of it",
@@ -316,12 +308,12 @@ def _score_image(path, result, truth, block):
     return score_picture(result.values, truth, block)
 
 
-def _sensor_snr(path, mem_limit):
+def _sensor_snr(path):
     """Sensor-model SNR of a capture from its mosaic and the noise it says it got."""
     from plenocli.evaluation.metrics.snr import snr_sensor
     from plenocli.files.artefacts.container import read_artefact
 
-    capture = read_artefact(path, "capture", mem_limit=mem_limit)
+    capture = read_artefact(path, "capture")
     attrs = capture.attrs.get("capture", {})
     sigma = float(attrs.get("noise_sigma") or 0)
     if not sigma > 0:

@@ -23,7 +23,6 @@ def run_show(
     points=(),
     lenslets=(),
     overwrite=False,
-    mem_limit=None,
 ):
     """Draw `files` into one PNG and return {"output", "files", "kinds", "captions"}.
 
@@ -38,8 +37,8 @@ def run_show(
 
     output = Path(output) if output is not None else Path(f"{Path(files[0]).stem}.png")
     check_output(output, overwrite=overwrite, suffixes=(".png",))
-    centres = None if calibration is None else _centres(calibration, mem_limit)
-    found = [opened(file, mem_limit) for file in files]
+    centres = None if calibration is None else _centres(calibration)
+    found = [opened(file) for file in files]
     kinds = [kind for kind, _ in found]
     if truth is not None:
         if set(kinds) != {"image"}:
@@ -48,14 +47,13 @@ def run_show(
                 "--truth",
                 "give image files, or leave the option out",
             )
-        figures = _compared(files, truth, mem_limit)
+        figures = _compared(files, truth)
     else:
         choice = _Choice(
             centres,
             points or None,
             lenslets or None,
             next((a for kind, a in found if kind == "pif"), None),
-            mem_limit,
         )
         figures = [
             figure
@@ -81,10 +79,9 @@ class _Choice:
     points: tuple | None
     lenslets: tuple | None
     pif: object
-    mem_limit: int | None
 
 
-def opened(file, mem_limit=None):
+def opened(file):
     """(kind, verified artefact or None) of a file: pif, capture, calibration, dictionary,
     spectra or image; InputError where it is none.
     """
@@ -99,23 +96,21 @@ def opened(file, mem_limit=None):
     path = Path(file)
     require_file(path)
     if is_hdf5(path):
-        artefact = read_artefact(path, mem_limit=mem_limit)
+        artefact = read_artefact(path)
         return (
-            ("pif", read_pif(path, mem_limit))
-            if artefact.kind == "pif-index"
-            else (artefact.kind, artefact)
+            ("pif", read_pif(path)) if artefact.kind == "pif-index" else (artefact.kind, artefact)
         )
     if file_type(path) == "exr":
-        return "spectra" if is_spectral(path) else "capture" if CAPTURE in read_exr(
-            path, mem_limit=mem_limit
-        )[1] else "image", None
+        return "spectra" if is_spectral(path) else "capture" if CAPTURE in read_exr(path)[
+            1
+        ] else "image", None
     return "capture", None
 
 
-def _centres(path, mem_limit):
+def _centres(path):
     from plenocli.files.artefacts.container import read_artefact
 
-    return read_artefact(path, "calibration", mem_limit=mem_limit).data["grid/centre"]
+    return read_artefact(path, "calibration").data["grid/centre"]
 
 
 def _pif(path, artefact, choice):
@@ -147,7 +142,7 @@ def _capture(path, artefact, choice):
         if choice.centres is not None or artefact is None
         else artefact.data.get("capture/lenslet_centre")
     )
-    return capture_figures(read_mosaic(path, mem_limit=choice.mem_limit), path.name, centres)
+    return capture_figures(read_mosaic(path), path.name, centres)
 
 
 def _calibration(path, artefact, choice):
@@ -161,16 +156,14 @@ def _dictionary(path, artefact, choice):
     from plenocli.report.figures import dictionary_figures, learning, own_matrix
 
     system = None if choice.pif is None else own_matrix(choice.pif)
-    return dictionary_figures(
-        read_result(path, mem_limit=choice.mem_limit), path.name, learning(artefact), system
-    )
+    return dictionary_figures(read_result(path), path.name, learning(artefact), system)
 
 
 def _spectra(path, artefact, choice):
     from plenocli.files.read.results import read_result
     from plenocli.report.figures import spectra_figures
 
-    result = read_result(path, mem_limit=choice.mem_limit)
+    result = read_result(path)
     _inside(choice.lenslets, result.grid, "--lenslet", "lenslets")
     return spectra_figures(result, path.name, choice.lenslets)
 
@@ -179,7 +172,7 @@ def _image(path, artefact, choice):
     from plenocli.files.read.results import read_result
     from plenocli.report.figures import image_figures, spectra_figures
 
-    result = read_result(path, mem_limit=choice.mem_limit)
+    result = read_result(path)
     if result.wavelengths is not None:
         return spectra_figures(result, path.name)[:1]
     return image_figures(
@@ -211,12 +204,12 @@ _FIGURES = {
 }
 
 
-def _compared(files, truth, mem_limit):
+def _compared(files, truth):
     from plenocli.evaluation.metrics.quality import psnr
     from plenocli.files.read.results import block_of, read_result, read_truth
     from plenocli.report.pictures import close_ups, reconstructions
 
-    results = [read_result(file, ("image",), mem_limit) for file in files]
+    results = [read_result(file, ("image",)) for file in files]
     several = [file for file, result in zip(files, results) if result.wavelengths is not None]
     if several:
         raise UsageError(

@@ -16,6 +16,12 @@ the brightest pixel.
 """
 
 
+_MOST = 8 << 30
+"""Bytes of memory above which parts of a matrix grow no further: the order of sums, and with it
+the last digits, are the same on all larger machines.
+"""
+
+
 @dataclass(frozen=True)
 class Settings:
     """What the command line says beyond the files; lengths in m, exposure in s (None: the
@@ -35,7 +41,6 @@ class Settings:
     noise: str = "sensor"
     exposure: float | None = None
     seed: int = 0
-    mem_limit: int = 8 << 30
 
 
 def run_capture_sim(
@@ -141,7 +146,7 @@ def _check_memory(camera, settings, where):
     """Refuse, before any work, a sensor or an object larger than the memory granted: light,
     white and mosaic, float64, by colour.
     """
-    from plenocli.base.memory import require_memory
+    from plenocli.base.budget import budget
 
     lenslets, pixels, points = (
         int(np.prod(n, dtype=object))
@@ -153,9 +158,8 @@ def _check_memory(camera, settings, where):
     )
     colours = 1 if camera.sensor.cfa == "mono" else 3
     needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * settings.refine**2)
-    require_memory(
+    budget().require(
         needed,
-        settings.mem_limit,
         "the capture",
         where,
         "take fewer lenslets, pixels or points, a smaller --refine",
@@ -231,7 +235,7 @@ def _read_pif(path, camera, settings, wavelengths, camera_path):
     from plenocli.files.config.camera_file import parse_camera
     from plenocli.files.read.cameras import require_same_files
 
-    artefact = read_pif(path, settings.mem_limit)
+    artefact = read_pif(path)
     if settings.refine != 1:
         raise UsageError(
             "--refine computes its own finer system matrix and cannot take --pif",
@@ -281,6 +285,7 @@ def _carry(camera, source, scene, settings, matrix):
     """((letters, light on every superpixel by letter), the white superpixel by letter, the
     object as sampled).
     """
+    from plenocli.base.budget import budget
     from plenocli.forward.sensor.cfa import sensitivity
     from plenocli.forward.sensor.irradiance import superpixel_light
 
@@ -299,7 +304,7 @@ def _carry(camera, source, scene, settings, matrix):
         system = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
         if not scene.uniform and (picture is None or scene.spectral):
             picture = scene.at(wavelength, *grid)
-        size = max(8, settings.mem_limit // 16 // (8 * len(system.offsets) * pixels))
+        size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
         carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
         if scene.uniform:
             carried = np.broadcast_to(scene.level * white, (*count, pixels))

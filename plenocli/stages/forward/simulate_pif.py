@@ -26,7 +26,6 @@ class Settings:
     scene: str | None = None
     lenslet: tuple | None = None
     dtype: str = "auto"
-    mem_limit: int = 8 << 30
 
 
 def run_simulate_pif(
@@ -39,7 +38,7 @@ def run_simulate_pif(
     Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
-    from plenocli.base.threads import one_thread
+    from plenocli.base.budget import one_thread
     from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
@@ -74,9 +73,9 @@ def run_simulate_pif(
         lenslet=settings.lenslet,
     )
     if explain:
-        return _explained(plan, pif_pieces.cost(plan, settings.mem_limit)[1])
-    chosen = pif_pieces.layout(plan, settings.mem_limit, camera_path)
-    for line in (*plan.warnings, expectation(plan, pif_pieces.cost(plan, settings.mem_limit)[1])):
+        return _explained(plan, pif_pieces.cost(plan)[1])
+    chosen = pif_pieces.layout(plan, camera_path)
+    for line in (*plan.warnings, expectation(plan, pif_pieces.cost(plan)[1])):
         if line:
             note(line)
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None

@@ -43,7 +43,6 @@ class Settings:
     synthesis: bool = False
     seed: int = 0
     workers: int | None = None
-    mem_limit: int | None = None
 
 
 def run_learn_dict(
@@ -87,7 +86,7 @@ def run_learn_dict(
             suffixes=(".h5",),
         )
         resume = checkpoint if kept else resume
-    system = read_lenslet_matrix(pif, settings.mem_limit)
+    system = read_lenslet_matrix(pif)
     pictures = read_training(images, system.object_shape)
     training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))
     earlier = read_unfinished(resume, system) if resume else None

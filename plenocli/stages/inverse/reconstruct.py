@@ -44,7 +44,6 @@ class Settings:
     clip: bool = False
     seed: int = 0
     workers: int = 1
-    mem_limit: int | None = None
 
 
 @dataclass(frozen=True)
@@ -150,9 +149,7 @@ def run_reconstruct(
 
     try:
         if pif:  # a broken one ends the run here, before any capture
-            _estimators(recipe) if split or not pooled else read_lenslet_matrix(
-                pif, settings.mem_limit, by_band=True
-            )
+            _estimators(recipe) if split or not pooled else read_lenslet_matrix(pif, by_band=True)
         with open_pool(workers, scheduler) as pool:
             if split and pooled:
                 _estimators(recipe).elsewhere = partial(_spread, recipe, pool)
@@ -169,13 +166,13 @@ def run_reconstruct(
 @lru_cache(maxsize=1)
 def _estimators(recipe):
     settings = recipe.settings
-    system = read_lenslet_matrix(recipe.pif, settings.mem_limit, by_band=True)
+    system = read_lenslet_matrix(recipe.pif, by_band=True)
 
     def read_pictures(scene):
         return read_training(settings.training, system.object_shape, not_scene=scene)
 
     def read_learnt():
-        return read_dictionary(settings.dictionary, system, settings.mem_limit)
+        return read_dictionary(settings.dictionary, system)
 
     return Estimators(
         system,
@@ -261,7 +258,7 @@ def reconstruct_capture(recipe, capture):
     else:
         estimators = _estimators(recipe)
         data, block = (
-            read_superpixels(capture, estimators.system, recipe.calibration, settings.mem_limit),
+            read_superpixels(capture, estimators.system, recipe.calibration),
             estimators.system.object_shape,
         )
         bands = estimators.system.bands

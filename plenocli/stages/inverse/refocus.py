@@ -24,7 +24,6 @@ def run_refocus(
     views=3,
     overwrite=False,
     seed=0,
-    mem_limit=None,
     command="",
 ):
     """Refocus one capture and write a light-field artefact; returns a summary dict.
@@ -46,7 +45,7 @@ def run_refocus(
     )
     geometry = _geometry(camera) if camera is not None else None
     slopes = _slopes(slopes, distances, planes, geometry)
-    samples, shape = _samples(capture, calibration, mem_limit, len(slopes))
+    samples, shape = _samples(capture, calibration, len(slopes))
     pictures = np.stack([lightfield.refocus(samples, slope, shape)[0] for slope in slopes])
     sharp = [lightfield.sharpness(p) for p in pictures]
     data = {
@@ -124,20 +123,19 @@ PIXEL_BYTES, PLANE_BYTES = 126, 1
 """Memory for each pixel of the capture, and for each of its pixels and each plane (measured)."""
 
 
-def _samples(capture, calibration, mem_limit, planes=1):
+def _samples(capture, calibration, planes=1):
     """(Samples, (rows, columns) of the picture in lenslet pitches) of a capture, along a
     calibration's grid or the tiles that its file names.
     """
-    from plenocli.base.memory import require_memory
+    from plenocli.base.budget import budget
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.images.mosaic import read_mosaic
     from plenocli.forward.sensor.frames import tiled
     from plenocli.inverse.lightfield.refocus import collect
 
-    mosaic = read_mosaic(capture, mem_limit=mem_limit)
-    require_memory(
+    mosaic = read_mosaic(capture)
+    budget().require(
         mosaic.values.size * (PIXEL_BYTES + PLANE_BYTES * planes),
-        mem_limit,
         "refocusing",
         capture,
         "cut the capture",
@@ -149,7 +147,7 @@ def _samples(capture, calibration, mem_limit, planes=1):
             "demultiplex it first",
         )
     if calibration is not None:
-        found = read_artefact(calibration, "calibration", mem_limit=mem_limit)
+        found = read_artefact(calibration, "calibration")
         if "white/flat" not in found.data or found.data["white/flat"].shape != mosaic.values.shape:
             raise InputError(
                 "holds no white image of this sensor",

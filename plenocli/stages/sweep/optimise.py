@@ -26,7 +26,6 @@ def run_optimise(
     seed=0,
     workers=1,
     scheduler=None,
-    mem_limit=None,
     plot=None,
     overwrite=False,
     command="",
@@ -57,7 +56,6 @@ def run_optimise(
                 found,
                 pool,
                 list(space.files),
-                mem_limit,
                 label=f"points {start + 1} to {start + len(asked)} of {trials}",
             )
             for (trial, _), row in zip(asked, found):

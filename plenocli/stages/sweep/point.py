@@ -170,7 +170,7 @@ def run_point(task):
     "notes", "seconds"}.
 
     task["matrix"]: where the system matrix lies already, with task["info"] about it, or None;
-    "files": what else is read; "scratch": folder for files, or None; "mem_limit": bytes. A camera
+    "files": what else is read; "scratch": folder for files, or None. A camera
     or an option that a stage refuses is a result like any other; what keeps files from being
     written is raised (OutputError).
     """
@@ -182,12 +182,8 @@ def run_point(task):
                 info, pif = _simulate_pif(task, folder), folder / "pif.h5"
             else:
                 info, pif = task["info"], Path(task["matrix"])
-            settings = {
-                stage: values | _memory(task) if stage in ("capture-sim", "reconstruct") else values
-                for stage, values in task["settings"].items()
-            }
             metrics = {"spatial": _spatial, "spectral": _spectral}[task["chain"]](
-                settings, folder, pif
+                task["settings"], folder, pif
             )
             found = {
                 "status": 0,
@@ -256,13 +252,9 @@ def _simulate_pif(task, folder):
     report = run_simulate_pif(
         folder / "camera.toml",
         folder / "pif.h5",
-        _settings(Settings, task["settings"]["simulate-pif"] | _memory(task)),
+        _settings(Settings, task["settings"]["simulate-pif"]),
     )
     return {"matrix_seconds": report["nominal_seconds"], "matrix_bytes": report["bytes"]}
-
-
-def _memory(task):
-    return {"mem_limit": task["mem_limit"]} if task.get("mem_limit") else {}
 
 
 def _settings(kind, values):

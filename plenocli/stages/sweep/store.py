@@ -8,6 +8,7 @@ from collections import deque
 from importlib.util import find_spec
 from pathlib import Path
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
@@ -73,14 +74,14 @@ class Store:
         )
         self.journal.close()
 
-    def evaluate(self, rows, pool, files=(), mem_limit=None, label="points"):
+    def evaluate(self, rows, pool, files=(), label="points"):
         """Give every row its result, from the journal or through `pool`; returns the number
         of points computed.
 
         Rows of one content key are computed once, a matrix that several need is computed
         once, before them.
         files: what tasks read;
-        mem_limit: as run_sweep; what was refused under another limit is tried again.
+        What was refused within another budget of memory is tried again.
         OutputError at the end where a worker was lost: all others are done then.
         """
         todo = {}
@@ -90,7 +91,8 @@ class Store:
                 row.task is not None
                 and row.key not in todo
                 and (
-                    known is None or (known["status"] == 5 and known.get("mem_limit") != mem_limit)
+                    known is None
+                    or (known["status"] == 5 and known.get("mem_limit") != budget().memory)
                 )
             ):
                 todo[row.key] = row
@@ -103,7 +105,7 @@ class Store:
                 self,
                 groups,
                 pool,
-                {"scratch": scratch, "files": list(files), "mem_limit": mem_limit},
+                {"scratch": scratch, "files": list(files)},
             ).run(progress)
         if lost:
             raise OutputError(
@@ -195,7 +197,7 @@ class _Work:
     def _done(self, key, row, result):
         if isinstance(result, PlenoError):
             result = refused(result)
-        self.store.journal.add(row.key, result | {"mem_limit": self.surroundings["mem_limit"]})
+        self.store.journal.add(row.key, result | {"mem_limit": budget().memory})
         self.left[key] -= 1
         if not self.left[key]:
             self._path(key).unlink(missing_ok=True)

@@ -16,7 +16,6 @@ def run_sweep(
     seed=0,
     workers=1,
     scheduler=None,
-    mem_limit=None,
     plot=None,
     overwrite=False,
     command="",
@@ -26,8 +25,7 @@ def run_sweep(
 
     Finished points lie in the folder OUT.parts and are never computed again, whatever ended the
     run. A point that a stage refuses is a row with the reason.
-    workers, scheduler: see stages.scheduler;
-    mem_limit: bytes that a stage may plan for, in each of them. Errors: as open_space;
+    workers, scheduler: see execution.pool. Errors: as open_space;
     UsageError for the front, OutputError where nothing can be written or a worker was lost.
     """
     from plenocli.files.config.sweep_file import points
@@ -42,5 +40,5 @@ def run_sweep(
         open_store(output, plot, overwrite, [path, space.camera_path]) as store,
         open_pool(workers, scheduler) as pool,
     ):
-        computed = store.evaluate(rows, pool, list(space.files), mem_limit)
+        computed = store.evaluate(rows, pool, list(space.files))
         return finish(space, rows, objectives, store, computed, command)

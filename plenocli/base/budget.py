@@ -1,0 +1,148 @@
+"""How much memory, and how many threads, this process may use: one object, asked by whoever is
+about to take some; and work on several threads.
+
+The command line sets it from --mem-limit; tasks in other processes get that of the process that
+hands them out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.memory import size_text
+
+EXPANSION = 1 << 15
+"""Times its own size that a whole file can declare: deflate packs 1032 bytes into one, and a pixel
+of one bit is read as three bytes of colour.
+"""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What this process may use.
+
+    memory: bytes for data, beside what interpreter and libraries take.
+    threads: that work at the same time.
+    """
+
+    memory: int
+    threads: int = 1
+
+    def require(
+        self,
+        needed: float,
+        what: str,
+        where: object = None,
+        fewer: str = "take less of it",
+    ) -> None:
+        """NumericsError, before a long computation, where it needs more memory than there is.
+
+        needed: bytes.
+        what: the computation in words, the subject of "needs".
+        where: the file or option that the message names.
+        fewer: what to do beside raising the limit.
+        """
+        if needed > self.memory:
+            raise NumericsError(
+                f"{what} needs about {size_text(needed)}, more than the limit of "
+                f"{size_text(self.memory)}",
+                where,
+                f"{fewer}, or raise --mem-limit to {size_text(1.05 * needed)}",
+            )
+
+    def require_reading(self, path: str | os.PathLike, needed: float) -> None:
+        """NumericsError where reading the file at `path` takes more than there is.
+
+        needed: bytes.
+        """
+        if needed > self.memory:
+            raise NumericsError(
+                f"needs about {size_text(needed)} to be read, more than the limit of "
+                f"{size_text(self.memory)}",
+                path,
+                f"raise --mem-limit to {size_text(1.05 * needed)}",
+            )
+
+    def require_declared(
+        self, path: str | os.PathLike, declared: int, needed: float, part: str = ""
+    ) -> None:
+        """Refuse a file before its values are read, where they do not fit.
+
+        declared: bytes of values that its header declares.
+        needed: bytes that reading them takes.
+        part: up to where in the file, for the message.
+
+        Raises NumericsError where memory is all that is missing, InputError where the file is far
+        too small for what it declares.
+        """
+        if needed <= self.memory:
+            return
+        if declared > EXPANSION * Path(path).stat().st_size:
+            raise InputError(
+                f"declares {size_text(declared)} of data{part} in a file of "
+                f"{size_text(Path(path).stat().st_size)}, above the memory limit of "
+                f"{size_text(self.memory)}",
+                path,
+                "make or copy it again; it is damaged, or made to fill the memory",
+            )
+        self.require_reading(path, needed)
+
+
+def machine_budget() -> Budget:
+    """Half of the machine's memory, and one thread."""
+    return Budget(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2)
+
+
+_current: Budget | None = None
+
+
+def budget() -> Budget:
+    """The Budget of this process; machine_budget() until somebody sets another."""
+    return machine_budget() if _current is None else _current
+
+
+def set_budget(new: Budget) -> None:
+    """From now on `new` holds for this process, in all its threads."""
+    global _current
+    _current = new
+
+
+@contextlib.contextmanager
+def within(new: Budget | None = None) -> Iterator[None]:
+    """`new` holds until the block ends, and so does whatever is set meanwhile."""
+    global _current
+    before = _current
+    if new is not None:
+        set_budget(new)
+    try:
+        yield
+    finally:
+        _current = before
+
+
+def one_thread():
+    """A context in which products and decompositions of matrices stay on the thread that asks for
+    them: idle threads that wait for the next product cost many times its processor time.
+    """
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(1, "blas")
+
+
+def spread(parts, work, workers):
+    """work(*part) for all parts on `workers` threads."""
+    with one_thread():
+        if workers <= 1 or len(parts) < 2:
+            for part in parts:
+                work(*part)
+            return
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(workers) as pool:
+            for done in [pool.submit(work, *part) for part in parts]:
+                done.result()

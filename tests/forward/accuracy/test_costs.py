@@ -2,6 +2,8 @@
 spread function), and that the laws say what they said when their numbers still lay in the code.
 """
 
+import dataclasses
+import importlib
 import json
 from pathlib import Path
 
@@ -163,3 +165,44 @@ def test_a_cost_is_the_sum_of_its_features_and_the_highest_moment():
     assert costs.summed([{"a": 1.0, "b": 2.0}, {"b": 3.0}]) == {"a": 1.0, "b": 5.0}
     with pytest.raises(KeyError):
         law.cost(costs.Features({"unknown": 1}, {}, ({},)))
+
+
+@pytest.fixture
+def fit_costs(monkeypatch):
+    monkeypatch.syspath_prepend(SAMPLES.parent / "pipelines" / "benchmarks")
+    return importlib.import_module("fit_costs")
+
+
+def test_a_fit_finds_the_laws_that_made_its_cases(fit_costs, tmp_path):
+    laws = costs.read(costs.FITTED)
+    (tmp_path / "costs.toml").write_text(fit_costs.to_toml(laws))
+    assert costs.read(tmp_path / "costs.toml") == laws
+    cases = [
+        fit_costs.Case(fit_costs.EXACT, scope, camera, accuracy)
+        for scope in fit_costs.SCOPES
+        for camera in ("f/22", "20 um pixels", "10 um LWIR")
+        for accuracy in (1e-1, 1e-2, 1e-3)
+    ]
+    for name in ("fresnel, low rank", fit_costs.EXACT):
+        true, took = laws[name], {}
+        for case in (dataclasses.replace(case, model=name) for case in cases):
+            cost, terms, products = true.cost(fit_costs.features_of(case)), 0.0, 0.0
+            if name == fit_costs.EXACT:
+                terms, products = fit_costs.expected(case, true.counts)
+            took[case] = fit_costs.Measured(
+                seconds=cost.operations / 5e10 + cost.seconds,
+                bytes=cost.bytes,
+                rate=5e10,
+                terms=terms,
+                products=products,
+            )
+        other = dataclasses.replace(
+            true,
+            seconds={n: 3 * c for n, c in true.seconds.items()},
+            bytes={n: 0.5 * c for n, c in true.bytes.items()},
+            counts={n: 1.2 * c if n == "rank_joined" else c for n, c in true.counts.items()},
+        )
+        assert fit_costs.residuals(name, other, took).as_toml()["time_within_factor_2"] < 0.5
+        found = fit_costs.residuals(name, fit_costs.refitted(name, other, took, 1e-6), took)
+        for ratios in (found.times, found.memory, found.counts):
+            assert np.abs(ratios - 1).max(initial=0) < 0.02

@@ -8,15 +8,26 @@ intensities do. As a function of the wave number the intensity is band-limited b
 difference, so a rule of n nodes is either enough or useless; see docs/model.md.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.camera.quadrature import gauss
+from plenocli.forward.propagation.lenslet_fields import LensletFields, PixelEnergies
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.models import Model
+    from plenocli.forward.propagation.sampling import BandPlan, PifPlan
 
 MAX_NODES = 64
 """More wavelengths than this in one band are a spectrum, not a band."""
@@ -115,83 +126,68 @@ def node_count(view, band, accuracy, window=None):
     )
 
 
-class CombinedBands:
-    """Several makers of one plan as one: pixel energies are the weighted sums of theirs."""
+class BandFields(LensletFields):
+    """Fields at several wavelengths as one: pixel energies are the weighted sums of theirs."""
 
-    def __init__(self, makers, weights):
-        self.makers, self.weights = list(makers), [float(w) for w in weights]
-        self.symmetry = tuple(all(flags) for flags in zip(*(m.symmetry for m in self.makers)))
-        self.shared_axis = getattr(self.makers[0], "shared_axis", 1)
-        notes = [m.notes for m in self.makers]
-        self.notes = (
-            notes[0]
-            | {key: max(n[key] for n in notes) for key in ("separable_terms", "field_tail")}
-            | {"band_nodes": len(self.makers)}
+    def __init__(self, fields: Sequence[LensletFields], weights: Sequence[float]) -> None:
+        """`fields` of one camera and plan, and the share of the photons of each."""
+        self._fields, self._weights = list(fields), [float(w) for w in weights]
+        self.superpixels, self.shared_axis = fields[0].superpixels, fields[0].shared_axis
+        self.symmetry = tuple(all(flags) for flags in zip(*(f.symmetry for f in fields)))
+        self.by_superpixel = all(f.by_superpixel for f in fields)
+        notes = [f.notes for f in fields]
+        self.notes = replace(
+            notes[0],
+            separable_terms=max(n.separable_terms for n in notes),
+            field_tail=max(n.field_tail for n in notes),
+            band_nodes=len(notes),
         )
-        if all(hasattr(m, "superpixel") for m in self.makers):
-            self.superpixel = self._superpixel
 
-    def incident(self, rows, columns):
-        """As every maker: share of light entering the lenslets, (points,)."""
-        return sum(w * m.incident(rows, columns) for m, w in zip(self.makers, self.weights))
+    def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """As LensletFields.incident."""
+        return sum(w * f.incident(rows, columns) for f, w in zip(self._fields, self._weights))
 
-    def columns(self, rows, columns, out):
-        """As every maker: pixel energies into out (points, superpixel rows, superpixel columns,
-        pixel rows, pixel columns).
-        """
-        self._sum(out, lambda maker, part: maker.columns(rows, columns, part))
+    def columns(self, rows: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
+        """As LensletFields.columns."""
+        self._sum([f.columns for f in self._fields], rows, columns, out)
 
-    def _superpixel(self, sy, sx, rows, columns, out):
-        """As every maker that computes superpixels one by one: into out (points, pixel
-        rows, pixel columns).
-        """
-        self._sum(out, lambda maker, part: maker.superpixel(sy, sx, rows, columns, part))
+    def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
+        """As LensletFields.on_superpixel."""
+        return partial(self._sum, [f.on_superpixel(sy, sx) for f in self._fields])
 
-    def _sum(self, out, compute):
+    def _sum(
+        self,
+        energies: Sequence[PixelEnergies],
+        rows: np.ndarray,
+        columns: np.ndarray,
+        out: np.ndarray,
+    ) -> None:
         part = np.empty_like(out)
         total = np.zeros(out.shape)
-        for maker, weight in zip(self.makers, self.weights):
-            compute(maker, part)
+        for fill, weight in zip(energies, self._weights):
+            fill(rows, columns, part)
             total += weight * part
         out[...] = total
 
 
-def combined(maker, nodes):
-    """A maker class for a camera whose light is a band: `maker` at `nodes` wavelengths
+def band_fields(
+    model: Model, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan
+) -> BandFields:
+    """Fields of a camera whose light is a band: those of `model` at plan.band_nodes wavelengths
     of camera.light.band.
 
-    It is called as any maker, (camera, geometry, plan, band); the BandPlan must have been sized for
-    the shortest of the wavelengths, and serves all of them.
+    band: sized for the shortest of the wavelengths; it serves all of them.
     """
-
-    def make(camera, view, plan, band):
-        wavelengths, weights = spectral_nodes(camera.light.band, nodes)
-        views = [geometry(camera, w, view.pixel_shift) for w in wavelengths]
-        return CombinedBands(
-            [maker(camera, v, plan, replace(band, wavelength=v.wavelength)) for v in views], weights
-        )
-
-    return make
-
-
-def band_matrix(camera, plan, nodes, *, workers=1):
-    """A (superpixel, pixel, point) of camera.light.band, wavelength by wavelength into one array;
-    `plan` as for `combined`.
-
-    Holds the sum, one matrix and one wavelength's tables, where `combined` holds the tables of all.
-    """
-    from plenocli.forward.propagation.system_matrix import PifBuilder
-
-    total, work = None, None
-    for wavelength, weight in zip(*spectral_nodes(camera.light.band, nodes)):
-        here = replace(
-            plan, band_nodes=0, bands=(replace(plan.bands[0], wavelength=float(wavelength)),)
-        )
-        builder = PifBuilder(camera, float(wavelength), here, dtype=plan.dtype)
-        if total is None:
-            total = np.zeros((*builder.shape, builder.points), plan.dtype)
-            work = np.empty_like(total)
-        builder.fill(work, workers=workers)
-        work *= weight
-        total += work
-    return total
+    wavelengths, weights = spectral_nodes(camera.light.band, plan.band_nodes)
+    return BandFields(
+        [
+            model.fields(
+                camera,
+                geometry_of(camera, w, geometry.pixel_shift),
+                plan,
+                replace(band, wavelength=w),
+            )
+            for w in wavelengths
+        ],
+        weights,
+    )

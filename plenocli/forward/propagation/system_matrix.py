@@ -6,7 +6,11 @@ Berkner 2013). Columns are shares of the light through the main-lens aperture; n
 normalised or thresholded.
 """
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,49 +18,137 @@ from plenocli.base.budget import one_thread, spread
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.lens import at_wavelength
-from plenocli.forward.propagation.bands import combined
-from plenocli.forward.propagation.exact.lenslets import ExactSquareLenslets
-from plenocli.forward.propagation.fresnel.shaped import ShapedLenslets
-from plenocli.forward.propagation.fresnel.square import SquareLenslets
-from plenocli.forward.propagation.rays import RayLenslets
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.propagation.bands import band_fields
+from plenocli.forward.propagation.models import model_named
+from plenocli.forward.propagation.symmetry import (
+    Turn,
+    fill_below_diagonal,
+    superpixel_orbits,
+    turned_planes,
+)
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.lenslet_fields import FieldNotes
+    from plenocli.forward.propagation.sampling import PifPlan
 
 BLOCK_BYTES = 1 << 28
 """Size of a block of columns while a matrix is filled."""
+Progress = Callable[[int, int], None]
+"""Called with the number of columns that are done and of all."""
 
 
-@dataclass(frozen=True)
-class Pif:
+@dataclass(frozen=True, kw_only=True)
+class LensletWindow:
+    """Where the pixels of an off-axis lenslet's own superpixel lie on the sensor.
+
+    lenslet: (row, column) on the array;
+    first_pixel: (row, column) of the sensor;
+    pixel_shift: (rows, columns) in pixels, from the chief ray to the middle of the window.
+    """
+
+    lenslet: tuple[int, int]
+    first_pixel: tuple[int, int]
+    pixel_shift: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatrixNotes:
+    """How a system matrix was made, beside its AccuracyRecord.
+
+    model: "ray", "fresnel" or "exact";
+    coherent_ring: rings of neighbours whose fields add;
+    superpixels: (rows, columns) kept;
+    precision: "single" or "double", of the fields;
+    nodes: per axis across a "lenslet", a "pixel" and the spread function ("psf"), by band;
+    symmetry: (flip rows, flip columns, transpose) that map columns onto columns;
+    separable_terms: of the factor tables;
+    field_tail: largest root energy of what was cut from the spread function;
+    kappa, eps: 1/m, curvature left on a lenslet and defocus of the main lens;
+    superpixel_pitch: m;
+    quartic_phase_rad: phase that the paraxial model drops at a lenslet's edge;
+    diffraction_cells: of a lenslet, per axis;
+    energy_min, energy_max: of all columns;
+    window: of an off-axis lenslet.
+    """
+
+    model: str
+    coherent_ring: int
+    superpixels: tuple[int, int]
+    accuracy: float
+    estimated_accuracy: float
+    precision: str
+    nodes: Mapping[str, list[int]]
+    error_by_source: Mapping[str, float]
+    left_out: tuple[str, ...]
+    symmetry: tuple[bool, ...]
+    separable_terms: int
+    field_tail: float
+    kappa: float
+    eps: float
+    superpixel_pitch: float
+    quartic_phase_rad: float
+    diffraction_cells: float
+    energy_min: float
+    energy_max: float
+    reasons: tuple[str, ...]
+    warnings: tuple[str, ...]
+    window: LensletWindow | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The notes as artefacts hold them: what is known of the window stands among the rest."""
+        notes = asdict(self)
+        window = notes.pop("window")
+        return notes | (window or {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SystemMatrix:
     """A system matrix.
 
-    A: (band, lenslet, pixel, point), share of the light through the main-lens aperture (filters not
-        counted) from a point that lands in a pixel;
-    wavelength: (band,) m;
-    lenslet_offset: (lenslet, 2) superpixel row and column relative to the object's own, axial
-        numbers on a hexagonal lattice;
+    A: (band, superpixel, pixel, point), share of the light through the main-lens aperture (filters
+        not counted) from a point that lands in a pixel; None where it was written in pieces;
+    wavelengths: (band,) m;
+    lenslet_offset: (superpixel, 2) row and column relative to the object's own, axial numbers on a
+        hexagonal lattice;
     pixel_shape, object_shape: rows, columns;
     column_energy: (band, point);
+    accuracy: how accurate it is, and why;
     notes: how it was made.
     """
 
-    A: np.ndarray
-    wavelength: np.ndarray
+    A: np.ndarray | None
+    wavelengths: np.ndarray
     lenslet_offset: np.ndarray
-    pixel_shape: tuple
-    object_shape: tuple
+    pixel_shape: tuple[int, int]
+    object_shape: tuple[int, int]
     column_energy: np.ndarray
-    notes: dict = field(default_factory=dict)
+    accuracy: AccuracyRecord
+    notes: MatrixNotes
 
 
 class PifBuilder:
     """Columns of A at one wavelength on demand; the set-up is shared by all blocks.
 
-    offsets: (superpixels, 2) rows and columns;
+    lenslets: the LensletFields that give the energies;
+    offsets: (superpixel, 2) rows and columns;
+    shape: (superpixels, pixels), points: how many;
     symmetry: (flip rows, flip columns, transpose) that map columns onto columns.
     """
 
-    def __init__(self, camera, wavelength, plan, *, dtype=np.float32):
-        """Prepare `camera` (plenocli.forward.camera.model.Camera) at `wavelength` (m), one of
-        those of the PifPlan `plan`.
+    def __init__(
+        self,
+        camera: Camera,
+        wavelength: float,
+        plan: PifPlan,
+        *,
+        dtype: np.typing.DTypeLike = np.float32,
+    ) -> None:
+        """Prepare the columns.
+
+        wavelength: m, one of the plan's;
+        dtype: of A.
         """
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = (
@@ -69,9 +161,13 @@ class PifBuilder:
             # a library can be told to stay on one thread only once it is loaded
             import scipy.linalg  # noqa: F401
         with one_thread():
-            self._lenslets = _maker(camera, plan)(camera, self.geometry, plan, band)
+            model = model_named(plan.rung)
+            if plan.band_nodes:
+                self.lenslets = band_fields(model, camera, self.geometry, plan, band)
+            else:
+                self.lenslets = model.fields(camera, self.geometry, plan, band)
         self._sampling = band.sampling
-        self.notes = self._lenslets.notes
+        self.notes: FieldNotes = self.lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
         self.points = self.object_shape[0] * self.object_shape[1]
         ry, rx = ((n - 1) // 2 for n in plan.superpixels)
@@ -84,25 +180,28 @@ class PifBuilder:
         )
         flips = [
             a and b
-            for a, b in zip(self._lenslets.symmetry, self.geometry.mirrors(plan.superpixels))
+            for a, b in zip(self.lenslets.symmetry, self.geometry.mirrors(plan.superpixels))
         ]
         self.symmetry = (flips[0], flips[1], flips[2] and turn)
 
-    def columns(self, points):
-        """A for object points `points` (flat indices or a slice): (superpixel, pixel, len(points)),
-        a view that may not be contiguous.
+    def columns(self, points: np.ndarray | slice) -> np.ndarray:
+        """A for some object points.
 
-        NumericsError if a column holds more energy than entered the lenslets, the
-        sign of too few nodes.
+        points: flat indices or a slice.
+
+        Returns (superpixel, pixel, point), a view that may not be contiguous.
+        Raises NumericsError if a column holds more energy than entered the lenslets, the sign of
+        too few nodes.
         """
         points = np.arange(self.points)[points]
         return self._flat(self._images(points)).transpose(1, 2, 0)
 
-    def blocks(self, size=None):
-        """All columns in an order that uses the symmetry: yields (flat indices, A of these points
-        as from `columns`).
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """All columns in an order that uses the symmetry.
 
-        At most about `size` columns at a time (default: a quarter GiB).
+        size: about how many columns at a time at most (default: a quarter GiB of them).
+
+        Yields (flat indices of points, A of these as from `columns`). Raises as `columns`.
         """
         size = size or max(8, BLOCK_BYTES // (self.shape[0] * self.shape[1] * self.dtype.itemsize))
         seeds = self._seeds()
@@ -118,118 +217,75 @@ class PifBuilder:
                     yield points[fresh], self._flat(images[fresh]).transpose(1, 2, 0)
                 done = np.union1d(done, points)
 
-    def orbits(self):
+    def orbits(self) -> list[tuple[int, list[tuple[int, Turn]]]]:
         """As superpixel_orbits, of this matrix."""
         return superpixel_orbits(self.offsets, self.symmetry)
 
     @property
-    def _turns(self):
+    def turns(self) -> bool:
+        """Whether rows and columns of the points may be exchanged."""
         return self.symmetry[2] and self.symmetry[0] == self.symmetry[1]
 
-    def fill(self, A, *, workers=1, progress=None):
-        """Write the whole matrix of this wavelength into A (superpixel, pixel, point); the same
-        bytes for any number of threads.
+    def fill(
+        self,
+        A: np.ndarray,
+        *,
+        workers: int = 1,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        """Write the whole matrix of this wavelength; the same bytes for any number of threads.
 
+        A: (superpixel, pixel, point), filled;
+        workers: threads;
         progress: called with the number of columns x superpixels that are done.
-            Errors as `columns`.
+
+        Raises as `columns`.
         """
-        if not hasattr(self._lenslets, "superpixel"):
+        if not self.lenslets.by_superpixel:
             for points, block in self.blocks(max(8, self.points // 8)):
                 A[:, :, points] = block
                 if progress:
                     progress(len(points) * len(self.offsets))
             return
         for first, members in self.orbits():
-            self._slab(first, A[first], workers)
+            one = _OneSuperpixel(self, first, A[first])
+            spread(one.parts, one.compute, workers)
+            one.complete()
             for index, how in members:
                 if index != first:
-                    np.copyto(self._planes(A[index]), _mapped(self._planes(A[first]), how))
+                    np.copyto(self.planes(A[index]), turned_planes(self.planes(A[first]), how))
                 if progress:
                     progress(self.points)
 
-    def pieces(self, *, workers=1):
-        """The matrix superpixel by superpixel, as (superpixel, A of it (pixel, point)), in the
-        order of `orbits`.
+    def pieces(self, *, workers: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+        """The matrix superpixel by superpixel, in the order of `orbits`.
 
-        The array is a work array, overwritten by the next one. Makers that compute all superpixels
-        of a point at once hold the whole matrix meanwhile.
+        workers: threads.
+
+        Yields (superpixel, A of it (pixel, point)), a work array that the next one overwrites.
+        Models that compute all superpixels of a point at once hold the whole matrix meanwhile.
+        Raises as `columns`.
         """
-        if not hasattr(self._lenslets, "superpixel"):
+        if not self.lenslets.by_superpixel:
             whole = np.empty((*self.shape, self.points), self.dtype)
             self.fill(whole)
             yield from enumerate(whole)
             return
         slab, other = np.empty((2, self.shape[1], self.points), self.dtype)
         for first, members in self.orbits():
-            self._slab(first, slab, workers)
+            one = _OneSuperpixel(self, first, slab)
+            spread(one.parts, one.compute, workers)
+            one.complete()
             for index, how in members:
                 if how == (False, False, False):
                     yield index, slab
                 else:
-                    np.copyto(self._planes(other), _mapped(self._planes(slab), how))
+                    np.copyto(self.planes(other), turned_planes(self.planes(slab), how))
                     yield index, other
 
-    def _planes(self, slab):
+    def planes(self, slab: np.ndarray) -> np.ndarray:
+        """A of one superpixel (pixel, point) by rows and columns of both: a view."""
         return slab.reshape(*self.pixel_shape, *self.object_shape)
-
-    def _slab(self, index, out, workers):
-        """A of one superpixel into out (pixel, point); points that the symmetry of this
-        superpixel joins are computed once.
-        """
-        (oy, ox), (r, c) = self.object_shape, self.offsets[index].tolist()
-        sy, sx = (int(n) for n in self.offsets[index] - self.offsets[0])
-        mirror_y, mirror_x = self.symmetry[0] and r == 0, self.symmetry[1] and c == 0
-        turn = self._turns and r == c
-        rows, columns = (oy + 1) // 2 if mirror_y else oy, (ox + 1) // 2 if mirror_x else ox
-        planes = self._planes(out)
-        share = np.empty((oy, ox))
-        entered = self._lenslets.incident(*(a.ravel() for a in np.indices((oy, ox)))).reshape(
-            oy, ox
-        )
-
-        def work(start, stop):
-            """Point columns start to stop, all the rows that no symmetry gives,
-            into planes and share.
-            """
-            count = stop if turn else rows
-            j, i = (
-                a.ravel()
-                for a in np.meshgrid(np.arange(start, stop), np.arange(count), indexing="ij")
-            )
-            images = np.empty((len(i), *self.pixel_shape), self.dtype)
-            if turn:
-                # a block of columns of different lengths: what is beyond their ends comes
-                # from the others later
-                within = i <= j
-                found = np.empty((int(within.sum()), *self.pixel_shape), self.dtype)
-                self._lenslets.superpixel(sy, sx, i[within], j[within], found)
-                images[within], images[~within] = found, 0
-            else:
-                self._lenslets.superpixel(sy, sx, i, j, images)
-            share[:count, start:stop] = (
-                images.reshape(stop - start, count, -1).sum(axis=2, dtype=float).T
-            )
-            planes[:, :, :count, start:stop] = images.reshape(
-                stop - start, count, *self.pixel_shape
-            ).transpose(2, 3, 1, 0)
-
-        # a cache line of points at a time; where columns differ in length, fewer,
-        # for threads to share
-        step = 8 if turn else 16
-        spread(
-            [(start, min(start + step, columns)) for start in range(0, columns, step)],
-            work,
-            workers,
-        )
-        if turn:
-            _complete(planes, share, rows)
-        if mirror_y:
-            planes[:, :, rows:, :columns] = planes[::-1, :, : oy - rows, :columns][:, :, ::-1]
-            share[rows:, :columns] = share[: oy - rows, :columns][::-1]
-        if mirror_x:
-            planes[:, :, :, columns:] = planes[:, ::-1, :, : ox - columns][:, :, :, ::-1]
-            share[:, columns:] = share[:, : ox - columns][:, ::-1]
-        self._within(share, entered, *np.indices((oy, ox)))
 
     def _seeds(self):
         """One flat index of each set of points that the symmetry maps onto each
@@ -244,8 +300,8 @@ class PifBuilder:
             keep &= j < (columns + 1) // 2
         if self.symmetry[2]:
             keep &= i <= j if self.symmetry[0] == self.symmetry[1] else keep
-        # points whose work a maker shares stand together
-        flat, shared = (i * columns + j)[keep], getattr(self._lenslets, "shared_axis", 1)
+        # points that share work stand together
+        flat, shared = (i * columns + j)[keep], self.lenslets.shared_axis
         return flat[np.argsort(flat % columns if shared else flat // columns, kind="stable")]
 
     def _orbit(self, points, images):
@@ -275,7 +331,7 @@ class PifBuilder:
         ry, rx = self.plan.superpixels
         out = np.empty((len(points), ry, rx, *self.pixel_shape), self.dtype)
         rows, columns = points // self.object_shape[1], points % self.object_shape[1]
-        self._lenslets.columns(rows, columns, out)
+        self.lenslets.columns(rows, columns, out)
         self._guard(rows, columns, out)
         return out
 
@@ -283,16 +339,21 @@ class PifBuilder:
         return np.ascontiguousarray(images).reshape(len(images), *self.shape)
 
     def _guard(self, rows, columns, out):
-        self._within(
+        self.require_light(
             out.sum(axis=(1, 2, 3, 4), dtype=float),
-            self._lenslets.incident(rows, columns),
+            self.lenslets.incident(rows, columns),
             rows,
             columns,
         )
 
-    def _within(self, sensor, entered, rows, columns):
-        """NumericsError where points (rows, columns) put more light on the `sensor` than
-        `entered` the lenslets.
+    def require_light(
+        self, sensor: np.ndarray, entered: np.ndarray, rows: np.ndarray, columns: np.ndarray
+    ) -> None:
+        """Check that no point puts more light on the sensor than entered the lenslets.
+
+        sensor, entered: shares of the light of points (rows, columns), all of one shape.
+
+        Raises NumericsError where one does.
         """
         sensor, entered, rows, columns = (np.ravel(a) for a in (sensor, entered, rows, columns))
         excess = sensor - entered
@@ -310,65 +371,95 @@ class PifBuilder:
             )
 
 
-def _maker(camera, plan):
-    """The class that computes sensor fields for a plan; all take (camera, geometry, plan, band)."""
-    if plan.model != "fresnel":
-        maker = {"ray": RayLenslets, "exact": ExactSquareLenslets}[plan.model]
-    else:
-        maker = SquareLenslets if plan.rung == "fresnel, low rank" else ShapedLenslets
-    return combined(maker, plan.band_nodes) if plan.band_nodes else maker
-
-
-def superpixel_orbits(offsets, symmetry):
-    """Superpixels (offsets (superpixel, 2)) that the symmetry (flip rows, flip columns, transpose)
-    of A maps onto each other.
-
-    [(first, [(superpixel, (turned, flipped rows, flipped columns) that leads there from the
-    first)])], numbers of superpixels.
+class _OneSuperpixel:
+    """A of one superpixel in parts, each a few columns of points; points that the symmetry of this
+    superpixel joins are computed once.
     """
-    place, found = {tuple(o): i for i, o in enumerate(np.asarray(offsets).tolist())}, {}
-    turns = symmetry[2] and symmetry[0] == symmetry[1]
-    for (r, c), index in place.items():
-        flips = bool(r < 0 and symmetry[0]), bool(c < 0 and symmetry[1])
-        a, b = (-n if flip else n for n, flip in zip((r, c), flips))
-        turned = bool(turns and a > b)
-        found.setdefault(place[(b, a) if turned else (a, b)], []).append((index, (turned, *flips)))
-    return list(found.items())
+
+    def __init__(self, builder: PifBuilder, index: int, out: np.ndarray) -> None:
+        """`index` of the superpixel, `out` (pixel, point) to fill."""
+        (oy, ox), (r, c) = builder.object_shape, builder.offsets[index].tolist()
+        sy, sx = (int(n) for n in builder.offsets[index] - builder.offsets[0])
+        self._builder, self._planes = builder, builder.planes(out)
+        self._mirror_y = builder.symmetry[0] and r == 0
+        self._mirror_x = builder.symmetry[1] and c == 0
+        self._turn = builder.turns and r == c
+        self._rows = (oy + 1) // 2 if self._mirror_y else oy
+        self._columns = (ox + 1) // 2 if self._mirror_x else ox
+        self._share = np.empty((oy, ox))
+        self._entered = builder.lenslets.incident(
+            *(a.ravel() for a in np.indices((oy, ox)))
+        ).reshape(oy, ox)
+        self._energies = builder.lenslets.on_superpixel(sy, sx)
+        # a cache line of points at a time; where columns differ in length, fewer,
+        # for threads to share
+        step = 8 if self._turn else 16
+        self.parts = [
+            (start, min(start + step, self._columns)) for start in range(0, self._columns, step)
+        ]
+
+    def compute(self, start: int, stop: int) -> None:
+        """Point columns start to stop, all the rows that no symmetry gives."""
+        pixels, dtype = self._builder.pixel_shape, self._builder.dtype
+        count = stop if self._turn else self._rows
+        j, i = (
+            a.ravel() for a in np.meshgrid(np.arange(start, stop), np.arange(count), indexing="ij")
+        )
+        images = np.empty((len(i), *pixels), dtype)
+        if self._turn:
+            # a block of columns of different lengths: what is beyond their ends comes
+            # from the others later
+            within = i <= j
+            found = np.empty((int(within.sum()), *pixels), dtype)
+            self._energies(i[within], j[within], found)
+            images[within], images[~within] = found, 0
+        else:
+            self._energies(i, j, images)
+        self._share[:count, start:stop] = (
+            images.reshape(stop - start, count, -1).sum(axis=2, dtype=float).T
+        )
+        self._planes[:, :, :count, start:stop] = images.reshape(
+            stop - start, count, *pixels
+        ).transpose(2, 3, 1, 0)
+
+    def complete(self) -> None:
+        """Fill in what symmetry gives, once all parts are there.
+
+        Raises NumericsError as PifBuilder.columns.
+        """
+        planes, share, rows, columns = self._planes, self._share, self._rows, self._columns
+        oy, ox = share.shape
+        if self._turn:
+            fill_below_diagonal(planes, share, rows)
+        if self._mirror_y:
+            planes[:, :, rows:, :columns] = planes[::-1, :, : oy - rows, :columns][:, :, ::-1]
+            share[rows:, :columns] = share[: oy - rows, :columns][::-1]
+        if self._mirror_x:
+            planes[:, :, :, columns:] = planes[:, ::-1, :, : ox - columns][:, :, :, ::-1]
+            share[:, columns:] = share[:, : ox - columns][:, ::-1]
+        self._builder.require_light(share, self._entered, *np.indices((oy, ox)))
 
 
-def _mapped(planes, how):
-    """(pixel row, pixel column, point row, point column) of the superpixel that (turned, flipped
-    rows, flipped columns) leads to: a view.
-    """
-    turned, rows, columns = how
-    planes = planes.transpose(1, 0, 3, 2) if turned else planes
-    planes = planes[::-1, :, ::-1] if rows else planes
-    return planes[:, ::-1, :, ::-1] if columns else planes
-
-
-def _complete(planes, share, count):
-    """Fill points below the diagonal of the first count x count from those above, rows and
-    columns exchanged.
-    """
-    turned = planes.transpose(1, 0, 3, 2)
-    for j in range(count):
-        planes[:, :, j + 1 : count, j] = turned[:, :, j + 1 : count, j]
-        share[j + 1 : count, j] = share[j, j + 1 : count]
-
-
-def build_pif(camera, plan, *, points=None, progress=None, workers=1):
-    """Compute the system matrix of `camera` (plenocli.forward.camera.model.Camera) as a Pif by a
-    PifPlan (plenocli.forward.accuracy.dial.plan_pif).
+def build_pif(
+    camera: Camera,
+    plan: PifPlan,
+    *,
+    points: slice | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> SystemMatrix:
+    """Compute a system matrix as planned (plenocli.forward.accuracy.dial.plan_pif).
 
     points: slice of flat point indices, as planned;
-    progress: called as progress(done, total);
+    progress: called as progress(done, total) in columns;
     workers: threads.
-    NumericsError where a column holds more energy than entered the lenslets.
+
+    Raises NumericsError where a column holds more energy than entered the lenslets.
     """
     dtype = np.dtype(plan.dtype)
     A = np.empty(plan.shape, dtype)
-    count = _Count(plan, progress)
-    tails, builder = [], None
+    count = _ColumnCount(plan, progress)
+    tails = []
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=dtype)
         if points is None:
@@ -377,18 +468,19 @@ def build_pif(camera, plan, *, points=None, progress=None, workers=1):
             for where, block in _chunks(builder, np.arange(builder.points)[points]):
                 A[b][:, :, where] = block
                 count(len(where) * len(builder.offsets))
-        tails.append(builder.notes["field_tail"])
-    return Pif(A, *described(plan, builder, tails, A.sum(axis=(1, 2), dtype=float)))
+        tails.append(builder.notes.field_tail)
+    return described(plan, builder, tails, A.sum(axis=(1, 2), dtype=float), A)
 
 
-def pif_pieces(camera, plan, *, progress=None, workers=1):
-    """The system matrix in pieces, for one too large to hold: yields (builder, band, superpixel, A
-    of it (pixel, point)).
+def pif_pieces(
+    camera: Camera, plan: PifPlan, *, progress: Progress | None = None, workers: int = 1
+) -> Iterator[tuple[PifBuilder, int, int, np.ndarray]]:
+    """The system matrix in pieces, for one too large to hold; arguments as build_pif.
 
-    The array is overwritten by the next piece; see PifBuilder.pieces and `described`. Arguments and
-    errors as build_pif.
+    Yields (builder, band, superpixel, A of it (pixel, point)); the next piece overwrites the array.
+    See PifBuilder.pieces and `described`. Raises as build_pif.
     """
-    count = _Count(plan, progress)
+    count = _ColumnCount(plan, progress)
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=plan.dtype)
         for index, slab in builder.pieces(workers=workers):
@@ -396,70 +488,80 @@ def pif_pieces(camera, plan, *, progress=None, workers=1):
             count(builder.points)
 
 
-class _Count:
+class _ColumnCount:
     """Progress in columns of A from numbers of columns of single superpixels."""
 
-    def __init__(self, plan, progress):
-        self._superpixels, self._total, self._done, self._report = (
-            plan.shape[1],
-            plan.shape[0] * plan.shape[3],
-            0,
-            progress,
-        )
+    def __init__(self, plan: PifPlan, progress: Progress | None) -> None:
+        self._superpixels, self._total = plan.shape[1], plan.shape[0] * plan.shape[3]
+        self._done, self._report = 0, progress
 
-    def __call__(self, columns):
+    def __call__(self, columns: int) -> None:
         self._done += columns
         if self._report:
             self._report(self._done // self._superpixels, self._total)
 
 
-def described(plan, builder, tails, energy):
-    """What a Pif holds beside A, in its order: `builder` of any band, the field tails of all
-    bands and the energy (band, point) of all columns.
+def described(
+    plan: PifPlan,
+    builder: PifBuilder,
+    tails: Sequence[float],
+    energy: np.ndarray,
+    A: np.ndarray | None = None,
+) -> SystemMatrix:
+    """The SystemMatrix of a plan that was carried out.
+
+    builder: of any band;
+    tails: the field tails of all bands;
+    energy: (band, point) of all columns;
+    A: (band, superpixel, pixel, point), None where it was written in pieces.
     """
-    return (
-        np.array([band.wavelength for band in plan.bands]),
-        builder.offsets,
-        builder.pixel_shape,
-        builder.object_shape,
-        energy,
-        _notes(plan, builder, tails, energy),
+    return SystemMatrix(
+        A=A,
+        wavelengths=np.array([band.wavelength for band in plan.bands]),
+        lenslet_offset=builder.offsets,
+        pixel_shape=builder.pixel_shape,
+        object_shape=builder.object_shape,
+        column_energy=energy,
+        accuracy=plan.accuracy_record(),
+        notes=_notes(plan, builder, tails, energy),
     )
 
 
-def _chunks(builder, points):
+def _chunks(builder: PifBuilder, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     size = max(1, BLOCK_BYTES // (builder.shape[0] * builder.shape[1] * builder.dtype.itemsize))
     for start in range(0, len(points), size):
         part = points[start : start + size]
         yield np.arange(start, start + len(part)), builder.columns(part)
 
 
-def _notes(plan, builder, tails, energy):
+def _notes(
+    plan: PifPlan, builder: PifBuilder, tails: Sequence[float], energy: np.ndarray
+) -> MatrixNotes:
     g = builder.geometry
-    return {
-        "model": plan.model,
-        "coherent_ring": plan.coherent_ring,
-        "superpixels": list(plan.superpixels),
-        "accuracy": plan.accuracy,
-        "estimated_accuracy": plan.estimated,
-        "precision": "double" if plan.double else "single",
-        "nodes": {
+    return MatrixNotes(
+        model=plan.model,
+        coherent_ring=plan.coherent_ring,
+        superpixels=plan.superpixels,
+        accuracy=plan.accuracy,
+        estimated_accuracy=plan.estimated,
+        precision="double" if plan.double else "single",
+        nodes={
             "lenslet": [b.lenslet_nodes for b in plan.bands],
             "pixel": [b.pixel_nodes for b in plan.bands],
             "psf": [b.psf_nodes for b in plan.bands],
         },
-        "error_by_source": plan.split,
-        "left_out": list(plan.left_out),
-        "symmetry": list(builder.symmetry),
-        "separable_terms": builder.notes["separable_terms"],
-        "field_tail": max(tails),
-        "kappa": g.kappa,
-        "eps": g.eps,
-        "superpixel_pitch": g.superpixel_pitch,
-        "quartic_phase_rad": g.quartic_phase,
-        "diffraction_cells": g.diffraction_cells,
-        "energy_min": float(energy.min()),
-        "energy_max": float(energy.max()),
-        "reasons": list(plan.reasons),
-        "warnings": list(plan.warnings),
-    }
+        error_by_source=plan.split,
+        left_out=plan.left_out,
+        symmetry=builder.symmetry,
+        separable_terms=builder.notes.separable_terms,
+        field_tail=max(tails),
+        kappa=g.kappa,
+        eps=g.eps,
+        superpixel_pitch=g.superpixel_pitch,
+        quartic_phase_rad=g.quartic_phase,
+        diffraction_cells=g.diffraction_cells,
+        energy_min=float(energy.min()),
+        energy_max=float(energy.max()),
+        reasons=plan.reasons,
+        warnings=plan.warnings,
+    )

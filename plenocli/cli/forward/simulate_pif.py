@@ -105,7 +105,7 @@ def command(ctx, camera, output, explain, workers, overwrite, as_json, **setting
       plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 \\
           --coherent-ring 0 -o isolated.h5
     """
-    from plenocli.stages.forward.simulate_pif import Settings, line, run_simulate_pif
+    from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 
     report = run_simulate_pif(
         camera,
@@ -116,4 +116,4 @@ def command(ctx, camera, output, explain, workers, overwrite, as_json, **setting
         workers=workers,
         command=options.command_line(ctx),
     )
-    options.summary(report, as_json, line(report))
+    options.summary(report.as_json(), as_json, report.line())

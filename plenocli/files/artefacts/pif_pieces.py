@@ -60,13 +60,14 @@ def layout(plan, where):
 
 
 def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progress=None, workers=1):
-    """Compute a matrix piece by piece into `output`; returns (Pif without A, what was found).
+    """Compute a matrix piece by piece into `output`; returns (SystemMatrix without A, its
+    Diagnosis).
 
     finish(pif, found): the Artefact of all but A. Errors as build_pif and write_artefact.
     """
     from plenocli.files.artefacts.shards import writing_pif
-    from plenocli.forward.propagation.diagnosis import Diagnosis
-    from plenocli.forward.propagation.system_matrix import Pif, described, pif_pieces
+    from plenocli.forward.propagation.diagnosis import PiecewiseDiagnosis
+    from plenocli.forward.propagation.system_matrix import described, pif_pieces
 
     diagnosis, tails, last = None, {}, None
     with writing_pif(
@@ -75,7 +76,7 @@ def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progres
         for builder, band, superpixel, slab in pif_pieces(
             camera, plan, progress=progress, workers=workers
         ):
-            diagnosis = diagnosis or Diagnosis(
+            diagnosis = diagnosis or PiecewiseDiagnosis(
                 len(plan.bands),
                 builder.offsets,
                 builder.pixel_shape,
@@ -84,8 +85,8 @@ def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progres
             )
             diagnosis.add(band, superpixel, slab)
             writer.put(band, superpixel, slab)
-            tails[band], last = builder.notes["field_tail"], builder
-        pif = Pif(None, *described(plan, last, list(tails.values()), writer.energy))
+            tails[band], last = builder.notes.field_tail, builder
+        pif = described(plan, last, list(tails.values()), writer.energy)
         found = diagnosis.result(pif.column_energy)
         writer.close(finish(pif, found))
     return pif, found

@@ -12,7 +12,7 @@ from plenocli.forward.accuracy.needs import seen_wavelengths, sensor_noise, visi
 from plenocli.forward.accuracy.rates import NOMINAL, product_rate
 from plenocli.forward.camera.geometry import geometry, lenslet_shift
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
-from plenocli.forward.propagation.models import RUNGS
+from plenocli.forward.propagation.models import MODELS
 from plenocli.forward.propagation.sampling import (
     PifPlan,
     blur_ring,
@@ -24,7 +24,8 @@ from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
 
 BEST_ACCURACY = 1e-8
 """Finest sampling on offer: double precision."""
-MODELS = ("auto", "ray", "fresnel", "exact")
+KINDS = ("auto", "ray", "fresnel", "exact")
+"""What --model takes."""
 MAX_RING = 8
 """Rings of coherent neighbours that the dial adds by itself."""
 SINGLE_LIMIT = 3e-6
@@ -53,7 +54,7 @@ the accuracy's whole.
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rung as it was considered.
+    """One model as it was considered.
 
     `why`: why it was not chosen (None: it was);
     split: error by its source; rings and bands as PifPlan; seconds: of one core at nominal rates;
@@ -121,7 +122,7 @@ def plan_pif(
         needs,
         lenslet,
     )
-    found = [_consider(request, rung) for rung in RUNGS if model in ("auto", rung.model)]
+    found = [_consider(request, each) for each in MODELS if model in ("auto", each.kind)]
     best = _cheapest(found)
     if best is None:
         request, found, best = _fall_back(request, found)
@@ -144,8 +145,8 @@ class _Request:
         needs,
         lenslet,
     ):
-        if model not in MODELS:
-            raise UsageError(f"model {model!r} is not one of {', '.join(MODELS)}", "model")
+        if model not in KINDS:
+            raise UsageError(f"model {model!r} is not one of {', '.join(KINDS)}", "model")
         if coherent_ring != "auto" and not (
             isinstance(coherent_ring, int) and 0 <= coherent_ring <= 20
         ):
@@ -261,39 +262,39 @@ def _place(camera, lenslet):
     return lenslet_shift(camera, *lenslet)[2], any(2 * n != m - 1 for n, m in zip(lenslet, count))
 
 
-def _consider(request, rung):
-    """The Candidate of one rung: its error by source, and the rings, precision and node counts
+def _consider(request, model):
+    """The Candidate of one model: its error by source, and the rings, precision and node counts
     that it would take.
     """
     reason = next(
-        (r for r in (rung.valid_for(request.camera, v) for v in request.views) if r), None
+        (r for r in (model.valid_for(request.camera, v) for v in request.views) if r), None
     )
-    if request.off_axis and rung.model == "exact":
+    if request.off_axis and model.kind == "exact":
         reason = (
             reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
         )
     if reason:
-        return Candidate(rung.name, rung.model, reason)
+        return Candidate(model.name, model.kind, reason)
     fixed = {
         "model": 0.0
         if request.model != "auto"
-        else max(rung.error_bound(request.camera, v) for v in request.views),
+        else max(model.error_bound(request.camera, v) for v in request.views),
         "storage": 3e-8 if request.dtype == np.float32 else 0.0,
     }
     tried = []
-    for ring in _rings_of(request, rung):
+    for ring in _rings_of(request, model):
         outside = (
             0.0
-            if rung.model == "ray"
+            if model.kind == "ray"
             else max(window_error(v, request.grid, ring) for v in request.depths)
         )
         # the rings that a user asks for are the user's model
-        nodes, spectrum = _band_nodes(request, rung, ring)
+        nodes, spectrum = _band_nodes(request, model, ring)
         split = fixed | {
             "spectrum": spectrum,
             "neighbourhood": outside if len(request.rings) > 1 else 0.0,
         }
-        tried.append(_sized(request, rung, ring, split, nodes))
+        tried.append(_sized(request, model, ring, split, nodes))
         if tried[-1].why is None:
             return tried[-1]
         if not math.isfinite(tried[-1].error):  # nor with more rings
@@ -303,13 +304,13 @@ def _consider(request, rung):
     return next(c for c in tried if c.error <= 1.1 * least)
 
 
-def _rings_of(request, rung):
+def _rings_of(request, model):
     """The rings of coherent neighbours to choose from: of the least number only for rays, which
     end where the blur ends.
     """
-    if rung.model == "ray" or len(request.rings) == 1:
+    if model.kind == "ray" or len(request.rings) == 1:
         return request.rings[:1]
-    if rung.model != "exact":
+    if model.kind != "exact":
         return request.rings
     # what lies outside is known from the paraxial model, which says less than a third of
     # it 64 degrees aside
@@ -322,7 +323,7 @@ def _rings_of(request, rung):
     ]
 
 
-def _band_nodes(request, rung, ring):
+def _band_nodes(request, model, ring):
     """(wavelengths that stand for the camera's band of light, error that leaves);
     (0, 0.0) for lines.
     """
@@ -337,7 +338,7 @@ def _band_nodes(request, rung, ring):
     return count, spectral_error(view, request.band, count, window)
 
 
-def _sized(request, rung, ring, split, nodes):
+def _sized(request, model, ring, split, nodes):
     """Node counts for the accuracy that the other errors leave to sampling."""
     rest = math.hypot(*split.values())
     room = math.sqrt(max(request.accuracy**2 - rest**2, 0))
@@ -350,22 +351,22 @@ def _sized(request, rung, ring, split, nodes):
     double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
         bands = tuple(
-            rung.size(v, request.grid, ring, sampling, sampling / 2)
+            model.size(v, request.grid, ring, sampling, sampling / 2)
             for v in _finest(request, nodes)
         )
         costs = [
-            rung.cost(request.camera, v, b, request.shape, double)
+            model.cost(request.camera, v, b, request.shape, double)
             for v, b in zip(request.views, bands)
         ]
     except NumericsError as error:
-        return Candidate(rung.name, rung.model, error.what)
+        return Candidate(model.name, model.kind, error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     if nodes:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(
-        rung.name,
-        rung.model,
+        model.name,
+        model.kind,
         why,
         math.hypot(*split.values()),
         split,
@@ -450,7 +451,7 @@ def _fall_back(request, found):
 
 
 def _reasons(found):
-    """Why each rung does not serve, rungs with the same reason together."""
+    """Why each model does not serve, models with the same reason together."""
     reasons = dict.fromkeys(c.why for c in found)
     return "; ".join(
         f"{' and '.join(c.name for c in found if c.why == why)}: {why}" for why in reasons
@@ -463,7 +464,7 @@ def _finest_served(request, found, limit):
     nothing serves any.
     """
     asked, low, served = request.accuracy, request.accuracy, (limit, found, None)
-    # what limits a rung that could be sized is known; others may serve what is coarser
+    # what limits a model that could be sized is known; others may serve what is coarser
     trials = [limit] if any(math.isfinite(c.error) for c in found) else []
     high = limit
     for accuracy in [*trials, 0.99]:
@@ -483,7 +484,7 @@ def _finest_served(request, found, limit):
 
 def _served(request, accuracy):
     request.accuracy = accuracy
-    found = [_consider(request, rung) for rung in RUNGS if request.model in ("auto", rung.model)]
+    found = [_consider(request, each) for each in MODELS if request.model in ("auto", each.kind)]
     return accuracy, found, _cheapest(found)
 
 
@@ -544,8 +545,8 @@ def _plan(request, found, best):
 
 
 def _model_error(request, best):
-    rung = next(r for r in RUNGS if r.name == best.name)
-    return max(rung.error_bound(request.camera, v) for v in request.views)
+    model = next(m for m in MODELS if m.name == best.name)
+    return max(model.error_bound(request.camera, v) for v in request.views)
 
 
 def seconds_here(candidate):
@@ -610,7 +611,7 @@ def _warnings(request, best):
 
 
 def system_matrix(camera, *, progress=None, **request):
-    """Plan and compute the system matrix of `camera`, a Pif; `request` as for plan_pif."""
+    """Plan and compute the SystemMatrix of `camera`; `request` as for plan_pif."""
     return build_pif(
         camera, plan_pif(camera, **request), points=request.get("points"), progress=progress
     )

@@ -2,16 +2,24 @@
 what each would cost.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 from plenocli.forward.accuracy.dial import seconds_here
+
+if TYPE_CHECKING:
+    from plenocli.forward.propagation.sampling import PifPlan
 
 LONG = 20.0
 """Seconds at nominal speed from which on a plan is told before the work starts."""
 
 
-def explain(plan, memory=None):
-    """Several lines of text about a PifPlan: the rungs considered, the error by source, what was
+def explain(plan: PifPlan, memory: int | None = None) -> str:
+    """Several lines of text about a plan: the models considered, the error by source, what was
     left out, warnings.
 
     memory: bytes that the chosen one takes as it is written, where known.
@@ -61,31 +69,56 @@ def explain(plan, memory=None):
     )
 
 
-def candidates(plan):
-    """The rungs considered, as JSON-able dicts: rung, model, chosen, serves, reason, error,
-    split, seconds (of one core here), bytes.
+@dataclass(frozen=True, kw_only=True)
+class Considered:
+    """A model that a plan considered; None where nothing is known, since it does not serve.
+
+    rung: its name;
+    model: its kind, "ray", "fresnel" or "exact";
+    reason: why it was not chosen;
+    error: relative L2 of the worst column, of which `split` names the parts by source;
+    seconds: of one core of this machine;
+    bytes: of result and work.
     """
+
+    rung: str
+    model: str
+    chosen: bool
+    reason: str | None
+    error: float | None
+    split: Mapping[str, float] | None
+    coherent_ring: int | None
+    seconds: float | None
+    bytes: int | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return asdict(self)
+
+
+def candidates(plan: PifPlan) -> list[Considered]:
+    """The models that a plan considered, coarse to fine."""
     found = []
     for c in plan.candidates:
         known = c.split is not None
         found.append(
-            {
-                "rung": c.name,
-                "model": c.model,
-                "chosen": c.why is None,
-                "reason": c.why,
-                "error": c.error if known else None,
-                "split": c.split,
-                "coherent_ring": c.ring if known else None,
-                "seconds": seconds_here(c) if known else None,
-                "bytes": c.bytes if known else None,
-            }
+            Considered(
+                rung=c.name,
+                model=c.model,
+                chosen=c.why is None,
+                reason=c.why,
+                error=c.error if known else None,
+                split=c.split,
+                coherent_ring=c.ring if known else None,
+                seconds=seconds_here(c) if known else None,
+                bytes=c.bytes if known else None,
+            )
         )
     return found
 
 
-def expectation(plan, memory=None, times=1):
-    """One line about work that takes long, and the rung that would take much less; None
+def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str | None:
+    """One line about work that takes long, and the model that would take much less; None
     where it does not.
 
     memory: bytes, where known;
@@ -119,14 +152,14 @@ def expectation(plan, memory=None, times=1):
 def _table(rows):
     cells = [("rung", "error", "time", "memory", "")]
     for r in rows:
-        known = r["error"] is not None
+        known = r.error is not None
         cells.append(
             (
-                r["rung"],
-                f"{r['error']:.1g}" if known else "-",
-                _duration(r["seconds"]) if known else "-",
-                _size(r["bytes"]) if known else "-",
-                "chosen" if r["chosen"] else r["reason"],
+                r.rung,
+                f"{r.error:.1g}" if known else "-",
+                _duration(r.seconds) if known else "-",
+                _size(r.bytes) if known else "-",
+                "chosen" if r.chosen else r.reason,
             )
         )
     widths = [max(len(row[i]) for row in cells) for i in range(4)]

@@ -5,7 +5,18 @@ kappa = W = 0), object points at +x and -x give the same superpixel of an isolat
 the object is invisible (docs/model.md).
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+from plenocli.forward.propagation.symmetry import superpixel_orbits
+
+if TYPE_CHECKING:
+    from plenocli.forward.propagation.system_matrix import SystemMatrix
 
 RANK_THRESHOLD = 1e-6
 """Singular values below this share of the largest do not count towards the rank: the rounding of
@@ -24,6 +35,29 @@ _ROWS = 1024
 _RESOLUTION = 3e-8
 
 
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """What a system matrix can tell apart, by band; None where that was left out.
+
+    energy_min, energy_max: of the columns;
+    symmetry_defect: of the object's own superpixel, None where only some points were computed;
+    singular_values: (band, value) descending, None (as the next three) above 4000 points;
+    rank: singular values above RANK_THRESHOLD of the largest;
+    rank_60db: those above NOISE_THRESHOLD of it;
+    condition: largest over smallest, a lower bound where the smallest is under 3e-8 of it;
+    warnings: a sentence each.
+    """
+
+    energy_min: list[float]
+    energy_max: list[float]
+    symmetry_defect: list[float] | None = None
+    singular_values: np.ndarray | None = None
+    rank: list[int] | None = None
+    rank_60db: list[int] | None = None
+    condition: list[float] | None = None
+    warnings: tuple[str, ...] = ()
+
+
 class Spectrum:
     """Singular values of a matrix that comes in pieces of rows, through A^T A in double precision.
 
@@ -32,12 +66,17 @@ class Spectrum:
         of its rows only: A^T A then falls into blocks for points even and odd in that direction.
     """
 
-    def __init__(self, object_shape, flips=(False, False)):
+    def __init__(
+        self, object_shape: tuple[int, int], flips: Sequence[bool] = (False, False)
+    ) -> None:
         self._shape, self._flips, self._grams = tuple(object_shape), flips, None
 
-    def add(self, part, times=1, turned=0):
-        """Add rows (..., point), `times` times, and `turned` times with rows and columns
-        of points exchanged.
+    def add(self, part: np.ndarray, times: int = 1, turned: int = 0) -> None:
+        """Add rows of the matrix.
+
+        part: (..., point);
+        times: how often;
+        turned: how often with rows and columns of points exchanged.
         """
         part = part.reshape(-1, *self._shape)
         grams = None
@@ -61,7 +100,7 @@ class Spectrum:
             total if self._grams is None else [old + new for old, new in zip(self._grams, total)]
         )
 
-    def values(self):
+    def values(self) -> np.ndarray:
         """Singular values, descending; those under 3e-8 of the largest are
         reported as that bound.
         """
@@ -86,7 +125,7 @@ def _parities(values, axis):
     ) * np.sqrt(0.5)
 
 
-def singular_values(matrix):
+def singular_values(matrix: np.ndarray) -> np.ndarray:
     """Singular values (descending, float64) of one band, (..., point): rows may have
     any leading shape.
 
@@ -101,7 +140,7 @@ def singular_values(matrix):
     return spectrum.values()
 
 
-def symmetry_defect(own):
+def symmetry_defect(own: np.ndarray) -> float:
     """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point); A' is A for the
     object turned by 180 degrees.
     """
@@ -110,20 +149,28 @@ def symmetry_defect(own):
     return float(np.abs(own[:, :half] - own[:, ::-1][:, :half]).max() / peak) if peak > 0 else 0.0
 
 
-class Diagnosis:
-    """What `describe` finds, gathered from a matrix that comes superpixel by superpixel.
+class PiecewiseDiagnosis:
+    """The Diagnosis of a matrix that comes superpixel by superpixel.
 
-    bands: how many;
-    offsets: (superpixel, 2);
-    pixel_shape, object_shape: (rows, columns);
-    symmetry: of A, as PifBuilder has it. Only the first superpixel of each orbit is looked at
-        (optics.pif.superpixel_orbits), and only half of one that mirrors itself: the others
-        hold the same light.
+    Only the first superpixel of each orbit is looked at (superpixel_orbits), and only half of one
+    that mirrors itself: the others hold the same light.
     """
 
-    def __init__(self, bands, offsets, pixel_shape, object_shape, symmetry):
-        from plenocli.forward.propagation.system_matrix import superpixel_orbits
+    def __init__(
+        self,
+        bands: int,
+        offsets: np.ndarray,
+        pixel_shape: tuple[int, int],
+        object_shape: tuple[int, int],
+        symmetry: Sequence[bool],
+    ) -> None:
+        """What is known before the first piece.
 
+        bands: how many;
+        offsets: (superpixel, 2);
+        pixel_shape, object_shape: rows and columns;
+        symmetry: of A, as PifBuilder has it.
+        """
         self._pixel_shape = tuple(pixel_shape)
         self._mirrors = (
             (np.asarray(offsets) == 0)
@@ -139,7 +186,7 @@ class Diagnosis:
         self._defects = [0.0] * bands
         self._few = int(np.prod(object_shape)) <= LARGEST
 
-    def add(self, band, superpixel, slab):
+    def add(self, band: int, superpixel: int, slab: np.ndarray) -> None:
         """Take A (pixel, point) of one band and superpixel into account."""
         if superpixel == self._own:
             self._defects[band] = symmetry_defect(slab)
@@ -154,67 +201,68 @@ class Diagnosis:
                 *(n * 2 ** int(self._mirrors[superpixel].sum()) for n in self._times[superpixel]),
             )
 
-    def result(self, energy):
-        """As `describe`, for column energies (band, point)."""
+    def result(self, energy: np.ndarray) -> Diagnosis:
+        """What was found, for column energies (band, point)."""
         values = np.array([spectrum.values() for spectrum in self._spectra]) if self._few else None
-        return _found(energy, self._defects, values)
+        return _diagnosis(energy, self._defects, values)
 
 
-def describe(pif):
-    """Diagnose a Pif: dict of per-band lists and arrays.
-
-    rank (threshold 1e-6 of the largest singular value), rank_60db (1e-3), condition (largest over
-    smallest; a lower bound where the smallest is under 3e-8 of it), singular_values (band, value),
-    or absent above 4000 points, symmetry_defect of the object's own superpixel, energy_min,
-    energy_max, and warnings (sentences).
-    """
-    points = pif.A.shape[-1]
-    if points == int(np.prod(pif.object_shape)) and points > _DIRECT:
-        diagnosis = Diagnosis(
-            len(pif.A),
-            pif.lenslet_offset,
-            pif.pixel_shape,
-            pif.object_shape,
-            pif.notes.get("symmetry", (False, False, False)),
+def describe(matrix: SystemMatrix) -> Diagnosis:
+    """Diagnose a system matrix that is held whole."""
+    points = matrix.A.shape[-1]
+    whole = points == int(np.prod(matrix.object_shape))
+    if whole and points > _DIRECT:
+        diagnosis = PiecewiseDiagnosis(
+            len(matrix.A),
+            matrix.lenslet_offset,
+            matrix.pixel_shape,
+            matrix.object_shape,
+            matrix.notes.symmetry,
         )
-        for band, matrix in enumerate(pif.A):
-            for superpixel, slab in enumerate(matrix):
+        for band, of_band in enumerate(matrix.A):
+            for superpixel, slab in enumerate(of_band):
                 diagnosis.add(band, superpixel, slab)
-        return diagnosis.result(pif.column_energy)
-    own = int(np.flatnonzero((np.asarray(pif.lenslet_offset) == 0).all(axis=1))[0])
-    defects = (
-        [symmetry_defect(band[own]) for band in pif.A]
-        if points == int(np.prod(pif.object_shape))
-        else None
-    )
-    return _found(
-        pif.column_energy,
-        defects,
-        np.array([singular_values(band) for band in pif.A]) if points <= LARGEST else None,
+        return diagnosis.result(matrix.column_energy)
+    own = int(np.flatnonzero((np.asarray(matrix.lenslet_offset) == 0).all(axis=1))[0])
+    return _diagnosis(
+        matrix.column_energy,
+        [symmetry_defect(band[own]) for band in matrix.A] if whole else None,
+        np.array([singular_values(band) for band in matrix.A]) if points <= LARGEST else None,
     )
 
 
-def _found(energy, defects, values):
-    found = {
-        "energy_min": energy.min(axis=1).tolist(),
-        "energy_max": energy.max(axis=1).tolist(),
-        "warnings": [],
-    }
-    if defects is not None:
-        found["symmetry_defect"] = defects
-        if energy.shape[1] > 1 and min(defects) < SYMMETRY_WARNING:
-            found["warnings"].append(
-                "half of the object is invisible to an isolated lenslet: points at +x and -x give "
-                f"the same superpixel (symmetry defect {min(defects):.1e}); move the sensor off "
-                "the pupil's image, as to sensor.distance = "
-                "lenslet_array.focal_length, or defocus a little"
-            )
+def _diagnosis(
+    energy: np.ndarray, defects: list[float] | None, values: np.ndarray | None
+) -> Diagnosis:
+    """The Diagnosis of column energies (band, point), symmetry defects by band and singular
+    values (band, value).
+    """
+    found = Diagnosis(
+        energy_min=energy.min(axis=1).tolist(),
+        energy_max=energy.max(axis=1).tolist(),
+        symmetry_defect=defects,
+        warnings=_warnings(energy, defects),
+    )
     if values is None:
         return found
     top = np.maximum(values[:, :1], np.finfo(float).tiny)
-    found["singular_values"] = values
-    found["rank"] = [int(n) for n in (values > RANK_THRESHOLD * top).sum(axis=1)]
-    found["rank_60db"] = [int(n) for n in (values > NOISE_THRESHOLD * top).sum(axis=1)]
     with np.errstate(divide="ignore"):
-        found["condition"] = [float(c) for c in top[:, 0] / values[:, -1]]
-    return found
+        condition = [float(c) for c in top[:, 0] / values[:, -1]]
+    return replace(
+        found,
+        singular_values=values,
+        rank=[int(n) for n in (values > RANK_THRESHOLD * top).sum(axis=1)],
+        rank_60db=[int(n) for n in (values > NOISE_THRESHOLD * top).sum(axis=1)],
+        condition=condition,
+    )
+
+
+def _warnings(energy: np.ndarray, defects: list[float] | None) -> tuple[str, ...]:
+    if defects is None or energy.shape[1] == 1 or min(defects) >= SYMMETRY_WARNING:
+        return ()
+    return (
+        "half of the object is invisible to an isolated lenslet: points at +x and -x give "
+        f"the same superpixel (symmetry defect {min(defects):.1e}); move the sensor off "
+        "the pupil's image, as to sensor.distance = "
+        "lenslet_array.focal_length, or defocus a little",
+    )

@@ -1,4 +1,4 @@
-"""The rungs: every way to compute a system matrix, where it holds, how far it is from the finest
+"""The models: every way to compute a system matrix, where it holds, how far it is from the finest
 one and what it costs.
 
 The finest model is scalar and exact from the lenslets to the sensor
@@ -6,31 +6,86 @@ The finest model is scalar and exact from the lenslets to the sensor
 column against it.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
 from functools import partial
+from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation import rays
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.fresnel import shaped, square_cost
-from plenocli.forward.propagation.sampling import size_band
+from plenocli.forward.propagation.fresnel.square import SquareLenslets
+from plenocli.forward.propagation.lenslet_fields import LensletFields
+from plenocli.forward.propagation.sampling import BandPlan, PifPlan, size_band
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.costs import Cost
 
 
-@dataclass(frozen=True)
-class Rung:
-    """One way: `model` ray, fresnel or exact; `valid_for(camera, view)` None or why not;
-    `error_bound(camera, view)` against the finest model; `size(view, grid, ring, sampling,
-    tolerance)` a BandPlan; `cost(camera, view, band, shape, double)` a Cost.
+class Model(ABC):
+    """One way to compute a system matrix.
+
+    name: as plans and tables show it;
+    kind: "ray", "fresnel" or "exact", what --model asks for;
+    lenslets: the LensletFields that compute it.
     """
 
     name: str
-    model: str
-    valid_for: Callable
-    error_bound: Callable
-    size: Callable
-    cost: Callable
+    kind: str
+    lenslets: type[LensletFields]
+
+    @abstractmethod
+    def valid_for(self, camera: Camera, geometry: Geometry) -> str | None:
+        """None, or one sentence why the model cannot serve the camera."""
+
+    @abstractmethod
+    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+        """Estimated relative L2 error of the worst column against the finest model."""
+
+    @abstractmethod
+    def size(
+        self,
+        geometry: Geometry,
+        superpixels: tuple[int, int],
+        ring: int,
+        accuracy: float,
+        tolerance: float,
+    ) -> BandPlan:
+        """Node counts at one wavelength.
+
+        superpixels: (rows, columns) kept;
+        ring: rings of coherent neighbours, 0 for isolated lenslets;
+        accuracy: that sampling may use up;
+        tolerance: root-energy cut of the spread function.
+
+        Raises NumericsError where there is no affordable one.
+        """
+
+    @abstractmethod
+    def cost(
+        self,
+        camera: Camera,
+        geometry: Geometry,
+        band: BandPlan,
+        shape: tuple[int, int, int, int],
+        double: bool,
+    ) -> Cost:
+        """Cost of the matrix of `shape` (band, superpixel, pixel, point) at one wavelength, with
+        fields in double precision or single.
+
+        Raises NumericsError where the model would need too much.
+        """
+
+    def fields(
+        self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan
+    ) -> LensletFields:
+        """The fields at the wavelength of `geometry`, as planned."""
+        return self.lenslets(camera, geometry, plan, band)
 
 
 def _square_only(camera, view):
@@ -40,37 +95,65 @@ def _square_only(camera, view):
     return None
 
 
-def _ray_error(camera, view):
-    # a law within 2.5 of what was measured promises only what its double is
-    return min(2.0, math.hypot(2 * rays.error_bound(camera, view), _paraxial_error(camera, view)))
 
 
 def _paraxial_error(camera, view):
     return exact.fresnel_model_error(view, camera.lenslet_array.profile == "parabolic")
 
 
-def _no_error(camera, view):
-    return 0.0
+class Rays(Model):
+    """Geometric optics."""
+
+    name, kind, lenslets = "rays", "ray", rays.RayLenslets
+    valid_for = staticmethod(rays.valid_for)
+    size = staticmethod(rays.size_band)
+    cost = staticmethod(rays.cost)
+
+    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+        """As Model.error_bound; a law that is within 2.5 of what was measured promises only what
+        its double is.
+        """
+        beside_waves = 2 * rays.error_bound(camera, geometry)
+        return min(2.0, math.hypot(beside_waves, _paraxial_error(camera, geometry)))
 
 
-RUNGS = (
-    Rung("rays", "ray", rays.valid_for, _ray_error, rays.size_band, rays.cost),
-    Rung(
-        "fresnel, low rank",
-        "fresnel",
-        _square_only,
-        _paraxial_error,
-        partial(size_band, dim=True),
-        square_cost.cost,
-    ),
-    Rung(
-        "fresnel, triple product",
-        "fresnel",
-        shaped.valid_for,
-        _paraxial_error,
-        size_band,
-        shaped.cost,
-    ),
-    Rung("exact, low rank", "exact", exact.valid_for, _no_error, exact.exact_band, cost_law.cost),
-)
+class FresnelLowRank(Model):
+    """Paraxial waves through square lenslets."""
+
+    name, kind, lenslets = "fresnel, low rank", "fresnel", SquareLenslets
+    valid_for = staticmethod(_square_only)
+    error_bound = staticmethod(_paraxial_error)
+    size = staticmethod(partial(size_band, dim=True))
+    cost = staticmethod(square_cost.cost)
+
+
+class FresnelTripleProduct(Model):
+    """Paraxial waves through lenslets of any shape."""
+
+    name, kind, lenslets = "fresnel, triple product", "fresnel", shaped.ShapedLenslets
+    valid_for = staticmethod(shaped.valid_for)
+    error_bound = staticmethod(_paraxial_error)
+    size = staticmethod(size_band)
+    cost = staticmethod(shaped.cost)
+
+
+class ExactLowRank(Model):
+    """Scalar waves without the paraxial approximation, through square lenslets."""
+
+    name, kind, lenslets = "exact, low rank", "exact", exact.ExactSquareLenslets
+    valid_for = staticmethod(exact.valid_for)
+    size = staticmethod(exact.exact_band)
+    cost = staticmethod(cost_law.cost)
+
+    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+        """None: it is what the others are measured by."""
+        return 0.0
+
+
+MODELS: tuple[Model, ...] = (Rays(), FresnelLowRank(), FresnelTripleProduct(), ExactLowRank())
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""
+
+
+def model_named(name: str) -> Model:
+    """The model that plans and tables call so."""
+    return next(model for model in MODELS if model.name == name)

@@ -18,6 +18,7 @@ their lower edges.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,11 @@ import numpy as np
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
 from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.lenslet_fields import (
+    FieldNotes,
+    LensletFields,
+    PixelEnergies,
+)
 from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
 
 if TYPE_CHECKING:
@@ -103,8 +109,8 @@ def features(
     return Features({}, {"process": 1.0, "edges": edges, **lit}, ({"corners": 8.0 * SLAB},))
 
 
-class RayLenslets:
-    """Pixel energies by rays; made and asked like the makers of the wave rungs."""
+class RayLenslets(LensletFields):
+    """Pixel energies by rays."""
 
     def __init__(self, camera, geometry, plan, band):
         lens = at_wavelength(camera, geometry.wavelength).main_lens
@@ -119,30 +125,26 @@ class RayLenslets:
         half = lens.aperture_diameter / 2
         self._cells = [((-half, half, -half, half), 1.0)] if cells is None else cells
         plain = cells is None and lens.aperture_shape != "image" and not any(self._tilt)
-        self.symmetry, self.notes = (plain, plain, plain), {"separable_terms": 0, "field_tail": 0.0}
+        self.symmetry = (plain, plain, plain)
+        self.notes = FieldNotes(separable_terms=0, field_tail=0.0)
         self._passed = sum(
             t * float(self._rectangles(np.array([[y0, y1]]), np.array([[x0, x1]]))[0, 0, 0])
             for (y0, y1, x0, x1), t in self._cells
         )
         self._places = {where: place for place, where in geometry.places(plan.superpixels).items()}
 
-    def incident(self, rows, columns):
+    def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """An upper bound of the share of light entering the lenslets: all that the
         filters pass, (points,).
         """
         return np.full(len(rows), self._passed)
 
-    def columns(self, rows, columns, out):
-        """As SquareLenslets.columns."""
-        for sy in range(out.shape[1]):
-            for sx in range(out.shape[2]):
-                self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
+    def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
+        """As LensletFields.on_superpixel."""
+        return partial(self._energies, self._places[sy, sx])
 
-    def superpixel(self, sy, sx, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) in superpixel (sy, sx) of the grid,
-        counted from its corner: out (points, pixel rows, pixel columns).
-        """
-        place = self._places[sy, sx]
+    def _energies(self, place, rows, columns, out):
+        """Pixel energies in the superpixel at `place` (pitches), as PixelEnergies."""
         g = self.geometry
         step = max(1, SLAB // (4 * g.pixel_shape[0] * g.pixel_shape[1]))
         products = (

@@ -2,40 +2,171 @@
 and cannot resolve.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.forward.accuracy.explain import Considered
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+    from plenocli.forward.propagation.diagnosis import Diagnosis
+    from plenocli.forward.propagation.sampling import PifPlan
+    from plenocli.forward.propagation.system_matrix import LensletWindow, SystemMatrix
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What the command line says beyond the camera: wavelengths in m (empty: the camera's),
-    spectral_step m, "auto" or None.
+    """What the command line says beyond the camera.
+
+    wavelengths: m, empty for the camera's;
+    spectral_step: m, "auto" or None;
+    superpixels: "auto" or odd (rows, columns);
+    coherent_ring: "auto" or a number of rings;
+    accuracy: relative L2 error of the worst column, None for what the noise lets be seen;
+    model: "auto", "ray", "fresnel" or "exact";
+    scene: file of the scene that the matrix is for;
+    lenslet: (row, column) of the array, None for the one on the axis;
+    dtype: "auto", "float32" or "float64";
+    mem_limit: bytes.
     """
 
-    wavelengths: tuple = ()
-    spectral_step: object = None
-    superpixels: object = "auto"
-    coherent_ring: object = "auto"
+    wavelengths: tuple[float, ...] = ()
+    spectral_step: float | str | None = None
+    superpixels: tuple[int, int] | str = "auto"
+    coherent_ring: int | str = "auto"
     accuracy: float | None = None
     model: str = "auto"
     scene: str | None = None
-    lenslet: tuple | None = None
+    lenslet: tuple[int, int] | None = None
     dtype: str = "auto"
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanSummary:
+    """What --explain tells; no matrix was computed.
+
+    plan: several lines of text;
+    memory, bytes: at work, and of the result;
+    seconds: of one core of this machine.
+    """
+
+    plan: str
+    memory: int
+    accuracy: AccuracyRecord
+    considered: list[Considered]
+    seconds: float
+    bytes: int
+    superpixels: tuple[int, int]
+    coherent_ring: int
+    estimated_accuracy: float
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return _named(self) | {
+            "accuracy": self.accuracy.as_json(),
+            "considered": [c.as_json() for c in self.considered],
+        }
+
+    def line(self) -> str:
+        """What people read."""
+        return self.plan
+
+
+@dataclass(frozen=True, kw_only=True)
+class PifSummary:
+    """What was computed and written.
+
+    pixels, points: of a superpixel and of the object under one lenslet;
+    wavelengths: (band,) m;
+    kappa, eps: 1/m;
+    nominal_seconds: of one core at nominal rates, as planned.
+    """
+
+    output: str
+    bands: int
+    superpixels: tuple[int, int]
+    pixels: int
+    points: int
+    wavelengths: list[float]
+    model: str
+    rung: str
+    coherent_ring: int
+    accuracy: float
+    estimated_accuracy: float
+    kappa: float
+    eps: float
+    bytes: int
+    nominal_seconds: float
+    quartic_phase_rad: float
+    warnings: list[str]
+    diagnosis: Diagnosis
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name, those of the diagnosis that are known among them."""
+        found = self.diagnosis
+        known = {
+            "rank": found.rank,
+            "rank_60db": found.rank_60db,
+            "condition": found.condition,
+            "symmetry_defect": found.symmetry_defect,
+            "energy_min": found.energy_min,
+            "energy_max": found.energy_max,
+        }
+        report = _named(self)
+        del report["diagnosis"]
+        return report | {name: value for name, value in known.items() if value is not None}
+
+    def line(self) -> str:
+        """One sentence for people."""
+        found, (rows, columns) = self.diagnosis, self.superpixels
+        text = (
+            f"{Path(self.output)}: A of {self.bands} band(s), {rows}x{columns} superpixels, "
+            f"{self.pixels} pixels, {self.points} points; column energy "
+            f"{min(found.energy_min):.3f} to {max(found.energy_max):.3f}"
+        )
+        if found.rank is not None:
+            text += (
+                f"; rank {min(found.rank)} ({min(found.rank_60db)} above 60 dB noise), "
+                f"condition {max(found.condition):.1e}"
+            )
+        if found.symmetry_defect is not None:
+            text += f"; symmetry defect {min(found.symmetry_defect):.1e}"
+        return f"{text}; {self.rung}, estimated error {self.estimated_accuracy:.1g}"
+
+
+def _named(summary: PlanSummary | PifSummary) -> dict[str, Any]:
+    return {field.name: getattr(summary, field.name) for field in fields(summary)}
+
+
 def run_simulate_pif(
-    camera_path, output, settings, *, explain=False, overwrite=False, workers=1, command=""
-):
-    """Compute A and write it as a pif artefact; returns a summary dict.
+    camera_path: Path | str,
+    output: Path | str | None,
+    settings: Settings,
+    *,
+    explain: bool = False,
+    overwrite: bool = False,
+    workers: int = 1,
+    command: str = "",
+) -> PifSummary | PlanSummary:
+    """Compute A and write it as a pif artefact.
 
-    With `explain` only the plan is made.
+    camera_path: camera description (.toml);
+    output: file to write (.h5), not needed with `explain`;
+    explain: only make the plan;
+    overwrite: whether `output` may exist;
+    workers: threads;
+    command: what the artefact says it was made by.
 
-    Errors: InputError and ConfigError for the camera, UsageError for options, NumericsError where
+    Raises InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
     from plenocli.base.budget import one_thread
@@ -87,12 +218,12 @@ def run_simulate_pif(
         plan.accuracy_record().as_json(),
     )
 
-    def finish(pif, found):
-        data, attrs = _contents(pif, found)
-        attrs["pif"]["lattice"] = camera.lenslet_array.lattice
+    def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
         if settings.lenslet is not None:
-            attrs["pif"]["notes"] |= _window(camera, settings.lenslet)
-        return Artefact("pif", data, attrs, provenance)
+            window = _window(camera, settings.lenslet)
+            matrix = replace(matrix, notes=replace(matrix.notes, window=window))
+        contents = _contents(matrix, found, camera.lenslet_array.lattice)
+        return Artefact("pif", *contents, provenance)
 
     # the diagnosis too: its singular values must not depend on the cores of a machine
     with (
@@ -103,37 +234,37 @@ def run_simulate_pif(
             progress=lambda done, total: progress.update(done - progress.n), workers=workers
         )
         if chosen.streamed:
-            pif, found = pif_pieces.stream_pif(
+            matrix, found = pif_pieces.stream_pif(
                 camera, plan, output, chosen, finish, overwrite=overwrite, **options
             )
         else:
-            pif = build_pif(camera, plan, **options)
-            found = describe(pif)
-    for warning in found["warnings"]:
+            matrix = build_pif(camera, plan, **options)
+            found = describe(matrix)
+    for warning in found.warnings:
         note(warning)
     if not chosen.streamed:
-        write_artefact(output, finish(pif, found), overwrite=overwrite)
-    return _summary(output, pif, found, plan)
+        write_artefact(output, finish(matrix, found), overwrite=overwrite)
+    return _summary(output, matrix, found, plan)
 
 
-def _explained(plan, memory):
+def _explained(plan: PifPlan, memory: int) -> PlanSummary:
     from plenocli.forward.accuracy.explain import candidates, explain
 
     considered = candidates(plan)
-    return {
-        "plan": explain(plan, memory),
-        "memory": memory,
-        "accuracy": plan.accuracy_record().as_json(),
-        "considered": considered,
-        "seconds": next(c["seconds"] for c in considered if c["chosen"]),
-        "bytes": plan.bytes,
-        "superpixels": list(plan.superpixels),
-        "coherent_ring": plan.coherent_ring,
-        "estimated_accuracy": plan.estimated,
-    }
+    return PlanSummary(
+        plan=explain(plan, memory),
+        memory=memory,
+        accuracy=plan.accuracy_record(),
+        considered=considered,
+        seconds=next(c.seconds for c in considered if c.chosen),
+        bytes=plan.bytes,
+        superpixels=plan.superpixels,
+        coherent_ring=plan.coherent_ring,
+        estimated_accuracy=plan.estimated,
+    )
 
 
-def _wavelengths(camera, settings):
+def _wavelengths(camera: Camera, settings: Settings) -> tuple[float, ...] | None:
     if settings.wavelengths and settings.spectral_step is not None:
         raise UsageError(
             "--wavelength and --spectral-step contradict each other", fix="leave one of them out"
@@ -154,82 +285,67 @@ def _wavelengths(camera, settings):
     )
 
 
-def _window(camera, lenslet):
-    """Where the pixels of an off-axis lenslet's own superpixel lie on the sensor."""
+def _window(camera: Camera, lenslet: tuple[int, int]) -> LensletWindow:
     from plenocli.forward.camera.geometry import lenslet_shift
+    from plenocli.forward.propagation.system_matrix import LensletWindow
 
     row, column, shift = lenslet_shift(camera, *lenslet)
-    return {"lenslet": list(lenslet), "first_pixel": [row, column], "pixel_shift": list(shift)}
+    return LensletWindow(lenslet=lenslet, first_pixel=(row, column), pixel_shift=shift)
 
 
-def _contents(pif, found):
+def _contents(
+    matrix: SystemMatrix, found: Diagnosis, lattice: str
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Datasets and attributes of a pif artefact."""
+    notes = matrix.notes
     data = {
-        "pif/A": pif.A,
-        "pif/wavelength": pif.wavelength,
-        "pif/lenslet_offset": np.asarray(pif.lenslet_offset, np.int32),
-        "pif/pixel_shape": np.array(pif.pixel_shape, np.int32),
-        "pif/object_shape": np.array(pif.object_shape, np.int32),
-        "pif/column_energy": pif.column_energy,
+        "pif/A": matrix.A,
+        "pif/wavelength": matrix.wavelengths,
+        "pif/lenslet_offset": np.asarray(matrix.lenslet_offset, np.int32),
+        "pif/pixel_shape": np.array(matrix.pixel_shape, np.int32),
+        "pif/object_shape": np.array(matrix.object_shape, np.int32),
+        "pif/column_energy": matrix.column_energy,
+        "pif/singular_values": found.singular_values,
     }
-    notes = pif.notes
     attrs = {
-        "coherent_ring": notes["coherent_ring"],
-        "kappa": notes["kappa"],
-        "eps": notes["eps"],
-        "superpixel_pitch": notes["superpixel_pitch"],
-        "model": notes["model"],
-        "notes": notes,
+        "coherent_ring": notes.coherent_ring,
+        "kappa": notes.kappa,
+        "eps": notes.eps,
+        "superpixel_pitch": notes.superpixel_pitch,
+        "model": notes.model,
+        "notes": notes.as_json(),
+        "rank": found.rank,
+        "condition": found.condition,
+        "symmetry_defect": found.symmetry_defect,
+        "lattice": lattice,
     }
-    if "singular_values" in found:
-        data["pif/singular_values"] = found["singular_values"]
-    attrs |= {key: found[key] for key in ("rank", "condition", "symmetry_defect") if key in found}
-    return data, {"pif": attrs}
-
-
-def _summary(output, pif, found, plan):
-    keep = {
-        key: found[key]
-        for key in ("rank", "rank_60db", "condition", "symmetry_defect", "energy_min", "energy_max")
-        if key in found
-    }
-    bands, _, pixels, points = plan.shape
-    return {
-        "output": str(output),
-        "bands": bands,
-        "superpixels": list(plan.superpixels),
-        "pixels": pixels,
-        "points": points,
-        "wavelengths": pif.wavelength.tolist(),
-        "model": plan.model,
-        "rung": plan.rung,
-        "coherent_ring": plan.coherent_ring,
-        "accuracy": plan.accuracy,
-        "estimated_accuracy": plan.estimated,
-        "kappa": pif.notes["kappa"],
-        "eps": pif.notes["eps"],
-        "bytes": plan.bytes,
-        "nominal_seconds": plan.chosen.seconds(),
-        "quartic_phase_rad": pif.notes["quartic_phase_rad"],
-        "warnings": [*plan.warnings, *found["warnings"]],
-        **keep,
-    }
-
-
-def line(report):
-    """One sentence about what run_simulate_pif did, for people."""
-    if "plan" in report:
-        return report["plan"]
-    low, high = min(report["energy_min"]), max(report["energy_max"])
-    text = (
-        f"{Path(report['output'])}: A of {report['bands']} band(s), "
-        f"{report['superpixels'][0]}x{report['superpixels'][1]} superpixels, {report['pixels']} "
-        f"pixels, {report['points']} points; column energy {low:.3f} to {high:.3f}"
+    return (
+        {name: value for name, value in data.items() if name == "pif/A" or value is not None},
+        {"pif": {name: value for name, value in attrs.items() if value is not None}},
     )
-    if "rank" in report:
-        text += (
-            f"; rank {min(report['rank'])} ({min(report['rank_60db'])} above 60 dB noise), "
-            f"condition {max(report['condition']):.1e}"
-        )
-    if "symmetry_defect" in report:
-        text += f"; symmetry defect {min(report['symmetry_defect']):.1e}"
-    return f"{text}; {report['rung']}, estimated error {report['estimated_accuracy']:.1g}"
+
+
+def _summary(
+    output: Path | str, matrix: SystemMatrix, found: Diagnosis, plan: PifPlan
+) -> PifSummary:
+    bands, _, pixels, points = plan.shape
+    return PifSummary(
+        output=str(output),
+        bands=bands,
+        superpixels=plan.superpixels,
+        pixels=pixels,
+        points=points,
+        wavelengths=matrix.wavelengths.tolist(),
+        model=plan.model,
+        rung=plan.rung,
+        coherent_ring=plan.coherent_ring,
+        accuracy=plan.accuracy,
+        estimated_accuracy=plan.estimated,
+        kappa=matrix.notes.kappa,
+        eps=matrix.notes.eps,
+        bytes=plan.bytes,
+        nominal_seconds=plan.chosen.seconds(),
+        quartic_phase_rad=matrix.notes.quartic_phase_rad,
+        warnings=[*plan.warnings, *found.warnings],
+        diagnosis=found,
+    )

@@ -254,7 +254,7 @@ def _simulate_pif(task, folder):
         folder / "pif.h5",
         _settings(Settings, task["settings"]["simulate-pif"]),
     )
-    return {"matrix_seconds": report["nominal_seconds"], "matrix_bytes": report["bytes"]}
+    return {"matrix_seconds": report.nominal_seconds, "matrix_bytes": report.bytes}
 
 
 def _settings(kind, values):

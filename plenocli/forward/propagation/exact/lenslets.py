@@ -15,6 +15,7 @@ them (optics.factors).
 """
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -36,6 +37,11 @@ from plenocli.forward.propagation.fresnel.spread_function import (
     edge_emphasis,
     psf_nodes,
     separable_field,
+)
+from plenocli.forward.propagation.lenslet_fields import (
+    FieldNotes,
+    LensletFields,
+    PixelEnergies,
 )
 from plenocli.forward.propagation.sampling import size_band
 
@@ -148,10 +154,8 @@ def fresnel_model_error(view, parabolic):
     return min(1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, view.diffraction_cells))) * dim)
 
 
-class ExactSquareLenslets:
-    """Sensor fields behind square lenslets by the exact kernel; see the module
-    and optics.square.SquareLenslets.
-    """
+class ExactSquareLenslets(LensletFields):
+    """Sensor fields behind square lenslets by the exact kernel; see the module."""
 
     def __init__(self, camera, geometry, plan, band):
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
@@ -168,12 +172,12 @@ class ExactSquareLenslets:
             self._tables[sy, sx], products = self._compressed(sy, sx)
             counts.append(products)
         self._intervals = {}
-        self.notes = {
-            "separable_terms": max(t.high.shape[3] for t in self._tables.values()),
-            "field_tail": self._field.tail,
-            "psf_terms": self._field.terms,
-            "products": max(counts),
-        }
+        self.notes = FieldNotes(
+            separable_terms=max(t.high.shape[3] for t in self._tables.values()),
+            field_tail=self._field.tail,
+            psf_terms=self._field.terms,
+            products=max(counts),
+        )
 
     def _illuminate(self, camera, tolerance):
         """The main lens's field, its symmetries, and the light of points that enters, down to
@@ -369,15 +373,13 @@ class ExactSquareLenslets:
         # the cut, of weighted fields, may add as well as take
         return self._entering[rows, columns] * (1 + self.band.sampling)
 
-    def columns(self, rows, columns, out):
-        """As Factors.columns."""
-        for sy in range(self.superpixels[0]):
-            for sx in range(self.superpixels[1]):
-                self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
+    def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
+        """As LensletFields.on_superpixel."""
+        return partial(self._energies, sy, sx)
 
-    def superpixel(self, sy, sx, rows, columns, out):
-        """As Factors.superpixel; mirrored points and superpixels are computed as
-        their mirror images.
+    def _energies(self, sy, sx, rows, columns, out):
+        """As PixelEnergies; mirrored points and superpixels are computed as their mirror
+        images.
         """
         sy, sx = sy - self._reach(0), sx - self._reach(1)
         *table, turned = self._canonical(sy, sx)

@@ -48,20 +48,13 @@ class Factors:
         self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
 
-    def columns(self, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows,
-        superpixel columns, pixel rows, pixel columns).
-        """
-        for sy in range(len(self.high)):
-            for sx in range(len(self.wide)):
-                self.superpixel(sy, sx, rows, columns, out[:, sy, sx])
-
     def superpixel(self, sy, sx, rows, columns, out):
         """Pixel energies on one superpixel, as counted in the tables, of points (rows[i],
         columns[i]) into out (points, pixel rows, pixel columns).
         """
         real = self.high.real.dtype
         lines, terms = self.high.shape[2:]
+        (py, px), nodes = self.pixel_shape, self.pixel_nodes
         step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
         work = np.empty((step * lines, 2 * self.wide.shape[2]), real)
         order = np.argsort(columns, kind="stable")
@@ -76,15 +69,10 @@ class Factors:
                     chosen = slice(chosen[0], chosen[-1] + 1)
                 left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
                 product = np.matmul(left, right, out=work[: len(left)])
-                out[part] = self._energy(product.reshape(len(part), self.pixel_nodes, -1))
-
-    def _energy(self, parts):
-        """Sums of squares over the nodes of each pixel: (points, nodes, pixel rows x (part,
-        node, pixel column)) real.
-        """
-        (py, px), p = self.pixel_shape, self.pixel_nodes
-        lines = np.einsum("nqk,nqk->nk", parts, parts)
-        return np.einsum("nyqx->nyx", lines.reshape(len(parts), py, 2 * p, px))
+                # (point, node, pixel row x (part, node, pixel column)): |U|^2, summed over nodes
+                parts = product.reshape(len(part), nodes, -1)
+                lines = np.einsum("nqk,nqk->nk", parts, parts)
+                out[part] = np.einsum("nyqx->nyx", lines.reshape(len(part), py, 2 * nodes, px))
 
     def _right(self, factor):
         """(node, term) complex as the right-hand side of a real product: (term x (real,

@@ -24,6 +24,7 @@ from plenocli.forward.propagation.fresnel.array_to_sensor import (
     sensor_nodes,
 )
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
+from plenocli.forward.propagation.lenslet_fields import FieldNotes, LensletFields
 from plenocli.forward.propagation.sampling import BandPlan, distinct, field_features, grid_of
 
 if TYPE_CHECKING:
@@ -106,10 +107,12 @@ def _chords(axis, at, weight, ends, slope, error):
     return Chords(axis, at, weight, tuple(pieces))
 
 
-class ShapedLenslets:
+class ShapedLenslets(LensletFields):
     """Sensor fields behind lenslets of one shape on a square or hexagonal lattice, for any
     pupil of the main lens.
     """
+
+    by_superpixel = False
 
     def __init__(self, camera, geometry, plan, band):
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
@@ -119,10 +122,8 @@ class ShapedLenslets:
             np.complex128 if plan.double else np.complex64,
         )
         self.field = separable_field(camera, geometry, band.half, plan.tolerance)
-        self.symmetry, self.notes = (
-            self.field.symmetry,
-            {"separable_terms": self.field.terms, "field_tail": self.field.tail},
-        )
+        self.symmetry = self.field.symmetry
+        self.notes = FieldNotes(separable_terms=self.field.terms, field_tail=self.field.tail)
         self.cut = chords(
             geometry.lenslet_shape,
             geometry.lenslet_width,
@@ -226,10 +227,8 @@ class ShapedLenslets:
 
     # pixel energies
 
-    def columns(self, rows, columns, out):
-        """Pixel energies of points (rows[i], columns[i]) into out (points, superpixel rows,
-        superpixel columns, pixel rows, pixel columns).
-        """
+    def columns(self, rows: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
+        """As LensletFields.columns."""
         points = (rows, columns)
         scan, chord = points[self.cut.axis], points[1 - self.cut.axis]
         order = np.argsort(chord, kind="stable")

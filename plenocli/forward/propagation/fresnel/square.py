@@ -2,7 +2,7 @@
 of separable arrays.
 """
 
-from threading import Lock
+from functools import partial
 
 import numpy as np
 
@@ -19,13 +19,18 @@ from plenocli.forward.propagation.fresnel.spread_function import (
     psf_nodes,
     separable_field,
 )
+from plenocli.forward.propagation.lenslet_fields import (
+    FieldNotes,
+    LensletFields,
+    PixelEnergies,
+)
 from plenocli.forward.propagation.sampling import NARROW
 
 SLAB = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
 
 
-class SquareLenslets(Factors):
+class SquareLenslets(LensletFields):
     """Sensor fields behind square lenslets: every separable term of h stays
     separable up to the sensor.
 
@@ -43,10 +48,8 @@ class SquareLenslets(Factors):
         # off the sensor's own raster every superpixel has its pixels around its centre
         self._centred = geometry.pixel_shift is None
         field = separable_field(camera, geometry, band.half, plan.tolerance)
-        self.symmetry, self.notes = (
-            field.symmetry,
-            {"separable_terms": field.terms, "field_tail": field.tail},
-        )
+        self.symmetry = field.symmetry
+        self.notes = FieldNotes(separable_terms=field.terms, field_tail=field.tail)
         self._x, self._w, self._basis = self._lenslet_nodes()
         self._kernels = {}
         self._cut = (
@@ -64,14 +67,14 @@ class SquareLenslets(Factors):
             (wide, across), signs = self._tables(field, 1, rules), None
         self._entering = (down @ across.T).real
         self._kernels.clear()
-        super().__init__(high[0], wide[0], geometry.pixel_shape, rules[0][1][0], signs)
+        self.factors = Factors(high[0], wide[0], geometry.pixel_shape, rules[0][1][0], signs)
         # the object's own superpixel, where it has more nodes
         self._own = (
             Factors(high[1], wide[1], geometry.pixel_shape, rules[1][1][0], signs)
             if len(rules) > 1
             else None
         )
-        self._roots, self._narrow, self._least, self._lock = {}, (None, None), None, Lock()
+        self._roots, self._least = {}, None
 
     def _rules(self):
         """[(whether all superpixels or the object's own only, (nodes of a pixel per axis,
@@ -84,23 +87,19 @@ class SquareLenslets(Factors):
             else [(True, self._band.beside), (False, own)]
         )
 
-    def superpixel(self, sy, sx, rows, columns, out):
-        """As Factors.superpixel, with no more terms than the light of the neighbourhood needs
-        on this superpixel.
+    def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
+        """As LensletFields.on_superpixel, with no more terms than the light of the neighbourhood
+        needs there.
         """
         if self._cut is None:
-            return super().superpixel(sy, sx, rows, columns, out)
-        with self._lock:
-            if self._narrow[0] != (sy, sx):
-                self._narrow = (sy, sx), self._narrowed(sy, sx)
-            narrow = self._narrow[1]
-        return narrow.superpixel(0, 0, rows, columns, out)
+            return partial(self.factors.superpixel, sy, sx)
+        return partial(self._narrowed(sy, sx).superpixel, 0, 0)
 
     def _narrowed(self, sy, sx):
         """Factors of one superpixel, without the terms that its light does not need."""
         if self._least is None:
             self._least = self._least_term()
-        own, source = (2 * sy + 1, 2 * sx + 1) == self.superpixels, self
+        own, source = (2 * sy + 1, 2 * sx + 1) == self.superpixels, self.factors
         left, right, signs = self._roots_of(sy, sx)
         u, s, vh = np.linalg.svd(left @ right.T)
         terms = max(1, int(np.count_nonzero(s > self._least)))
@@ -113,7 +112,7 @@ class SquareLenslets(Factors):
         wide = source.wide[sx] @ (signs[:, None] * left.T @ u[:, :terms].conj() * scale).astype(
             self.dtype
         )
-        return Factors(high[None], wide[None], self.pixel_shape, source.pixel_nodes)
+        return Factors(high[None], wide[None], source.pixel_shape, source.pixel_nodes)
 
     def _least_term(self):
         """The terms up to which size (root energy of a mean point, points at the lenslet's edge
@@ -129,17 +128,19 @@ class SquareLenslets(Factors):
 
     def _roots_of(self, sy, sx):
         """(_root of superpixel row sy, of column sx with the signs of the terms, these signs)."""
-        signs = np.ones(self.high.shape[3]) if self.signs is None else self.signs
+        signs = self.factors.signs
+        signs = np.ones(self.factors.high.shape[3]) if signs is None else signs
         return self._root(0, sy), self._root(1, sx) * signs, signs
 
     def _root(self, axis, s):
         """R with R^H R the overlaps of the terms on superpixel s for a mean point, on
         half of its nodes.
         """
-        axis = 0 if self.wide is self.high else axis
+        factors = self.factors
+        axis = 0 if factors.wide is factors.high else axis
         if (axis, s) not in self._roots:
-            table, points = (self.wide if axis else self.high)[s], self.geometry.points(axis)
-            node, pixel = np.divmod(np.arange(table.shape[1]), self.pixel_shape[axis])
+            table, points = (factors.wide if axis else factors.high)[s], self.geometry.points(axis)
+            node, pixel = np.divmod(np.arange(table.shape[1]), factors.pixel_shape[axis])
             # every other node, of the next pixel the others
             chosen, gram = (node + pixel) % 2 == 0, 0
             for fields, weight in zip(

@@ -243,13 +243,13 @@ def ours(camera, accuracy, rung, symmetric):
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.propagation.system_matrix import PifBuilder
 
-    kept, dial.RUNGS = dial.RUNGS, tuple(r for r in dial.RUNGS if r.name == rung)
+    kept, dial.MODELS = dial.MODELS, tuple(m for m in dial.MODELS if m.name == rung)
     try:
         plan = plan_pif(
             camera, model="fresnel", superpixels=(1, 1), coherent_ring=0, accuracy=accuracy
         )
     finally:
-        dial.RUNGS = kept
+        dial.MODELS = kept
     band = plan.bands[0]
 
     def compute():
@@ -264,7 +264,7 @@ def ours(camera, accuracy, rung, symmetric):
             A[0],
             ready - start,
             time.process_time() - ready,
-            builder.notes["separable_terms"],
+            builder.notes.separable_terms,
             band,
         )
 

@@ -172,7 +172,7 @@ def compute(name, accuracy, model, scope, rung):
     except NumericsError as error:
         return {"refused": str(error)}, None
     seconds = time.process_time() - start
-    notes = {k: v for k, v in pif.notes.items() if isinstance(v, (int, float))}
+    notes = {k: v for k, v in pif.notes.as_json().items() if isinstance(v, (int, float))}
     found = {
         "seconds": seconds,
         "bytes": _resident() - before,

@@ -95,8 +95,6 @@ def _square_only(camera, view):
     return None
 
 
-
-
 def _paraxial_error(camera, view):
     return exact.fresnel_model_error(view, camera.lenslet_array.profile == "parabolic")
 

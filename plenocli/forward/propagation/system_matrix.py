@@ -179,8 +179,7 @@ class PifBuilder:
             and ry == rx
         )
         flips = [
-            a and b
-            for a, b in zip(self.lenslets.symmetry, self.geometry.mirrors(plan.superpixels))
+            a and b for a, b in zip(self.lenslets.symmetry, self.geometry.mirrors(plan.superpixels))
         ]
         self.symmetry = (flips[0], flips[1], flips[2] and turn)
 

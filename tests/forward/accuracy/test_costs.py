@@ -17,7 +17,7 @@ from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation import costs
 from plenocli.forward.propagation.fresnel.shaped import _chord_counts, chords
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
-from plenocli.forward.propagation.models import RUNGS
+from plenocli.forward.propagation.models import MODELS
 from plenocli.forward.propagation.sampling import distinct, expected_terms
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import small_camera
@@ -35,15 +35,15 @@ CHANGES = {
 
 
 def counted(camera, plan):
-    """Columns that a builder asks its maker for: pairs of a superpixel and a point."""
+    """Columns that a builder asks the lenslets' fields for: pairs of a superpixel and a point."""
     builder, asked = PifBuilder(camera, plan.bands[0].wavelength, plan), []
-    original = builder._lenslets.superpixel
+    original = builder.lenslets.on_superpixel
 
-    def superpixel(sy, sx, rows, columns, out):
-        asked.append(len(rows))
-        return original(sy, sx, rows, columns, out)
+    def on_superpixel(sy, sx):
+        energies = original(sy, sx)
+        return lambda rows, columns, out: asked.append(len(rows)) or energies(rows, columns, out)
 
-    builder._lenslets.superpixel = superpixel
+    builder.lenslets.on_superpixel = on_superpixel
     builder.fill(np.empty(plan.shape[1:]))
     return sum(asked)
 
@@ -102,11 +102,11 @@ def test_chords_are_shared_by_the_points_of_a_line(shape, lattice):
     plan = plan_pif(camera, model="fresnel", accuracy=1e-2, superpixels=(1, 1), coherent_ring=0)
     assert plan.rung == "fresnel, triple product"
     builder, begun, blocks = PifBuilder(camera, plan.bands[0].wavelength, plan), [], []
-    spread, columns = builder._lenslets._spread, builder._lenslets.columns
-    builder._lenslets._spread = lambda product, across, index: (
+    spread, columns = builder.lenslets._spread, builder.lenslets.columns
+    builder.lenslets._spread = lambda product, across, index: (
         begun.append(index) or spread(product, across, index)
     )
-    builder._lenslets.columns = lambda *block: blocks.append(len(block[0])) or columns(*block)
+    builder.lenslets.columns = lambda *block: blocks.append(len(block[0])) or columns(*block)
     builder.fill(np.empty(plan.shape[1:]))
     assert len(blocks) > 4 and len(begun) <= len(set(begun)) + len(blocks)
 
@@ -124,7 +124,7 @@ def estimates():
     for name, camera in cameras.items():
         view = geometry(camera, camera.light.wavelengths[0])
         pixels, points = np.prod(view.pixel_shape), np.prod(view.object_shape)
-        for model in (m for m in RUNGS if m.valid_for(camera, view) is None):
+        for model in (m for m in MODELS if m.valid_for(camera, view) is None):
             for side, ring in ((1, 0), (1, 1), (3, 2)):
                 for accuracy, double in ((0.1, False), (1e-3, False), (1e-5, False), (1e-7, True)):
                     key = f"{name}, {model.name}, {side}x{side}, ring {ring}, {accuracy:g}"
@@ -152,7 +152,7 @@ def test_laws_in_a_file_say_what_they_said_in_the_code():
 
 def test_every_model_has_a_law_without_names_that_nothing_counts():
     laws = costs.read(costs.FITTED)
-    assert list(laws) == [model.name for model in RUNGS]
+    assert list(laws) == [model.name for model in MODELS]
     for law in laws.values():
         numbers = [*law.operations.values(), *law.seconds.values(), *law.bytes.values()]
         assert min(numbers) >= 0 and {"origin", "cases", "time_within_factor_2"} <= set(law.fit)

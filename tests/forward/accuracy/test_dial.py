@@ -1,9 +1,9 @@
-"""The dial: it takes the cheapest rung that serves, says why the others lost, and refuses
+"""The dial: it takes the cheapest model that serves, says why the others lost, and refuses
 what cannot be had.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,35 +14,47 @@ from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.accuracy.explain import _duration, candidates, expectation, explain
 from plenocli.forward.accuracy.needs import Needs, sensor_noise
 from plenocli.forward.propagation.costs import Cost
-from plenocli.forward.propagation.models import Rung
 from plenocli.forward.propagation.sampling import size_band
 from tests.forward.propagation.cameras import small_camera
 
 
-def rung(name, model, error, operations, reason=None):
-    return Rung(
-        name,
-        model,
-        lambda camera, view: reason,
-        lambda camera, view: error,
-        size_band,
-        lambda camera, view, band, shape, double: Cost(
-            operations * (2 if double else 1), 0.0, 1000
-        ),
-    )
+@dataclass(frozen=True)
+class FakeModel:
+    """A model of known error and cost, which computes nothing."""
+
+    name: str
+    kind: str
+    error: float
+    operations: float
+    reason: str | None = None
+    least: float = 0.0
+
+    def valid_for(self, camera, geometry):
+        return self.reason
+
+    def error_bound(self, camera, geometry):
+        return self.error
+
+    def size(self, geometry, superpixels, ring, accuracy, tolerance):
+        if accuracy < self.least:
+            raise NumericsError("a million terms", "model", "ask for less")
+        return size_band(geometry, superpixels, ring, accuracy, tolerance)
+
+    def cost(self, camera, geometry, band, shape, double):
+        return Cost(self.operations * (2 if double else 1), 0.0, 1000)
 
 
 @pytest.fixture
 def ladder(monkeypatch):
-    """Three rungs whose errors and costs are known: 0.1 for one second, 1e-3 for ten, 0 for a
+    """Three models whose errors and costs are known: 0.1 for one second, 1e-3 for ten, 0 for a
     hundred (nominal, single precision).
     """
-    rungs = (
-        rung("coarse", "ray", 0.1, 60e9),
-        rung("middle", "fresnel", 1e-3, 600e9),
-        rung("fine", "exact", 0.0, 6000e9),
+    models = (
+        FakeModel("coarse", "ray", 0.1, 60e9),
+        FakeModel("middle", "fresnel", 1e-3, 600e9),
+        FakeModel("fine", "exact", 0.0, 6000e9),
     )
-    monkeypatch.setattr(dial, "RUNGS", rungs)
+    monkeypatch.setattr(dial, "MODELS", models)
 
 
 @pytest.mark.parametrize(
@@ -56,20 +68,19 @@ def ladder(monkeypatch):
         (2e-4, "fine"),
     ],
 )
-def test_the_cheapest_rung_that_serves_is_taken(ladder, accuracy, chosen):
+def test_the_cheapest_model_that_serves_is_taken(ladder, accuracy, chosen):
     plan = plan_pif(small_camera(), accuracy=accuracy)
     assert plan.rung == chosen and plan.estimated <= accuracy
     assert math.hypot(*plan.split.values()) == pytest.approx(plan.estimated)
-    table = {c["rung"]: c for c in candidates(plan)}
-    assert [name for name, c in table.items() if c["chosen"]] == [chosen]
+    table = {c.rung: c for c in candidates(plan)}
+    assert [name for name, c in table.items() if c.chosen] == [chosen]
     for name, error in (("coarse", 0.1), ("middle", 1e-3), ("fine", 0.0)):
-        assert table[name]["split"]["model"] == error
+        assert table[name].split["model"] == error
         if error > accuracy:
-            assert "model error" in table[name]["reason"]
+            assert "model error" in table[name].reason
     if accuracy == 0.2:
         assert (
-            "10 times the cost" in table["middle"]["reason"]
-            and "1e+02 times" in table["fine"]["reason"]
+            "10 times the cost" in table["middle"].reason and "1e+02 times" in table["fine"].reason
         )
     text = explain(plan)
     assert all(name in text for name in table) and "chosen" in text and "error by source" in text
@@ -107,7 +118,7 @@ def test_default_accuracy_is_what_noise_lets_be_seen(ladder):
 
 
 def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
-    monkeypatch.setattr(dial, "RUNGS", (rung("only", "fresnel", 0.05, 1e9),))
+    monkeypatch.setattr(dial, "MODELS", (FakeModel("only", "fresnel", 0.05, 1e9),))
     plan = plan_pif(small_camera())
     assert (
         plan.rung == "only"
@@ -116,7 +127,8 @@ def test_default_accuracy_falls_back_to_the_best_there_is(monkeypatch):
     )
     with pytest.raises(NumericsError, match="name a model"):
         plan_pif(small_camera(), accuracy=1e-3)
-    monkeypatch.setattr(dial, "RUNGS", (rung("only", "fresnel", 0.0, 1e9, reason="it rains"),))
+    wet = FakeModel("only", "fresnel", 0.0, 1e9, reason="it rains")
+    monkeypatch.setattr(dial, "MODELS", (wet,))
     with pytest.raises(NumericsError, match="it rains"):
         plan_pif(small_camera(), accuracy=1e-3)
 
@@ -151,18 +163,10 @@ def test_a_field_that_cannot_be_sampled_is_left_to_rays_before_any_work():
 
 
 def test_what_too_many_terms_refuse_may_be_had_coarser(monkeypatch):
-    """The message and the default name what the fine rung can do, not the coarse rung's error."""
-
-    def size(view, grid, ring, accuracy, tolerance):
-        if accuracy < 0.0123:
-            raise NumericsError("a million terms", "model", "ask for less")
-        return size_band(view, grid, ring, accuracy, tolerance)
-
-    coarse, fine = (
-        rung("coarse", "ray", 0.7, 60e9),
-        replace(rung("fine", "exact", 0.0, 6000e9), size=size),
-    )
-    monkeypatch.setattr(dial, "RUNGS", (coarse, fine))
+    """The message and the default name what the fine model can do, not the coarse one's error."""
+    coarse = FakeModel("coarse", "ray", 0.7, 60e9)
+    fine = FakeModel("fine", "exact", 0.0, 6000e9, least=0.0123)
+    monkeypatch.setattr(dial, "MODELS", (coarse, fine))
     with pytest.raises(NumericsError, match="fine: a million terms") as caught:
         plan_pif(small_camera(), accuracy=1e-4)
     best = float(str(caught.value).split("best is about ")[1].split()[0])

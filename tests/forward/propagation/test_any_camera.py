@@ -62,7 +62,7 @@ def error_over_asked(camera, pixels, accuracy, **request):
     ):
         builder = PifBuilder(camera, band.wavelength, each)
         if each is not plan:
-            builder._lenslets._cut = None
+            builder.lenslets._cut = None
         found.append(np.empty(plan.shape[1:]))
         builder.fill(found[-1])
     return (

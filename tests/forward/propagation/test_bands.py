@@ -11,14 +11,13 @@ from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.model import Band
 from plenocli.forward.propagation.bands import (
-    band_matrix,
-    combined,
+    band_fields,
     node_count,
     rule_error,
     spectral_error,
     spectral_nodes,
 )
-from plenocli.forward.propagation.fresnel.square import SquareLenslets
+from plenocli.forward.propagation.models import model_named
 from plenocli.forward.propagation.sampling import size_band
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import small_camera
@@ -108,20 +107,35 @@ def planned(camera, nodes):
     return replace(plan, bands=(replace(sized, wavelength=550e-9),))
 
 
-def test_combined_maker_and_accumulated_matrix_are_the_weighted_sum():
+def band_matrix(camera, plan, nodes):
+    """A (superpixel, pixel, point) summed wavelength by wavelength."""
+    total = 0.0
+    for wavelength, weight in zip(*spectral_nodes(camera.light.band, nodes)):
+        line = replace(plan.bands[0], wavelength=float(wavelength))
+        plan_of_line = replace(plan, band_nodes=0, bands=(line,))
+        builder = PifBuilder(camera, float(wavelength), plan_of_line, dtype=plan.dtype)
+        matrix = np.empty((*builder.shape, builder.points), plan.dtype)
+        builder.fill(matrix)
+        total = total + matrix * weight
+    return total
+
+
+def test_fields_of_a_band_are_the_weighted_sum_of_matrices():
     camera = banded(20e-9)
-    plan = planned(camera, 3)
+    plan = replace(planned(camera, 3), band_nodes=3)
     total = band_matrix(camera, plan, 3)
-    maker = combined(SquareLenslets, 3)(camera, geometry(camera, 550e-9), plan, plan.bands[0])
+    maker = band_fields(
+        model_named(plan.rung), camera, geometry(camera, 550e-9), plan, plan.bands[0]
+    )
     points = np.array([0, 11, 36])
     out = np.empty((3, 3, 3, 13, 13), np.float32)
     maker.columns(points // 8, points % 8, out)
-    assert maker.symmetry[:2] == (True, True) and maker.notes["band_nodes"] == 3
+    assert maker.symmetry[:2] == (True, True) and maker.notes.band_nodes == 3
     expected = total[:, :, points].transpose(2, 0, 1).reshape(out.shape)
     assert np.abs(out - expected).max() < 1e-6 * expected.max()
     assert np.all(out.sum((1, 2, 3, 4)) <= maker.incident(points // 8, points % 8) + 1e-5)
     single = np.empty((3, 13, 13), np.float32)
-    maker.superpixel(0, 2, points // 8, points % 8, single)
+    maker.on_superpixel(0, 2)(points // 8, points % 8, single)
     assert np.abs(single - out[:, 0, 2]).max() < 1e-6 * expected.max()
 
 

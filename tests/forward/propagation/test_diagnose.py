@@ -5,8 +5,8 @@ import pytest
 
 from plenocli.forward.accuracy.dial import system_matrix
 from plenocli.forward.propagation import diagnosis as diagnose
-from plenocli.forward.propagation.diagnosis import Diagnosis, Spectrum, describe
-from plenocli.forward.propagation.system_matrix import superpixel_orbits
+from plenocli.forward.propagation.diagnosis import PiecewiseDiagnosis, Spectrum, describe
+from plenocli.forward.propagation.symmetry import superpixel_orbits
 from tests.forward.propagation.cameras import small_camera
 
 
@@ -31,18 +31,18 @@ def test_orbits_and_parities_give_the_values_of_the_whole(change, monkeypatch):
         dtype=np.float64,
     )
     exact = np.linalg.svd(pif.A[0].reshape(-1, pif.A.shape[3]), compute_uv=False)
-    found = Diagnosis(
-        1, pif.lenslet_offset, pif.pixel_shape, pif.object_shape, pif.notes["symmetry"]
+    found = PiecewiseDiagnosis(
+        1, pif.lenslet_offset, pif.pixel_shape, pif.object_shape, pif.notes.symmetry
     )
     for superpixel, slab in enumerate(pif.A[0]):
         found.add(0, superpixel, slab)
-    values = found.result(pif.column_energy)["singular_values"][0]
+    values = found.result(pif.column_energy).singular_values[0]
     assert (
         np.abs(values - exact).max() < 1e-7 * exact[0]
         and np.abs(values / exact - 1)[exact > 1e-3 * exact[0]].max() < 1e-9
     )
     monkeypatch.setattr(diagnose, "_DIRECT", 3)
-    assert np.abs(describe(pif)["singular_values"][0] - exact).max() < 1e-7 * exact[0]
+    assert np.abs(describe(pif).singular_values[0] - exact).max() < 1e-7 * exact[0]
 
 
 def test_without_symmetry_the_gram_matrix_is_whole():

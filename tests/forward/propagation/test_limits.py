@@ -84,7 +84,7 @@ def test_field_on_the_sensor_is_the_kernel_with_its_phases():
         main_lens__aperture_shape="square", object__samples_per_lenslet=(5, 5), **BENT
     )
     builder = pif_builder(camera, WAVELENGTH, accuracy=1e-8, dtype=np.float64, **ISOLATED)
-    assert builder.notes["separable_terms"] == 1
+    assert builder.notes.separable_terms == 1
     t, w = band_rule(builder.plan.bands[0].pixel_nodes, builder.plan.bands[0].pixel_rule)
     sensor = (1e-6 * t[:, None] + (np.arange(13) - 6) * 2e-6).ravel()
     distances, lenses = square_system(camera, (0,))
@@ -93,7 +93,7 @@ def test_field_on_the_sensor_is_the_kernel_with_its_phases():
         coherent_kernel(sensor, start, WAVELENGTH, distances[::-1], lenses[::-1], (90, 130)).T
         * np.repeat(np.sqrt(w), 13)[:, None]
     )
-    field = builder._lenslets.wide[0, :, :, 0].T
+    field = builder.lenslets.factors.wide[0, :, :, 0].T
     field = field * np.exp(
         0.5j * k * (start**2 / distances[0] + sensor[:, None] ** 2 / distances[2])
     )
@@ -238,9 +238,9 @@ def test_a_twentieth_of_a_wave_restores_the_rank(shape):
             **ISOLATED,
         )
         found.append(describe(pif))
-    values = [f["singular_values"][0] / f["singular_values"][0][0] for f in found]
+    values = [f.singular_values[0] / f.singular_values[0][0] for f in found]
     assert values[0][19] > 1e-6 and values[0][20] < 1e-13 and values[1][39] > 1e-6
-    assert found[0]["rank"] == [20] and found[1]["rank"] == [40]
+    assert found[0].rank == [20] and found[1].rank == [40]
     assert found[0]["symmetry_defect"][0] < 1e-12 and found[1]["symmetry_defect"][0] > 0.1
 
 
@@ -254,7 +254,7 @@ def test_a_twentieth_of_a_wave_restores_the_rank_of_a_square_of_points():
                 accuracy=1e-8,
                 **ISOLATED,
             )
-        )["rank"][0]
+        ).rank[0]
         for z1 in (0.55, twentieth_wave(6.875e-3 / 2))
     ]
     assert ranks == [32, 64]

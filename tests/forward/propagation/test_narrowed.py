@@ -45,9 +45,9 @@ def test_columns_hold_beside_the_whole_factors(config, superpixels, changes, acc
     found = []
     for each in (plan, fine):
         builder = PifBuilder(camera, band.wavelength, each)
-        assert builder._lenslets._cut is not None
+        assert builder.lenslets._cut is not None
         if each is fine:
-            builder._lenslets._cut = None
+            builder.lenslets._cut = None
         found.append(np.empty(each.shape[1:]))
         builder.fill(found[-1])
     errors = np.linalg.norm(found[0] - found[1], axis=(0, 1)) / np.linalg.norm(

@@ -126,7 +126,7 @@ def test_hexagonal_lattice_against_brute_force(change):
     # a corner point's image lies outside of its own hexagon: the column is faint
     for index in (18, 29) if not change else (29,):
         builder, found = column(camera, index)
-        assert isinstance(builder._lenslets, ShapedLenslets)
+        assert isinstance(builder.lenslets, ShapedLenslets)
         assert (
             apart(
                 found[0],
@@ -221,7 +221,7 @@ def test_hexagons_pass_all_light_between_them():
     """
     camera = small_camera(**HEXAGONAL)
     plan = plan_pif(camera, superpixels=(1, 1), coherent_ring=2, accuracy=1e-6, dtype=np.float64)
-    lenslets = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)._lenslets
+    lenslets = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64).lenslets
     share = lenslets.incident(np.array([0, 3, 4]), np.array([0, 5, 4]))
     # encircled energy within the window's nearest edge, 2/(pi v) outside of it
     view = geometry(camera, WAVELENGTH)
@@ -622,7 +622,7 @@ def test_low_rank_and_triple_product_agree_on_squares():
     plan = plan_pif(camera, superpixels=(3, 3), coherent_ring=1, accuracy=1e-6, dtype=np.float64)
     plan = replace(plan, pixel_shift=lenslet_shift(camera, 0, 3)[2])
     builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
-    assert not isinstance(builder._lenslets, ShapedLenslets)
+    assert not isinstance(builder.lenslets, ShapedLenslets)
     other = ShapedLenslets(camera, builder.geometry, plan, plan.bands[0])
     rows, columns_ = np.array([0, 3, 7]), np.array([2, 2, 5])
     out = np.empty((3, 3, 3, 13, 13))
@@ -630,5 +630,5 @@ def test_low_rank_and_triple_product_agree_on_squares():
     truth = builder.columns(rows * 8 + columns_).transpose(2, 0, 1).reshape(out.shape)
     assert apart(out, truth) < 1e-6
     np.testing.assert_allclose(
-        other.incident(rows, columns_), builder._lenslets.incident(rows, columns_), rtol=1e-6
+        other.incident(rows, columns_), builder.lenslets.incident(rows, columns_), rtol=1e-6
     )

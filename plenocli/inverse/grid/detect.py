@@ -6,7 +6,7 @@ illumination-flattened image (vignetting left in biases the pitch) and the simpl
 the places support. See docs/model.md, "Spectral response: calibration and demultiplexing".
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.text import by
 from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
+from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 STRUCTURED = 0.2
 # of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it
@@ -24,32 +25,6 @@ FIX = (
     "give a white image (even light through the main lens) of a lenslet array "
     "in focus on the sensor"
 )
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """A lenslet grid. Positions are (row, column) px with pixel centres at integers.
-
-    kind: "square" or "hexagonal" (rows of a hexagonal grid are offset by half a pitch).
-    pitch: lengths of the two lattice vectors, (down, right), px.
-    angle: of the right vector, degrees, positive towards larger rows.
-    centres (R, C, 2): the fitted map at every site of the array;
-    valid (R, C): the cell lies in the frame and is lit;
-    residual (R, C): distance of the measured place from the fit, px, NaN where not measured.
-    rms: of all residuals of valid sites.
-    model: form of the map.
-    basis (2, 2): mean lattice vectors [down, right] px.
-    """
-
-    kind: str
-    pitch: np.ndarray
-    angle: float
-    centres: np.ndarray
-    valid: np.ndarray
-    residual: np.ndarray
-    rms: float
-    model: str
-    basis: np.ndarray
 
 
 def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, window=1024):
@@ -430,8 +405,8 @@ def _assemble(kind, model, index, miss, clean, shape, pitch, lit):
     place = lattice.from_array(grid[valid] if not rows.size else grid[block][valid], kind)
     mean = distortion.fit_model("affine", place, centres[valid], robust=False)
     vectors = mean.coefficients[1:] / mean.scale
-    return Lattice(
-        kind=kind,
+    return LensletGrid(
+        lattice=kind,
         pitch=np.hypot(*vectors.T),
         angle=float(np.degrees(np.arctan2(*vectors[1]))),
         centres=centres,

@@ -2,9 +2,15 @@
 lenslet or one for all, as the data say.
 """
 
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.inverse.spectra.calibration import Quality, Response, Windows
 
 KINDS = ("auto", "shared", "own", "low-rank")
 SAME_PLACE = 0.1
@@ -16,40 +22,81 @@ OUTLIER = 10.0
 BLOCK = 256
 
 
-def mean(cells):
+def mean_of_known(values: np.ndarray) -> np.ndarray:
     """Mean over the first axis of the values known; NaN where none is."""
-    known = np.isfinite(cells)
+    known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
-        return (np.where(known, cells, 0).sum(axis=0, dtype=float) / known.sum(axis=0)).astype(
+        return (np.where(known, values, 0).sum(axis=0, dtype=float) / known.sum(axis=0)).astype(
             np.float32
         )
 
 
-class Gathered:
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Which response was taken, and what the lenslets say about it.
+
+    response: "own", "shared" or "low-rank".
+    text: the reasons, in words.
+    excess: mean square by which lenslets differ over what their noise explains.
+    error_of_shared: error of radiances by one F for all over that by one for each.
+    worst_excess, worst_lenslet: the same for the lenslet that differs most, and where it is, if it
+        is worth a word.
+    rank, noise_left: of a low-rank response, and the share of the noise variance left in it.
+    """
+
+    response: str
+    text: str
+    excess: float | None = None
+    error_of_shared: float | None = None
+    worst_excess: float | None = None
+    worst_lenslet: list[int] | None = None
+    rank: int | None = None
+    noise_left: float | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The notes of a response in its file: what is known of the above."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+class GatheredResponses:
     """Responses of lenslets, filled band by band.
 
-    origin (R, C, 2) and window (h, w) px;
-    valid (R, C).
+    windows: of all lenslets.
+    valid: (lenslet_row, lenslet_column), which of them count.
+    bands: how many there will be.
 
-    response (lenslet, pixel, band) of the valid lenslets in their order;
-    energy (band,): radiance of the sources;
-    light and times (pixel, band): means over lenslets of signal / exposure^2 and of 1 / exposure,
+    response: (lenslet, pixel, band) of the valid lenslets in their order.
+    energy: (band,), relative radiance of the sources.
+    light, times: (pixel, band), means over lenslets of signal / exposure^2 and of 1 / exposure,
         from which the variance follows.
     """
 
-    def __init__(self, origin, window, valid, bands):
-        self.origin, self.window, self.valid = origin, window, valid
-        pixels = window[0] * window[1]
+    def __init__(self, windows: Windows, valid: np.ndarray, bands: int) -> None:
+        self.windows, self.valid = windows, valid
+        pixels = windows.shape[0] * windows.shape[1]
         self.response = np.empty((int(valid.sum()), pixels, bands), np.float32)
         self.energy, self.shares = np.ones(bands), np.ones(bands)
         self.light, self.times = np.full((2, pixels, bands), np.nan)
 
-    def add(self, k, wavelength, signal, weight, share, energy):
-        """Band k: signal (rows, columns), NaN where not known, and its exposure `weight`, both at
-        the reference exposure;
+    def add(
+        self,
+        k: int,
+        wavelength: float,
+        signal: np.ndarray,
+        weight: np.ndarray,
+        share: float,
+        energy: float,
+    ) -> None:
+        """Take in one band.
 
+        k: its number.
+        wavelength: m.
+        signal: (row, column) at the reference exposure, NaN where not known.
+        weight: (row, column), exposure of the signal over the reference's.
         share: exposure of one frame over the reference's.
-        NumericsError where there is no light.
+        energy: relative radiance of the source.
+
+        Raises NumericsError where there is no light.
         """
         from plenocli.forward.sensor.superpixel import extract
 
@@ -59,11 +106,11 @@ class Gathered:
             np.zeros(2),
             0,
         )
-        corners = self.origin[self.valid][:, None]
+        corners = self.windows.origin[self.valid][:, None]
         for first in range(0, len(corners), BLOCK):
-            cells = extract(signal, corners[first : first + BLOCK], self.window)[:, 0]
+            cells = extract(signal, corners[first : first + BLOCK], self.windows.shape)[:, 0]
             times = extract(
-                weight.astype(np.float32, copy=False), corners[first : first + BLOCK], self.window
+                weight.astype(np.float32, copy=False), corners[first : first + BLOCK], self.windows.shape
             )[:, 0]
             self.response[first : first + BLOCK, :, k] = cells / np.float32(energy)
             good = np.isfinite(cells)
@@ -85,33 +132,66 @@ class Gathered:
             self.light[:, k], self.times[:, k] = sums / known
         self.energy[k], self.shares[k] = energy, share
 
-    def variance(self, gain, read_variance, dark_variance):
-        """Variance (pixel, band) of one lenslet's response, mean over lenslets: shot noise, read
-        noise, which comes once a frame, however short, and that of the dark image.
+    def variance(self, gain: float, read_variance: float, dark_variance: float) -> np.ndarray:
+        """Variance of one lenslet's response, mean over lenslets: shot noise, read noise, which
+        comes once a frame, however short, and that of the dark image.
+
+        gain: units per electron.
+        read_variance: of a frame, units^2.
+        dark_variance: of the dark image, units^2.
+
+        Returns (pixel, band), units^2.
         """
         return (
             gain * self.light + read_variance / self.shares * self.times + dark_variance
         ) / self.energy**2
 
 
-def decide(asked, gathered, variance, places, cfa):
-    """(F, its variance (pixel, band) or None, record): F (R, C, pixel, band), or (pixel,
-    band) for all lenslets.
+def measured_response(
+    asked: str,
+    gathered: GatheredResponses,
+    variance: np.ndarray | None,
+    *,
+    wavelengths: np.ndarray,
+    centres: np.ndarray,
+    cfa: str,
+) -> Response:
+    """The response of a camera from what its captures gathered, which may give its array up.
 
     asked: "own", "shared", "low-rank" (noise taken off by what the lenslets have in common), or
         "auto": shared where lenslets sit at one place within their windows and differ by so little
         more than their noise that one F for all predicts the smaller error of radiances.
-    places (lenslet, 2) px: of the lenslets within their windows.
-    NumericsError where what is asked for cannot be.
-    """
-    from plenocli.inverse.spectra.sharing import differences
+    variance: (pixel, band) of one lenslet's response; None: unknown.
+    wavelengths: (band,) m.
+    centres: (lenslet_row, lenslet_column, 2) px.
+    cfa: "mono" or four letters.
 
-    valid, phase = (
-        gathered.valid,
-        gathered.origin[gathered.valid] % 2 @ [2, 1]
-        if cfa != "mono"
-        else np.zeros(int(gathered.valid.sum()), int),
+    Returns Response, its notes being those of a Verdict.
+    Raises NumericsError where what is asked for cannot be.
+    """
+    matrix, variance, verdict = _decided(asked, gathered, variance, centres, cfa)
+    quality, least = _quality(matrix, variance, gathered.valid)
+    return Response(
+        matrix=matrix,
+        variance=variance,
+        wavelengths=wavelengths,
+        energy=gathered.energy,
+        quality=quality,
+        notes=replace(verdict, text=f"{least}; {verdict.text}").as_json(),
     )
+
+
+def _decided(
+    asked: str,
+    gathered: GatheredResponses,
+    variance: np.ndarray | None,
+    centres: np.ndarray,
+    cfa: str,
+) -> tuple[np.ndarray, np.ndarray | None, Verdict]:
+    """(F, its variance or None, Verdict), arguments as measured_response's."""
+    valid, origin = gathered.valid, gathered.windows.origin
+    places = (centres - origin)[valid]
+    phase = origin[valid] % 2 @ [2, 1] if cfa != "mono" else np.zeros(int(valid.sum()), int)
     obstacle = _obstacle(places, phase)
     known = variance is not None and bool(np.isfinite(variance).all(axis=0).any())
     if asked == "shared" and obstacle:
@@ -128,42 +208,43 @@ def decide(asked, gathered, variance, places, cfa):
             if not known
             else " (there is but one lenslet)"
         )
-        return (
-            _whole(gathered),
-            variance,
-            {"response": "own", "text": f"F of its own for each of {len(phase)} lenslets{why}"},
-        )
-    middle = mean(gathered.response)
-    if not known:
-        return middle, None, {"response": "shared", "text": f"one F for {len(phase)} lenslets"}
-    found = differences(gathered.response, middle, variance)
-    record = {
-        "response": "shared" if asked == "shared" or found.error < 1 else "own",
-        "excess": found.excess,
-        "error_of_shared": found.error,
-    }
+        text = f"F of its own for each of {len(phase)} lenslets{why}"
+        return _whole(gathered), variance, Verdict(response="own", text=text)
+    middle = mean_of_known(gathered.response)
+    if variance is None or not known:
+        return middle, None, Verdict(response="shared", text=f"one F for {len(phase)} lenslets")
+    return _own_or_shared(asked, gathered, middle, variance)
+
+
+def _own_or_shared(
+    asked: str, gathered: GatheredResponses, middle: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Verdict]:
+    """As _decided where one F for all, `middle`, is possible and the noise of each is known."""
+    from plenocli.inverse.spectra.sharing import differences
+
+    found, count = differences(gathered.response, middle, variance), len(gathered.response)
+    verdict = Verdict(
+        response="shared" if asked == "shared" or found.error < 1 else "own",
+        text="",
+        excess=found.excess,
+        error_of_shared=found.error,
+    )
     text = (
         f"lenslets differ by {found.excess:.3g} times what noise explains (mean square), an F for "
         f"all errs {found.error:.3g} times as much as one for each"
     )
     if found.worst > OUTLIER * max(1.0, found.excess):
-        site = [int(n) for n in np.argwhere(valid)[found.number]]
-        record |= {"worst_excess": found.worst, "worst_lenslet": site}
+        site = [int(n) for n in np.argwhere(gathered.valid)[found.number]]
+        verdict = replace(verdict, worst_excess=found.worst, worst_lenslet=site)
         text += f", lenslet {site} differs by {found.worst:.3g} times"
-    if record["response"] == "own":
-        return (
-            _whole(gathered),
-            variance,
-            record | {"text": f"F of its own for each of {len(phase)} lenslets ({text})"},
-        )
-    return (
-        middle,
-        variance / len(phase) + found.spread,
-        record | {"text": f"one F for {len(phase)} lenslets ({text})"},
-    )
+    if verdict.response == "own":
+        text = f"F of its own for each of {count} lenslets ({text})"
+        return _whole(gathered), variance, replace(verdict, text=text)
+    text = f"one F for {count} lenslets ({text})"
+    return middle, variance / count + found.spread, replace(verdict, text=text)
 
 
-def _obstacle(places, phase):
+def _obstacle(places: np.ndarray, phase: np.ndarray) -> str | None:
     """Why no response can serve all lenslets, or None: every window must see its lenslet, and
     its colours, at the same place.
     """
@@ -173,8 +254,8 @@ def _obstacle(places, phase):
     return "windows start on different colours of the filter array" if np.ptp(phase) else None
 
 
-def _whole(gathered):
-    """(R, C, pixel, band), NaN at lenslets that are not valid; `gathered` gives its own array up
+def _whole(gathered: GatheredResponses) -> np.ndarray:
+    """(lenslet_row, lenslet_column, pixel, band), NaN at lenslets that are not valid; `gathered` gives its own array up
     where it is the same.
     """
     valid, response = gathered.valid, gathered.response
@@ -185,7 +266,9 @@ def _whole(gathered):
     return out
 
 
-def _low_rank(gathered, variance, phase):
+def _low_rank(
+    gathered: GatheredResponses, variance: np.ndarray | None, phase: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Verdict]:
     from plenocli.inverse.spectra.low_rank import low_rank
 
     if variance is None:
@@ -201,14 +284,14 @@ def _low_rank(gathered, variance, phase):
     return (
         _whole(gathered),
         variance * left,
-        {"response": "low-rank", "rank": rank, "noise_left": left, "text": text},
+        Verdict(response="low-rank", text=text, rank=rank, noise_left=left),
     )
 
 
-def conditions(response, variance, valid, record):
-    """What is said of F beside its values: condition, angles between columns, brightest pixels,
-    bias by its noise, and `record`.
-    """
+def _quality(
+    response: np.ndarray, variance: np.ndarray | None, valid: np.ndarray
+) -> tuple[Quality, str]:
+    """(Quality of F, what its smallest angle between columns is in words)."""
     from plenocli.inverse.spectra.demultiplex import (
         calibration_bias,
         choose_pixels,
@@ -227,18 +310,18 @@ def conditions(response, variance, valid, record):
     condition = np.concatenate([condition_number(one) for one in blocks])
     angles = np.concatenate([column_angles(one) for one in blocks])
     between = angles[(slice(None), *np.triu_indices(response.shape[-1], 1))]
-    least = (
+    bias = None
+    if variance is not None:
+        matrices = calibration_bias(sample[:: max(1, len(sample) // 32)], variance)
+        bias = np.median(np.diagonal(matrices, axis1=-2, axis2=-1), axis=0).tolist()
+    quality = Quality(
+        condition=float(np.median(condition)),
+        angles=np.median(angles, axis=0).tolist(),
+        single_pixel=[int(p) for p in choose_pixels(mean_of_known(sample))],
+        bias=bias,
+    )
+    return quality, (
         f"smallest angle between two columns of F {between.min():.2f} deg"
         if between.size
         else "one band"
     )
-    out = dict(
-        condition=float(np.median(condition)),
-        angles=np.median(angles, axis=0).tolist(),
-        single_pixel=[int(p) for p in choose_pixels(mean(sample))],
-        notes=record | {"text": f"{least}; {record['text']}"},
-    )
-    if variance is not None:
-        bias = calibration_bias(sample[:: max(1, len(sample) // 32)], variance)
-        out["bias"] = np.median(np.diagonal(bias, axis1=-2, axis2=-1), axis=0).tolist()
-    return out

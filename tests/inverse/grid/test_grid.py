@@ -110,7 +110,7 @@ CASES = [
 def test_synthetic_arrays(kind, pitch, angle, shape, options, bound):
     white, centres = make_white(kind, pitch, angle, shape, **options)
     grid = find_grid(white)
-    assert grid.kind == kind
+    assert grid.lattice == kind
     np.testing.assert_allclose(grid.pitch, pitch, rtol=1e-4 if pitch < 100 else 3e-4)
     period = 60 if kind == "hexagonal" else 90
     assert abs((grid.angle - angle + period / 2) % period - period / 2) < 0.02
@@ -301,7 +301,7 @@ def test_published_spot_pictures(shared_data, name, kind, bound, centred):
     truth = truth[((truth >= margin - 0.5) & (truth <= 719.5 - margin)).all(axis=1)]
     distance, which = cKDTree(grid.centres.reshape(-1, 2)).query(truth)
     miss = grid.centres.reshape(-1, 2)[which] - truth
-    assert grid.kind == kind and len(set(which)) == len(truth) and grid.valid.ravel()[which].all()
+    assert grid.lattice == kind and len(set(which)) == len(truth) and grid.valid.ravel()[which].all()
     assert (
         np.sqrt(((miss - (miss.mean(axis=0) if centred else 0)) ** 2).sum(axis=1).mean()) <= bound
     )
@@ -347,7 +347,7 @@ def test_real_cameras(shared_data, name):
     white, dark, pitch, bound, least, residual, models = REAL[name]
     white, dark = read(shared_data / white), read(shared_data / dark)
     took, grid = seconds(lambda: find_grid(white, dark=dark))
-    assert grid.kind == "square" and grid.valid.sum() >= least and grid.model in models
+    assert grid.lattice == "square" and grid.valid.sum() >= least and grid.model in models
     np.testing.assert_allclose(grid.pitch, pitch, atol=bound)
     assert np.isfinite(grid.residual[grid.valid]).all()
     assert np.sqrt(np.mean(grid.residual[grid.valid] ** 2)) <= residual

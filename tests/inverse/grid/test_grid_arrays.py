@@ -87,7 +87,7 @@ def test_every_lenslet_is_found_where_it_is(array):
     grid = find_grid(white, cfa="RGGB" if array.gains else "mono", dark=400)
     found = grid.centres[grid.valid]
     miss, which = cKDTree(found).query(centres)
-    assert grid.kind == array.kind
+    assert grid.lattice == array.kind
     assert len(set(which)) == len(centres), "every whole lenslet once"
     assert np.sqrt(np.mean(miss**2)) <= (0.005 if array.pitch < 40 else 0.015)
     np.testing.assert_allclose(

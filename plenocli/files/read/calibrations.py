@@ -1,0 +1,250 @@
+"""Calibration files: the one place that knows their datasets and attributes, read and written."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import Any
+
+import numpy as np
+
+from plenocli.base.errors import InputError
+from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.forward.sensor.frames import Dark
+from plenocli.inverse.grid.lenslet_grid import LensletGrid
+from plenocli.inverse.spectra.calibration import (
+    Calibration,
+    Quality,
+    Response,
+    Sensor,
+    White,
+    Windows,
+)
+
+Datasets = dict[str, np.ndarray]
+Attributes = dict[str, Any]
+
+PARTS = {
+    "response": ("response/F", "response/wavelength"),
+    "windows": ("response/origin", "response/window"),
+    "white": ("response/white",),
+    "dark": ("dark/mean",),
+}
+"""Datasets that a file must have to hold a part."""
+WHITE_IMAGE = ("white/flat", "white/level")
+"""The white image, which is large and which those do not need who have its superpixels."""
+
+
+def read_calibration(
+    path: str | os.PathLike[str],
+    *,
+    needs: tuple[str, ...] = (),
+    response: bool = True,
+    white_image: bool = True,
+) -> Calibration:
+    """The Calibration of an artefact.
+
+    needs: parts (of PARTS) that it must hold.
+    response: whether the response is wanted; without it the sensor's levels are those of the white
+        image.
+    white_image: whether the white image is wanted; without it White has its superpixels alone.
+
+    Raises InputError where the file cannot be read or lacks what is needed.
+    """
+    artefact = read_artefact(path, "calibration", skip=() if white_image else WHITE_IMAGE)
+    for part in needs:
+        for name in PARTS[part]:
+            if name not in artefact.data:
+                raise _lacks(name, path)
+    return calibration_of(artefact, response=response)
+
+
+def calibration_of(artefact: Artefact, *, response: bool = True) -> Calibration:
+    """The Calibration of an artefact that was read already; arguments as read_calibration's."""
+    data, attrs = artefact.data, artefact.attrs
+    white, dark = attrs.get("white", {}), attrs.get("dark", {})
+    has = {part: all(name in data for name in PARTS[part]) for part in PARTS}
+    with_response = response and has["response"]
+    return Calibration(
+        grid=_grid(data, attrs.get("grid", {})),
+        sensor=_sensor(white, attrs.get("response", {}) if with_response else None),
+        windows=Windows(data["response/origin"], _pair(data["response/window"]))
+        if has["windows"]
+        else None,
+        white=White(data.get("response/white"), data.get("white/level"), data.get("white/flat")),
+        dark=Dark(
+            mean=data["dark/mean"],
+            black=_black(white),
+            exposure=dark.get("exposure"),
+            sigma=dark.get("sigma"),
+        )
+        if has["dark"]
+        else None,
+        response=_response(data, attrs.get("response", {})) if with_response else None,
+    )
+
+
+def write_calibration(
+    path: str | os.PathLike[str],
+    calibration: Calibration,
+    provenance: Provenance,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a calibration, whole or not at all.
+
+    Raises UsageError, OutputError.
+    """
+    c = calibration
+    datasets = {
+        "grid/centre": c.grid.centres,
+        "grid/valid": c.grid.valid,
+        "grid/residual": c.grid.residual,
+        "white/flat": None if c.white is None else c.white.flat,
+        "white/level": None if c.white is None else c.white.level,
+        "dark/mean": None if c.dark is None else c.dark.mean.astype(np.float32, copy=False),
+        "response/origin": None if c.windows is None else c.windows.origin,
+        "response/window": None if c.windows is None else np.array(c.windows.shape),
+        "response/white": None if c.white is None else c.white.superpixels,
+    }
+    attrs = {"grid": _grid_attrs(c.grid), "white": _white_attrs(c), "dark": _dark_attrs(c.dark)}
+    if c.response is not None:
+        datasets |= {
+            "response/F": c.response.matrix,
+            "response/covariance": c.response.variance,
+            "response/wavelength": c.response.wavelengths,
+            "response/energy": c.response.energy,
+        }
+        attrs["response"] = _response_attrs(c.response, c.sensor)
+    write_artefact(
+        path,
+        Artefact("calibration", datasets, attrs, provenance),
+        overwrite=overwrite,
+    )
+
+
+# --- reading --------------------------------------------------------------------------------------
+
+
+def _lacks(name: str, path: str | os.PathLike[str]) -> InputError:
+    if name == "response/F":
+        return InputError(
+            "holds no response F, only the lenslet grid", path, "calibrate with --band captures"
+        )
+    return InputError(f"lacks {name}", path, "run calibrate again")
+
+
+def _pair(values: np.ndarray) -> tuple[int, int]:
+    rows, columns = (int(n) for n in values)
+    return rows, columns
+
+
+def _grid(data: Datasets, attrs: Attributes) -> LensletGrid:
+    model = attrs.get("model")
+    model = model if isinstance(model, dict) else {}
+    return LensletGrid(
+        lattice=str(attrs.get("lattice", "square")),
+        pitch=np.array(attrs.get("pitch", [np.nan, np.nan]), float),
+        angle=float(attrs.get("angle", np.nan)),
+        basis=np.array(model.get("vectors", np.full((2, 2), np.nan)), float),
+        model=str(model.get("kind", "")),
+        centres=data["grid/centre"],
+        valid=data["grid/valid"].astype(bool),
+        residual=data.get("grid/residual"),
+        rms=float(attrs.get("rms", np.nan)),
+    )
+
+
+def _sensor(white: Attributes, response: Attributes | None) -> Sensor:
+    """What is said beside the response holds for it, what is said beside the white image where
+    there is no response.
+    """
+    of, exposure = (white, "exposure") if response is None else (response, "exposure_s")
+    read_noise = of.get("read_noise")
+    return Sensor(
+        cfa=str(of.get("cfa", "mono")),
+        units="DN" if response is None else str(response.get("units", "DN")),
+        white_level=float(white.get("white", np.inf)),
+        exposure=of.get(exposure),
+        gain_e_per_dn=of.get("gain_e_per_dn"),
+        read_noise=None if read_noise is None else float(read_noise),
+        notes=white.get("notes"),
+    )
+
+
+def _black(white: Attributes) -> np.ndarray:
+    """Levels of no light by position, (2, 2)."""
+    black = np.asarray(white.get("black", 0.0), float)
+    return black.reshape(2, 2) if black.size == 4 else np.full((2, 2), float(black.ravel()[0]))
+
+
+def _response(data: Datasets, attrs: Attributes) -> Response:
+    quality, notes = None, attrs.get("notes")
+    if all(name in attrs for name in ("condition", "angles", "single_pixel")):
+        quality = Quality(
+            condition=attrs["condition"],
+            angles=attrs["angles"],
+            single_pixel=attrs["single_pixel"],
+            bias=attrs.get("bias"),
+        )
+    return Response(
+        matrix=data["response/F"],
+        variance=data.get("response/covariance"),
+        wavelengths=data["response/wavelength"],
+        energy=data.get("response/energy"),
+        quality=quality,
+        notes=notes if isinstance(notes, dict) else None,
+    )
+
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+def _grid_attrs(grid: LensletGrid) -> Attributes:
+    return {
+        "lattice": grid.lattice,
+        "pitch": [float(p) for p in grid.pitch],
+        "angle": grid.angle,
+        "rms": grid.rms,
+        "lenslets": int(grid.valid.sum()),
+        "offset": [float(c) for c in grid.centres[0, 0]],
+        "model": {
+            "kind": grid.model,
+            "vectors": [[float(v) for v in vector] for vector in grid.basis],
+        },
+    }
+
+
+def _noise_attrs(sensor: Sensor) -> Attributes:
+    return {"read_noise": sensor.read_noise, "gain_e_per_dn": sensor.gain_e_per_dn}
+
+
+def _white_attrs(calibration: Calibration) -> Attributes:
+    sensor, dark = calibration.sensor, calibration.dark
+    return {
+        "cfa": sensor.cfa,
+        "black": None if dark is None else [float(b) for b in dark.black.ravel()],
+        "white": float(sensor.white_level) if np.isfinite(sensor.white_level) else None,
+        **_noise_attrs(sensor),
+        "notes": sensor.notes,
+        "exposure": sensor.exposure,
+    }
+
+
+def _dark_attrs(dark: Dark | None) -> Attributes:
+    return {} if dark is None else {"exposure": dark.exposure, "sigma": dark.sigma}
+
+
+def _response_attrs(response: Response, sensor: Sensor) -> Attributes:
+    quality = response.quality
+    bias = None if quality is None else quality.bias
+    return {
+        **({} if quality is None else dataclasses.asdict(dataclasses.replace(quality, bias=None))),
+        "notes": response.notes,
+        "bias": bias,
+        **_noise_attrs(sensor),
+        "cfa": sensor.cfa,
+        "units": sensor.units,
+        "exposure_s": sensor.exposure,
+    }

@@ -113,20 +113,20 @@ def command(ctx, output, as_json, radiances, **settings):
     """
     from plenocli.stages.inverse.calibrate import run_calibrate
 
-    report = run_calibrate(
+    summary = run_calibrate(
         output, radiances=radiances, command=options.command_line(ctx), **settings
     )
-    down, right = report["pitch_px"]
+    down, right = summary.pitch_px
     line = (
-        f"{output}: {report['lattice']} grid, pitch {down:.4f} x {right:.4f} px, angle "
-        f"{report['angle_deg']:.3f} deg, {report['lenslets']} lenslets, residual "
-        f"{report['rms_px']:.3f} px rms ({report['model']})"
+        f"{output}: {summary.lattice} grid, pitch {down:.4f} x {right:.4f} px, angle "
+        f"{summary.angle_deg:.3f} deg, {summary.lenslets} lenslets, residual "
+        f"{summary.rms_px:.3f} px rms ({summary.model})"
     )
-    if "condition" in report:
+    if response := summary.response:
         line += (
-            f"; F: {len(report['bands_nm'])} bands, condition {report['condition']:.3g}, "
-            f"{report['columns']}"
+            f"; F: {len(response.bands_nm)} bands, condition {response.condition:.3g}, "
+            f"{response.columns}"
         )
-        if report["bias"]:
-            line += f", bias by its noise up to {max(map(abs, report['bias'])):.1g}"
-    options.summary(report, as_json, line)
+        if response.bias:
+            line += f", bias by its noise up to {max(map(abs, response.bias)):.1g}"
+    options.summary(summary.as_json(), as_json, line)

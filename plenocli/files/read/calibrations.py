@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from typing import Any
 
@@ -238,11 +237,12 @@ def _dark_attrs(dark: Dark | None) -> Attributes:
 
 def _response_attrs(response: Response, sensor: Sensor) -> Attributes:
     quality = response.quality
-    bias = None if quality is None else quality.bias
     return {
-        **({} if quality is None else dataclasses.asdict(dataclasses.replace(quality, bias=None))),
+        "condition": None if quality is None else quality.condition,
+        "angles": None if quality is None else quality.angles,
+        "single_pixel": None if quality is None else quality.single_pixel,
         "notes": response.notes,
-        "bias": bias,
+        "bias": None if quality is None else quality.bias,
         **_noise_attrs(sensor),
         "cfa": sensor.cfa,
         "units": sensor.units,

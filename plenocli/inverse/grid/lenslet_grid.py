@@ -30,3 +30,13 @@ class LensletGrid:
     valid: np.ndarray
     residual: np.ndarray | None
     rms: float
+
+    def window_shape(self) -> tuple[int, int]:
+        """Rows and columns of a superpixel's window, px: the pitch, whole; a hexagonal cell's
+        bounding square.
+        """
+        if self.lattice == "square":
+            rows, columns = np.rint(np.abs(np.array([self.basis[0, 0], self.basis[1, 1]])))
+        else:
+            rows, columns = np.ceil(np.full(2, self.pitch.max()))
+        return int(rows), int(columns)

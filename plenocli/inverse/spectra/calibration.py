@@ -2,11 +2,15 @@
 description.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor import superpixel
 from plenocli.forward.sensor.frames import Dark
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
@@ -23,6 +27,24 @@ class Windows:
     shape: tuple[int, int]
 
 
+def windows_on(grid: LensletGrid, sensor_shape: tuple[int, ...]) -> tuple[Windows, np.ndarray]:
+    """The windows of a grid's superpixels, and which lenslets have one wholly on the sensor.
+
+    sensor_shape: rows and columns, px.
+
+    Returns Windows and (lenslet_row, lenslet_column) bool.
+    Raises NumericsError where no lenslet does.
+    """
+    shape = grid.window_shape()
+    origin = superpixel.windows(grid.centres, shape)
+    valid = grid.valid & superpixel.inside(origin, shape, sensor_shape)
+    if not valid.any():
+        raise NumericsError(
+            "no lenslet lies wholly on the sensor", fix="use a larger part of the sensor"
+        )
+    return Windows(origin, shape), valid
+
+
 @dataclass(frozen=True)
 class White:
     """The white reference.
@@ -36,6 +58,27 @@ class White:
     superpixels: np.ndarray | None = None
     level: np.ndarray | None = None
     flat: np.ndarray | None = None
+
+    @classmethod
+    def measured(cls, signal: np.ndarray, windows: Windows, valid: np.ndarray) -> White:
+        """The white reference from a white image.
+
+        signal: (row, column), dark removed, NaN where a pixel is bad.
+        windows: of the superpixels.
+        valid: (lenslet_row, lenslet_column), which of them lie on the sensor.
+        """
+        (rows, columns), kept = windows.shape, valid
+        superpixels = superpixel.extract(signal, windows.origin, windows.shape)
+        superpixels[~valid] = np.nan
+        level = np.full(valid.shape, np.nan, np.float32)
+        level[valid] = np.nanpercentile(superpixels[valid], 98, axis=-1)
+        if not (level[valid] > 0).all():
+            kept = valid & (level > 0)
+        flat = np.full(signal.shape, np.nan, np.float32)
+        for (row, column), peak in zip(windows.origin[kept], level[kept]):
+            part = (slice(row, row + rows), slice(column, column + columns))
+            flat[part] = signal[part] / peak
+        return cls(superpixels, level, flat)
 
 
 @dataclass(frozen=True, kw_only=True)

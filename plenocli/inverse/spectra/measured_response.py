@@ -100,18 +100,13 @@ class GatheredResponses:
         """
         from plenocli.forward.sensor.superpixel import extract
 
-        sums, known, light, number = (
-            np.zeros((2, len(self.light))),
-            np.zeros(len(self.light)),
-            np.zeros(2),
-            0,
-        )
-        corners = self.windows.origin[self.valid][:, None]
+        sums, known = np.zeros((2, len(self.light))), np.zeros(len(self.light))
+        light, number = np.zeros(2), 0
+        corners, shape = self.windows.origin[self.valid][:, None], self.windows.shape
+        weight = weight.astype(np.float32, copy=False)
         for first in range(0, len(corners), BLOCK):
-            cells = extract(signal, corners[first : first + BLOCK], self.windows.shape)[:, 0]
-            times = extract(
-                weight.astype(np.float32, copy=False), corners[first : first + BLOCK], self.windows.shape
-            )[:, 0]
+            part = corners[first : first + BLOCK]
+            cells, times = (extract(one, part, shape)[:, 0] for one in (signal, weight))
             self.response[first : first + BLOCK, :, k] = cells / np.float32(energy)
             good = np.isfinite(cells)
             cells, times = np.where(good, cells, 0), np.where(good, times, 1)
@@ -255,8 +250,8 @@ def _obstacle(places: np.ndarray, phase: np.ndarray) -> str | None:
 
 
 def _whole(gathered: GatheredResponses) -> np.ndarray:
-    """(lenslet_row, lenslet_column, pixel, band), NaN at lenslets that are not valid; `gathered` gives its own array up
-    where it is the same.
+    """Responses (lenslet_row, lenslet_column, pixel, band), NaN at lenslets that are not valid;
+    `gathered` gives its own array up where it is the same.
     """
     valid, response = gathered.valid, gathered.response
     if valid.all():

@@ -301,7 +301,9 @@ def test_published_spot_pictures(shared_data, name, kind, bound, centred):
     truth = truth[((truth >= margin - 0.5) & (truth <= 719.5 - margin)).all(axis=1)]
     distance, which = cKDTree(grid.centres.reshape(-1, 2)).query(truth)
     miss = grid.centres.reshape(-1, 2)[which] - truth
-    assert grid.lattice == kind and len(set(which)) == len(truth) and grid.valid.ravel()[which].all()
+    assert (
+        grid.lattice == kind and len(set(which)) == len(truth) and grid.valid.ravel()[which].all()
+    )
     assert (
         np.sqrt(((miss - (miss.mean(axis=0) if centred else 0)) ** 2).sum(axis=1).mean()) <= bound
     )

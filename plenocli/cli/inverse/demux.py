@@ -72,7 +72,7 @@ def command(
     """
     from plenocli.stages.inverse.demux import Settings, run_demux
 
-    report = run_demux(
+    summary = run_demux(
         captures,
         output,
         calibration=calibration,
@@ -83,17 +83,18 @@ def command(
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
-    if len(captures) == 1 and report["done"] == 1:
-        one = report["captures"][0]
+    if len(captures) == 1 and summary.done == 1:
+        one = summary.captures[0]
         line = (
-            f"{one['output']}: {one['quantity']} in {len(one['bands_nm'])} bands behind "
-            f"{one['lenslets']} lenslets, {one['method']} ({one['reason']})"
+            f"{one.output}: {one.quantity} in {len(one.bands_nm)} bands behind "
+            f"{one.lenslets} lenslets, {one.method} ({one.reason})"
         )
-        if (one["registration"] or {}).get("corrected"):
+        registration = one.registration
+        if registration and registration.corrected:
             line += (
-                f"; corrected: {', '.join(one['registration']['corrected'])} (lenslets moved by up "
-                f"to {one['registration']['largest_px']:.3g} px)"
+                f"; corrected: {', '.join(registration.corrected)} (lenslets moved by up "
+                f"to {registration.motion.reach:.3g} px)"
             )
     else:
-        line = f"{output}: {report['done']} demultiplexed, {report['skipped']} were finished before"
-    options.summary(report, as_json, line)
+        line = f"{output}: {summary.done} demultiplexed, {summary.skipped} were finished before"
+    options.summary(summary.as_json(), as_json, line)

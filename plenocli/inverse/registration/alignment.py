@@ -2,47 +2,116 @@
 calibration does not know.
 """
 
-from dataclasses import replace
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.progress import note
 
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.forward.sensor.readout import Readout
+    from plenocli.inverse.registration.motion import Motion
+    from plenocli.inverse.registration.smooth_response import SmoothResponses
+    from plenocli.inverse.spectra.responses import LensletResponses
+
 MODES = ("auto", "on", "off")
-# residual over noise, mean squares, above which the calibration does not describe the capture
 POOR_FIT = 1.5
-FITS = 1.02  # residual over noise up to which a correction is believed without further question
-# share of the residual's excess over noise that a correction may leave where the capture
-# fits worse than that
+"""Residual over noise, mean squares, above which the calibration does not describe the capture."""
+FITS = 1.02
+"""Residual over noise up to which a correction is believed without further question."""
 BELIEVED = 0.15
-ALIKE = 0.02  # px: a shared response stays shared where displacements differ by less
-# standard deviations of one pixel in the dark: less costs less than the noise of one lenslet
+"""Share of the residual's excess over noise that a correction may leave where the capture fits
+worse than that.
+"""
+ALIKE = 0.02
+"""px: a shared response stays shared where displacements differ by less."""
 LEAST_OFFSET = 0.1
+"""Standard deviations of one pixel in the dark: less costs less than the noise of one lenslet."""
 
 
-def align(calibration, signal, noise, mode, path, levels=True):
-    """(calibration, signal, stray, record) with the response moved to where the
-    capture's lenslets are.
+@dataclass(frozen=True)
+class Registration:
+    """What was found between a capture and its calibration.
 
-    calibration: plenocli.stages.inverse.demux.Response;
-    signal (rows, columns), dark removed;
-    noise: (gain, read variance) or None.
+    corrected: what was corrected of "motion", "offset" and "stray light".
+    motion: None where nothing could be found, which `reason` tells.
+    """
+
+    corrected: tuple[str, ...]
+    motion: Motion | None
+    reason: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """For the file and the report."""
+        found, motion = {"corrected": list(self.corrected)}, self.motion
+        if motion is None:
+            return found | {"reason": self.reason}
+        return found | {
+            "shift_px": [float(v) for v in motion.shift],
+            "shift_sigma_px": [float(v) for v in motion.sigma[:2]],
+            "rotation_deg": float(np.degrees(motion.rotation)),
+            "stretch": (motion.matrix + motion.matrix.T).tolist(),
+            "largest_px": motion.reach,
+            "offset": motion.offset,
+            "offset_sigma": _or_none(motion.sigma[2]),
+            "stray": motion.stray,
+            "stray_sigma": _or_none(motion.stray_sigma),
+            "residual_before": motion.before,
+            "residual_after": motion.after,
+            "lenslets": motion.lenslets,
+        }
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A capture and responses that go together.
+
+    responses: where the capture's lenslets are.
+    signal: of the capture, an offset taken off.
+    stray: plenocli.inverse.registration.moved_response.even_light, patterns that deserve unknowns
+        of their own where there is more of it than chance; None: there is not.
+    registration: what was found; None: nobody looked.
+    """
+
+    responses: LensletResponses
+    signal: Readout | np.ndarray
+    stray: np.ndarray | None
+    registration: Registration | None
+
+
+def align(
+    c: LensletResponses,
+    signal: Readout | np.ndarray,
+    noise: Noise | None,
+    mode: str,
+    path: str | os.PathLike[str],
+    levels: bool = True,
+) -> Aligned:
+    """The responses moved to where the lenslets of a capture are.
+
+    signal: (row, column), dark removed.
+    noise: of the signal; None: unknown.
     mode: auto corrects what is more than chance, on corrects whatever is found and fails where
-        nothing can be, off looks at nothing. stray:
-        plenocli.inverse.registration.moved_response.even_light, patterns that deserve unknowns of
-        their own where there is more of it than chance (None: there is not). record: what was
-        found, for the file and the report (None: off).
+        nothing can be, off looks at nothing.
+    path: of the capture, for messages.
     levels: whether offset and stray light are corrected, which mean nothing where the motion cannot
         be followed. A predicted response errs in shape by more than either, and would pass its
         errors off as both: there motion alone is corrected.
-    """
-    from plenocli.inverse.registration.motion import REACH, motion_since
-    from plenocli.inverse.registration.moved_response import even_light
 
-    c = calibration
+    Raises NumericsError where the mode is on and the motion cannot be told or followed.
+    """
+    from plenocli.inverse.registration.motion import motion_since
+    from plenocli.inverse.registration.moved_response import even_light
+    from plenocli.inverse.registration.reference import REACH
+
     if mode == "off":
-        return c, signal, None, None
+        return Aligned(c, signal, None, None)
     motion = motion_since(c.reference, signal, noise)
     if motion is None:
         if mode == "on":
@@ -51,10 +120,8 @@ def align(calibration, signal, noise, mode, path, levels=True):
                 path,
                 "expose longer, or use --register off",
             )
-        return c, signal, None, {"corrected": [], "reason": "fewer than three lenslets hold light"}
-    better = motion.after < motion.before
-    dark = np.sqrt(noise[1]) if noise is not None else 0.0
-    corrected = []
+        reason = "fewer than three lenslets hold light"
+        return Aligned(c, signal, None, Registration((), None, reason))
     lost = motion.reach > REACH + 2
     if mode == "on" and lost:
         raise NumericsError(
@@ -65,31 +132,29 @@ def align(calibration, signal, noise, mode, path, levels=True):
             path,
             "calibrate again, or use --register off",
         )
-    if better and (mode == "on" or motion.moved):
+    corrected = []
+    if motion.after < motion.before and (mode == "on" or motion.moved):
         corrected.append("motion")
-    levels = levels and not lost and not c.predicted
+    dark = noise.sigma if noise is not None else 0.0
+    levels = levels and not lost and not c.calibration.response.predicted
     if levels and motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
         corrected.append("offset")
     if levels and motion.strayed:
         corrected.append("stray light")
     if "motion" in corrected:
-        c = _moved(c, motion)
+        c = moved_with(c, motion)
     if "offset" in corrected:
         signal = signal - np.float32(motion.offset)
-    return (
-        c,
-        signal,
-        even_light(c.window, c.cfa) if "stray light" in corrected else None,
-        _record(motion, corrected),
-    )
+    stray = even_light(c.window, c.cfa) if "stray light" in corrected else None
+    return Aligned(c, signal, stray, Registration(tuple(corrected), motion))
 
 
-def _moved(c, motion):
-    """The calibration with windows moved by whole pixels (whole periods of a colour mosaic) and
-    responses by what is left.
+def moved_with(c: LensletResponses, motion: Motion) -> LensletResponses:
+    """The responses after a motion: windows moved by whole pixels (whole periods of a colour
+    mosaic) and responses by what is left.
     """
-    from plenocli.inverse.registration.motion import Smooth
-    from plenocli.inverse.registration.moved_response import Moved
+    from plenocli.inverse.registration.moved_response import MovedResponses
+    from plenocli.inverse.registration.smooth_response import SmoothResponses
 
     shifts = np.zeros((*c.valid.shape, 2))
     shifts[c.sites] = motion.at(c.centres[c.sites])
@@ -105,10 +170,10 @@ def _moved(c, motion):
     )
     origin, rest = c.origin + whole, shifts - whole
     variance = _carried(
-        c, Smooth.of(None, c.window, c.cfa, gains), corners[0], rest[c.sites].mean(axis=0)
+        c, SmoothResponses.of(None, c.window, c.cfa, gains), corners[0], rest[c.sites].mean(axis=0)
     )
     if together:
-        smooth = Smooth(c.response[None], corners[:1], c.window, c.cfa, gains)
+        smooth = SmoothResponses(c.response[None], corners[:1], c.window, c.cfa, gains)
         return replace(
             c,
             response=smooth.at(origin[c.sites][:1], rest[c.sites].mean(axis=0, keepdims=True))[0],
@@ -117,46 +182,30 @@ def _moved(c, motion):
         )
     return replace(
         c,
-        response=Moved(c.response, c.origin, origin, rest, c.reference),
+        response=MovedResponses(c.response, c.origin, origin, rest, c.reference),
         origin=origin,
         variance=variance,
     )
 
 
-def _carried(c, smooth, corner, shift):
+def _carried(
+    c: LensletResponses, smooth: SmoothResponses, corner: np.ndarray, shift: np.ndarray
+) -> np.ndarray | None:
     """Variance of the moved response (pixel, band): that of one for all is moved with it; that of
     own ones stays, and what is left of it in the pictures that they have in common comes on top.
     """
     if c.variance is None:
         return None
     if c.shared:
-        return smooth.noise(c.variance, corner, corner, shift)
-    return c.variance + smooth.noise(c.reference.variance, corner, corner, shift)
+        return smooth.moved_variance(c.variance, corner, corner, shift)
+    return c.variance + smooth.moved_variance(c.reference.variance, corner, corner, shift)
 
 
-def _record(motion, corrected):
-    return {
-        "corrected": corrected,
-        "shift_px": [float(v) for v in motion.shift],
-        "shift_sigma_px": [float(v) for v in motion.sigma[:2]],
-        "rotation_deg": float(np.degrees(motion.rotation)),
-        "stretch": (motion.matrix + motion.matrix.T).tolist(),
-        "largest_px": motion.reach,
-        "offset": motion.offset,
-        "offset_sigma": _or_none(motion.sigma[2]),
-        "stray": motion.stray,
-        "stray_sigma": _or_none(motion.stray_sigma),
-        "residual_before": motion.before,
-        "residual_after": motion.after,
-        "lenslets": motion.lenslets,
-    }
-
-
-def _or_none(value):
+def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def misfit(residual):
+def misfit(residual: np.ndarray | None) -> float:
     """Median over lenslets of the residual's mean square over the expected one; 0 where the
     noise is not known.
     """
@@ -167,31 +216,40 @@ def misfit(residual):
     )
 
 
-def doubtful(residual, record):
+def doubtful(residual: np.ndarray | None, registration: Registration | None) -> bool:
     """Whether something was corrected although the calibration does not quite describe the capture:
     another shape of the superpixels (focus, filters), or neighbours' light, passes for a little
     motion, an offset and stray light.
     """
-    return misfit(residual) > FITS and record is not None and bool(record["corrected"])
+    return misfit(residual) > FITS and registration is not None and bool(registration.corrected)
 
 
-def believed(residual, plain):
+def believed(residual: np.ndarray | None, plain: np.ndarray | None) -> bool:
     """Whether the residuals with a correction are as far below those without (plain) as they are
     if that is what was wrong.
     """
     return misfit(residual) - 1 <= BELIEVED * (misfit(plain) - 1)
 
 
-def judge(residual, record, path):
-    """Warn where the calibration does not describe the capture; returns the sentence, or None."""
+def warn_of_misfit(
+    residual: np.ndarray | None, registration: Registration | None, path: str | os.PathLike[str]
+) -> str | None:
+    """Warn where the calibration does not describe the capture.
+
+    residual: (lenslet_row, lenslet_column), of its mean square over the expected one.
+    registration: what was found between the two.
+    path: of the capture, for the message.
+
+    Returns the sentence, or None.
+    """
     middle = misfit(residual)
     if middle <= POOR_FIT:
         return None
     tried = (
         "it was not registered"
-        if record is None
+        if registration is None
         else "after registration"
-        if record["corrected"]
+        if registration.corrected
         else "and no motion explains it"
     )
     text = (

@@ -7,7 +7,7 @@ of them never exists whole.
 
 import numpy as np
 
-from plenocli.inverse.registration.motion import Smooth, _parity
+from plenocli.inverse.registration.smooth_response import PARITIES, SmoothResponses, parity
 
 NODES = 1 / 16
 """px between displacements for which pictures are moved, where lenslets have many: the rest is
@@ -17,12 +17,12 @@ KEPT = 64
 """Displacements whose pictures are kept."""
 
 
-class Moved:
+class MovedResponses:
     """Responses (R, C, pixel, band) whose light is displaced by `rest` (R, C, 2) px within windows
     that went from `before` to `after` (R, C, 2) by whole periods of the mosaic.
 
     response: of the calibration, (pixel, band) or (R, C, pixel, band).
-    reference: plenocli.inverse.registration.motion.Reference of it. `moved[rows, columns]` makes
+    reference: plenocli.inverse.registration.reference.Reference of it. `moved[rows, columns]` makes
         (lenslet, pixel, band).
 
     What lenslets have in common is moved, and its change added to each lenslet's own response: a
@@ -85,10 +85,10 @@ class Moved:
             before, after = (np.array([o[places][one]]) for o in (self._before, self._after))
             shift = np.array([node])
             settings = reference.window, reference.cfa, reference.gains
-            parts = Smooth(pictures, before.repeat(len(pictures), axis=0), *settings).at(
+            parts = SmoothResponses(pictures, before.repeat(len(pictures), axis=0), *settings).at(
                 after.repeat(len(pictures), axis=0), shift, derivatives=True, sharp=False
             )
-            seen = Smooth(typical, before, *settings).at(after, shift)[0]
+            seen = SmoothResponses(typical, before, *settings).at(after, shift)[0]
             parts[0] = parts[0] - pictures
             self._made[kind, node] = (
                 np.nan_to_num(np.concatenate(parts)),
@@ -98,7 +98,7 @@ class Moved:
         return self._made[kind, node]
 
 
-class Widened:
+class WidenedResponses:
     """Responses (R, C, pixel, band + n) with `patterns` (4, pixel, n) as further bands, chosen by
     the parity of windows' first pixels `origin` (R, C, 2).
     """
@@ -114,7 +114,7 @@ class Widened:
         self._response, self._patterns, self._origin = response, patterns, origin
 
     def __getitem__(self, places):
-        more = self._patterns[_parity(self._origin[places])]
+        more = self._patterns[parity(self._origin[places])]
         own = (
             self._response[places]
             if self._response.ndim > 2
@@ -124,13 +124,13 @@ class Widened:
 
 
 def widened(response, patterns, origin, sites):
-    """As Widened, one array (pixel, band + n) where one response and one pattern serve all
+    """As WidenedResponses, one array (pixel, band + n) where one response and one pattern serve all
     lenslets at `sites`.
     """
-    kinds = np.unique(_parity(origin[sites]))
+    kinds = np.unique(parity(origin[sites]))
     if response.ndim == 2 and len(kinds) == 1:
         return np.concatenate([response, patterns[kinds[0]]], axis=-1)
-    return Widened(response, patterns, origin)
+    return WidenedResponses(response, patterns, origin)
 
 
 def even_light(window, cfa):
@@ -139,7 +139,7 @@ def even_light(window, cfa):
     neighbours' light cannot be told from stray light.
     """
     from plenocli.forward.sensor.cfa import MONO, cfa_map
-    from plenocli.inverse.registration.motion import PARITIES, own_pixels
+    from plenocli.inverse.registration.reference import own_pixels
 
     letters = dict.fromkeys(cfa if cfa != "mono" else MONO)
     patterns = np.stack(

@@ -5,7 +5,7 @@ description.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -178,3 +178,14 @@ class Calibration:
     white: White | None = None
     dark: Dark | None = None
     response: Response | None = None
+
+
+class MadeResponses(Protocol):
+    """Responses (lenslet_row, lenslet_column, pixel, band) that are made lenslet by lenslet, and
+    never held whole: plenocli.inverse.registration.moved_response.
+    """
+
+    shape: tuple[int, ...]
+    ndim: int
+
+    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray: ...

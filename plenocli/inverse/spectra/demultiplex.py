@@ -8,9 +8,12 @@ Sources: Berkner et al. 2013, section on spectral demultiplexing; S. M. Kay, Fun
 Statistical Signal Processing I (1993), ch. 6 (BLUE) and 12 (LMMSE).
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor.noise import Noise
 
 METHODS = ("pinv", "single-pixel", "wls", "lmmse", "nnls")
 BATCH_NUMBERS = 4_000_000
@@ -63,19 +66,25 @@ def calibration_bias(response, variance):
     return back - (pseudo @ np.swapaxes(pseudo, -1, -2)) * lost[..., None, :]
 
 
-def noise_variance(response, radiance, gain, read_variance, response_variance=None):
-    """Variance (..., pixel) of the pixel values, DN^2: gain * E[F b] +
-    read_variance [+ b^2 var(F)].
+def noise_variance(
+    response: np.ndarray,
+    radiance: np.ndarray,
+    noise: Noise,
+    response_variance: np.ndarray | None = None,
+) -> np.ndarray:
+    """Variance of pixel values: that of their noise, and of what the calibration does not know.
 
-    radiance (..., band): the expected one, not the outcome of a noisy pixel; negative
-        parts count as zero.
-    gain in DN per electron;
-    read_variance in DN^2, with the 1/12 of the rounding;
-    response_variance (..., pixel, band) or (band,) adds what the calibration does not know.
+    response: F (..., pixel, band).
+    radiance: (..., band), the expected one, not the outcome of a noisy pixel; negative parts count
+        as zero.
+    noise: of the signal, with that of the rounding.
+    response_variance: (..., pixel, band) or (band,), adds b^2 var(F).
+
+    Returns (..., pixel), units^2.
     """
     radiance = np.clip(radiance, 0, None)
     mean = (np.nan_to_num(response) @ radiance[..., None])[..., 0]
-    variance = gain * np.clip(mean, 0, None) + read_variance
+    variance = noise.variance(mean)
     if response_variance is not None:
         spread = np.broadcast_to(
             np.nan_to_num(response_variance),

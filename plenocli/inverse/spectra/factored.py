@@ -458,7 +458,8 @@ class _Variance:
 
     def __init__(self, factored, noise, response_variance, doubt):
         self.factored = factored
-        self.gain, self.read = noise[0], np.float32(max(noise[1], 1e-12))
+        self.gain = noise.gain
+        self.read = np.float32(max(noise.without_signal, 1e-12))
         self.known, self.doubt = (
             None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32)
             for v in (response_variance, doubt)

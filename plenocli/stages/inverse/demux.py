@@ -2,10 +2,14 @@
 standard deviations.
 """
 
-import threading
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,15 +19,28 @@ from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.read.mosaics import read_exposure
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.inverse.spectra.radiance import estimate, light_prior, read_response, readout
+from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
+
+if TYPE_CHECKING:
+    from plenocli.execution.batch import Batch
+    from plenocli.files.read.mosaics import Exposure
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.forward.sensor.readout import Readout
+    from plenocli.inverse.registration.alignment import Registration
+    from plenocli.inverse.spectra.spectra import Spectra
+
+Name = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """method: pinv, single-pixel, wls, lmmse, nnls or auto;
-    reference_reflectance: of the white reference;
-    register: auto, on or off, whether captures are brought into line with the
-        calibration (plenocli.inverse.registration.alignment).
+    """How captures are demultiplexed.
+
+    method: pinv, single-pixel, wls, lmmse, nnls or auto.
+    reference: capture of the white reference that makes reflectances of radiances, or None.
+    reference_reflectance: of the white reference.
+    register: auto, on or off, whether captures are brought into line with the calibration
+        (plenocli.inverse.registration.alignment).
     """
 
     method: str = "auto"
@@ -32,19 +49,75 @@ class Settings:
     register: str = "auto"
 
 
+@dataclass(frozen=True, kw_only=True)
+class CaptureSummary:
+    """What came of one capture.
+
+    capture, output: file names.
+    method, reason, registration, warning: plenocli.inverse.spectra.spectra.Trace.
+    quantity: "radiance" or "reflectance".
+    lenslets: how many have a spectrum.
+    array: rows and columns of lenslets.
+    bands_nm, mean, sigma: (band,), mean value and standard deviation; sigma None: unknown.
+    """
+
+    capture: str
+    output: str
+    method: str
+    reason: str
+    registration: Registration | None
+    warning: str | None
+    quantity: str
+    lenslets: int
+    array: list[int]
+    bands_nm: list[float]
+    mean: list[float]
+    sigma: list[float] | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The entry of --json."""
+        registration = None if self.registration is None else self.registration.as_json()
+        flat = {field.name: getattr(self, field.name) for field in fields(self)}
+        return flat | {"registration": registration}
+
+
+@dataclass(frozen=True)
+class DemuxSummary:
+    """What a run did.
+
+    output: file or folder.
+    done, skipped: captures demultiplexed now, and finished before.
+    captures: those done now, in their order.
+    """
+
+    output: str
+    done: int
+    skipped: int
+    captures: tuple[CaptureSummary, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary as --json prints it."""
+        return {
+            "output": self.output,
+            "done": self.done,
+            "skipped": self.skipped,
+            "captures": [one.as_json() for one in self.captures],
+        }
+
+
 def run_demux(
-    captures,
-    output,
+    captures: Sequence[Name],
+    output: Name,
     *,
-    calibration,
-    settings=Settings(),
-    suffix=".exr",
-    workers=1,
-    scheduler=None,
-    overwrite=False,
-    command="",
-):
-    """Demultiplex every capture; returns a summary dict.
+    calibration: Name,
+    settings: Settings = Settings(),
+    suffix: str = ".exr",
+    workers: int = 1,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> DemuxSummary:
+    """Demultiplex every capture.
 
     One capture gives the file `output` (.exr or .h5), several a folder with one file each, named
     after the capture; finished ones are skipped unless overwrite. A capture that fails does not
@@ -52,7 +125,7 @@ def run_demux(
     code of the worst.
     workers: captures that are read and demultiplexed at the same time, in threads; they share one
         calibration, and results are written one at a time.
-    scheduler: a Dask cluster that demultiplexes them instead (stages.scheduler).
+    scheduler: a Dask cluster that demultiplexes them instead (plenocli.execution.pool).
     """
     # a library of its own, which the limit below reaches only once it is loaded
     import scipy.linalg.blas  # noqa: F401
@@ -75,8 +148,8 @@ def run_demux(
             else None
         )
         _say_what_is_old(batch, calibration, settings)
-        if not batch.todo:
-            return summarise(batch, ())
+        if job is None:
+            return _summary(summarise(batch, ()))
         work = (
             job.demux
             if scheduler is None
@@ -90,10 +163,14 @@ def run_demux(
             )
         )
         with open_pool(min(workers, len(batch.todo)), scheduler, threads=True) as pool:
-            return summarise(batch, outcomes(batch, pool, work, job.write))
+            return _summary(summarise(batch, outcomes(batch, pool, work, job.write)))
 
 
-def _say_what_is_old(batch, calibration, settings):
+def _summary(done: dict[str, Any]) -> DemuxSummary:
+    return DemuxSummary(**done | {"captures": tuple(done["captures"])})
+
+
+def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> None:
     """A note where finished results, which stay, were made in another way than this run would
     make them, or are damaged.
     """
@@ -117,45 +194,46 @@ def _say_what_is_old(batch, calibration, settings):
         )
 
 
-def _recipe(inputs, method, unregistered):
-    return {role: inputs.get(role, {}).get("sha256") for role in ("calibration", "reference")} | {
-        "method": method,
-        "unregistered": unregistered,
-    }
+@dataclass(frozen=True)
+class Recipe:
+    """What makes two results of one capture differ: digests of the calibration and the reference,
+    the method asked for, and whether nobody looked for motion.
+    """
+
+    calibration: str | None
+    reference: str | None
+    method: str
+    unregistered: bool
 
 
-def _recipe_of(target):
+def _recipe(inputs: dict[str, Any], method: str, unregistered: bool) -> Recipe:
+    calibration, reference = (
+        inputs.get(role, {}).get("sha256") for role in ("calibration", "reference")
+    )
+    return Recipe(calibration, reference, method, unregistered)
+
+
+def _recipe_of(target: Path) -> Recipe | None:
     """The recipe of a finished result, None where it cannot be read."""
-    import json
-
-    from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.provenance import read_provenance_texts
-    from plenocli.files.images.spectral_exr import read_spectral_exr
+    from plenocli.files.images.spectra import read_origin
 
     try:
-        if target.suffix == ".h5":
-            artefact = read_artefact(target, "spectra")
-            inputs, parameters = artefact.provenance.inputs, artefact.attrs["spectra"]["parameters"]
-        else:
-            attrs = read_spectral_exr(target).attrs
-            inputs, parameters = (
-                read_provenance_texts(attrs).inputs,
-                json.loads(attrs["parameters"]),
-            )
-        return _recipe(inputs, parameters["asked"], parameters["registration"] is None)
+        origin = read_origin(target)
+        return _recipe(origin.inputs, origin.asked, not origin.registered)
     except (InputError, KeyError, TypeError, ValueError):
         return None
 
 
 @lru_cache(maxsize=1)
-def _demultiplexer(recipe):
+def _demultiplexer(recipe: tuple[Any, ...]) -> Demultiplexer:
     return Demultiplexer(*recipe[:2], False, "")
 
 
-def demux_elsewhere(recipe, capture):
+def demux_elsewhere(recipe: tuple[Any, ...], capture: Name) -> tuple[Spectra, dict[str, Any]]:
     """Demultiplexer.demux of a capture in a process of its own, which reads the calibration once.
 
     recipe: calibration, settings, and digests that tell them from others of the same name.
+    capture: its file.
     """
     return _demultiplexer(recipe).demux(capture)
 
@@ -163,197 +241,159 @@ def demux_elsewhere(recipe, capture):
 class Demultiplexer:
     """What any number of captures need: calibration read and factored, white reference
     demultiplexed, once.
+
+    calibration: its file.
+    settings: how captures are demultiplexed.
+    overwrite: whether results replace files.
+    command: for their provenance.
+    threads: for factoring the response.
     """
 
-    def __init__(self, calibration, settings, overwrite, command, threads=1):
+    def __init__(
+        self,
+        calibration: Name,
+        settings: Settings,
+        overwrite: bool,
+        command: str,
+        threads: int = 1,
+    ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
+        from plenocli.files.read.calibrations import read_calibration
+        from plenocli.inverse.spectra.responses import LensletResponses
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
         self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
-        found = read_response(calibration)
-        self.prior = light_prior(found)
-        self.calibration, self._lock = (
-            replace(found, white=None, threads=threads).prepare(),
-            threading.Lock(),
+        found = read_calibration(
+            calibration, needs=("response", "windows", "white", "dark"), white_image=False
         )
-        self.reference = None
+        self.prior = light_prior(LensletResponses.of(found))
+        # its superpixels, one for every lenslet, have served
+        self.responses = LensletResponses.of(replace(found, white=None), threads).prepare()
+        self.reference: Spectra | None = None
         if settings.reference is not None:
-            self.reference = self.demux(settings.reference, self._plain_method())[0]
+            self.reference = self.demux(settings.reference, self._method_of_reference())[0]
 
-    def _plain_method(self):
+    def _method_of_reference(self) -> str:
         """The white reference is demultiplexed without a prior: a prior's pull
         would not divide out.
         """
         method = self.settings.method
         return {"auto": "pinv", "lmmse": "wls"}.get(method, method)
 
-    def demux(self, path, method=None):
-        """(Estimate, name and digest) of one capture, registered to the calibration."""
+    def demux(self, path: Name, method: str | None = None) -> tuple[Spectra, dict[str, Any]]:
+        """Radiances of one capture, registered to the calibration, and its name and digest.
+
+        method: instead of the settings' one.
+        """
         from plenocli.files.artefacts.provenance import describe_inputs
 
-        exposure = read_exposure(path, cfa=self.calibration.cfa)
+        exposure = read_exposure(path, cfa=self.responses.cfa)
         return self.estimate(exposure, path, method), describe_inputs({"capture": path})
 
-    def estimate(self, exposure, path, method=None):
-        """The Estimate of a capture that was read already."""
-        from plenocli.inverse.registration.alignment import doubtful, judge
+    def estimate(self, exposure: Exposure, path: Name, method: str | None = None) -> Spectra:
+        """Radiances of a capture that was read already."""
+        from plenocli.inverse.registration.alignment import doubtful, warn_of_misfit
 
         method = method or self.settings.method
-        signal, noise = readout(exposure, self.calibration, path)
+        signal, noise = readout(exposure, self.responses, path)
         found = self._aligned(signal, noise, method, path, self.settings.register)
-        if self.settings.register == "auto" and doubtful(found.residual, found.record):
+        if self.settings.register == "auto" and doubtful(found.residual, found.trace.registration):
             found = self._believed(found, signal, noise, method, path)
         if not np.isfinite(found.value).any():
             raise NumericsError(
                 "no lenslet could be demultiplexed", path, "check exposure and calibration"
             )
-        return replace(found, warning=judge(found.residual, found.record, path))
+        warning = warn_of_misfit(found.residual, found.trace.registration, path)
+        return replace(found, trace=replace(found.trace, warning=warning))
 
-    def _believed(self, found, signal, noise, method, path):
+    def _believed(
+        self, found: Spectra, signal: Readout, noise: Noise | None, method: str, path: Name
+    ) -> Spectra:
         """`found`, or the estimate with motion alone corrected, or with nothing: the first that
         explains its residuals.
         """
         from plenocli.inverse.registration.alignment import believed
 
-        plain = self._aligned(signal, noise, method, path, "off")
-        if believed(found.residual, plain.residual):
+        uncorrected = self._aligned(signal, noise, method, path, "off")
+        if believed(found.residual, uncorrected.residual):
             return found
-        if "motion" in found.record["corrected"]:
+        registration = found.trace.registration
+        if "motion" in registration.corrected:
             moved = (
                 found
-                if found.record["corrected"] == ["motion"]
+                if registration.corrected == ("motion",)
                 else self._aligned(signal, noise, method, path, "auto", levels=False)
             )
-            if believed(moved.residual, plain.residual):
+            if believed(moved.residual, uncorrected.residual):
                 return moved
-        return replace(plain, record=found.record | {"corrected": []})
+        trace = replace(uncorrected.trace, registration=replace(registration, corrected=()))
+        return replace(uncorrected, trace=trace)
 
-    def _aligned(self, signal, noise, method, path, mode, levels=True):
+    def _aligned(
+        self,
+        signal: Readout,
+        noise: Noise | None,
+        method: str,
+        path: Name,
+        mode: str,
+        levels: bool = True,
+    ) -> Spectra:
         from plenocli.inverse.registration.alignment import align
 
-        c, signal, stray, record = align(self.calibration, signal, noise, mode, path, levels)
-        return replace(
-            estimate(
-                c, signal, noise, method, self.prior, self.settings.reference is not None, stray
-            ),
-            record=record,
+        aligned = align(self.responses, signal, noise, mode, path, levels)
+        found = estimate(
+            aligned.responses,
+            aligned.signal,
+            noise,
+            method,
+            self.prior,
+            self.settings.reference is not None,
+            aligned.stray,
         )
+        return replace(found, trace=replace(found.trace, registration=aligned.registration))
 
-    def write(self, done, capture, target):
-        """Write what `demux` returned for `capture` to `target`; returns its report."""
+    def write(
+        self, done: tuple[Spectra, dict[str, Any]], capture: Name, target: Name
+    ) -> CaptureSummary:
+        """Write what `demux` returned for `capture` to the file `target`."""
+        from plenocli.files.artefacts.provenance import Provenance
+        from plenocli.files.images.spectra import write_spectra
+
         found, own = done
-        value, sigma, reference = found.value, found.sigma, self.settings.reference
-        quantity = "radiance"
-        if reference is not None:
-            value, sigma = _reflectance(
-                value,
-                sigma,
-                self.reference.value,
-                self.reference.sigma,
-                self.settings.reference_reflectance,
-            )
-            quantity = "reflectance"
-            if not np.isfinite(value).any():
+        # the white reference may have been asked for by another method than the captures
+        found = replace(found, trace=replace(found.trace, asked=self.settings.method))
+        if self.reference is not None:
+            found = found.relative_to(self.reference, self.settings.reference_reflectance)
+            if not np.isfinite(found.value).any():
                 raise NumericsError(
                     "no lenslet has light in capture and reference", capture, "check the reference"
                 )
-        attrs = dict(quantity=quantity, method=found.method) | (
-            {} if reference is None else {"reference": Path(reference).name}
-        )
-        parameters = {
-            "registration": found.record,
-            "warning": found.warning,
-            "asked": self.settings.method,
-            "reason": found.why,
-            "reference_reflectance": None
-            if reference is None
-            else self.settings.reference_reflectance,
-        }
-        wavelengths = self.calibration.wavelengths
-        _write(
+        write_spectra(
             target,
-            wavelengths,
-            np.moveaxis(value, -1, 0),
-            np.moveaxis(sigma, -1, 0),
-            found.residual,
-            attrs,
-            parameters,
-            own | self.inputs,
-            self.overwrite,
-            self.command,
+            found,
+            Provenance(self.command, own | self.inputs),
+            reference=self.settings.reference,
+            overwrite=self.overwrite,
         )
-        seen = np.isfinite(value).all(axis=-1)
-        return dict(
-            capture=Path(capture).name,
-            output=str(target),
-            method=found.method,
-            reason=found.why,
-            registration=found.record,
-            warning=found.warning,
-            quantity=quantity,
-            lenslets=int(seen.sum()),
-            array=list(value.shape[:2]),
-            bands_nm=[float(w * 1e9) for w in wavelengths],
-            mean=[float(v) for v in value[seen].mean(axis=0)],
-            sigma=[float(v) for v in np.nanmean(sigma[seen], axis=0)]
-            if np.isfinite(sigma[seen]).any()
-            else None,
-        )
+        return _capture_summary(found, capture, target)
 
 
-def _reflectance(value, sigma, white, white_sigma, level):
-    """Ratio to the white reference times its reflectance, with both relative errors."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        known = np.where(white > 0, white, np.nan)
-        ratio = level * value / known
-        spread = level / known * np.sqrt(sigma**2 + (value / known * white_sigma) ** 2)
-    return ratio, spread
-
-
-def _write(
-    target, wavelengths, value, sigma, residual, attrs, parameters, inputs, overwrite, command
-):
-    from plenocli.files.artefacts.container import Artefact, write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, provenance_texts
-    from plenocli.files.images.spectral_exr import write_spectral_exr
-
-    value, sigma, provenance = (
-        value.astype(np.float32),
-        sigma.astype(np.float32),
-        Provenance(command, inputs),
-    )
-    if Path(target).suffix == ".h5":
-        data = {"spectra/value": value, "spectra/sigma": sigma, "spectra/wavelength": wavelengths}
-        if residual is not None:
-            data["spectra/residual"] = residual
-        write_artefact(
-            target,
-            Artefact("spectra", data, {"spectra": attrs | {"parameters": parameters}}, provenance),
-            overwrite=overwrite,
-        )
-        return
-    import json
-
-    from plenocli.forward.scene.colour import preview_rgb
-
-    whole = np.nan_to_num(value)
-    if attrs["quantity"] == "reflectance":
-        rgb = preview_rgb(wavelengths, whole)
-    else:  # no light is taken off: shown under the one that was there
-        rgb = preview_rgb(wavelengths, whole / max(float(whole.max()), 1e-30), "E")
-    texts = {
-        "method": attrs["method"],
-        "parameters": json.dumps(parameters, sort_keys=True),
-    } | provenance_texts(provenance)
-    if attrs["quantity"] == "radiance":
-        texts["emissiveUnits"] = "relative"
-    write_spectral_exr(
-        target,
-        wavelengths,
-        value,
-        attrs["quantity"],
-        rgb=rgb,
-        sigma=sigma,
-        attrs=texts,
-        overwrite=overwrite,
+def _capture_summary(found: Spectra, capture: Name, target: Name) -> CaptureSummary:
+    value, sigma = (np.moveaxis(part, 0, -1) for part in (found.value, found.sigma))
+    seen = np.isfinite(value).all(axis=-1)
+    return CaptureSummary(
+        capture=Path(capture).name,
+        output=str(target),
+        method=found.method,
+        reason=found.trace.reason,
+        registration=found.trace.registration,
+        warning=found.trace.warning,
+        quantity=found.quantity,
+        lenslets=int(seen.sum()),
+        array=list(value.shape[:2]),
+        bands_nm=[float(w * 1e9) for w in found.wavelength],
+        mean=[float(v) for v in value[seen].mean(axis=0)],
+        sigma=[float(v) for v in np.nanmean(sigma[seen], axis=0)]
+        if np.isfinite(sigma[seen]).any()
+        else None,
     )

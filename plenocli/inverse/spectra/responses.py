@@ -1,0 +1,191 @@
+"""The responses of all lenslets as one capture meets them: as calibrated, moved since then, or with
+stray light as further bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.inverse.spectra.calibration import Calibration, MadeResponses
+
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.frames import Dark
+    from plenocli.forward.sensor.readout import Levels
+    from plenocli.inverse.registration.reference import Reference
+    from plenocli.inverse.spectra.factored import Factored
+
+SAMPLE = 256
+"""Lenslets on which methods are compared."""
+BATCH_NUMBERS = 4_000_000
+"""Numbers of responses that are held at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensletResponses:
+    """Responses of the lenslets, and what follows from them once for all captures.
+
+    calibration: of the camera, with windows, dark and response.
+    response: F, (lenslet_row, lenslet_column, pixel, band), or (pixel, band) for all lenslets.
+    variance: (pixel, band) of its entries; None: unknown.
+    origin: (lenslet_row, lenslet_column, 2), first pixels of the windows that F belongs to.
+    threads: for factoring it.
+    """
+
+    calibration: Calibration
+    response: np.ndarray | MadeResponses
+    variance: np.ndarray | None
+    origin: np.ndarray
+    threads: int = 1
+
+    @classmethod
+    def of(cls, calibration: Calibration, threads: int = 1) -> LensletResponses:
+        """The responses as they were calibrated."""
+        return cls(
+            calibration=calibration,
+            response=calibration.response.matrix,
+            variance=calibration.response.variance,
+            origin=calibration.windows.origin,
+            threads=threads,
+        )
+
+    @property
+    def wavelengths(self) -> np.ndarray:
+        """Of the bands, (band,) m."""
+        return self.calibration.response.wavelengths
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Rows and columns of a superpixel, px."""
+        return self.calibration.windows.shape
+
+    @property
+    def centres(self) -> np.ndarray:
+        """Of the superpixels when they were calibrated, (lenslet_row, lenslet_column, 2) px."""
+        return self.calibration.grid.centres
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which lenslets can be used, (lenslet_row, lenslet_column)."""
+        return self.calibration.grid.valid
+
+    @property
+    def dark(self) -> Dark:
+        """What the sensor reports without light."""
+        return self.calibration.dark
+
+    @property
+    def cfa(self) -> str:
+        """ "mono" or the four letters of the colour filter array."""
+        return self.calibration.sensor.cfa
+
+    @property
+    def shared(self) -> bool:
+        """Whether one F serves all lenslets."""
+        return self.response.ndim == 2
+
+    @property
+    def passing(self) -> bool:
+        """Whether F is made lenslet by lenslet for one capture."""
+        return not isinstance(self.response, np.ndarray)
+
+    @cached_property
+    def sites(self) -> tuple[np.ndarray, ...]:
+        """Row and column indices of the valid lenslets, which results below are ordered by."""
+        return np.nonzero(self.valid)
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """First pixels (lenslet, 2) of the valid lenslets' windows."""
+        return self.origin[self.sites]
+
+    @cached_property
+    def levels(self) -> Levels | None:
+        """Dark levels under the windows, None where they are black levels alone or some window
+        is not on the sensor.
+        """
+        from plenocli.forward.sensor.readout import Levels
+        from plenocli.forward.sensor.superpixel import inside
+
+        if self.dark.flat or not inside(self.corners, self.window, self.dark.mean.shape).all():
+            return None
+        return Levels(self.dark, self.corners, self.window).keep()
+
+    @cached_property
+    def factored(self) -> Factored:
+        """F = Q R of the valid lenslets."""
+        from plenocli.inverse.spectra.factored import factor
+
+        return factor(self.response, None if self.shared else self.sites, self.threads)
+
+    @cached_property
+    def reference(self) -> Reference:
+        """What registration needs of these responses."""
+        from plenocli.inverse.registration.reference import Reference
+
+        origin = np.where(self.valid[..., None], self.origin, -(2**20))
+        return Reference(
+            self.response,
+            origin,
+            self.window,
+            self.centres,
+            self.cfa,
+            self.dark.mean.shape,
+            self.variance,
+        )
+
+    @cached_property
+    def sample(self) -> np.ndarray:
+        """Indices of lenslets all over the array, enough to compare methods on."""
+        return np.unique(
+            np.linspace(0, len(self.sites[0]) - 1, min(len(self.sites[0]), SAMPLE)).astype(int)
+        )
+
+    @cached_property
+    def sampled(self) -> Factored:
+        """`factored` of the sample."""
+        from plenocli.inverse.spectra.factored import factor
+
+        return (
+            factor(self.response, tuple(part[self.sample] for part in self.sites))
+            if self.passing
+            else self.factored.some(self.sample)
+        )
+
+    @cached_property
+    def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """`pixels` of the sample."""
+        return self.pixels(self.sample)
+
+    def pixels(self, which: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        """What single-pixel extraction takes.
+
+        which: lenslets, by their index among the valid ones.
+
+        Returns the pixel of each band (lenslet or 1, band), and F there (lenslet or 1, pixel's
+        band, band).
+        """
+        from plenocli.inverse.spectra.demultiplex import choose_pixels
+
+        if self.shared:
+            pixels = choose_pixels(self.response)[None]
+            return pixels, self.response[pixels].astype(float)
+        rows, columns = (part[which] for part in self.sites)
+        step = max(1, BATCH_NUMBERS // int(np.prod(self.response.shape[-2:])))
+        found = []
+        for start in range(0, len(rows), step):
+            f = self.response[rows[start : start + step], columns[start : start + step]]
+            pixels = choose_pixels(f)
+            found.append((pixels, np.take_along_axis(f, pixels[..., None], axis=-2).astype(float)))
+        chosen, there = zip(*found)
+        return np.concatenate(chosen), np.concatenate(there)
+
+    def prepare(self) -> LensletResponses:
+        """Make now what all captures need and several threads would make at
+        once; returns itself.
+        """
+        _ = self.levels, self.reference.gains
+        return self

@@ -44,7 +44,6 @@ PENDING = {
     ("plenocli.evaluation.depth_score", "plenocli.files.config.camera_file"),
     ("plenocli.evaluation.response_score", "plenocli.files.artefacts.container"),
     ("plenocli.evaluation.spectra_score", "plenocli.files.read.results"),
-    ("plenocli.inverse.spectra.radiance", "plenocli.files.artefacts.container"),
 }
 """Arrows up that are being taken away; none may be added."""
 

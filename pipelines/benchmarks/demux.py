@@ -226,13 +226,13 @@ def measure(run, kind, rounds):
             return raw.raw_image_visible.copy()
 
     worker = clock.time("prepare", lambda: Demultiplexer(run / f"{kind}.h5", Settings(), True, ""))
-    exposure = read_exposure(shot, cfa=worker.calibration.cfa)
+    exposure = read_exposure(shot, cfa=worker.responses.cfa)
     # and what it leaves for the others
     clock.time("first", lambda: worker.estimate(exposure, shot))
     plain = replace(worker, "register", "off")
     for _ in range(rounds):
         clock.time("decode", decode)
-        exposure = clock.time("read", lambda: read_exposure(shot, cfa=worker.calibration.cfa))
+        exposure = clock.time("read", lambda: read_exposure(shot, cfa=worker.responses.cfa))
         found = clock.time("demux", lambda: worker.estimate(exposure, shot))
         clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
         clock.time(
@@ -241,7 +241,7 @@ def measure(run, kind, rounds):
                 (found, describe_inputs({"capture": shot})), shot, run / "shot.exr"
             ),
         )
-    elsewhere = read_exposure(run / "moved.dng", cfa=worker.calibration.cfa)
+    elsewhere = read_exposure(run / "moved.dng", cfa=worker.responses.cfa)
     for _ in range(2):
         away = clock.time("demux, moved", lambda: worker.estimate(elsewhere, run / "moved.dng"))
     parts = clock.medians()
@@ -252,8 +252,8 @@ def measure(run, kind, rounds):
         "ratios": ratio,
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "method": found.method,
-        "corrected": away.record["corrected"],
-        "shift": away.record["shift_px"],
+        "corrected": list(away.trace.registration.corrected),
+        "shift": away.trace.registration.motion.shift.tolist(),
         "load": os.getloadavg()[0],
     }
 

@@ -96,7 +96,7 @@ def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path
     for name in before:
         assert (out / name).read_bytes() == (folder / "whole" / name).read_bytes()
     report = run_demux(shots(folder), out, calibration=folder / "c.h5", suffix=".exr", workers=2)
-    assert (report["done"], report["skipped"]) == (FILES - len(before), len(before))
+    assert (report.done, report.skipped) == (FILES - len(before), len(before))
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in before.items())
     # nothing half-written is left
     assert sorted(p.name for p in out.iterdir()) == sorted(
@@ -116,7 +116,7 @@ def test_finished_results_of_another_recipe_stay_and_are_named(folder, tmp_path,
             suffix=suffix,
             settings=Settings(**settings),
         )
-        return report["done"], report["skipped"], capsys.readouterr().err
+        return report.done, report.skipped, capsys.readouterr().err
 
     assert rerun()[:2] == (3, 0)
     assert rerun() == (0, 3, "")

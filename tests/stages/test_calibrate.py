@@ -115,11 +115,11 @@ def test_grid_and_windows_sit_where_the_superpixels_are(calibration):
     path, report = calibration
     data = read_artefact(path, "calibration").data
     assert (
-        report["lattice"] == "square"
-        and report["lenslets"] == ROWS * COLUMNS
-        and report["window"] == [PITCH, PITCH]
+        report.lattice == "square"
+        and report.lenslets == ROWS * COLUMNS
+        and report.window == [PITCH, PITCH]
     )
-    np.testing.assert_allclose(report["pitch_px"], PITCH, rtol=2e-4)
+    np.testing.assert_allclose(report.pitch_px, PITCH, rtol=2e-4)
     index = np.stack(np.meshgrid(np.arange(ROWS), np.arange(COLUMNS), indexing="ij"), axis=-1)
     first = np.argwhere(data["grid/valid"])[0]
     valid = data["grid/valid"]
@@ -143,7 +143,7 @@ def test_response_is_the_painted_one_within_its_own_variance(calibration):
     assert np.abs(error.mean(axis=0) / sigma * np.sqrt(len(found))).max() < 6
     np.testing.assert_allclose(error.std(axis=0) / sigma, 1, atol=0.35)
     assert (error.std(axis=0) / sigma).mean() == pytest.approx(1, abs=0.05)
-    assert report["condition"] == pytest.approx(np.linalg.cond(truth), rel=0.02)
+    assert report.response.condition == pytest.approx(np.linalg.cond(truth), rel=0.02)
     np.testing.assert_allclose(data["response/wavelength"], BANDS)
     assert (
         artefact.attrs["response"]["exposure_s"] == EXPOSURE
@@ -308,7 +308,7 @@ def test_bayer_mosaic_is_part_of_the_response(tmp_path):
     white, dark, scene = paint("w.h5", LIGHT, 1), paint("d.h5", 0.0, 2), paint("s.h5", truth, 9)
     bands = [(w, paint(f"b{k}.h5", narrow(k), 3 + k)) for k, w in enumerate(BANDS)]
     report = run_calibrate(tmp_path / "c.h5", whites=[white], darks=[dark], bands=bands)
-    assert report["window"] == [15, 15] and report["lenslets"] == 81
+    assert report.window == [15, 15] and report.lenslets == 81
     run_demux([scene], tmp_path / "o.h5", calibration=tmp_path / "c.h5", settings=Settings("wls"))
     data = read_artefact(tmp_path / "o.h5", "spectra").data
     error = np.moveaxis(data["spectra/value"], 0, -1) - truth
@@ -386,10 +386,12 @@ def test_refusals_say_what_is_wrong(files, calibration, tmp_path):
 def test_a_sensor_smaller_than_a_lenslet_is_refused():
     from types import SimpleNamespace
 
-    from plenocli.stages.inverse.calibrate import _describe_grid
+    from plenocli.inverse.spectra.calibration import windows_on
 
     grid = SimpleNamespace(
-        kind="square", centres=np.full((1, 1, 2), 4.5), valid=np.ones((1, 1), bool)
+        window_shape=lambda: (20, 20),
+        centres=np.full((1, 1, 2), 4.5),
+        valid=np.ones((1, 1), bool),
     )
     with pytest.raises(NumericsError, match="no lenslet lies wholly"):
-        _describe_grid(grid, (20, 20), (10, 10))
+        windows_on(grid, (10, 10))

@@ -107,7 +107,7 @@ def test_exr_holds_value_and_preview(files, tmp_path):
         settings=Settings("pinv", files["white"]),
     )
     found = read_spectral_exr(tmp_path / "s.exr")
-    assert report["captures"][0]["quantity"] == "reflectance"
+    assert report.captures[0].quantity == "reflectance"
     np.testing.assert_allclose(found.wavelengths, BANDS, rtol=1e-9)
     cube = found.values if hasattr(found, "values") else found.cube
     np.testing.assert_allclose(
@@ -152,10 +152,9 @@ def test_both_files_hold_the_same_and_others_read_them(files, tmp_path):
 
 
 def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files, tmp_path):
-    report = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])[
-        "captures"
-    ][0]
-    assert report["method"] == "pinv" and "not known" in report["reason"]
+    summary = run_demux([files["shots"][0]], tmp_path / "s.h5", calibration=files["calibration"])
+    report = summary.captures[0]
+    assert report.method == "pinv" and "not known" in report.reason
     data = read_artefact(tmp_path / "s.h5", "spectra").data
     error = np.moveaxis(data["spectra/value"], 0, -1) - files["truth"][0]
     assert (error / np.moveaxis(data["spectra/sigma"], 0, -1)).std() == pytest.approx(1, abs=0.25)

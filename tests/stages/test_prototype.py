@@ -12,9 +12,10 @@ from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
 from plenocli.forward.sensor.noise import SensorModel
-from plenocli.inverse.spectra.radiance import Response, estimate, light_prior
+from plenocli.inverse.spectra.radiance import estimate, light_prior
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
+from tests.reference.calibrations import lenslet_responses
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME = 6, 9, 52, 6
@@ -97,7 +98,7 @@ def demultiplexed(folder, capture, method, reference, calibration="calibration.h
         overwrite=True,
         settings=Settings(method, reference, 1.0, **settings),
     )
-    assert report["captures"][0]["quantity"] == "reflectance"
+    assert report.captures[0].quantity == "reflectance"
     out = read_artefact(folder / "out.h5", "spectra")
     parameters = out.attrs["spectra"]["parameters"]
     return (
@@ -150,16 +151,13 @@ def test_monte_carlo_errors_are_the_predicted_ones_with_everything_estimated(fol
     electrons = rng.poisson(4 * response @ truth, (100, 100, 26**2))
     values = np.rint(0.25 * (electrons + rng.normal(0, 4, electrons.shape))).astype(np.float32)
     c = ideal(response, (100, 100))
-    noise = (0.25, (0.25 * 4) ** 2 + 1 / 12)
+    noise = SENSOR.noise
     snr = {}
     for method in ("pinv", "wls", "lmmse", "single-pixel"):
         found = estimate(c, values, noise, method, light_prior(c))
-        error = (
-            found.value - found.value.mean(axis=(0, 1))
-            if method in ("single-pixel", "lmmse")
-            else found.value - truth
-        )
-        measured, predicted = error.var(axis=(0, 1)), (found.sigma**2).mean(axis=(0, 1))
+        value, sigma = (np.moveaxis(part, 0, -1) for part in (found.value, found.sigma))
+        error = value - (value.mean(axis=(0, 1)) if method in ("single-pixel", "lmmse") else truth)
+        measured, predicted = error.var(axis=(0, 1)), (sigma**2).mean(axis=(0, 1))
         # 10 000 draws tell 1.4 % at one sigma
         np.testing.assert_allclose(measured, predicted, rtol=0.05)
         snr[method] = truth / np.sqrt(measured), truth / np.sqrt(predicted)
@@ -170,23 +168,7 @@ def test_monte_carlo_errors_are_the_predicted_ones_with_everything_estimated(fol
 
 def ideal(response, shape):
     """A calibration without error: every lenslet alike, a white under LIGHT."""
-    return Response(
-        response,
-        None,
-        BANDS,
-        None,
-        None,
-        None,
-        np.ones(shape, bool),
-        response @ LIGHT,
-        None,
-        "mono",
-        "DN",
-        np.inf,
-        None,
-        0.25,
-        13 / 12,
-    )
+    return lenslet_responses(response, BANDS, np.ones(shape, bool), white=response @ LIGHT)
 
 
 def test_when_starved_the_prior_pays_and_auto_takes_it():
@@ -198,15 +180,17 @@ def test_when_starved_the_prior_pays_and_auto_takes_it():
     values = np.rint(
         0.25 * (rng.poisson(4 * truth * LIGHT @ response.T) + rng.normal(0, 4, (6, 400, 4)))
     )
-    c, noise = ideal(response, (6, 400)), (0.25, 13 / 12)
+    c, noise = ideal(response, (6, 400)), SENSOR.noise
     error = {
-        m: rmse(estimate(c, values, noise, m, light_prior(c)).value / LIGHT, truth).mean()
+        m: rmse(
+            np.moveaxis(estimate(c, values, noise, m, light_prior(c)).value, 0, -1) / LIGHT, truth
+        ).mean()
         for m in ("pinv", "wls", "lmmse")
     }
     assert error["lmmse"] < 0.95 * error["wls"]
     assert error["pinv"] == pytest.approx(error["wls"])  # as many pixels as bands: nothing to weigh
     found = estimate(c, values, noise, "auto", light_prior(c))
-    assert found.method == "lmmse" and "wls" in found.why
+    assert found.method == "lmmse" and "wls" in found.trace.reason
 
 
 @pytest.mark.parametrize("shift", [(0.5, 0.5), (1.0, -1.0)])

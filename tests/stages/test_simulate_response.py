@@ -141,8 +141,7 @@ def test_demux_takes_a_prediction_as_it_stands(bench):
         # within what the prediction is said to be known to, and its errors in shape are not
         # passed off as light
         assert (
-            report["captures"][0]["warning"] is None
-            and report["captures"][0]["registration"]["corrected"] == []
+            report.captures[0].warning is None and report.captures[0].registration.corrected == ()
         )
         assert read_artefact(folder / "white-spectra.h5", "spectra").data[
             "spectra/value"

@@ -1,4 +1,4 @@
 """From a file to a type: cameras, captures, scenes, system matrices, results.
 
-Formats are one room up; nothing is written here.
+Formats are one room up. Nothing is written here but what one module reads and writes: calibrations.
 """

@@ -36,7 +36,7 @@ GOOD_FIT = 1.5
 """Residual over noise, mean squares, up to which a fit needs no second look."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Motion:
     """Displacement of superpixels at c (rows, columns) px: shift + matrix (c - middle).
 
@@ -229,17 +229,17 @@ class _LensletSample:
         reach = np.linalg.norm(q[:, 0] + (self.extremes - self.middle) @ matrix.T, axis=1).max()
         sigma = np.array([spread[0], spread[arms.shape[1]], spread[-2]]) * scale
         return Motion(
-            q[:, 0].copy(),
-            matrix,
-            self.middle,
-            float(solved[-2]),
-            float(solved[-1]),
-            sigma,
-            float(spread[-1] * scale),
-            float(np.median(before)),
-            float(np.median(after)),
-            self.count,
-            float(reach),
+            shift=q[:, 0].copy(),
+            matrix=matrix,
+            middle=self.middle,
+            offset=float(solved[-2]),
+            stray=float(solved[-1]),
+            sigma=sigma,
+            stray_sigma=float(spread[-1] * scale),
+            before=float(np.median(before)),
+            after=float(np.median(after)),
+            lenslets=self.count,
+            reach=float(reach),
         )
 
     def _equations(self, shifts, arms):

@@ -8,10 +8,11 @@ import pytest
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import Dark
 from plenocli.forward.sensor.superpixel import extract
-from plenocli.inverse.registration.alignment import _moved
-from plenocli.inverse.registration.motion import Motion, own_pixels
-from plenocli.inverse.registration.moved_response import Widened, even_light, widened
-from plenocli.inverse.spectra.radiance import Response
+from plenocli.inverse.registration.alignment import moved_with
+from plenocli.inverse.registration.motion import Motion
+from plenocli.inverse.registration.moved_response import WidenedResponses, even_light, widened
+from plenocli.inverse.registration.reference import own_pixels
+from tests.reference.calibrations import lenslet_responses
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME = 3, 4, 40, 8
@@ -52,38 +53,31 @@ def calibration(cfa, shared):
     valid = np.ones((ROWS, COLUMNS), bool)
     valid[1, 2] = False
     dark = Dark(np.zeros(SHAPE, np.float32), np.zeros((2, 2)), None, None)
-    return Response(
+    return lenslet_responses(
         response[0, 0] if shared else response,
-        None,
         np.array([450e-9, 540e-9, 570e-9, 650e-9]),
-        ORIGIN,
-        (PITCH, PITCH),
-        CENTRES,
         valid,
-        None,
-        dark,
-        cfa,
-        "DN",
-        np.inf,
-        None,
-        0.25,
-        1.0,
+        origin=ORIGIN,
+        window=(PITCH, PITCH),
+        centres=CENTRES,
+        dark=dark,
+        cfa=cfa,
     )
 
 
 def motion(shift, turn=0.0):
     return Motion(
-        np.array(shift),
-        np.array([[0.0, -turn], [turn, 0.0]]),
-        CENTRES.mean(axis=(0, 1)),
-        0.0,
-        0.0,
-        np.zeros(3),
-        0.0,
-        1.0,
-        1.0,
-        48,
-        1.0,
+        shift=np.array(shift),
+        matrix=np.array([[0.0, -turn], [turn, 0.0]]),
+        middle=CENTRES.mean(axis=(0, 1)),
+        offset=0.0,
+        stray=0.0,
+        sigma=np.zeros(3),
+        stray_sigma=0.0,
+        before=1.0,
+        after=1.0,
+        lenslets=48,
+        reach=1.0,
     )
 
 
@@ -92,7 +86,7 @@ def motion(shift, turn=0.0):
 @pytest.mark.parametrize("shift, turn", [((0.3, -0.2), 0.0), ((1.4, 2.0), 0.0), ((0.1, 0.6), 6e-3)])
 def test_a_moved_response_is_that_of_the_moved_superpixel(shared, cfa, shift, turn):
     c, move = calibration(cfa, shared), motion(shift, turn)
-    found = _moved(c, move)
+    found = moved_with(c, move)
     assert found.shared == (shared and not turn)
     response = (
         np.broadcast_to(found.response, (*c.valid.shape, PITCH**2, 4))[c.sites]
@@ -112,7 +106,7 @@ def test_stray_light_is_even_within_each_colour(cfa):
     patterns, window = even_light((17, 20), cfa), (17, 20)
     origin = np.array([[[3, 5], [4, 4]], [[2, 7], [9, 6]]])
     letters = dict.fromkeys(cfa if cfa != "mono" else "Y")
-    whole = Widened(np.zeros((17 * 20, 0), np.float32), patterns, origin)[
+    whole = WidenedResponses(np.zeros((17 * 20, 0), np.float32), patterns, origin)[
         np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
     ]
     for k, letter in enumerate(letters):

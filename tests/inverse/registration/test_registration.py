@@ -5,14 +5,17 @@
 import numpy as np
 import pytest
 
+from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
-from plenocli.inverse.registration.motion import Reference, Smooth, motion_since, spline_matrix
+from plenocli.inverse.registration.motion import motion_since
+from plenocli.inverse.registration.reference import Reference
+from plenocli.inverse.registration.smooth_response import SmoothResponses, spline_matrix
 from plenocli.inverse.spectra.demultiplex import demultiplex
 from tests.reference.prototype import superpixels
 
 ROWS, COLUMNS, PITCH, FRAME, ELECTRONS, GAIN, READ = 6, 8, 40, 8, 12000, 0.25, 4.0
 SIZE = dict(pixels=PITCH, side=33.0, gap=1.5)
-NOISE = (GAIN, (GAIN * READ) ** 2 + 1 / 12)
+NOISE = Noise(gain=GAIN, read_variance=(GAIN * READ) ** 2 + 1 / 12)
 SIX = np.array(
     [
         [0.9, 0.9, 0.9, 0.9],
@@ -91,7 +94,7 @@ def error(signal, response, truth, motion=None, cfa="mono"):
     if motion is not None:
         shifts = motion.at(CENTRES)
         whole = np.rint(shifts).astype(int)
-        smooth = Smooth(
+        smooth = SmoothResponses(
             response.reshape(-1, PITCH * PITCH, 4), ORIGIN.reshape(-1, 2), (PITCH, PITCH), cfa
         )
         origin = ORIGIN + whole
@@ -134,7 +137,7 @@ def test_standard_deviations_of_the_motion_are_what_repeated_captures_show(truth
             capture(truth, 0.25, 20 + i, offset=3.0, exposure=0.1),
             response,
             "mono",
-            (NOISE[0] / 0.1, NOISE[1] / 0.01),
+            NOISE.scaled(1 / 0.1),
         )
         for i in range(8)
     ]

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import nnls
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra import demultiplex as spectral
 
 READ, QUANT = 3.0, 1.0
@@ -167,7 +168,9 @@ def test_sigma_from_residual_where_noise_is_unknown(system):
 
 def test_noise_variance_and_angles(system):
     response, mean, *_ = system
-    value = spectral.noise_variance(response, mean, 0.25, 2.0, np.full(BANDS, 9.0))
+    value = spectral.noise_variance(
+        response, mean, Noise(gain=0.25, read_variance=2.0), np.full(BANDS, 9.0)
+    )
     np.testing.assert_allclose(value, 0.25 * response @ mean + 2.0 + 9.0 * (mean**2).sum())
     angles = spectral.column_angles(np.array([[1.0, 1.0], [0.0, 1.0], [0.0, 0.0]]))
     np.testing.assert_allclose(angles, [[0, 45], [45, 0]], atol=1e-5)

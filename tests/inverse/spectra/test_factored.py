@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import plenocli.inverse.spectra.factored as factored_module
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
 from plenocli.inverse.spectra.factored import answer, collect, factor, stream
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
+NOISE = Noise(gain=GAIN, read_variance=READ)
 PRIOR = np.full(BANDS, 0.4), 0.04 * (0.6 * np.ones((BANDS, BANDS)) + 0.4 * np.eye(BANDS))
 
 
@@ -45,14 +47,14 @@ def both(response, values, method, known=None, **settings):
         factored,
         lambda part: values[part].copy(),
         len(values),
-        (GAIN, READ),
+        NOISE,
         known,
         sandwich=True,
         **settings,
     )
     start = np.clip(np.nan_to_num(demultiplex(response, values)[0]), 0, None)
     variance = np.maximum(
-        noise_variance(response, settings.get("radiance", start), GAIN, READ, known), READ
+        noise_variance(response, settings.get("radiance", start), NOISE, known), READ
     )
     return answer(factored, sums, method, PRIOR), demultiplex(
         response, values, method, variance=variance, prior=PRIOR
@@ -105,11 +107,11 @@ def test_chi_is_the_weighted_residual(case, doubted):
     known = rng.uniform(0, 2000, (PIXELS, BANDS))
     settings = dict(doubt=known) if doubted else dict(response_variance=known)
     sums = collect(
-        factor(response), lambda part: values[part].copy(), len(values), (GAIN, READ), **settings
+        factor(response), lambda part: values[part].copy(), len(values), NOISE, **settings
     )
     b = demultiplex(response, values)[0]
     mean = (response @ b[..., None])[..., 0]
-    variance = noise_variance(response, b, GAIN, READ, known)
+    variance = noise_variance(response, b, NOISE, known)
     residual = (values - mean) ** 2 / variance
     np.testing.assert_allclose(sums.chi, np.nansum(residual, axis=-1), rtol=1e-3)
     np.testing.assert_array_equal(sums.count, np.isfinite(residual).sum(axis=-1))
@@ -166,7 +168,7 @@ def test_sums_made_in_passing_are_those_of_all_factors_at_once(case, monkeypatch
     values[rng.uniform(size=values.shape) < 0.02] = np.nan
     monkeypatch.setattr(factored_module, "STREAMED_NUMBERS", 17 * PIXELS)
     radiance = rng.uniform(0, 1, (LENSLETS, BANDS)) if known else None
-    settings = dict(noise=(GAIN, READ), sandwich=True, radiance=radiance)
+    settings = dict(noise=NOISE, sandwich=True, radiance=radiance)
     whole = factor(response)
     expected = collect(whole, lambda part: values[part].copy(), LENSLETS, **settings)
     passing, sums = stream(

@@ -3,82 +3,184 @@ they start (docs/model.md, "Faults, memory and repetition"). What numbers stand 
 bytes a number that are held at the same time, measured where a library makes them.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
 import numpy as np
 
 from plenocli.base.budget import budget
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.solvers.joint_lmmse import MOST
+from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 
 NUMBER = 8
+"""Bytes of a number."""
 
 
-def reconstruction(system, lenslets, method, directions, *, joint=False, atoms=0):
-    """Bytes for `lenslets` (count) behind a stages.systems.System.
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """What the memory of a method depends on.
 
+    lenslets: how many.
+    pixels, points: of a superpixel and of an object, all bands together.
+    bands: of the object.
+    offsets: superpixels that one object sends light to.
+    reach: of them, in lenslets.
     directions: singular vectors through which the joint estimate sees a superpixel.
-    joint: whether that estimate is made;
-    atoms: of the dictionary.
+    atoms: of the dictionary, 0 without one.
     """
-    blocks, (pixels, points) = system.blocks.size, system.own.shape
-    least, block, wide = (
-        min(pixels, points),
-        points // max(1, len(system.bands)),
-        2 * int(np.abs(system.offsets).max(initial=0)) + 1,
-    )
-    svd, y = least * (pixels + points), lenslets * pixels
-    phases = [
-        1.5 * blocks,
-        lenslets * (3.25 * pixels + 1.5 * points),
-        y + 4.3 * pixels * points + least**2,
-    ]
-    if joint or method in ("lmmse", "auto", "tv", "pnp"):
-        phases += [
-            y + svd + 13 * block**2,
-            svd + block**2 + lenslets * (2 * pixels + 4 * points + 240),
-        ]
-    if joint:
-        footprints = (2 * wide**2 + (wide + 4) ** 2 + len(system.blocks) + 18) * directions * points
-        phases += [
-            y + svd + block**2 + footprints + 268 * directions**2,
-            svd
-            + block**2
-            + 18 * directions * points
-            + 243 * directions**2
-            + lenslets * (2 * pixels + 4 * points + 240 + 20 * directions),
-        ]
-    if method == "nnls":
-        phases.append(y + svd + 2 * least * points + points**2 + lenslets * points)
-    if atoms:
-        phases.append(
-            y + svd + 3 * points * atoms + atoms**2 + 3 * least * atoms + lenslets * points
+
+    lenslets: int
+    pixels: int
+    points: int
+    bands: int
+    offsets: int
+    reach: int
+    directions: int
+    atoms: int
+
+    @classmethod
+    def of(cls, system: LensletMatrix, lenslets: int, directions: int, atoms: int) -> Sizes:
+        """Those of `lenslets` behind a matrix."""
+        pixels, points = system.own.shape
+        return cls(
+            lenslets=lenslets,
+            pixels=pixels,
+            points=points,
+            bands=max(1, len(system.bands)),
+            offsets=len(system.blocks),
+            reach=int(np.abs(system.offsets).max(initial=0)),
+            directions=directions,
+            atoms=atoms,
         )
-    if method in ("tv", "auto", "pnp"):
-        phases.append(svd + block**2 + lenslets * points * (20 if method == "tv" else 137))
-    return NUMBER * (blocks + max(phases))
+
+    @property
+    def blocks(self) -> int:
+        """Numbers of the matrix."""
+        return self.offsets * self.pixels * self.points
+
+    @property
+    def least(self) -> int:
+        """Singular values of the own block."""
+        return min(self.pixels, self.points)
+
+    @property
+    def block(self) -> int:
+        """Points of an object in one band."""
+        return self.points // self.bands
+
+    @property
+    def svd(self) -> int:
+        """Numbers of the singular value decomposition."""
+        return self.least * (self.pixels + self.points)
+
+    @property
+    def y(self) -> int:
+        """Numbers of the capture."""
+        return self.lenslets * self.pixels
 
 
-def require_reconstruction(camera, data, where):
-    """NumericsError, before anything is worked out, where the Superpixels `data` do not fit the
-    memory of this process.
+Phases = Callable[[Sizes], list[float]]
+"""Numbers that are held at the same time, the matrix apart, in each phase of a method."""
+
+
+def no_more(n: Sizes) -> list[float]:
+    """Of a method that needs no more than reading and the decomposition."""
+    return []
+
+
+def lmmse_phases(n: Sizes) -> list[float]:
+    """Of LMMSE of each lenslet by itself."""
+    return [
+        n.y + n.svd + 13 * n.block**2,
+        n.svd + n.block**2 + n.lenslets * (2 * n.pixels + 4 * n.points + 240),
+    ]
+
+
+def joint_phases(n: Sizes) -> list[float]:
+    """Of LMMSE over 3x3 lenslets."""
+    wide = 2 * n.reach + 1
+    footprints = (2 * wide**2 + (wide + 4) ** 2 + n.offsets + 18) * n.directions * n.points
+    return [
+        *lmmse_phases(n),
+        n.y + n.svd + n.block**2 + footprints + 268 * n.directions**2,
+        n.svd
+        + n.block**2
+        + 18 * n.directions * n.points
+        + 243 * n.directions**2
+        + n.lenslets * (2 * n.pixels + 4 * n.points + 240 + 20 * n.directions),
+    ]
+
+
+def nnls_phases(n: Sizes) -> list[float]:
+    """Of non-negative least squares."""
+    return [n.y + n.svd + 2 * n.least * n.points + n.points**2 + n.lenslets * n.points]
+
+
+def dictionary_phases(n: Sizes) -> list[float]:
+    """Of sparse coding, where there is a dictionary."""
+    if not n.atoms:
+        return []
+    coding = 3 * n.points * n.atoms + n.atoms**2 + 3 * n.least * n.atoms
+    return [n.y + n.svd + coding + n.lenslets * n.points]
+
+
+def tv_phases(n: Sizes) -> list[float]:
+    """Of total variation, which starts from LMMSE."""
+    return [*lmmse_phases(n), n.svd + n.block**2 + n.lenslets * n.points * 20]
+
+
+def pnp_phases(n: Sizes) -> list[float]:
+    """Of plug and play, which starts from LMMSE."""
+    return [*lmmse_phases(n), n.svd + n.block**2 + n.lenslets * n.points * 137]
+
+
+def reconstruction(n: Sizes, phases: Phases, *, joint: bool = False) -> float:
+    """Bytes of a method.
+
+    phases: its own.
+    joint: whether the joint estimate is made before or instead.
     """
-    from plenocli.inverse.picture.solvers.joint_lmmse import MOST
+    held = [
+        1.5 * n.blocks,
+        n.lenslets * (3.25 * n.pixels + 1.5 * n.points),
+        n.y + 4.3 * n.pixels * n.points + n.least**2,
+        *(joint_phases(n) if joint else []),
+        *phases(n),
+    ]
+    return NUMBER * (n.blocks + max(held))
 
-    settings, system = camera.settings, camera.system
-    sizes = dict(
-        joint=camera.overlap == 3
-        and (camera.coupled or settings.method == "lmmse")
-        and settings.method != "block-mean",
-        atoms=camera.learnt.atoms.shape[1] if settings.dictionary is not None else 0,
-    )
-    lenslets, most = data.y.shape[0] * data.y.shape[1], min(MOST, *system.own.shape)
-    needed = reconstruction(system, lenslets, settings.method, most, **sizes)
+
+def require_reconstruction(
+    estimators: Estimators,
+    data: Superpixels,
+    where: Path,
+    phases: Phases,
+    *,
+    joint: bool,
+) -> None:
+    """Refuse, before anything is worked out, what does not fit the memory of this process.
+
+    data: the capture.
+    where: its path, for the message.
+    phases, joint: as in `reconstruction`.
+
+    Raises NumericsError.
+    """
+    system = estimators.system
+    most = min(MOST, *system.own.shape)
+    atoms = 0 if estimators.read_dictionary is None else estimators.learnt.atoms.shape[1]
+    sizes = Sizes.of(system, data.y.shape[0] * data.y.shape[1], most, atoms)
+    needed = reconstruction(sizes, phases, joint=joint)
     # what stands above the noise decides, and may be much less
     if needed > budget().memory > 3 * NUMBER * system.own.size:
-        needed = reconstruction(
-            system,
-            lenslets,
-            settings.method,
-            min(most, _directions(system.own, settings.noise_sigma or data.sigma or 0.0)),
-            **sizes,
-        )
+        seen = _directions(system.own, estimators.options.noise_sigma or data.sigma or 0.0)
+        sizes = replace(sizes, directions=min(most, seen))
+        needed = reconstruction(sizes, phases, joint=joint)
     budget().require(
         needed,
         "the reconstruction",
@@ -87,7 +189,7 @@ def require_reconstruction(camera, data, where):
     )
 
 
-def _directions(own, sigma):
+def _directions(own: np.ndarray, sigma: float) -> int:
     """Singular vectors of `own` (pixel, point) whose signal can exceed a hundredth of the noise,
     about: of photographs of a standard deviation of 0.25.
     """
@@ -95,11 +197,18 @@ def _directions(own, sigma):
     return max(1, int(np.count_nonzero(strength > 0.01 * sigma)))
 
 
-def learning(shape, offsets, atoms, batch, synthesis):
-    """Bytes of learn-dict for a matrix of `shape` (pixel, point), its neighbours' blocks in hand.
+def learning(
+    shape: tuple[int, int], offsets: int, atoms: int, batch: int, synthesis: bool
+) -> float:
+    """Bytes of learn-dict, its neighbours' blocks in hand.
 
     What a batch is coded and refitted with goes back to the system in part only, before the
     training patches of the LMMSE beside which the dictionary is judged are drawn.
+
+    shape: (pixel, point) of the own block.
+    offsets: blocks of the matrix.
+    batch: patches of an iteration.
+    synthesis: whether atoms that paint are regressed too.
     """
     pixels, points = shape
     held = offsets * pixels * points + min(shape) * (pixels + points)
@@ -116,12 +225,23 @@ def learning(shape, offsets, atoms, batch, synthesis):
     )
 
 
-def require_learning(system, chosen, settings, where):
-    """NumericsError, before the decomposition, where learn-dict with solvers.dictionary.Settings
-    `chosen` does not fit the memory of this process.
+def require_learning(
+    system: LensletMatrix,
+    settings: LearnerSettings,
+    where: Path,
+    *,
+    synthesis: bool,
+) -> None:
+    """Refuse, before the decomposition, learning that does not fit the memory of this process.
+
+    settings: of Algorithm 1.
+    where: the pif, for the message.
+    synthesis: as in `learning`.
+
+    Raises NumericsError.
     """
     needed = learning(
-        system.own.shape, len(system.blocks), chosen.atoms, chosen.batch, settings.synthesis
+        system.own.shape, len(system.blocks), settings.atoms, settings.batch, synthesis
     )
     budget().require(
         needed,

@@ -1,21 +1,30 @@
 """Methods of reconstruct that look at one lenslet at a time.
 
-Each takes (camera, y (pixel, signal), sigma, truth or None, report) and returns x (point, signal);
-camera is the Estimators that asks. The report learns the method's parameters.
-
 Where a lenslet takes long, what is the same for all is worked out first, and the lenslets are
-solved in batches, by a function of (camera, batch, ...) that other processes can run.
+solved in batches, by a function of (estimators, batch, ...) that other processes can run.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.progress import note
+from plenocli.inverse.picture import footprint
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.joint import believed_noise
+from plenocli.inverse.picture.method import Estimate, Estimator, OwnLight, Sees
+from plenocli.inverse.picture.reconstruction import Told
+from plenocli.inverse.picture.solvers import least_squares
+from plenocli.inverse.sparse.dictionary import Averaged
 
-SPLIT = ("nnls", "dictionary")
-"""Methods whose lenslets are solved in batches."""
-BATCH = {"nnls": 64, "nnls converged": 4, "dictionary": 128}
-"""Lenslets of a batch: some seconds of work. The same however many work, as the last
-digits depend on it.
+NNLS_BATCH, NNLS_CONVERGED_BATCH, DICTIONARY_BATCH = 64, 4, 128
+"""Lenslets of a batch: some seconds of work. The same however many work, as the last digits depend
+on it.
 """
 HINDSIGHT = "oracle: least error against the truth, which no camera has"
 LOUDER_POWER = 1.75
@@ -25,49 +34,125 @@ coefficients with one Laplacian density.
 TOO_LOUD = 50
 """Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
+Solve = Callable[[Estimators, np.ndarray, float, np.ndarray | None], tuple[np.ndarray, Told | None]]
+"""(estimators, y (pixel, signal), noise, truth (point, signal) or None) -> (x (point, signal), what
+there is to tell).
+"""
 
-def block_mean(camera, y, sigma, truth, report):
+
+@dataclass(frozen=True, kw_only=True)
+class TikhonovStats:
+    """alpha: weight of |x|^2, in units of A's squared singular values; rule: how it was chosen."""
+
+    alpha: float
+    rule: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {"alpha": self.alpha, "rule": self.rule}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TsvdStats:
+    """rank: directions kept; rule: how it was chosen."""
+
+    rank: int
+    rule: str
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {"rank": self.rank, "rule": self.rule}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NnlsStats:
+    """How far non-negative least squares went.
+
+    iterations: of the gradient method, None for the converged one.
+    kkt_violation: the worst of the optimality conditions (solvers.nnls).
+    """
+
+    iterations: int | None
+    kkt_violation: float
+
+    @property
+    def rule(self) -> str:
+        """Where it stopped, in words."""
+        if self.iterations:
+            return f"stopped after {self.iterations} steps of accelerated projected gradient from 0"
+        return "converged, optimality conditions checked"
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        return {"kkt_violation": self.kkt_violation, "rule": self.rule}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DictionaryStats:
+    """How lenslets were coded.
+
+    lam: weight of |c|_1.
+    rule: how it was chosen.
+    worst_gap: largest relative duality gap.
+    nonzeros: mean number of penalised atoms in use.
+    """
+
+    lam: float
+    rule: str
+    worst_gap: float
+    nonzeros: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        return {
+            "lambda": self.lam,
+            "rule": self.rule,
+            "average": "over the mirror images of the dictionary",
+            "worst_gap": self.worst_gap,
+            "nonzeros": self.nonzeros,
+        }
+
+
+def block_mean(
+    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+) -> tuple[np.ndarray, None]:
     """One value a lenslet and band."""
-    system = camera.system
-    return np.repeat(system.levels(y.T).T, int(np.prod(system.object_shape)), axis=0)
+    system = estimators.system
+    return np.repeat(system.levels(y.T).T, int(np.prod(system.object_shape)), axis=0), None
 
 
-def tikhonov(camera, y, sigma, truth, report):
+def tikhonov(
+    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+) -> tuple[np.ndarray, TikhonovStats]:
     """Weight given, by the discrepancy principle, or with hindsight."""
-    from plenocli.inverse.picture.solvers import least_squares as linear
-
-    svd, alpha, rule = camera.svd, camera.settings.alpha, "given"
+    svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
     z = svd.compress(y)
-    if alpha is None:
-        alpha, rule = (
-            (linear.discrepancy_alpha(svd, z, sigma), "discrepancy")
-            if truth is None
-            else (linear.oracle_alpha(svd, z, truth), HINDSIGHT)
-        )
-    report |= {"alpha": float(alpha), "rule": rule}
-    return linear.tikhonov(svd, z, alpha)
+    if alpha is None and truth is None:
+        alpha, rule = least_squares.discrepancy_alpha(svd, z, sigma), "discrepancy"
+    elif alpha is None:
+        alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
+    return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
 
-def tsvd(camera, y, sigma, truth, report):
+def tsvd(
+    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+) -> tuple[np.ndarray, TsvdStats]:
     """Rank given, by the least estimated error, or with hindsight."""
-    from plenocli.inverse.picture.solvers import least_squares as linear
-
-    svd, rank, rule = camera.svd, camera.settings.rank, "given"
+    svd, rank, rule = estimators.svd, estimators.options.rank, "given"
     z = svd.compress(y)
-    if rank is None:
-        rank, rule = (
-            (linear.best_rank(svd, z, sigma), "least estimated error")
-            if truth is None
-            else (linear.oracle_rank(svd, z, truth), HINDSIGHT)
-        )
+    if rank is None and truth is None:
+        rank, rule = least_squares.best_rank(svd, z, sigma), "least estimated error"
+    elif rank is None:
+        rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
     rank = min(rank, svd.rank())
-    report |= {"rank": int(rank), "rule": rule}
-    return linear.truncated(svd, z, rank)
+    return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
 
 
-def nnls(camera, y, sigma, truth, report):
-    """Converged, or stopped after settings.nnls_iterations."""
-    svd, steps = camera.svd, camera.settings.nnls_iterations
+def nnls(
+    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+) -> tuple[np.ndarray, NnlsStats]:
+    """Converged, or stopped after so many iterations as the options say."""
+    svd, steps = estimators.svd, estimators.options.nnls_iterations
     lenslets, points = y.shape[1], svd.vt.shape[1]
     if not steps and lenslets * points > 50_000:
         note(
@@ -75,34 +160,37 @@ def nnls(camera, y, sigma, truth, report):
             f"{2 * lenslets * (points / 1600) ** 2.5 / 60:.0f} minutes of CPU; "
             "--nnls-iterations 300 stops early"
         )
-    found = camera.in_batches(
-        nnls_batch, svd.compress(y), BATCH["nnls" if steps else "nnls converged"]
+    found = estimators.in_batches(
+        nnls_batch, svd.compress(y), NNLS_BATCH if steps else NNLS_CONVERGED_BATCH
     )
-    report |= {
-        "kkt_violation": max(kkt for _, kkt in found),
-        "rule": f"stopped after {steps} steps of accelerated projected gradient from 0"
-        if steps
-        else "converged, optimality conditions checked",
-    }
-    return np.concatenate([x for x, _ in found], axis=1)
+    worst = max(kkt for _, kkt in found)
+    return (
+        np.concatenate([x for x, _ in found], axis=1),
+        NnlsStats(iterations=steps, kkt_violation=worst),
+    )
 
 
-def nnls_batch(camera, z):
-    """(x (point, signal), worst violation of the optimality conditions) of compressed signals z."""
+def nnls_batch(estimators: Estimators, z: np.ndarray) -> tuple[np.ndarray, float]:
+    """(x (point, signal), worst violation of the optimality conditions) of compressed signals z
+    (direction, signal).
+    """
     from plenocli.inverse.picture.solvers import nnls
 
-    matrix, steps = camera.svd.s[:, None] * camera.svd.vt, camera.settings.nnls_iterations
+    svd, steps = estimators.svd, estimators.options.nnls_iterations
+    matrix = svd.s[:, None] * svd.vt
     found = (
-        nnls.projected_gradient(matrix, z, steps, norm=camera.svd.s[0])
+        nnls.projected_gradient(matrix, z, steps, norm=svd.s[0])
         if steps
         else nnls.converged(matrix, z)
     )
     return found.x, float(found.kkt.max())
 
 
-def dictionary(camera, y, sigma, truth, report):
+def dictionary(
+    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+) -> tuple[np.ndarray, DictionaryStats]:
     """The mean over the mirror images of a learnt dictionary."""
-    learnt, svd, asked = camera.learnt, camera.svd, camera.settings.lam
+    learnt, svd, asked = estimators.learnt, estimators.svd, estimators.options.lam
     scale = float(svd.s[0])
     louder = max(1.0, sigma / scale / learnt.sigma) if learnt.sigma > 0 else 1.0
     lam = asked if asked is not None else learnt.lam * louder**LOUDER_POWER
@@ -113,48 +201,128 @@ def dictionary(camera, y, sigma, truth, report):
         )
     kept = min(svd.rank(), len(svd.s) if learnt.directions is None else learnt.directions)
     z = svd.compress(y)[:kept] / scale
-    found = camera.in_batches(dictionary_batch, z, BATCH["dictionary"], lam)
-    nonzeros = sum(n * part.shape[1] for part, _, n in found) / z.shape[1]
-    rule = (
-        "given"
-        if asked is not None
-        else "lambda as learnt"
-        if louder < 1.01
-        else f"lambda as learnt, times {louder**LOUDER_POWER:.3g} for {louder:.3g} times the noise"
+    found = estimators.in_batches(dictionary_batch, z, DICTIONARY_BATCH, lam)
+    if asked is not None:
+        rule = "given"
+    elif louder < 1.01:
+        rule = "lambda as learnt"
+    else:
+        rule = (
+            f"lambda as learnt, times {louder**LOUDER_POWER:.3g} for {louder:.3g} times the noise"
+        )
+    stats = DictionaryStats(
+        lam=lam,
+        rule=rule,
+        worst_gap=max(part.worst_gap for part in found),
+        nonzeros=sum(part.nonzeros * part.x.shape[1] for part in found) / z.shape[1],
     )
-    report |= {
-        "lambda": lam,
-        "rule": rule,
-        "average": "over the mirror images of the dictionary",
-        "worst_gap": max(gap for _, gap, _ in found),
-        "nonzeros": nonzeros,
-    }
-    return np.concatenate([x for x, _, _ in found], axis=1)
+    return np.concatenate([part.x for part in found], axis=1), stats
 
 
-def dictionary_batch(camera, z, lam):
-    """(x (point, signal), worst gap, mean non-zeros) of compressed signals z (direction,
-    signal), relative to the largest singular value.
+def dictionary_batch(estimators: Estimators, z: np.ndarray, lam: float) -> Averaged:
+    """The estimate from compressed signals z (direction, signal), relative to the largest singular
+    value.
     """
     from plenocli.inverse.sparse.dictionary import averaged
 
-    svd, kept = camera.svd, len(z)
-    seen = (svd.s[:kept, None] / float(svd.s[0])) * svd.vt[:kept]
+    svd, learnt, kept = estimators.svd, estimators.learnt, len(z)
     return averaged(
-        seen,
-        camera.learnt.atoms,
+        (svd.s[:kept, None] / float(svd.s[0])) * svd.vt[:kept],
+        learnt.atoms,
         z,
         lam,
-        camera.system.object_shape,
-        synthesis=camera.learnt.synthesis,
-        workers=camera.threads,
+        estimators.system.object_shape,
+        synthesis=learnt.synthesis,
+        workers=estimators.threads,
     )
 
 
-METHODS = {
-    "block-mean": block_mean,
-    "tikhonov": tikhonov,
-    "tsvd": tsvd,
-    "nnls": nnls,
-    "dictionary": dictionary,
-}
+def adaptive_lmmse(
+    estimators: Estimators, sigma: float, scene: str | None, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """LMMSE of each lenslet by itself, each with its own contrast.
+
+    sigma: noise of a pixel.
+    scene: that training leaves out.
+    y: (lenslet_row, lenslet_column, pixel).
+
+    Returns (x, its standard deviation), (lenslet_row, lenslet_column, point).
+    """
+    rows, columns = y.shape[:2]
+    lmmse = estimators.prior.lmmse(sigma, scene)
+    x, spread, _ = lmmse.adaptive(y.reshape(rows * columns, -1).T)
+    return x.T.reshape(rows, columns, -1), spread.T.reshape(rows, columns, -1)
+
+
+def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:
+    y = light.y[light.inner]
+    noise = believed_noise(estimators, light.data, y, at_least=light.at_least)
+    x, sigma = adaptive_lmmse(estimators, noise.sigma, light.data.scene, y)
+    return Estimate(value=x, sigma=sigma, noise_level=noise, from_lmmse=0.0)
+
+
+def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLight) -> Estimate:
+    """The Estimate of `solve`, on all superpixels at once.
+
+    noisy: whether it has a use for the noise.
+    """
+    y, truth = light.y[light.inner], light.truth
+    rows, columns = y.shape[:2]
+    noise = (
+        believed_noise(estimators, light.data, y, at_least=light.at_least) if noisy else None
+    )
+    if truth is not None:
+        truth = truth[light.inner].reshape(-1, truth.shape[2]).T
+    found, stats = solve(
+        estimators, y.reshape(rows * columns, -1).T, 0.0 if noise is None else noise.sigma, truth
+    )
+    value = found.T.reshape(rows, columns, -1)
+    if light.joint is not None:
+        value, inside = light.joint.value.copy(), value
+        value[light.inner] = inside
+    return Estimate(value=value, noise_level=noise, stats=stats)
+
+
+BLOCK_MEAN = Estimator(
+    name="block-mean",
+    sees=Sees.LENSLET_AS_IS,
+    phases=footprint.no_more,
+    needs_pif=False,
+    estimate=partial(_by_lenslet, block_mean, False),
+)
+TIKHONOV = Estimator(
+    name="tikhonov",
+    sees=Sees.LENSLET,
+    phases=footprint.no_more,
+    options=("alpha",),
+    hindsight=True,
+    estimate=partial(_by_lenslet, tikhonov, True),
+)
+TSVD = Estimator(
+    name="tsvd",
+    sees=Sees.LENSLET,
+    phases=footprint.no_more,
+    options=("rank",),
+    hindsight=True,
+    estimate=partial(_by_lenslet, tsvd, True),
+)
+NNLS = Estimator(
+    name="nnls",
+    sees=Sees.LENSLET,
+    phases=footprint.nnls_phases,
+    options=("nnls_iterations",),
+    in_batches=True,
+    estimate=partial(_by_lenslet, nnls, False),
+)
+LMMSE = Estimator(
+    name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse
+)
+DICTIONARY = Estimator(
+    name="dictionary",
+    sees=Sees.LENSLET,
+    phases=footprint.dictionary_phases,
+    needs_dictionary=True,
+    options=("lam", "dictionary"),
+    in_batches=True,
+    estimate=partial(_by_lenslet, dictionary, True),
+)

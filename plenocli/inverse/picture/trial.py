@@ -1,6 +1,16 @@
-"""`--method auto`: candidates are tried on pieces of training photographs, and
-the best is taken.
+"""`--method auto`: candidates are tried on pieces of training photographs, and the best is taken.
+
+What is compared is measured, not promised: pieces of training pictures, of about the capture's
+contrast, are captured by the own block with the noise of this capture, relative to the signal, and
+reconstructed by each candidate. lmmse has seen these pictures in its covariance, so that a method
+must do better than one that is flattered; what a dictionary was learnt from flatters it and is left
+out.
 """
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,6 +18,15 @@ from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
 from plenocli.base.tiling import to_blocks
 from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture import footprint
+from plenocli.inverse.picture.estimators import Estimators, TrialKey
+from plenocli.inverse.picture.footprint import Sizes
+from plenocli.inverse.picture.joint import noise_of
+from plenocli.inverse.picture.method import Method, Sees
+from plenocli.inverse.picture.per_lenslet import DICTIONARY, LMMSE
+from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
+from plenocli.inverse.picture.whole_picture import PNP
+from plenocli.inverse.prior.natural_images import draw_patches
 
 TRIALS, SIDE = 5, 3
 """Pieces of training pictures, of so many lenslets a side, on which the candidates are tried."""
@@ -17,58 +36,100 @@ SLOW = 2000
 """Lenslets from which on the time of whole-picture methods is told beforehand."""
 
 
-def choose(camera, data, kept):
-    """{"method", "reason", "trial_db"} for this noise: the best of the candidates on pieces of
-    photographs, seen by this camera.
+@dataclass(frozen=True, kw_only=True)
+class Trial(Method):
+    """The best of some methods at a capture's noise and contrast.
 
-    What is compared is measured, not promised: TRIALS pieces of training pictures, of about the
-    capture's contrast, are captured by the own block of `camera` (Estimators) with the noise of
-    this capture, relative to the signal, and reconstructed by each candidate. lmmse has seen these
-    pictures in its covariance, so that a method that wins wins in earnest; what a dictionary was
-    learnt from flatters it and is left out.
-    kept: a dict, where trials are kept for captures to come.
+    fallback: the method that the others must beat.
+    others: that are tried.
+    with_dictionary: that is tried where there is a dictionary.
     """
-    sigma = camera.noise(data, {})
-    # an empty capture is all noise
-    loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)
-    key = (float(f"{sigma / loudness:.1e}"), _contrast(camera, data, sigma), data.scene)
-    if key not in kept:
-        kept[key] = _trial(camera, *key)
-    quality = kept[key]
-    if not quality:
-        return {
-            "method": "lmmse",
-            "reason": "the training pictures are too small for a trial of others",
-        }
-    best = max(quality, key=quality.get)
-    best = best if quality[best] > quality["lmmse"] + MARGIN else "lmmse"
-    told = ", ".join(f"{m} {q:.1f} dB" for m, q in quality.items())
-    lenslets = data.y.shape[0] * data.y.shape[1]
-    if best == "pnp" and lenslets > SLOW:
-        note(
-            f"pnp of {lenslets} lenslets takes about "
-            f"{lenslets * camera.system.own.shape[1] * 1e-4 / 60:.0f} minutes of CPU; "
-            "--method lmmse takes seconds"
+
+    fallback: Method
+    others: tuple[Method, ...]
+    with_dictionary: Method
+
+    def reconstruct(
+        self,
+        estimators: Estimators,
+        data: Superpixels,
+        truth: np.ndarray | None = None,
+        choice: Choice | None = None,
+    ) -> Reconstruction:
+        """As in Method, by the method that does best in the trial."""
+        method, choice = self.choose(estimators, data)
+        return method.reconstruct(estimators, data, truth, choice)
+
+    def choose(self, estimators: Estimators, data: Superpixels) -> tuple[Method, Choice]:
+        """The best method for a capture, and why; trials are kept for captures to come."""
+        sigma = noise_of(estimators, data).sigma
+        # an empty capture is all noise
+        loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)
+        key = (float(f"{sigma / loudness:.1e}"), _contrast(estimators, data, sigma), data.scene)
+        if key not in estimators.trials:
+            estimators.trials[key] = self._try_all(estimators, key)
+        quality = estimators.trials[key]
+        if not quality:
+            return self.fallback, Choice(
+                method=self.fallback.name,
+                reason="the training pictures are too small for a trial of others",
+            )
+        methods = {m.name: m for m in (self.fallback, *self.others, self.with_dictionary)}
+        best = methods[max(quality, key=lambda name: quality[name])]
+        if not quality[best.name] > quality[self.fallback.name] + MARGIN:
+            best = self.fallback
+        lenslets = data.y.shape[0] * data.y.shape[1]
+        if best.sees is Sees.PICTURE and lenslets > SLOW:
+            note(
+                f"{best.name} of {lenslets} lenslets takes about "
+                f"{lenslets * estimators.system.own.shape[1] * 1e-4 / 60:.0f} minutes of CPU; "
+                f"--method {self.fallback.name} takes seconds"
+            )
+        told = ", ".join(f"{name} {db:.1f} dB" for name, db in quality.items())
+        return best, Choice(
+            method=best.name,
+            reason=f"best on pieces of training photographs at this noise ({told})",
+            trial_db=quality,
         )
-    return {
-        "method": best,
-        "reason": f"best on pieces of training photographs at this noise ({told})",
-        "trial_db": quality,
-    }
+
+    def _try_all(self, estimators: Estimators, key: TrialKey) -> dict[str, float]:
+        """PSNR (dB) of each candidate over pieces of about this contrast, {} where no picture is
+        large enough.
+
+        A dictionary's is that of the fallback and what it gains over it on pictures it was not
+        learnt from.
+        """
+        quality = _compare(estimators, (self.fallback, *self.others), (), key)
+        if estimators.read_dictionary is None:
+            return quality
+        first, other = self.fallback.name, self.with_dictionary.name
+        fresh = _compare(
+            estimators, (self.fallback, self.with_dictionary), estimators.learnt.training, key
+        )
+        if not fresh:
+            note(
+                "auto does not try the dictionary: it was learnt from all training pictures that "
+                "are large enough (give others with --training, or --method dictionary)"
+            )
+        elif quality:
+            quality[other] = quality[first] + fresh[other] - fresh[first]
+        return quality
 
 
-def _contrast(camera, data, sigma):
+def _contrast(estimators: Estimators, data: Superpixels, sigma: float) -> float:
     """Variance within a lenslet over its squared brightness, as LMMSE sees this capture; in
     powers of two, that captures share trials.
     """
-    y = camera.without_stray(data.y)
+    y = estimators.without_stray(data.y)
     y = y.reshape(-1, y.shape[2]).T
-    estimator = camera.prior.lmmse(sigma, data.scene)
-    bright = max(float(np.mean(estimator.brightness(y))), 1e-6)
-    return 2.0 ** round(np.log2(estimator.common_scale(y) * estimator.variance.mean() / bright**2))
+    lmmse = estimators.prior.lmmse(sigma, data.scene)
+    bright = max(float(np.mean(lmmse.brightness(y))), 1e-6)
+    return 2.0 ** round(np.log2(lmmse.common_scale(y) * lmmse.variance.mean() / bright**2))
 
 
-def _coloured(truth, bands, rng):
+def _coloured(
+    truth: np.ndarray, bands: tuple[float, ...], rng: np.random.Generator
+) -> np.ndarray:
     """Grey blocks (lenslet_row, lenslet_column, point) with points in several bands, each piece
     in the colour of some surface.
     """
@@ -82,65 +143,55 @@ def _coloured(truth, bands, rng):
     return (truth[:, :, None, :] * colours[:, :, None]).reshape(*truth.shape[:2], -1)
 
 
-def _trial(camera, relative, contrast, scene):
-    """PSNR (dB) of each candidate over pieces of about this contrast, {} where no
-    picture is large enough.
-
-    A dictionary's is that of lmmse and what it gains over lmmse on pictures it was not learnt from.
-    """
-    quality = _compare(camera, ("lmmse", "pnp"), (), relative, contrast, scene)
-    if camera.settings.dictionary is not None:
-        fresh = _compare(
-            camera,
-            ("lmmse", "dictionary"),
-            camera.learnt.training,
-            relative,
-            contrast,
-            scene,
-        )
-        if not fresh:
-            note(
-                "auto does not try the dictionary: it was learnt from all training pictures that "
-                "are large enough (give others with --training, or --method dictionary)"
-            )
-        elif quality:
-            quality["dictionary"] = quality["lmmse"] + fresh["dictionary"] - fresh["lmmse"]
-    return quality
-
-
-def _compare(camera, candidates, without, relative, contrast, scene):
-    """Mean PSNR (dB) of each candidate over pieces of about this contrast from pictures but
+def _compare(
+    estimators: Estimators,
+    candidates: tuple[Method, ...],
+    without: Collection[str],
+    key: TrialKey,
+) -> dict[str, float]:
+    """Mean PSNR (dB) of each candidate over pieces of about the key's contrast from pictures but
     those named in `without`, {} where none is large enough.
     """
-    from plenocli.inverse.prior.natural_images import draw_patches
-
-    shape = camera.system.object_shape
-    side = tuple(SIDE * n for n in shape)
+    (relative, contrast, scene), system = key, estimators.system
+    shape = system.object_shape
+    side = (SIDE * shape[0], SIDE * shape[1])
     large = [
         p
-        for p in camera.prior.pictures(scene, without)
+        for p in estimators.prior.pictures(scene, without)
         if p.shape[0] >= side[0] and p.shape[1] >= side[1]
     ]
     if not large:
         return {}
-    rng = stream(camera.settings.seed, "trial")
+    rng = stream(estimators.options.seed, "trial")
     pieces = draw_patches(large, side, 16 * TRIALS, rng).T.reshape(-1, *side)
     within = [to_blocks(p, shape).var(axis=2).mean() / max(p.mean() ** 2, 1e-12) for p in pieces]
     alike = np.argsort(np.abs(np.log(np.maximum(within, 1e-12) / contrast)), kind="stable")[:TRIALS]
-    truth = _coloured(
-        to_blocks(np.concatenate([pieces[k] for k in alike], axis=1), shape),
-        camera.system.bands,
-        rng,
-    )
-    y = truth @ camera.system.own.T
+    grey = to_blocks(np.concatenate([pieces[k] for k in alike], axis=1), shape)
+    truth = _coloured(grey, system.bands, rng)
+    y = truth @ system.own.T
     sigma = relative * float(np.sqrt(np.mean(y**2)))
     y += sigma * rng.standard_normal(y.shape)
-    alone, data, quality = camera.alone(sigma), Superpixels(y=y, sigma=sigma, scene=scene), {}
+    alone, quality = estimators.alone(sigma), {}
+    data = Superpixels(y=y, sigma=sigma, scene=scene)
     for method in candidates:
-        error = (
-            np.square(alone.run(method, data, None, {})[0] - truth)
-            .reshape(SIDE, TRIALS, -1)
-            .mean(axis=(0, 2))
-        )
-        quality[method] = float(np.mean(-10 * np.log10(np.maximum(error, 1e-12))))
+        difference = method.reconstruct(alone, data).value - truth
+        error = np.square(difference).reshape(SIDE, TRIALS, -1).mean(axis=(0, 2))
+        quality[method.name] = float(np.mean(-10 * np.log10(np.maximum(error, 1e-12))))
     return quality
+
+
+def _phases(n: Sizes) -> list[float]:
+    """Of the candidates."""
+    return [*footprint.pnp_phases(n), *footprint.dictionary_phases(n)]
+
+
+AUTO = Trial(
+    name="auto",
+    sees=Sees.PICTURE,
+    phases=_phases,
+    needs_pif=False,
+    options=("dictionary",),
+    fallback=LMMSE,
+    others=(PNP,),
+    with_dictionary=DICTIONARY,
+)

@@ -344,25 +344,53 @@ def mirror_images(shape):
     )
 
 
-def averaged(seen, atoms, measured, lam, shape, *, synthesis=None, tol=1e-6, workers=None):
-    """(x (point, signal), worst gap, mean non-zeros): the mean of the estimates by all mirror
-    images of a dictionary.
+@dataclass(frozen=True, kw_only=True)
+class Averaged:
+    """The mean of the estimates by all mirror images of a dictionary.
 
-    seen (row, point), measured (row, signal): matrix and signals, as in `Learner`. atoms (point,
-    atom), the first free; `synthesis` atoms paint. A dictionary stands for scenes that may as well
-    be mirrored, so that its images are as good as itself; each errs in its own way, as translates
-    do in cycle spinning (Coifman & Donoho 1995).
+    x: (point, signal).
+    worst_gap: largest relative duality gap.
+    nonzeros: mean number of penalised atoms in use.
+    """
+
+    x: np.ndarray
+    worst_gap: float
+    nonzeros: float
+
+
+def averaged(
+    seen: np.ndarray,
+    atoms: np.ndarray,
+    measured: np.ndarray,
+    lam: float,
+    shape: tuple[int, int],
+    *,
+    synthesis: np.ndarray | None = None,
+    tol: float = 1e-6,
+    workers: int | None = None,
+) -> Averaged:
+    """The mean of the estimates by all mirror images of a dictionary.
+
+    A dictionary stands for scenes that may as well be mirrored, so that its images are as good as
+    itself; each errs in its own way, as translates do in cycle spinning (Coifman & Donoho 1995).
+
+    seen: (row, point) the matrix, as in `Learner`.
+    atoms: (point, atom) that code, the first free.
+    measured: (row, signal).
+    lam: weight of |c|_1.
+    shape: (rows, columns) of an object.
+    synthesis: (point, atom) that paint, default those that code.
+    tol: relative duality gap to reach.
+    workers: threads.
     """
     paint, total, worst, nonzeros = atoms if synthesis is None else synthesis, 0.0, 0.0, 0.0
     images = mirror_images(shape)
     for image in images:
         code = sparse_code(seen @ atoms[image], measured, lam, free=[0], tol=tol, workers=workers)
         total = total + paint[image] @ code.c
-        worst, nonzeros = (
-            max(worst, float(code.gap.max())),
-            nonzeros + float(np.count_nonzero(code.c[1:], axis=0).mean()) / len(images),
-        )
-    return total / len(images), worst, nonzeros
+        worst = max(worst, float(code.gap.max()))
+        nonzeros += float(np.count_nonzero(code.c[1:], axis=0).mean()) / len(images)
+    return Averaged(x=total / len(images), worst_gap=worst, nonzeros=nonzeros)
 
 
 def psnr(estimate, truth):

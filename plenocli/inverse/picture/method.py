@@ -1,0 +1,209 @@
+"""What a method of reconstruct is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from types import EllipsisType
+
+import numpy as np
+
+from plenocli.base.progress import note
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
+from plenocli.inverse.picture.footprint import Phases
+from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, own_light
+from plenocli.inverse.picture.noise_level import NoiseLevel
+from plenocli.inverse.picture.reconstruction import (
+    Choice,
+    ContrastScale,
+    NeighboursTaken,
+    Reconstruction,
+    Told,
+)
+
+
+class Sees(Enum):
+    """What of the sensor a method looks at for one object."""
+
+    LENSLET_AS_IS = "its superpixel, neighbours' light included"
+    LENSLET = "its superpixel, neighbours' light taken away"
+    RING = "the 3x3 superpixels around it, at once"
+    PICTURE = "all superpixels, neighbours' light taken away"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnLight:
+    """What a method is given once the neighbours' light is away.
+
+    data: the capture.
+    y: (lenslet_row, lenslet_column, pixel) own light, in units of A x.
+    truth: (lenslet_row, lenslet_column, point) the true objects, to choose a weight with hindsight.
+    joint: the estimate that took the neighbours' light away, None where there is none of it; then
+        the lenslets of the border stay what they are there.
+    at_least: noise that is known to be there, as that estimate found it.
+    """
+
+    data: Superpixels
+    y: np.ndarray
+    truth: np.ndarray | None = None
+    joint: JointEstimate | None = None
+    at_least: float = 0.0
+
+    @property
+    def inner(self) -> tuple[slice, slice] | EllipsisType:
+        """The lenslets that the method estimates."""
+        return ... if self.joint is None else INNER
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What a method makes of own light.
+
+    value: (lenslet_row, lenslet_column, point).
+    sigma: its standard deviation, or None.
+    noise_level: what was taken for noise, None where the method does not ask.
+    from_lmmse: root mean square distance from LMMSE of each lenslet, where that is known.
+    stats: of the method.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None = None
+    noise_level: NoiseLevel | None = None
+    from_lmmse: float | None = None
+    stats: Told | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method(ABC):
+    """A method of reconstruct, all that the command needs to know of it.
+
+    name: as --method takes it.
+    sees: what of the sensor it looks at.
+    phases: its memory.
+    needs_pif: whether it does nothing without a system matrix.
+    needs_dictionary: whether it does nothing without a dictionary.
+    options: names of the Options and inputs that mean something to it alone.
+    hindsight: whether the truth may choose its weight.
+    in_batches: whether its lenslets are solved in batches, which processes may share.
+    """
+
+    name: str
+    sees: Sees
+    phases: Phases
+    needs_pif: bool = True
+    needs_dictionary: bool = False
+    options: tuple[str, ...] = ()
+    hindsight: bool = False
+    in_batches: bool = False
+
+    def makes_joint_estimate(self, estimators: Estimators) -> bool:
+        """Whether LMMSE over 3x3 lenslets is made, before the method or instead of it."""
+        if estimators.overlap != 3 or self.sees is Sees.LENSLET_AS_IS:
+            return False
+        return estimators.coupled or self.sees is Sees.RING
+
+    @abstractmethod
+    def reconstruct(
+        self,
+        estimators: Estimators,
+        data: Superpixels,
+        truth: np.ndarray | None = None,
+        choice: Choice | None = None,
+    ) -> Reconstruction:
+        """The picture of a capture.
+
+        truth: (lenslet_row, lenslet_column, point) chooses the weight with hindsight.
+        choice: why this method was taken; None: it was asked for.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimator(Method):
+    """A method with an estimate of its own.
+
+    estimate: from own light.
+    """
+
+    estimate: Callable[[Estimators, OwnLight], Estimate]
+
+    def reconstruct(
+        self,
+        estimators: Estimators,
+        data: Superpixels,
+        truth: np.ndarray | None = None,
+        choice: Choice | None = None,
+    ) -> Reconstruction:
+        """As in Method: the neighbours' light is taken away first, where the matrix knows it."""
+        choice = choice or Choice(method=self.name, reason="asked for")
+        self._note_overlap(estimators)
+        if not self.makes_joint_estimate(estimators):
+            own = self.estimate(estimators, OwnLight(data=data, y=data.y, truth=truth))
+            return self._result(estimators, choice, own)
+        joint = estimate_jointly(estimators, data)
+        if self.sees is Sees.RING:
+            return Reconstruction(
+                value=joint.value,
+                sigma=joint.sigma,
+                method=self.name,
+                overlap=estimators.overlap,
+                noise_level=joint.noise_level,
+                scale=joint.scale,
+                from_lmmse=0.0,
+                trace=(choice, joint.noise_level, ContrastScale(joint.scale)),
+            )
+        known = data.sigma is not None
+        taken = NeighboursTaken(
+            noise=joint.noise_level if known else None, scale=joint.scale if known else None
+        )
+        y = own_light(estimators, data.y, joint.value)
+        if min(y.shape[:2]) <= 2:
+            border = Estimate(value=joint.value, sigma=joint.sigma)
+            return self._result(estimators, choice, border, taken)
+        light = OwnLight(
+            data=data,
+            y=y,
+            truth=truth,
+            joint=joint,
+            at_least=joint.noise_level.sigma if known else 0.0,
+        )
+        own = self.estimate(estimators, light)
+        distance = root_mean_square(own.value - joint.value)
+        return self._result(estimators, choice, own, taken, distance)
+
+    def _result(
+        self,
+        estimators: Estimators,
+        choice: Choice,
+        own: Estimate,
+        taken: NeighboursTaken | None = None,
+        from_lmmse: float | None = None,
+    ) -> Reconstruction:
+        trace = tuple(entry for entry in (choice, taken, own.noise_level) if entry is not None)
+        before = None if taken is None else taken.noise
+        return Reconstruction(
+            value=own.value,
+            sigma=own.sigma,
+            method=self.name,
+            overlap=estimators.overlap,
+            noise_level=own.noise_level or before,
+            scale=None if taken is None else taken.scale,
+            from_lmmse=own.from_lmmse if from_lmmse is None else from_lmmse,
+            stats=own.stats,
+            trace=trace,
+        )
+
+    def _note_overlap(self, estimators: Estimators) -> None:
+        """Say where the options leave something to be had."""
+        if estimators.overlap == 3 and not estimators.coupled and self.sees is not Sees.RING:
+            note(
+                "--overlap 3: the pif holds own superpixels only, so there is no neighbours' "
+                "light to take away (simulate-pif --superpixels 3x3)"
+            )
+        if estimators.overlap == 1 and estimators.coupled and self.sees is not Sees.LENSLET_AS_IS:
+            note(
+                "--overlap 1: the neighbours' light, which the pif knows, stays in the "
+                "superpixels and is taken for the object's; --overlap 3 takes it away"
+            )

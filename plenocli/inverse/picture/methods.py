@@ -1,0 +1,26 @@
+"""The methods of reconstruct by name."""
+
+from __future__ import annotations
+
+from plenocli.inverse.picture.method import Method
+from plenocli.inverse.picture.per_lenslet import (
+    BLOCK_MEAN,
+    DICTIONARY,
+    LMMSE,
+    NNLS,
+    TIKHONOV,
+    TSVD,
+)
+from plenocli.inverse.picture.trial import AUTO
+from plenocli.inverse.picture.whole_picture import PNP, TV
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (AUTO, BLOCK_MEAN, TIKHONOV, TSVD, NNLS, LMMSE, DICTIONARY, TV, PNP)
+}
+"""In the order in which --method offers them."""
+
+
+def takers(option: str) -> tuple[str, ...]:
+    """Names of the methods to which an option means something."""
+    return tuple(name for name, method in METHODS.items() if option in method.options)

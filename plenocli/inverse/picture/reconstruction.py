@@ -1,0 +1,126 @@
+"""What a method gives: the picture, how sure it is, and what was tried, chosen and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from plenocli.base.tiling import to_plane
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture.noise_level import NoiseLevel
+
+
+class Told(Protocol):
+    """Something that a result's attributes tell of."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Which method was taken.
+
+    method: its name.
+    reason: why, in words.
+    trial_db: PSNR (dB) of every method that was tried, where there was a trial.
+    """
+
+    method: str
+    reason: str
+    trial_db: Mapping[str, float] | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        told: dict[str, Any] = {"method": self.method, "reason": self.reason}
+        return told if self.trial_db is None else told | {"trial_db": dict(self.trial_db)}
+
+
+@dataclass(frozen=True)
+class ContrastScale:
+    """The factor of the photographs' covariance that the whole capture was given."""
+
+    scale: float
+
+    def as_json(self) -> dict[str, Any]:
+        """The field by name."""
+        return {"scale": self.scale}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeighboursTaken:
+    """The neighbours' light was taken away before the method itself.
+
+    noise: as the joint estimate that knows the neighbours' light found it, None where the capture
+        does not say its own.
+    scale: that estimate's factor of the covariance, likewise.
+    """
+
+    noise: NoiseLevel | None
+    scale: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        told: dict[str, Any] = {
+            "neighbours": "their light is taken away as LMMSE over 3x3 lenslets sees it",
+            "border": "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light "
+            "from beyond the array cannot be taken away",
+        }
+        if self.noise is not None:
+            told |= {"noise_sigma": self.noise.sigma, "scale": self.scale}
+            told |= {} if self.noise.excess is None else {"excess": self.noise.excess}
+        return told
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """A picture, and how it came about.
+
+    value: (lenslet_row, lenslet_column, point); after `as_picture` (row, column) or (band, row,
+        column). Relative to white.
+    sigma: predicted standard deviation, like value, or None.
+    method: name of the method that made it.
+    overlap: superpixels (a side) looked at for each block; None without a system matrix.
+    noise_level: what was taken for noise, None where the method does not ask.
+    scale: factor of the photographs' covariance, where the method has one.
+    from_lmmse: root mean square distance from the picture of LMMSE, None where that is not known.
+    stats: of the method itself.
+    trace: what was tried and chosen, in this order.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None = None
+    method: str
+    overlap: int | None = None
+    noise_level: NoiseLevel | None = None
+    scale: float | None = None
+    from_lmmse: float | None = None
+    stats: Told | None = None
+    trace: tuple[Told, ...] = ()
+
+    @property
+    def noise(self) -> Noise | None:
+        """The noise that was used, in units of A x."""
+        return None if self.noise_level is None else Noise.of_sigma(self.noise_level.sigma)
+
+    def as_picture(self, object_shape: tuple[int, int]) -> Reconstruction:
+        """The same with its blocks of `object_shape` points (rows, columns) put together."""
+        return replace(
+            self,
+            value=to_plane(self.value, object_shape),
+            sigma=None if self.sigma is None else to_plane(self.sigma, object_shape),
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """All but the picture, as artefacts and summaries hold it; later entries of the trace
+        overrule earlier ones.
+        """
+        told: dict[str, Any] = {}
+        for entry in (*self.trace, *(() if self.stats is None else (self.stats,))):
+            told |= entry.as_json()
+        told |= {} if self.overlap is None else {"overlap": self.overlap}
+        return told | ({} if self.from_lmmse is None else {"from_lmmse": self.from_lmmse})

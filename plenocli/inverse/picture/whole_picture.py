@@ -1,0 +1,110 @@
+"""Methods of reconstruct that see all lenslets together: total variation, plug and play."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from plenocli.base.progress import bar
+from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.inverse.picture import footprint
+from plenocli.inverse.picture.estimators import Estimators, root_mean_square
+from plenocli.inverse.picture.joint import believed_noise
+from plenocli.inverse.picture.method import Estimate, Estimator, OwnLight, Sees
+from plenocli.inverse.picture.per_lenslet import adaptive_lmmse
+from plenocli.inverse.picture.solvers import whole_sensor
+
+Solve = Callable[
+    [Estimators, whole_sensor.DataTerm, np.ndarray, float], tuple[np.ndarray, str, int]
+]
+"""(estimators, data term, picture to start from, error expected of it) -> (picture, rule, rounds).
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WholePictureStats:
+    """What a method of the whole picture did.
+
+    expected_error: root mean square error that LMMSE, from which it starts, expects of itself.
+    rounds: of turns between data and prior.
+    rule: in words.
+    """
+
+    expected_error: float
+    rounds: int
+    rule: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        start = f"lmmse, which expects an error of {self.expected_error:.3g}"
+        return {"start": start, "rule": self.rule}
+
+
+def total_variation(
+    estimators: Estimators, term: whole_sensor.DataTerm, start: np.ndarray, error: float
+) -> tuple[np.ndarray, str, int]:
+    """Isotropic total variation from the picture `start`, whose error is about `error`."""
+    rounds = range(whole_sensor.TV_ROUNDS)
+    picture = whole_sensor.total_variation(term, start, error, bar(rounds, len(rounds), "rounds"))
+    rule = "isotropic total variation, weight by the error that lmmse expects"
+    return picture, rule, len(rounds)
+
+
+def plug_and_play(
+    estimators: Estimators, term: whole_sensor.DataTerm, start: np.ndarray, error: float
+) -> tuple[np.ndarray, str, int]:
+    """Block matching in turns with the data from the picture `start`, whose error is about `error`."""
+    taus = whole_sensor.schedule(error)
+    denoise = whole_sensor.denoiser(estimators.prior.bands())
+    picture = whole_sensor.plug_and_play(term, start, denoise, bar(taus, len(taus), "rounds"))
+    rule = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
+    return picture, rule, len(taus)
+
+
+def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estimate:
+    """The Estimate of `solve`, started from LMMSE of each lenslet, whose sigma it keeps: an upper
+    estimate.
+    """
+    shape, y, inner, joint = estimators.system.object_shape, light.y, light.inner, light.joint
+    noise = believed_noise(estimators, light.data, y[inner], at_least=light.at_least)
+    if joint is None:
+        x, sigma = np.empty((2, *y.shape[:2], estimators.svd.vt.shape[1]))
+    else:
+        x, sigma = joint.value.copy(), joint.sigma.copy()
+    x[inner], sigma[inner] = adaptive_lmmse(
+        estimators, noise.sigma, light.data.scene, y[inner]
+    )
+    error = root_mean_square(sigma[inner])
+    held = None
+    if joint is not None:
+        edge = np.ones(y.shape[:2], bool)
+        edge[inner] = False
+        held = edge, x.copy()
+    term = whole_sensor.DataTerm(estimators.svd, shape, y, noise.sigma, 2 * error, held)
+    picture, rule, rounds = solve(estimators, term, to_plane(x, shape), error)
+    found = to_blocks(picture, shape)
+    return Estimate(
+        value=found,
+        sigma=sigma,
+        noise_level=noise,
+        from_lmmse=root_mean_square(found - x),
+        stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule),
+    )
+
+
+TV = Estimator(
+    name="tv",
+    sees=Sees.PICTURE,
+    phases=footprint.tv_phases,
+    estimate=partial(_from_lmmse, total_variation),
+)
+PNP = Estimator(
+    name="pnp",
+    sees=Sees.PICTURE,
+    phases=footprint.pnp_phases,
+    estimate=partial(_from_lmmse, plug_and_play),
+)

@@ -104,17 +104,19 @@ def measure(estimators, data, truth, options):
     """{"psnr_db", "ssim", "seconds", "took"} of one method on one capture."""
     from plenocli.base.tiling import to_plane
     from plenocli.evaluation.metrics.quality import psnr, ssim
+    from plenocli.inverse.picture.methods import METHODS as BY_NAME
 
     shape = estimators.system.object_shape
     began = time.process_time()
-    x, _, report = estimators.solve(data, truth if options.get("oracle") else None)
+    method = BY_NAME[estimators.options.method]
+    found = method.reconstruct(estimators, data, truth if options.get("oracle") else None)
     seconds = time.process_time() - began
-    x, truth = to_plane(x, shape), to_plane(truth, shape)
+    x, truth = to_plane(found.value, shape), to_plane(truth, shape)
     return {
         "psnr_db": psnr(x, truth),
         "ssim": ssim(x, truth),
         "seconds": seconds,
-        "took": report["method"],
+        "took": found.method,
     }
 
 
@@ -126,7 +128,7 @@ def estimators_of(system, settings):
 
     return Estimators(
         system,
-        settings,
+        settings.options,
         lambda scene: read_training((), system.object_shape, not_scene=scene),
         settings.dictionary and (lambda: read_dictionary(settings.dictionary, system)),
     )

@@ -110,14 +110,15 @@ from plenocli.inverse.picture import per_lenslet
 from plenocli.stages.inverse import reconstruct
 
 if __name__ == "__main__":
-    per_lenslet.BATCH = dict.fromkeys(per_lenslet.BATCH, 2)  # nine lenslets: five batches
-    sent, send = [], reconstruct._spread
+    # nine lenslets: five batches
+    per_lenslet.NNLS_BATCH = per_lenslet.NNLS_CONVERGED_BATCH = per_lenslet.DICTIONARY_BATCH = 2
+    sent, send = [], reconstruct._solve_in_pool
 
     def noted(recipe, pool, solve, batches, options):
         sent.extend(batches)
         return send(recipe, pool, solve, batches, options)
 
-    reconstruct._spread = noted
+    reconstruct._solve_in_pool = noted
     code = run(sys.argv[1:])
     print(len(sent))
     sys.exit(code)

@@ -134,7 +134,7 @@ def command(
     """
     from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
 
-    report = run_reconstruct(
+    summary = run_reconstruct(
         captures,
         output,
         Settings(overlap=overlap and int(overlap), **settings),
@@ -145,27 +145,9 @@ def command(
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
-    if len(captures) == 1 and report["done"] == 1:
-        one = report["captures"][0]
-        rule = f" ({one['reason']})" if settings["method"] == "auto" else ""
-        rule += f", {one['rule']}" if "rule" in one else ""
-        seen = (
-            (
-                f", {one['seen']['directions']} of {one['seen']['points']} directions of the "
-                "object above the noise"
-            )
-            if "seen" in one
-            else ""
-        )
-        bands = (
-            " in bands of " + ", ".join(f"{b:.4g}" for b in one["bands_nm"]) + " nm"
-            if len(one["bands_nm"]) > 1
-            else ""
-        )
-        line = (
-            f"{one['output']}: {one['rows']} x {one['columns']} points{bands}, "
-            f"{one['method']}{rule}, {one['negative_share']:.1%} negative{seen}"
-        )
+    if len(captures) == 1 and len(summary.captures) == 1:
+        line = summary.captures[0].line(with_reason=settings["method"] == "auto")
     else:
-        line = f"{output}: {report['done']} reconstructed, {report['skipped']} were finished before"
-    options.summary(report, as_json, line)
+        done, skipped = len(summary.captures), summary.skipped
+        line = f"{output}: {done} reconstructed, {skipped} were finished before"
+    options.summary(summary.as_json(), as_json, line)

@@ -10,6 +10,7 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 
 if TYPE_CHECKING:
@@ -42,9 +43,10 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
         raise InputError(
             "lacks the object's own superpixel, offset (0, 0)", path, "run simulate-pif again"
         )
-    shapes = [
-        tuple(int(n) for n in artefact.data[f"pif/{name}_shape"]) for name in ("pixel", "object")
-    ]
+    shapes = []
+    for name in ("pixel", "object"):
+        rows, columns = artefact.data[f"pif/{name}_shape"]
+        shapes.append((int(rows), int(columns)))
     matrices = artefact.data["pif/A"]
     if matrices.shape[2:] != (np.prod(shapes[0]), np.prod(shapes[1])):
         raise InputError(
@@ -79,7 +81,7 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
         offsets=offsets,
         pixel_shape=shapes[0],
         object_shape=shapes[1],
-        accuracy=artefact.provenance.accuracy,
+        accuracy=AccuracyRecord.from_json(artefact.provenance.accuracy),
         bands=bands,
         illuminant=illuminant,
     )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.solvers.least_squares import resolution
 
@@ -99,7 +99,7 @@ def loss_db(
     if excess is None or found.from_lmmse is None or data.sigma is None:
         return None
     svd = estimators.svd
-    share = max(1, np.count_nonzero(svd.s * CONTRAST > data.sigma)) / len(svd.u)
+    share = max(1, int(np.count_nonzero(svd.s * CONTRAST > data.sigma))) / len(svd.u)
     wrong = HIDDEN * np.hypot(excess, error) / np.sqrt(share)
     scale = 1.0 if found.scale is None else found.scale
     now, known = (

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
-from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture import noise_level
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
+from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.noise_level import NoiseLevel
 
 
@@ -82,9 +82,7 @@ def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate
     more = noise_level.believed(data.y, data.sigma, left)
     if more.sigma > noise.sigma:
         return _scaled(estimators, data, more)
-    return JointEstimate(
-        value=first.value, sigma=first.sigma, scale=first.scale, noise_level=more
-    )
+    return JointEstimate(value=first.value, sigma=first.sigma, scale=first.scale, noise_level=more)
 
 
 def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -2,12 +2,14 @@
 units.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +21,7 @@ class LensletMatrix:
     offsets: (offset, 2) lenslets (rows, columns) from the object to the superpixel.
     pixel_shape: (rows, columns) of a superpixel.
     object_shape: (rows, columns) of an object block in one band.
-    accuracy: the record that simulate-pif left, {} where there is none.
+    accuracy: how accurate it is, None where that is not known.
     bands: (band,) wavelengths (m) of the pictures that the object has, () where it is one picture
         without a colour.
     illuminant: the light that the bands' shares are for.
@@ -30,7 +32,7 @@ class LensletMatrix:
     offsets: np.ndarray
     pixel_shape: tuple[int, int]
     object_shape: tuple[int, int]
-    accuracy: dict[str, Any] = field(default_factory=dict)
+    accuracy: AccuracyRecord | None = None
     bands: tuple[float, ...] = ()
     illuminant: str | None = None
 

@@ -11,17 +11,17 @@ from types import EllipsisType
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.footprint import Phases
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, own_light
+from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.noise_level import NoiseLevel
 from plenocli.inverse.picture.reconstruction import (
     Choice,
     ContrastScale,
     NeighboursTaken,
     Reconstruction,
-    Told,
+    Stats,
 )
 
 
@@ -73,7 +73,7 @@ class Estimate:
     sigma: np.ndarray | None = None
     noise_level: NoiseLevel | None = None
     from_lmmse: float | None = None
-    stats: Told | None = None
+    stats: Stats | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

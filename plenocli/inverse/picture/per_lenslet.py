@@ -18,7 +18,7 @@ from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.joint import believed_noise
 from plenocli.inverse.picture.method import Estimate, Estimator, OwnLight, Sees
-from plenocli.inverse.picture.reconstruction import Told
+from plenocli.inverse.picture.reconstruction import Stats
 from plenocli.inverse.picture.solvers import least_squares
 from plenocli.inverse.sparse.dictionary import Averaged
 
@@ -34,7 +34,9 @@ coefficients with one Laplacian density.
 TOO_LOUD = 50
 """Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
-Solve = Callable[[Estimators, np.ndarray, float, np.ndarray | None], tuple[np.ndarray, Told | None]]
+Solve = Callable[
+    [Estimators, np.ndarray, float, np.ndarray | None], tuple[np.ndarray, Stats | None]
+]
 """(estimators, y (pixel, signal), noise, truth (point, signal) or None) -> (x (point, signal), what
 there is to tell).
 """
@@ -268,9 +270,7 @@ def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLig
     """
     y, truth = light.y[light.inner], light.truth
     rows, columns = y.shape[:2]
-    noise = (
-        believed_noise(estimators, light.data, y, at_least=light.at_least) if noisy else None
-    )
+    noise = believed_noise(estimators, light.data, y, at_least=light.at_least) if noisy else None
     if truth is not None:
         truth = truth[light.inner].reshape(-1, truth.shape[2]).T
     found, stats = solve(
@@ -314,9 +314,7 @@ NNLS = Estimator(
     in_batches=True,
     estimate=partial(_by_lenslet, nnls, False),
 )
-LMMSE = Estimator(
-    name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse
-)
+LMMSE = Estimator(name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse)
 DICTIONARY = Estimator(
     name="dictionary",
     sees=Sees.LENSLET,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,6 +18,15 @@ class Told(Protocol):
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""
+        ...
+
+
+class Stats(Told, Protocol):
+    """What a method tells of itself."""
+
+    @property
+    def rule(self) -> str:
+        """How its parameter was chosen, or where it stopped, in words."""
         ...
 
 
@@ -77,12 +86,9 @@ class NeighboursTaken:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruction:
-    """A picture, and how it came about.
+class Account:
+    """How a picture came about.
 
-    value: (lenslet_row, lenslet_column, point); after `as_picture` (row, column) or (band, row,
-        column). Relative to white.
-    sigma: predicted standard deviation, like value, or None.
     method: name of the method that made it.
     overlap: superpixels (a side) looked at for each block; None without a system matrix.
     noise_level: what was taken for noise, None where the method does not ask.
@@ -92,20 +98,56 @@ class Reconstruction:
     trace: what was tried and chosen, in this order.
     """
 
-    value: np.ndarray
-    sigma: np.ndarray | None = None
     method: str
     overlap: int | None = None
     noise_level: NoiseLevel | None = None
     scale: float | None = None
     from_lmmse: float | None = None
-    stats: Told | None = None
+    stats: Stats | None = None
     trace: tuple[Told, ...] = ()
 
     @property
     def noise(self) -> Noise | None:
         """The noise that was used, in units of A x."""
         return None if self.noise_level is None else Noise.of_sigma(self.noise_level.sigma)
+
+    @property
+    def reason(self) -> str | None:
+        """Why this method was taken, in words."""
+        return next((entry.reason for entry in self.trace if isinstance(entry, Choice)), None)
+
+    @property
+    def rule(self) -> str | None:
+        """How the method's parameter was chosen, in words."""
+        return None if self.stats is None else self.stats.rule
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts and summaries hold them; later entries of the trace
+        overrule earlier ones.
+        """
+        told: dict[str, Any] = {}
+        for entry in (*self.trace, *(() if self.stats is None else (self.stats,))):
+            told |= entry.as_json()
+        told |= {} if self.overlap is None else {"overlap": self.overlap}
+        return told | ({} if self.from_lmmse is None else {"from_lmmse": self.from_lmmse})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction(Account):
+    """A picture, and how it came about.
+
+    value: (lenslet_row, lenslet_column, point); after `as_picture` (row, column) or (band, row,
+        column). Relative to white.
+    sigma: predicted standard deviation, like value, or None.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None = None
+
+    @property
+    def account(self) -> Account:
+        """How it came about, without the picture."""
+        return Account(**{f.name: getattr(self, f.name) for f in fields(Account)})
 
     def as_picture(self, object_shape: tuple[int, int]) -> Reconstruction:
         """The same with its blocks of `object_shape` points (rows, columns) put together."""
@@ -114,13 +156,3 @@ class Reconstruction:
             value=to_plane(self.value, object_shape),
             sigma=None if self.sigma is None else to_plane(self.sigma, object_shape),
         )
-
-    def as_json(self) -> dict[str, Any]:
-        """All but the picture, as artefacts and summaries hold it; later entries of the trace
-        overrule earlier ones.
-        """
-        told: dict[str, Any] = {}
-        for entry in (*self.trace, *(() if self.stats is None else (self.stats,))):
-            told |= entry.as_json()
-        told |= {} if self.overlap is None else {"overlap": self.overlap}
-        return told | ({} if self.from_lmmse is None else {"from_lmmse": self.from_lmmse})

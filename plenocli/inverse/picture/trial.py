@@ -17,11 +17,11 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
 from plenocli.base.tiling import to_blocks
-from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, TrialKey
 from plenocli.inverse.picture.footprint import Sizes
 from plenocli.inverse.picture.joint import noise_of
+from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.method import Method, Sees
 from plenocli.inverse.picture.per_lenslet import DICTIONARY, LMMSE
 from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
@@ -127,9 +127,7 @@ def _contrast(estimators: Estimators, data: Superpixels, sigma: float) -> float:
     return 2.0 ** round(np.log2(lmmse.common_scale(y) * lmmse.variance.mean() / bright**2))
 
 
-def _coloured(
-    truth: np.ndarray, bands: tuple[float, ...], rng: np.random.Generator
-) -> np.ndarray:
+def _coloured(truth: np.ndarray, bands: tuple[float, ...], rng: np.random.Generator) -> np.ndarray:
     """Grey blocks (lenslet_row, lenslet_column, point) with points in several bands, each piece
     in the colour of some surface.
     """

@@ -57,7 +57,9 @@ def total_variation(
 def plug_and_play(
     estimators: Estimators, term: whole_sensor.DataTerm, start: np.ndarray, error: float
 ) -> tuple[np.ndarray, str, int]:
-    """Block matching in turns with the data from the picture `start`, whose error is about `error`."""
+    """Block matching in turns with the data, from the picture `start`, whose error is about
+    `error`.
+    """
     taus = whole_sensor.schedule(error)
     denoise = whole_sensor.denoiser(estimators.prior.bands())
     picture = whole_sensor.plug_and_play(term, start, denoise, bar(taus, len(taus), "rounds"))
@@ -75,9 +77,7 @@ def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estima
         x, sigma = np.empty((2, *y.shape[:2], estimators.svd.vt.shape[1]))
     else:
         x, sigma = joint.value.copy(), joint.sigma.copy()
-    x[inner], sigma[inner] = adaptive_lmmse(
-        estimators, noise.sigma, light.data.scene, y[inner]
-    )
+    x[inner], sigma[inner] = adaptive_lmmse(estimators, noise.sigma, light.data.scene, y[inner])
     error = root_mean_square(sigma[inner])
     held = None
     if joint is not None:

@@ -1,5 +1,9 @@
 """Training pictures that are kept: in memory as long as there is room, then in a temporary file."""
 
+from __future__ import annotations
+
+from typing import BinaryIO
+
 import numpy as np
 
 IN_MEMORY = 1 << 30
@@ -14,7 +18,8 @@ class Shelf:
     """
 
     def __init__(self, limit: int | None = None) -> None:
-        self.limit, self.held, self.file = IN_MEMORY if limit is None else limit, 0, None
+        self.limit, self.held = IN_MEMORY if limit is None else limit, 0
+        self.file: BinaryIO | None = None
 
     def keep(self, values: np.ndarray) -> np.ndarray:
         """The array as float32, wherever it now lies."""

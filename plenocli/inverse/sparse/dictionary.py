@@ -383,7 +383,8 @@ def averaged(
     tol: relative duality gap to reach.
     workers: threads.
     """
-    paint, total, worst, nonzeros = atoms if synthesis is None else synthesis, 0.0, 0.0, 0.0
+    paint = atoms if synthesis is None else synthesis
+    total, worst, nonzeros = np.zeros(()), 0.0, 0.0
     images = mirror_images(shape)
     for image in images:
         code = sparse_code(seen @ atoms[image], measured, lam, free=[0], tol=tol, workers=workers)

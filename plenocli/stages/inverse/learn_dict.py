@@ -98,7 +98,7 @@ def run_learn_dict(
             "--resume",
             "give the same pictures",
         )
-    require_learning(system, chosen, settings, pif)
+    require_learning(system, chosen, pif, synthesis=settings.synthesis)
     svd = decompose(system.own)
 
     def learner(lam):
@@ -259,7 +259,7 @@ def _judge(machine, state, synthesis, svd, training, chosen):
     )
     lmmse = psnr(linear, machine.validation)
     objective, quality, nonzeros, gap = machine.validate(state.atoms)
-    mean, _, _ = averaged(
+    mean = averaged(
         machine.seen,
         state.atoms,
         machine.measured,
@@ -269,7 +269,7 @@ def _judge(machine, state, synthesis, svd, training, chosen):
         tol=chosen.tol,
         workers=machine.workers,
     )
-    best = psnr(mean, machine.validation)
+    best = psnr(mean.x, machine.validation)
     measures = coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)
     return {
         "iterations": state.iteration,

@@ -1,40 +1,57 @@
-"""reconstruct: the picture in front of the camera from a capture, per lenslet or
-with the neighbours.
+"""reconstruct: the picture in front of the camera from a capture, per lenslet or with the
+neighbours.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import bar, heard, note
-from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.base.tiling import to_blocks
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import Here, absolute, open_pool, run_all
 from plenocli.files.read.captures import calibrated, read_superpixels
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training
-from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.diagnosis import Seen, loss_db, what_is_seen
+from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import require_reconstruction
-from plenocli.inverse.picture.per_lenslet import SPLIT
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.methods import METHODS, takers
+from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.forward.accuracy.limits import Limits
+    from plenocli.inverse.prior.natural_images import TrainingPicture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """Options of the command.
 
-    noise_sigma in units of A x;
-    alpha in units of A's squared singular values;
-    lam as in learn-dict.
+    method: name of one of METHODS.
+    overlap, noise_sigma, alpha, rank, lam, nnls_iterations: as in Options.
+    dictionary: artefact of learn-dict.
+    training: photographs for the statistics; () for those of scikit-image.
+    truth: what chooses a weight with hindsight.
+    clip: set negative values to zero.
+    seed: of every random stream.
+    workers: processes.
     """
 
     method: str = "auto"
     overlap: int | None = None
     dictionary: Path | None = None
-    training: tuple = ()
+    training: tuple[str, ...] = ()
     truth: Path | None = None
     noise_sigma: float | None = None
     alpha: float | None = None
@@ -45,62 +62,193 @@ class Settings:
     seed: int = 0
     workers: int = 1
 
+    @property
+    def options(self) -> Options:
+        """What of them the estimate knows."""
+        return Options(
+            method=self.method,
+            overlap=self.overlap,
+            noise_sigma=self.noise_sigma,
+            alpha=self.alpha,
+            rank=self.rank,
+            lam=self.lam,
+            nnls_iterations=self.nnls_iterations,
+            seed=self.seed,
+        )
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """All that the picture of a capture depends on beside it; digests tell files from
-    others of the same name.
+    """All that the picture of a capture depends on beside it.
 
+    settings: of the command.
+    pif, calibration: paths, or None.
+    digests: of the files, to tell them from others of the same name.
     threads: as in Estimators.
     """
 
     settings: Settings
     pif: Path | None
     calibration: Path | None
-    digests: tuple
+    digests: tuple[str, ...]
     threads: int | None = None
 
 
-@dataclass(frozen=True)
-class Solved:
-    """A picture (row, column) or (band, row, column), its standard deviation and what is seen of a
-    block, or None, the report, the share of it below zero, points of a block or None, wavelengths
-    of the bands or ().
+@dataclass(frozen=True, kw_only=True)
+class PictureLimits:
+    """What limits a picture.
+
+    limits: the capture's noise against the error of the matrix.
+    loss_at_most_db: what the latter may cost, None where that is not known.
     """
 
-    picture: np.ndarray
-    sigma: np.ndarray | None
-    seen: np.ndarray | None
-    report: dict
-    negative: float
-    block: tuple | None
-    bands: tuple
+    limits: Limits
+    loss_at_most_db: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        return self.limits.as_json() | {"loss_at_most_db": self.loss_at_most_db}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """The picture of a capture.
+
+    found: its value (row, column) or (band, row, column).
+    seen: what of an object the sensor tells apart, None where the noise is not known.
+    limits: what limits it, None where that is not known.
+    negative_share: of the values, before they are clipped.
+    block: points (rows, columns) of an object, None without a system matrix.
+    bands: wavelengths (m) of the bands, () for one picture.
+    """
+
+    found: Reconstruction
+    seen: Seen | None = None
+    limits: PictureLimits | None = None
+    negative_share: float
+    block: tuple[int, int] | None = None
+    bands: tuple[float, ...] = ()
+
+    def summary(self, output: Path, *, clipped: bool) -> PictureSummary:
+        """What there is to tell of it once it is written to `output`."""
+        rows, columns = self.found.value.shape[-2:]
+        return PictureSummary(
+            output=str(output),
+            account=self.found.account,
+            limits=self.limits,
+            seen=self.seen,
+            rows=rows,
+            columns=columns,
+            bands=self.bands,
+            negative_share=self.negative_share,
+            clipped=clipped,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureSummary:
+    """One picture that was written.
+
+    output: its file.
+    account: how it came about.
+    limits, seen, bands, negative_share: as in Solved.
+    rows, columns: of points.
+    clipped: whether negative values were set to zero.
+    """
+
+    output: str
+    account: Account
+    limits: PictureLimits | None
+    seen: Seen | None
+    rows: int
+    columns: int
+    bands: tuple[float, ...]
+    negative_share: float
+    clipped: bool
+
+    def told(self) -> dict[str, Any]:
+        """How the picture came about, as its artefact holds it."""
+        told = self.account.as_json()
+        told |= {} if self.limits is None else {"limits": self.limits.as_json()}
+        return told | ({} if self.seen is None else {"seen": self.seen.as_json()})
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values of --json."""
+        return self.told() | {
+            "output": self.output,
+            "rows": self.rows,
+            "columns": self.columns,
+            "bands_nm": [w * 1e9 for w in self.bands],
+            "negative_share": self.negative_share,
+            "clipped": self.clipped,
+        }
+
+    def line(self, *, with_reason: bool) -> str:
+        """One line for a person; with_reason: why this method was taken, too."""
+        rule = f" ({self.account.reason})" if with_reason else ""
+        rule += f", {self.account.rule}" if self.account.rule else ""
+        seen = bands = ""
+        if self.seen is not None:
+            seen = (
+                f", {self.seen.directions} of {self.seen.points} directions of the object above "
+                "the noise"
+            )
+        if len(self.bands) > 1:
+            bands = f" in bands of {', '.join(f'{w * 1e9:.4g}' for w in self.bands)} nm"
+        return (
+            f"{self.output}: {self.rows} x {self.columns} points{bands}, "
+            f"{self.account.method}{rule}, {self.negative_share:.1%} negative{seen}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructSummary:
+    """What a run did.
+
+    output: file or folder.
+    skipped: captures that were finished before.
+    captures: pictures that were written, in the order of their captures.
+    """
+
+    output: str
+    skipped: int
+    captures: tuple[PictureSummary, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values of --json."""
+        return {
+            "output": self.output,
+            "done": len(self.captures),
+            "skipped": self.skipped,
+            "captures": [picture.as_json() for picture in self.captures],
+        }
 
 
 def run_reconstruct(
-    captures,
-    output,
-    settings,
+    captures: Sequence[Path],
+    output: Path,
+    settings: Settings,
     *,
-    pif=None,
-    calibration=None,
-    suffix=".h5",
-    scheduler=None,
-    overwrite=False,
-    command="",
-):
-    """Reconstruct every capture; returns a summary dict.
+    pif: Path | None = None,
+    calibration: Path | None = None,
+    suffix: str = ".h5",
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> ReconstructSummary:
+    """Reconstruct every capture.
 
-    Several go to settings.workers processes, or to the Dask cluster of `scheduler`
-    (stages.scheduler); so do batches of the lenslets of a single one, by methods that
-    take long over each.
+    Several go to settings.workers processes, or to a Dask cluster; so do batches of the lenslets of
+    a single one, by methods that take long over each. Finished ones are skipped unless overwrite.
+    One that fails does not stop the others; an error with the worst exit code follows at the end.
 
-    One capture gives the file `output` (.h5 or .exr), several a folder with one file each; finished
-    ones are skipped unless overwrite. One that fails does not stop the others; an error with the
-    worst exit code follows at the end.
+    captures: files.
+    output: the file (.h5 or .exr) of one capture, or a folder with one file each.
+    pif, calibration: what explains the captures; one of them at least.
+    suffix: of the files in a folder.
+    scheduler: address of the Dask scheduler (plenocli.execution.pool).
+    command: for the provenance.
     """
-    from plenocli.files.artefacts.provenance import describe_inputs
-
     _check_options(settings, pif, calibration)
     inputs = [
         *captures,
@@ -112,90 +260,104 @@ def run_reconstruct(
     ]
     batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
     if not batch.todo:
-        return summarise(batch, ())
-    split = not batch.several and settings.method in SPLIT
+        return _summary(summarise(batch, ()))
+    split = not batch.several and METHODS[settings.method].in_batches
     workers = settings.workers if split else min(settings.workers, len(batch.todo))
     pooled = scheduler is not None or workers > 1
-    files = describe_inputs(
-        {"pif": pif, "calibration": calibration, "dictionary": settings.dictionary}
-    )
-    recipe = Recipe(
-        settings,
-        pif,
-        calibration,
-        tuple(f["sha256"] for f in files.values()),
-        1 if pooled else None,
-    )
-    if scheduler is not None:
-        named = replace(
-            settings,
-            dictionary=absolute(settings.dictionary),
-            truth=absolute(settings.truth),
-            training=tuple(map(absolute, settings.training)),
-        )
-        recipe = replace(
-            recipe, settings=named, pif=absolute(pif), calibration=absolute(calibration)
-        )
+    recipe = _recipe(settings, pif, calibration, pooled, elsewhere=scheduler is not None)
 
-    def write(solved, capture, target):
-        return _write(
-            target,
-            solved,
-            settings,
-            capture,
-            dict(command=command, pif=pif, calibration=calibration),
-            overwrite,
-        )
+    def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
+        inputs = _inputs(settings, capture, pif, calibration)
+        return _write(target, solved, settings, command, inputs, overwrite)
 
     try:
         if pif:  # a broken one ends the run here, before any capture
             _estimators(recipe) if split or not pooled else read_lenslet_matrix(pif, by_band=True)
         with open_pool(workers, scheduler) as pool:
             if split and pooled:
-                _estimators(recipe).elsewhere = partial(_spread, recipe, pool)
-            return summarise(
-                batch,
-                outcomes(
-                    batch, Here() if split else pool, partial(reconstruct_capture, recipe), write
-                ),
-            )
+                _estimators(recipe).elsewhere = partial(_solve_in_pool, recipe, pool)
+            work = partial(reconstruct_capture, recipe)
+            done = outcomes(batch, Here() if split else pool, work, write)
+            return _summary(summarise(batch, done))
     finally:
         _estimators.cache_clear()
 
 
-@lru_cache(maxsize=1)
-def _estimators(recipe):
-    settings = recipe.settings
-    system = read_lenslet_matrix(recipe.pif, by_band=True)
-
-    def read_pictures(scene):
-        return read_training(settings.training, system.object_shape, not_scene=scene)
-
-    def read_learnt():
-        return read_dictionary(settings.dictionary, system)
-
-    return Estimators(
-        system,
-        settings,
-        read_pictures,
-        None if settings.dictionary is None else read_learnt,
-        recipe.threads,
+def _summary(told: dict[str, Any]) -> ReconstructSummary:
+    return ReconstructSummary(
+        output=told["output"], skipped=told["skipped"], captures=tuple(told["captures"])
     )
 
 
-def _spread(recipe, pool, solve, batches, options):
+def _recipe(
+    settings: Settings,
+    pif: Path | None,
+    calibration: Path | None,
+    pooled: bool,
+    *,
+    elsewhere: bool,
+) -> Recipe:
+    """The Recipe of a run.
+
+    pooled: whether captures or batches are shared out.
+    elsewhere: whether to processes to which relative file names mean nothing.
+    """
+    from plenocli.files.artefacts.provenance import describe_inputs
+
+    files = describe_inputs(
+        {"pif": pif, "calibration": calibration, "dictionary": settings.dictionary}
+    )
+    recipe = Recipe(
+        settings=settings,
+        pif=pif,
+        calibration=calibration,
+        digests=tuple(f["sha256"] for f in files.values()),
+        threads=1 if pooled else None,
+    )
+    if not elsewhere:
+        return recipe
+    named = replace(
+        settings,
+        dictionary=absolute(settings.dictionary),
+        truth=absolute(settings.truth),
+        training=tuple(map(absolute, settings.training)),
+    )
+    return replace(recipe, settings=named, pif=absolute(pif), calibration=absolute(calibration))
+
+
+@lru_cache(maxsize=1)
+def _estimators(recipe: Recipe) -> Estimators:
+    """What all captures of a recipe share; it has a pif."""
+    settings, learnt = recipe.settings, recipe.settings.dictionary
+    system = read_lenslet_matrix(recipe.pif or Path(), by_band=True)
+
+    def read_pictures(scene: str | None) -> list[TrainingPicture]:
+        return read_training(settings.training, system.object_shape, not_scene=scene)
+
+    return Estimators(
+        system,
+        settings.options,
+        read_pictures,
+        None if learnt is None else partial(read_dictionary, learnt, system),
+        threads=recipe.threads,
+    )
+
+
+def _solve_in_pool(
+    recipe: Recipe,
+    pool: Any,
+    solve: Callable[..., Any],
+    batches: list[np.ndarray],
+    options: tuple[Any, ...],
+) -> list[Any]:
     """What `solve` (see Estimators.in_batches) gives for the batches, through the pool, in their
     order; the first PlenoError is raised.
     """
     found = {}
+    task = partial(_solve_batch, recipe, solve, options)
     with bar(None, len(batches), "batches of lenslets") as progress:
-        for number, result in run_all(
-            pool,
-            (
-                (k, partial(_solve_batch, recipe, solve, options), batch)
-                for k, batch in enumerate(batches)
-            ),
-        ):
+        jobs = ((k, task, batch) for k, batch in enumerate(batches))
+        for number, result in run_all(pool, jobs):
             if isinstance(result, PlenoError):
                 raise result
             found[number] = result
@@ -203,7 +365,9 @@ def _spread(recipe, pool, solve, batches, options):
     return [found[number] for number in range(len(batches))]
 
 
-def _solve_batch(recipe, solve, options, batch):
+def _solve_batch(
+    recipe: Recipe, solve: Callable[..., Any], options: tuple[Any, ...], batch: np.ndarray
+) -> Any:
     """The task of a batch, in any process; what they share is made once a process.
 
     What there is to say, the one that sent it has said.
@@ -212,108 +376,116 @@ def _solve_batch(recipe, solve, options, batch):
         return solve(_estimators(recipe), batch, *options)
 
 
-def _check_options(settings, pif, calibration):
+def _check_options(settings: Settings, pif: Path | None, calibration: Path | None) -> None:
+    method = METHODS[settings.method]
     if pif is None and calibration is None:
         raise UsageError(
             "a picture needs --pif, or --calibration for the block mean of a real capture",
             fix="give one of them",
         )
-    if pif is None and settings.method not in ("auto", "block-mean"):
+    if pif is None and method.needs_pif:
         raise UsageError(
-            f"--method {settings.method} needs the system matrix",
+            f"--method {method.name} needs the system matrix",
             "--pif",
             "give it, or use --method block-mean",
         )
-    if settings.method == "dictionary" and settings.dictionary is None:
-        raise UsageError("--method dictionary needs --dictionary", fix="learn one with learn-dict")
-    if settings.truth and settings.method not in ("tikhonov", "tsvd"):
+    if method.needs_dictionary and settings.dictionary is None:
+        raise UsageError(
+            f"--method {method.name} needs --dictionary", fix="learn one with learn-dict"
+        )
+    if settings.truth and not method.hindsight:
         raise UsageError(
             "--truth serves only to choose the weight of tikhonov or tsvd with hindsight",
             "--truth",
             "leave it out; score compares results with the truth",
         )
-    for name, methods in (
-        ("alpha", ("tikhonov",)),
-        ("rank", ("tsvd",)),
-        ("lam", ("dictionary",)),
-        ("nnls_iterations", ("nnls",)),
-        ("dictionary", ("auto", "dictionary")),
+    for option, spelt, value in (
+        ("alpha", "alpha", settings.alpha),
+        ("rank", "rank", settings.rank),
+        ("lam", "lambda", settings.lam),
+        ("nnls_iterations", "nnls-iterations", settings.nnls_iterations),
+        ("dictionary", "dictionary", settings.dictionary),
     ):
-        if getattr(settings, name) is not None and settings.method not in methods:
-            option = {"lam": "lambda"}.get(name, name.replace("_", "-"))
+        if value is not None and option not in method.options:
             raise UsageError(
-                f"--{option} means nothing to --method {settings.method}",
-                fix=f"leave it out, or use --method {methods[-1]}",
+                f"--{spelt} means nothing to --method {method.name}",
+                fix=f"leave it out, or use --method {takers(option)[-1]}",
             )
 
 
-def reconstruct_capture(recipe, capture):
-    """The Solved of one capture; what many captures need is made once a process."""
-    settings, block, sigma, seen, bands = recipe.settings, None, None, None, ()
+def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
+    """The picture of one capture; what many captures need is made once a process."""
+    settings = recipe.settings
     if recipe.pif is None:
-        picture, report = (
-            _white_normalised(capture, recipe.calibration),
-            {"method": "block-mean", "reason": "sum over the superpixel, over that of white"},
+        choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
+        found = Reconstruction(
+            value=_white_normalised(capture, recipe.calibration),
+            method=choice.method,
+            trace=(choice,),
         )
-    else:
-        estimators = _estimators(recipe)
-        data, block = (
-            read_superpixels(capture, estimators.system, recipe.calibration),
-            estimators.system.object_shape,
-        )
-        bands = estimators.system.bands
-        require_reconstruction(estimators, data, capture)
-        blocks, spread, report = estimators.solve(
-            data, _truth(settings.truth, block, data.y.shape[:2], max(1, len(bands)))
-        )
-        picture, sigma = (
-            to_plane(blocks, block),
-            None if spread is None else to_plane(spread, block),
-        )
-        report |= _limits(data, estimators, report)
-        noise = report.get("noise_sigma") or data.sigma
-        if noise:
-            seen, report["seen"] = estimators.seen(noise)
-    negative = float(np.mean(picture < 0))
-    return Solved(
-        np.maximum(picture, 0) if settings.clip else picture,
-        sigma,
-        seen,
-        report,
-        negative,
-        block,
-        bands,
+        return _solved(found, settings)
+    estimators, method = _estimators(recipe), METHODS[settings.method]
+    system = estimators.system
+    data = read_superpixels(capture, system, recipe.calibration)
+    require_reconstruction(
+        estimators,
+        data,
+        capture,
+        method.phases,
+        joint=method.makes_joint_estimate(estimators),
+    )
+    count = data.y.shape[:2]
+    truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
+    found = method.reconstruct(estimators, data, truth)
+    sigma = data.sigma if found.noise_level is None else found.noise_level.sigma
+    limits = _limits(estimators, data, found, sigma)
+    seen = what_is_seen(estimators, sigma) if sigma else None
+    return _solved(
+        found.as_picture(system.object_shape),
+        settings,
+        seen=seen,
+        limits=limits,
+        block=system.object_shape,
+        bands=system.bands,
     )
 
 
-def _limits(data, estimators, report):
-    """{"limits": ...} of a picture: whether the capture's noise or the error of the matrix decides,
-    and what the latter is expected to cost; {} where that is not known.
+def _solved(found: Reconstruction, settings: Settings, **more: Any) -> Solved:
+    picture = found.value
+    return Solved(
+        found=replace(found, value=np.maximum(picture, 0) if settings.clip else picture),
+        negative_share=float(np.mean(picture < 0)),
+        **more,
+    )
+
+
+def _limits(
+    estimators: Estimators, data: Superpixels, found: Reconstruction, sigma: float | None
+) -> PictureLimits | None:
+    """Whether the capture's noise `sigma` or the error of the matrix decides, and what the latter
+    is expected to cost; None where that is not known.
     """
     from plenocli.files.artefacts.provenance import file_digest
     from plenocli.forward.accuracy.limits import what_limits
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
-    sigma = report.get("noise_sigma") or data.sigma
+    system = estimators.system
     signal = float(np.sqrt(np.mean(np.square(data.y))))
-    same = data.matrix is not None and data.matrix == file_digest(estimators.system.path)
-    found = what_limits(
+    limits = what_limits(
         sigma / signal if sigma and signal else None,
-        AccuracyRecord.from_json(estimators.system.accuracy),
+        system.accuracy,
         AccuracyRecord.from_json(data.accuracy),
-        same,
+        data.matrix is not None and data.matrix == file_digest(system.path),
     )
-    return (
-        {}
-        if found is None
-        else {
-            "limits": found.as_json()
-            | {"loss_at_most_db": estimators.loss_db(data, report, found.model_error * signal)}
-        }
-    )
+    if limits is None:
+        return None
+    loss = loss_db(estimators, data, found, limits.model_error * signal)
+    return PictureLimits(limits=limits, loss_at_most_db=loss)
 
 
-def _truth(path, shape, count, bands):
+def _truth(
+    path: Path | None, shape: tuple[int, int], count: tuple[int, ...], bands: int
+) -> np.ndarray | None:
     """The true blocks (lenslet_row, lenslet_column, point) from a capture that holds its scene,
     an image .h5 or an EXR; or None.
     """
@@ -350,7 +522,7 @@ def _truth(path, shape, count, bands):
     return to_blocks(picture, shape)
 
 
-def _white_normalised(capture, calibration):
+def _white_normalised(capture: Path, calibration: Path | None) -> np.ndarray:
     """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the
     white reference; 0 where it cannot be had.
 
@@ -371,66 +543,78 @@ def _white_normalised(capture, calibration):
     return np.where(lost, 0, value)
 
 
-def _write(target, solved, settings, capture, origin, overwrite):
-    """Write one picture; returns its report."""
-    from plenocli.files.artefacts.container import Artefact, write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, describe_inputs, provenance_texts
-    from plenocli.files.images.exr import write_exr
-    from plenocli.files.images.spectral_exr import write_spectral_exr
+def _inputs(
+    settings: Settings, capture: Path, pif: Path | None, calibration: Path | None
+) -> dict[str, Any]:
+    """The files that a picture was made from, for its provenance."""
+    from plenocli.files.artefacts.provenance import describe_inputs
 
-    picture, sigma, report = solved.picture, solved.sigma, solved.report
-    inputs = describe_inputs(
+    return describe_inputs(
         {
             "capture": capture,
-            "pif": origin["pif"],
-            "calibration": origin["calibration"],
+            "pif": pif,
+            "calibration": calibration,
             "dictionary": settings.dictionary,
             "truth": settings.truth,
             "training": files_of(settings.training),
         }
     )
-    provenance = Provenance(origin["command"], inputs, settings.seed)
-    if target.suffix == ".exr" and picture.ndim == 3:
+
+
+def _write(
+    target: Path,
+    solved: Solved,
+    settings: Settings,
+    command: str,
+    inputs: dict[str, Any],
+    overwrite: bool,
+) -> PictureSummary:
+    """Write one picture."""
+    from plenocli.files.artefacts.provenance import Provenance
+
+    provenance = Provenance(command, inputs, settings.seed)
+    summary = solved.summary(target, clipped=settings.clip)
+    write = _write_exr if target.suffix == ".exr" else _write_artefact
+    write(target, solved, summary, provenance, overwrite)
+    return summary
+
+
+def _write_exr(
+    target: Path, solved: Solved, summary: PictureSummary, provenance: Provenance, overwrite: bool
+) -> None:
+    from plenocli.files.artefacts.provenance import provenance_texts
+    from plenocli.files.images.exr import write_exr
+    from plenocli.files.images.spectral_exr import write_spectral_exr
+
+    picture, sigma = solved.found.value, solved.found.sigma
+    attrs = {"method": solved.found.method} | provenance_texts(provenance)
+    if picture.ndim == 3:
         write_spectral_exr(
-            target,
-            solved.bands,
-            picture,
-            sigma=sigma,
-            attrs={"method": report["method"]} | provenance_texts(provenance),
-            overwrite=overwrite,
-        )
-    elif target.suffix == ".exr":
-        channels = {"Y": picture.astype(np.float32)} | (
-            {} if sigma is None else {"sigma": sigma.astype(np.float32)}
-        )
-        write_exr(
-            target,
-            channels,
-            {"method": report["method"]} | provenance_texts(provenance),
-            overwrite=overwrite,
+            target, solved.bands, picture, sigma=sigma, attrs=attrs, overwrite=overwrite
         )
     else:
-        data = {"image/value": picture} | {
-            f"image/{name}": values
-            for name, values in (("sigma", sigma), ("seen", solved.seen))
-            if values is not None
-        }
-        data |= {"image/wavelength": np.array(solved.bands)} if picture.ndim == 3 else {}
-        attrs = {
-            "method": report["method"],
-            "parameters": {k: v for k, v in report.items() if k != "method"},
-            "clipped": solved.negative if settings.clip else 0.0,
-        }
-        if solved.block is not None:
-            attrs["notes"] = {"block": list(solved.block)}
-        write_artefact(
-            target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite
-        )
-    return report | {
-        "output": str(target),
-        "rows": picture.shape[-2],
-        "columns": picture.shape[-1],
-        "bands_nm": [w * 1e9 for w in solved.bands],
-        "negative_share": solved.negative,
-        "clipped": settings.clip,
+        channels = {"Y": picture} | ({} if sigma is None else {"sigma": sigma})
+        channels = {name: values.astype(np.float32) for name, values in channels.items()}
+        write_exr(target, channels, attrs, overwrite=overwrite)
+
+
+def _write_artefact(
+    target: Path, solved: Solved, summary: PictureSummary, provenance: Provenance, overwrite: bool
+) -> None:
+    from plenocli.files.artefacts.container import Artefact, write_artefact
+
+    picture, sigma = solved.found.value, solved.found.sigma
+    data = {"image/value": picture}
+    data |= {} if sigma is None else {"image/sigma": sigma}
+    data |= {} if solved.seen is None else {"image/seen": solved.seen.by_point}
+    data |= {"image/wavelength": np.array(solved.bands)} if picture.ndim == 3 else {}
+    attrs: dict[str, Any] = {
+        "method": solved.found.method,
+        "parameters": {k: v for k, v in summary.told().items() if k != "method"},
+        "clipped": solved.negative_share if summary.clipped else 0.0,
     }
+    if solved.block is not None:
+        attrs["notes"] = {"block": list(solved.block)}
+    write_artefact(
+        target, Artefact("image", data, {"image": attrs}, provenance), overwrite=overwrite
+    )

@@ -254,9 +254,7 @@ def test_mirror_images_are_the_symmetries_of_the_object(shape, count):
 def test_average_is_that_of_dictionaries_mirrored_one_by_one(setting):
     machine = learner(setting)
     state = run(machine, machine.start(), 2)
-    mean, gap, nonzeros = dictionary.averaged(
-        machine.seen, state.atoms, machine.measured, 1e-4, SHAPE, tol=1e-9
-    )
+    found = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE, tol=1e-9)
     grid, expected, count = state.atoms.reshape(*SHAPE, -1), [], []
     for axes in ((), (0,), (1,), (0, 1)):
         atoms = np.flip(grid, axes).reshape(30, -1)
@@ -265,8 +263,9 @@ def test_average_is_that_of_dictionaries_mirrored_one_by_one(setting):
         ).c
         expected.append(atoms @ c)
         count.append(np.count_nonzero(c[1:]) / c.shape[1])
-    np.testing.assert_allclose(mean, np.mean(expected, axis=0), atol=1e-6)
-    assert gap <= 1e-8 and nonzeros == pytest.approx(np.mean(count), rel=0.01)
+    np.testing.assert_allclose(found.x, np.mean(expected, axis=0), atol=1e-6)
+    assert found.worst_gap <= 1e-8
+    assert found.nonzeros == pytest.approx(np.mean(count), rel=0.01)
 
 
 def test_average_beats_the_typical_single_estimate(setting):
@@ -283,5 +282,5 @@ def test_average_beats_the_typical_single_estimate(setting):
         )
         for i in dictionary.mirror_images(SHAPE)
     ]
-    mean, _, _ = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE)
+    mean = dictionary.averaged(machine.seen, state.atoms, machine.measured, 1e-4, SHAPE).x
     assert dictionary.psnr(mean, machine.validation) > np.mean(single) + 0.1

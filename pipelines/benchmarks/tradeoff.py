@@ -12,7 +12,6 @@ the project's root: python pipelines/benchmarks/tradeoff.py --help.
 """
 
 import argparse
-import ast
 import hashlib
 import json
 import os
@@ -31,6 +30,7 @@ import numpy as np  # noqa: E402
 
 # as all else that is imported, it is there before time is taken
 import scipy.sparse  # noqa: E402, F401
+from model_code import model_code  # noqa: E402
 from tradeoff_truth import CAMERAS, ROOT, Truth, camera_of, places, truth_for  # noqa: E402
 
 from plenocli.base.errors import NumericsError  # noqa: E402
@@ -46,20 +46,6 @@ NEAR = 3.0
 """A rung that was passed over is timed if its estimated error is at most so many
 times what was asked.
 """
-LAWS = {
-    "cost",
-    "valid_for",
-    "error_bound",
-    "fresnel_model_error",
-    "expected_products",
-    "expected_rank",
-    "_own_terms",
-    "_require_sketch",
-    "exact_band",
-    "size_band",
-    "_chord_counts",
-}
-"""Functions that plan and do not compute: what was measured outlives their changes."""
 
 
 # planning
@@ -107,32 +93,9 @@ def forced(name):
 
 
 @cache
-def code(rung):
-    """Digest of the code that computes a rung: its modules without comments, docstrings
-    and planning laws.
-    """
-    files = ["pif", "geometry", "psf", "pupil", "quadrature", "relay", "factors"]
-    files += {
-        "rays": ["rays"],
-        "fresnel, low rank": ["square"],
-        "fresnel, triple product": ["shaped"],
-    }.get(rung, ["exact", "pairs", "prolate", "residual", "debye", "product"])
-    parts = []
-    for file in files:
-        path = ROOT / "plenocli" / "optics" / f"{file}.py"
-        tree = ast.parse(path.read_text()) if path.exists() else ast.Module([], [])
-        tree.body = [node for node in tree.body if getattr(node, "name", None) not in LAWS]
-        for node in ast.walk(tree):
-            body = getattr(node, "body", None)
-            if (
-                isinstance(body, list)
-                and body
-                and isinstance(body[0], ast.Expr)
-                and isinstance(body[0].value, ast.Constant)
-            ):
-                node.body = body[1:]
-        parts.append(ast.dump(tree))
-    return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
+def code_of(name):
+    """Digest of the code that computes the model `name`."""
+    return model_code(name, ROOT)
 
 
 def record_path(run, case, candidate, truth):
@@ -150,7 +113,7 @@ def record_path(run, case, candidate, truth):
         repr(candidate.bands),
         candidate.band_nodes,
         truth.key,
-        code(candidate.name),
+        code_of(candidate.name),
     ]
     return run / "cases" / f"{hashlib.sha256(json.dumps(what).encode()).hexdigest()[:20]}.json"
 

@@ -35,8 +35,7 @@ class Settings:
     model: "auto", "ray", "fresnel" or "exact";
     scene: file of the scene that the matrix is for;
     lenslet: (row, column) of the array, None for the one on the axis;
-    dtype: "auto", "float32" or "float64";
-    mem_limit: bytes.
+    dtype: "auto", "float32" or "float64".
     """
 
     wavelengths: tuple[float, ...] = ()

@@ -241,7 +241,7 @@ def test_a_twentieth_of_a_wave_restores_the_rank(shape):
     values = [f.singular_values[0] / f.singular_values[0][0] for f in found]
     assert values[0][19] > 1e-6 and values[0][20] < 1e-13 and values[1][39] > 1e-6
     assert found[0].rank == [20] and found[1].rank == [40]
-    assert found[0]["symmetry_defect"][0] < 1e-12 and found[1]["symmetry_defect"][0] > 0.1
+    assert found[0].symmetry_defect[0] < 1e-12 and found[1].symmetry_defect[0] > 0.1
 
 
 def test_a_twentieth_of_a_wave_restores_the_rank_of_a_square_of_points():

@@ -11,16 +11,30 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"^```python\n# (in )?(plenocli/[\w/]+\.py)(?:, (\w+))?\n(.*?)^```", re.S | re.M)
+BLOCK = re.compile(
+    r"^```python\n# (in )?(plenocli/[\w/]+\.py)(?:, (before )?(\w+))?\n(.*?)^```", re.S | re.M
+)
 
 
 def recipe(title):
-    """(whether it goes into a file that is there, file, name of a table, text) of each block."""
+    """(file, how it goes into one that is there, text) of each block of a recipe."""
     text = (ROOT / "CONTRIBUTING.md").read_text()
     part = re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", text, re.S | re.M)
-    return [
-        (bool(into), Path(file), table, code) for into, file, table, code in BLOCK.findall(part[1])
-    ]
+    for into, file, before, name, code in BLOCK.findall(part[1]):
+        yield Path(file), (before, name) if into else None, code
+
+
+def put(text, before, name, code):
+    """A module's text with a block added: to its imports, before a name, or to a table."""
+    if name == "imports":
+        return re.sub(r"^from plenocli", code + "from plenocli", text, count=1, flags=re.M)
+    start = re.search(rf"^{name}\b[^=\n]*= [({{]", text, re.M)
+    if before:
+        return f"{text[: start.start()]}{code}\n\n{text[start.start() :]}"
+    head, rest = text[: start.end()], text[start.end() :]
+    end = re.search(r"[)}]\n" if rest[0] != "\n" else r"^[)}]", rest, re.M).start()
+    entries = rest[:end].rstrip().rstrip(",")
+    return f"{head}{entries},\n{code}{rest[end:]}"
 
 
 def followed(title, folder):
@@ -30,17 +44,10 @@ def followed(title, folder):
     (folder / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "test_architecture.py", folder / "tests")
     shutil.copytree(ROOT / "docs", folder / "docs")
-    for into, file, table, code in recipe(title):
+    for file, into, code in recipe(title):
         place = folder / file
-        if into:
-            head, start, tail = re.split(
-                rf"^({table}\b[^=\n]*= [({{]\n)", place.read_text(), 1, re.M
-            )
-            body, end = re.split(r"^(?=[)}])", tail, maxsplit=1, flags=re.M)
-            place.write_text(head + start + body + code + end)
-        else:
-            assert not place.exists()
-            place.write_text(code)
+        assert place.exists() == (into is not None)
+        place.write_text(put(place.read_text(), *into, code) if into else code)
     return folder
 
 
@@ -69,4 +76,30 @@ def test_a_command(tmp_path, tiny):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {"camera": "tiny.toml", "f_number": pytest.approx(8)}
     assert "f-number" in run(folder, "plenocli", "--help").stdout
+    assert house_stands(folder)
+
+
+def test_a_model_of_propagation(tmp_path, tiny):
+    folder = followed("Add a model of propagation", tmp_path)
+    square = (
+        Path(tiny).read_text().replace("[main_lens]", '[main_lens]\naperture_shape = "square"', 1)
+    )
+    (folder / "square.toml").write_text(square)
+    made = run(
+        folder,
+        "plenocli",
+        "simulate-pif",
+        "square.toml",
+        "--model",
+        "ray",
+        "--superpixels",
+        "1x1",
+        "-o",
+        "a.h5",
+        "--json",
+    )
+    assert made.returncode == 0, made.stderr
+    summary = json.loads(made.stdout)
+    assert summary["rung"] == "pinholes" and summary["rank"] == [1]
+    assert summary["energy_min"] == summary["energy_max"] == [pytest.approx(1, abs=1e-6)]
     assert house_stands(folder)

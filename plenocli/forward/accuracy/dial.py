@@ -52,7 +52,7 @@ the accuracy's whole.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Candidate:
     """One model as it was considered.
 
@@ -274,7 +274,7 @@ def _consider(request, model):
             reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
         )
     if reason:
-        return Candidate(model.name, model.kind, reason)
+        return Candidate(name=model.name, model=model.kind, why=reason)
     fixed = {
         "model": 0.0
         if request.model != "auto"
@@ -359,25 +359,25 @@ def _sized(request, model, ring, split, nodes):
             for v, b in zip(request.views, bands)
         ]
     except NumericsError as error:
-        return Candidate(model.name, model.kind, error.what)
+        return Candidate(name=model.name, model=model.kind, why=error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
     if nodes:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(
-        model.name,
-        model.kind,
-        why,
-        math.hypot(*split.values()),
-        split,
-        ring,
-        sampling,
-        double,
-        bands,
-        max(nodes, 1) * sum(c.operations for c in costs),
-        max(nodes, 1) * sum(c.seconds for c in costs),
-        size + max(nodes, 1) * max(c.bytes for c in costs),
-        nodes,
+        name=model.name,
+        model=model.kind,
+        why=why,
+        error=math.hypot(*split.values()),
+        split=split,
+        ring=ring,
+        sampling=sampling,
+        double=double,
+        bands=bands,
+        operations=max(nodes, 1) * sum(c.operations for c in costs),
+        fixed_seconds=max(nodes, 1) * sum(c.seconds for c in costs),
+        bytes=size + max(nodes, 1) * max(c.bytes for c in costs),
+        band_nodes=nodes,
     )
 
 
@@ -519,28 +519,28 @@ def _plan(request, found, best):
             )
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(
-        best.model,
-        best.name,
-        request.grid,
-        best.ring,
-        request.accuracy,
-        request.asked_by,
-        best.sampling / 2,
-        best.double,
-        best.bands,
-        request.shape,
-        size,
-        best.bytes,
-        best.error,
-        best.split,
-        _model_error(request, best),
-        request.dtype.name,
-        tuple(request.reasons),
-        tuple(request.left_out),
-        tuple(warnings),
-        table,
-        request.pixel_shift,
-        best.band_nodes,
+        model=best.model,
+        rung=best.name,
+        superpixels=request.grid,
+        coherent_ring=best.ring,
+        accuracy=request.accuracy,
+        asked_by=request.asked_by,
+        tolerance=best.sampling / 2,
+        double=best.double,
+        bands=best.bands,
+        shape=request.shape,
+        bytes=size,
+        memory=best.bytes,
+        estimated=best.error,
+        split=best.split,
+        model_error=_model_error(request, best),
+        dtype=request.dtype.name,
+        reasons=tuple(request.reasons),
+        left_out=tuple(request.left_out),
+        warnings=tuple(warnings),
+        candidates=table,
+        pixel_shift=request.pixel_shift,
+        band_nodes=best.band_nodes,
     )
 
 

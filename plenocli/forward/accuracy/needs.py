@@ -11,7 +11,7 @@ total: it cannot be seen.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Needs:
     """What is known of a scene; None where it is not.
 

@@ -21,7 +21,7 @@ from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.pupil import ray_reach
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Geometry:
     """Distances (m) and derived constants of a camera at `wavelength` (m); Berkner et al.
     2013, section 2-3-1.

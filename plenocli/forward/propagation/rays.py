@@ -46,7 +46,7 @@ FOCUSED = 1e-9
 def valid_for(camera, view):
     """None, or one sentence why rays cannot serve this camera at the Geometry `view`."""
     lens = at_wavelength(camera, view.wavelength).main_lens
-    if lens.wavefront is not None or any(_noll(term) > 4 for term in lens.aberrations or ()):
+    if lens.wavefront is not None or any(term.noll > 4 for term in lens.aberrations or ()):
         return (
             "wavefront errors beyond tilt and defocus bend the pupil's image, which "
             "rays here take as affine"
@@ -67,7 +67,15 @@ def size_band(view, grid, ring, accuracy, tolerance):
     kept (ring 0: its own only).
     """
     window = None if ring == 0 else math.ceil(max(view.reach(grid))) + blur_ring(view) + 1
-    return BandPlan(view.wavelength, window, 0, 0, 0, 0, 0.0)
+    return BandPlan(
+        wavelength=view.wavelength,
+        window=window,
+        lenslet_nodes=0,
+        pixel_nodes=0,
+        psf_nodes=0,
+        terms=0,
+        half=0.0,
+    )
 
 
 def error_bound(camera, view):
@@ -237,10 +245,6 @@ def _lit(edges):
     return bool((edges != edges[:, :1]).any())
 
 
-def _noll(term):
-    return term.noll if hasattr(term, "noll") else term[0]
-
-
 def _affine(lens, geometry):
     """Defocus (1/m) and tilt (rows, columns) of the rays: those of the geometry and of the
     wavefront's Noll terms 2 to 4.
@@ -248,9 +252,8 @@ def _affine(lens, geometry):
     unit = unit_radius(lens)
     found = {2: 0.0, 3: 0.0, 4: 0.0}
     for term in lens.aberrations or ():
-        noll, coefficient = (term.noll, term.coefficient) if hasattr(term, "noll") else term
-        if noll in found:
-            found[noll] += coefficient
+        if term.noll in found:
+            found[term.noll] += term.coefficient
     return (
         geometry.eps + 8 * math.sqrt(3) * found[4] / unit**2 / 2,
         2 * found[3] / unit,

@@ -57,7 +57,7 @@ over the spread function's cut.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BandPlan:
     """Node counts of one wavelength.
 
@@ -80,7 +80,7 @@ class BandPlan:
     beside: tuple | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PifPlan:
     """The chosen computation (plenocli.forward.accuracy.dial.plan_pif makes it).
 
@@ -236,16 +236,16 @@ def size_band(view, grid, ring, accuracy, tolerance, dim=False):
                 [*errors, math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE)],
             )
     return BandPlan(
-        view.wavelength,
-        window,
-        nodes_for(slope),
-        nodes,
-        count,
-        terms,
-        half,
-        math.hypot(*errors),
-        rule,
-        beside,
+        wavelength=view.wavelength,
+        window=window,
+        lenslet_nodes=nodes_for(slope),
+        pixel_nodes=nodes,
+        psf_nodes=count,
+        terms=terms,
+        half=half,
+        sampling=math.hypot(*errors),
+        pixel_rule=rule,
+        beside=beside,
     )
 
 

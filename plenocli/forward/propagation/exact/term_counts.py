@@ -27,7 +27,7 @@ FINE_DECADES = 2.0
 """Decades below the coarsest cut from which on fields with neighbours take more terms."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExactBand(BandPlan):
     """A BandPlan of the exact rung.
 

@@ -31,7 +31,7 @@ SLAB = 1 << 11
 """Positions at which the series are summed together: the basis of a slab stays in the cache."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeparableField:
     """h(dy, dx) = sum_j a_j(dy) b_j(dx) for |dy|, |dx| <= `half`.
 
@@ -192,7 +192,14 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     scale = np.abs(h).max()
     if scale == 0:
         empty = np.zeros((1, 1))
-        return SeparableField(half, empty, empty, False, (True, True, True), 0.0)
+        return SeparableField(
+            half=half,
+            rows=empty,
+            columns=empty,
+            even=False,
+            symmetry=(True, True, True),
+            tail=0.0,
+        )
     same = [np.abs(h - other).max() < 1e-10 * scale for other in (h[::-1], h[:, ::-1], h.T)]
     even = bool(same[0] and same[1])
     if even:
@@ -211,7 +218,15 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     rows = project @ a
     signs = None if signs is None else signs[:terms]
     columns = project @ b if signs is None else rows * signs
-    return SeparableField(half, rows, columns, even, tuple(bool(x) for x in same), tail, signs)
+    return SeparableField(
+        half=half,
+        rows=rows,
+        columns=columns,
+        even=even,
+        symmetry=(bool(same[0]), bool(same[1]), bool(same[2])),
+        tail=tail,
+        signs=signs,
+    )
 
 
 def terms_within(values, tolerance, rest=0.0):

@@ -195,14 +195,14 @@ def test_a_telecentric_lens_has_no_f_number(tmp_path, capfd):
     file.write_text(
         lens_toml(
             Prescription(
-                (
-                    Surface(100.0, 2e-3, medium("N-BK7")),
-                    Surface(0.0, 0.01 / (n - 1) - 2e-3 / n),
-                    Surface(0.0, 5e-3),
+                surfaces=(
+                    Surface(curvature=100.0, thickness=2e-3, medium=medium("N-BK7")),
+                    Surface(curvature=0.0, thickness=0.01 / (n - 1) - 2e-3 / n),
+                    Surface(curvature=0.0, thickness=5e-3),
                 ),
-                2,
-                1e-3,
-                D_LINE,
+                stop=2,
+                stop_radius=1e-3,
+                design_wavelength=D_LINE,
             )
         )
     )

@@ -206,23 +206,23 @@ class LensFile(Section):
         """The plenocli.forward.camera.prescription.Prescription in SI units."""
         surfaces = tuple(
             Surface(
-                0.0 if math.isinf(e.radius) else 1 / e.radius,
-                e.thickness,
-                self.medium(e.glass),
-                e.conic,
-                e.asphere,
-                math.inf if e.semi_diameter is None else e.semi_diameter,
+                curvature=0.0 if math.isinf(e.radius) else 1 / e.radius,
+                thickness=e.thickness,
+                medium=self.medium(e.glass),
+                conic=e.conic,
+                asphere=e.asphere,
+                semi_diameter=math.inf if e.semi_diameter is None else e.semi_diameter,
             )
             for e in self.surface
         )
         distance = math.inf if self.lens.object_distance is None else self.lens.object_distance
         return Prescription(
-            surfaces,
-            self.lens.stop - 1,
-            self.lens.stop_diameter / 2,
-            self.lens.design_wavelength,
-            distance,
-            self.lens.name,
+            surfaces=surfaces,
+            stop=self.lens.stop - 1,
+            stop_radius=self.lens.stop_diameter / 2,
+            design_wavelength=self.lens.design_wavelength,
+            object_distance=distance,
+            name=self.lens.name,
         )
 
 

@@ -11,8 +11,11 @@ field of one lenslet is the rectangle (row spacing) x p around its centre, which
 lattice; on the hexagonal one its corners stick out of the hexagon into the next cells.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.glass import focal_length
@@ -20,19 +23,33 @@ from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.pupil import ray_reach
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from plenocli.forward.camera.model import Camera
+
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Distances (m) and derived constants of a camera at `wavelength` (m); Berkner et al.
-    2013, section 2-3-1.
+    """Distances (m) and derived constants of a camera at one wavelength.
 
+    wavelength: m;
+    z1, z2, z3: from object to main lens, to lenslet array, to sensor;
+    f1, f2: focal lengths of main lens and lenslets;
+    D1, D2: diameter of the main lens, pitch of the lenslets;
+    lenslet_width: of a lenslet's opening across its flat sides;
+    pixel_pitch, pixel_active: spacing of pixels, and side of what of them is sensitive;
+    pixel_shape: (rows, columns) of the pixels of a superpixel;
+    object_shape: (rows, columns) of the object points of a lenslet;
     lattice: "square" or "hexagonal";
-    lenslet_shape: "square", "circle" or "hexagon", lenslet_width across its flat sides;
+    lenslet_shape: "square", "circle" or "hexagon";
     pixel_shift: None where the pixels of every superpixel are centred on its chief ray, else where
         the sensor's raster lies: (rows, columns) in pixels from a superpixel's centre to the
         middle of its window;
-    ray_reach (m): farthest that a ray of an aberrated pupil lands on the array from the image point
+    ray_reach: farthest that a ray of an aberrated pupil lands on the array from the image point
         along either axis, None without wavefront error.
+
+    Berkner et al. 2013, section 2-3-1.
     """
 
     wavelength: float
@@ -46,100 +63,103 @@ class Geometry:
     lenslet_width: float
     pixel_pitch: float
     pixel_active: float
-    pixel_shape: tuple
-    object_shape: tuple
+    pixel_shape: tuple[int, int]
+    object_shape: tuple[int, int]
     lattice: str = "square"
     lenslet_shape: str = "square"
-    pixel_shift: tuple | None = None
+    pixel_shift: tuple[float, float] | None = None
     ray_reach: float | None = None
 
     @property
-    def k(self):
+    def k(self) -> float:
         """Wave number 2 pi / wavelength, 1/m."""
         return 2 * math.pi / self.wavelength
 
     @property
-    def eps(self):
+    def eps(self) -> float:
         """Defocus of the main lens at the array, 1/m: 1/z1 + 1/z2 - 1/f1; 0 when the object is
         imaged onto the array.
         """
         return 1 / self.z1 + 1 / self.z2 - 1 / self.f1
 
     @property
-    def kappa(self):
+    def kappa(self) -> float:
         """Curvature left on a lenslet, 1/m: 1/z2 + 1/z3 - 1/f2; 0 when the lenslets image the
         pupil onto the sensor.
         """
         return 1 / self.z2 + 1 / self.z3 - 1 / self.f2
 
     @property
-    def magnification(self):
+    def magnification(self) -> float:
         """Size of the image on the array over that of the object, z2/z1; the image is inverted."""
         return self.z2 / self.z1
 
     @property
-    def superpixel_pitch(self):
+    def superpixel_pitch(self) -> float:
         """Spacing of superpixel centres on the sensor, m: D2 (1 + z3/z2), because chief rays
         come from the pupil's centre.
         """
         return self.D2 * (1 + self.z3 / self.z2)
 
     @property
-    def blur(self):
+    def blur(self) -> float:
         """Width of the geometric blur of an object point on the array, m: D1 z2 |eps|; with
         wavefront error twice the reach of its rays z2 (eps r + grad W).
         """
         return self.D1 * self.z2 * abs(self.eps) if self.ray_reach is None else 2 * self.ray_reach
 
     @property
-    def row_spacing(self):
+    def row_spacing(self) -> float:
         """Distance of neighbouring rows of lenslets, in pitches."""
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0
 
     @property
-    def lenslet_extent(self):
+    def lenslet_extent(self) -> tuple[float, float]:
         """Half height and half width (m) of one lenslet's opening."""
         half = self.lenslet_width / 2
         return (half / ROW_SPACING if self.lenslet_shape == "hexagon" else half), half
 
     @property
-    def diffraction_cells(self):
+    def diffraction_cells(self) -> float:
         """Lenslet pitch in units of wavelength times image-side F-number: the
         space-bandwidth number per axis.
         """
         return self.D2 * self.D1 / (self.wavelength * self.z2)
 
     @property
-    def quartic_phase(self):
+    def quartic_phase(self) -> float:
         """Phase (rad) that the paraxial model drops between a lenslet's edge and its axis on the
         sensor: k (D2/2)^4/(8 z3^3). Above about 0.1 rad the difference from exact propagation
         shows in the fringes.
         """
         return self.k * (self.D2 / 2) ** 4 / (8 * self.z3**3)
 
-    def points(self, axis):
-        """Centres (m, on the array) of the images of the object points along `axis`
-        (0 rows, 1 columns).
+    def points(self, axis: int) -> np.ndarray:
+        """Centres of the images of the object points along `axis` (0 rows, 1 columns).
+
+        Returns (point,) m, on the array.
         """
         n = self.object_shape[axis]
         return _steps(n) * self.D2 * (1.0 if axis else self.row_spacing) / n
 
-    def pixels(self, axis):
-        """Pixel centres (m) along `axis` from the middle of a superpixel's window."""
+    def pixels(self, axis: int) -> np.ndarray:
+        """Pixel centres along `axis` (0 rows, 1 columns).
+
+        Returns (pixel,) m from the middle of a superpixel's window.
+        """
         return _steps(self.pixel_shape[axis]) * self.pixel_pitch
 
-    def centre(self, r, c):
+    def centre(self, r: int, c: int) -> tuple[float, float]:
         """Where lenslet (r, c) stands, in pitches: (row, column); on the sensor its superpixel
         does, in superpixel pitches.
         """
         return (r * ROW_SPACING, c + r / 2) if self.lattice == "hexagonal" else (float(r), float(c))
 
-    def neighbourhood(self, window):
-        """Lenslets up to `window` pitches away in rows and columns, as products [(row positions,
-        column positions)], in pitches.
+    def neighbourhood(self, window: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Lenslets up to `window` pitches away in rows and columns, mirror-symmetric.
 
-        Square: one product, |r|, |c| <= window. Hexagonal: even rows and, half a pitch aside, odd
-        rows. Both mirror-symmetric.
+        Returns products [(row positions, column positions)], in pitches. Square: one product,
+        |r|, |c| <= window. Hexagonal: even rows and, half a pitch aside, odd rows.
         """
         import numpy as np
 
@@ -153,9 +173,12 @@ class Geometry:
             (rows[rows % 2 == 1] * ROW_SPACING, odd),
         ]
 
-    def places(self, grid):
-        """Where the superpixels of `grid` (rows, columns of axial numbers, both odd) stand, in
-        pitches: {place: (row, column) in the grid}.
+    def places(self, grid: tuple[int, int]) -> dict[tuple[float, float], tuple[int, int]]:
+        """Where superpixels stand.
+
+        grid: (rows, columns) of axial numbers, both odd.
+
+        Returns {place in pitches: (row, column) in the grid}.
         """
         rows, columns = ((n - 1) // 2 for n in grid)
         return {
@@ -164,15 +187,18 @@ class Geometry:
             for c in range(-columns, columns + 1)
         }
 
-    def lines(self, grid, axis):
+    def lines(self, grid: tuple[int, int], axis: int) -> int:
         """How many different rows (axis 0) or columns (1) the superpixels of `grid` stand in."""
         aside = axis == 1 and self.lattice == "hexagonal" and grid[0] > 1  # every half pitch
         return 2 * grid[1] + grid[0] - 2 if aside else grid[axis]
 
-    def reach(self, grid, window=None):
-        """Farthest that a lenslet whose light counts stands from the object's own, (rows, columns)
-        in pitches: those of the neighbourhood, or where window is None those of
-        the superpixels kept.
+    def reach(self, grid: tuple[int, int], window: int | None = None) -> tuple[float, ...]:
+        """Farthest that a lenslet whose light counts stands from the object's own.
+
+        grid: (rows, columns) of the superpixels kept;
+        window: of the neighbourhood, whose lenslets count; None: those of the superpixels kept.
+
+        Returns (rows, columns) in pitches.
         """
         if window is None:
             rows, columns = ((n - 1) // 2 for n in grid)
@@ -186,9 +212,11 @@ class Geometry:
             for axis in (0, 1)
         )
 
-    def field_half(self, grid, window=None):
-        """Half width (m) on which the main lens's spread function is needed: from an object
-        point to a lenslet's far edge.
+    def field_half(self, grid: tuple[int, int], window: int | None = None) -> float:
+        """Half width (m) on which the main lens's spread function is needed: from an object point
+        to a lenslet's far edge.
+
+        grid, window: as in reach.
         """
         cell = self.row_spacing / 2, 0.5
         return max(
@@ -196,20 +224,26 @@ class Geometry:
             for far, c, e in zip(self.reach(grid, window), cell, self.lenslet_extent)
         )
 
-    def window_shift(self, axis, n=0.0):
-        """From the centre of the superpixel n superpixel pitches away along `axis` to the
-        middle of its window, m.
+    def window_shift(self, axis: int, n: float = 0.0) -> float:
+        """From the centre of a superpixel to the middle of its window.
 
-        Zero where windows are centred on chief rays; on a sensor's raster at most half a pixel.
+        axis: 0 rows, 1 columns;
+        n: where the superpixel stands along the axis, in superpixel pitches.
+
+        Returns m: zero where windows are centred on chief rays, on a sensor's raster at most half a
+        pixel.
         """
         if self.pixel_shift is None:
             return 0.0
         ideal = n * self.superpixel_pitch / self.pixel_pitch - self.pixel_shift[axis]
         return (round(ideal) - ideal) * self.pixel_pitch
 
-    def mirrors(self, grid):
-        """(flip rows, flip columns, transpose) that map lattice, lenslets and pixels of `grid`
-        superpixels onto themselves.
+    def mirrors(self, grid: tuple[int, int]) -> tuple[bool, bool, bool]:
+        """Which mirror images map lattice, lenslets and pixels of superpixels onto themselves.
+
+        grid: (rows, columns) of the superpixels.
+
+        Returns (flip rows, flip columns, transpose).
         """
         shift = self.pixel_shift or (0.0, 0.0)
         # a rhombus of axial coordinates is no mirror image of itself
@@ -218,21 +252,23 @@ class Geometry:
         return flips and shift[0] == 0, flips and shift[1] == 0, turn
 
 
-def _steps(n):
+def _steps(n: int) -> np.ndarray:
     import numpy as np
 
     return np.arange(n) - (n - 1) / 2
 
 
-def hexagonal_rows(window):
+def hexagonal_rows(window: int) -> int:
     """Rows of a hexagonal lattice, to either side, that cover `window` and a half pitches."""
     return math.ceil((window + 0.5 - ROW_SPACING / 3) / ROW_SPACING) if window else 0
 
 
-def geometry(camera, wavelength, pixel_shift=None):
-    """The Geometry of `camera` (plenocli.forward.camera.model.Camera) at `wavelength` (m), with the
-    focal lengths of its glasses there.
+def geometry(
+    camera: Camera, wavelength: float, pixel_shift: tuple[float, float] | None = None
+) -> Geometry:
+    """The Geometry of a camera, with the focal lengths of its glasses at one wavelength.
 
+    wavelength: m;
     pixel_shift: (rows, columns) as lenslet_shift gives it, for pixels on the sensor's own raster;
         None: centred on chief rays.
     """
@@ -256,8 +292,8 @@ def geometry(camera, wavelength, pixel_shift=None):
         lenslet_width=array.pitch * array.fill_factor,
         pixel_pitch=sensor.pixel_pitch,
         pixel_active=sensor.pixel_pitch * math.sqrt(sensor.pixel_fill_factor),
-        pixel_shape=tuple(sensor.pixels_per_lenslet),
-        object_shape=tuple(camera.object.samples_per_lenslet),
+        pixel_shape=sensor.pixels_per_lenslet,
+        object_shape=camera.object.samples_per_lenslet,
         lattice=array.lattice,
         lenslet_shape=array.aperture_shape,
         pixel_shift=pixel_shift,
@@ -265,13 +301,15 @@ def geometry(camera, wavelength, pixel_shift=None):
     )
 
 
-def array_position(camera, row, column):
-    """Where lenslet (row, column) of the array, counted from its first, stands from the optical
-    axis: (y, x) in pitches.
+def array_position(camera: Camera, row: int, column: int) -> tuple[float, float]:
+    """Where a lenslet of the array stands from the optical axis.
 
-    The axis meets the middle of a square array. Rows of a hexagonal one are upright, every odd one
-    half a pitch to the right; the axis meets lenslet (rows // 2, columns // 2). ConfigError
-    outside of the array.
+    row, column: counted from the array's first lenslet.
+
+    Returns (y, x) in pitches. The axis meets the middle of a square array. Rows of a hexagonal one
+    are upright, every odd one half a pitch to the right; the axis meets lenslet (rows // 2, columns
+    // 2).
+    Raises ConfigError outside of the array.
     """
     array = camera.lenslet_array
     if not all(0 <= n < count for n, count in zip((row, column), array.count)):
@@ -286,15 +324,18 @@ def array_position(camera, row, column):
     return (row - middle) * ROW_SPACING, column - array.count[1] // 2 + (row % 2 - middle % 2) / 2
 
 
-def lenslet_shift(camera, row, column):
-    """The window of lenslet (row, column) of the array on the sensor's raster: (first pixel row,
-    first pixel column, pixel_shift).
+def lenslet_shift(camera: Camera, row: int, column: int) -> tuple[int, int, tuple[float, float]]:
+    """The window of a lenslet of the array on the sensor's raster.
 
-    The raster is centred on the optical axis and holds pixels_per_lenslet times count pixels; the
-    window, as many pixels as a superpixel, may reach beyond it. pixel_shift (rows, columns), at
-    most half a pixel: from the superpixel's centre, where the chief ray lands, to the middle of the
-    window. In the paraxial model an off-axis lenslet differs from the central one by this shift
-    alone: where it is zero, A serves unchanged.
+    row, column: counted from the array's first lenslet.
+
+    Returns (first pixel row, first pixel column, pixel_shift). The raster is centred on the optical
+    axis and holds pixels_per_lenslet times count pixels; the window, as many pixels as a
+    superpixel, may reach beyond it. pixel_shift (rows, columns), at most half a pixel: from the
+    superpixel's centre, where the chief ray lands, to the middle of the window. In the paraxial
+    model an off-axis lenslet differs from the central one by this shift alone: where it is zero, A
+    serves unchanged.
+    Raises ConfigError outside of the array.
     """
     sensor, first, shift = camera.sensor, [], []
     for n, count, size in zip(
@@ -305,4 +346,4 @@ def lenslet_shift(camera, row, column):
         first.append(nearest)
         # a billionth of a pixel is rounding
         shift.append(0.0 if abs(nearest - ideal) < 1e-9 else nearest - ideal)
-    return first[0], first[1], tuple(shift)
+    return first[0], first[1], (shift[0], shift[1])

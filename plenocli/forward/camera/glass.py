@@ -277,28 +277,33 @@ _ALIASES = {
 GLASSES = tuple(_SELLMEIER)
 """Names that `refractive_index` knows, beside "none" (no dispersion)."""
 
-FORMULAS = ("constant", "sellmeier", "polynomial", "cauchy", "abbe")
-
 
 @dataclass(frozen=True)
 class Medium:
-    """What light runs through: a dispersion formula with l the wavelength in micrometres, as
-    data sheets print it.
+    """What light runs through: a dispersion formula with l the wavelength in micrometres, as data
+    sheets print it.
 
-    constant (n,) sellmeier ((B, C), ...) n^2 = 1 + sum B l^2/(l^2 - C) polynomial ((a, p), ...)
-    n^2 = sum a l^p (Schott before 1992, Hoya, Hikari) cauchy ((a, p), ...) n = sum a l^p abbe (nd,
-    Vd) n = a + b/l + c/l^3.5 (Conrady) through nd, Vd and the partial dispersion of normal glasses
-    `limits` (m) is the range the formula holds on.
+    formula, coefficients:
+        "constant": (n,);
+        "sellmeier": ((B, C), ...), n^2 = 1 + sum B l^2/(l^2 - C);
+        "polynomial": ((a, p), ...), n^2 = sum a l^p (Schott before 1992, Hoya, Hikari);
+        "cauchy": ((a, p), ...), n = sum a l^p;
+        "abbe": (nd, Vd), n = a + b/l + c/l^3.5 (Conrady) through nd, Vd and the partial dispersion
+            of normal glasses;
+    limits: (least, greatest) wavelength that the formula holds for, m.
     """
 
     name: str
     formula: str
     coefficients: tuple
-    limits: tuple = (0.0, math.inf)
+    limits: tuple[float, float] = (0.0, math.inf)
 
-    def index(self, wavelength):
-        """Index of refraction at `wavelength` (m), relative to air; ConfigError outside
-        the formula's range.
+    def index(self, wavelength: float) -> float:
+        """Index of refraction relative to air.
+
+        wavelength: m.
+
+        Raises ConfigError outside the formula's range and where it gives no index.
         """
         low, high = self.limits
         if not low * (1 - 1e-9) <= wavelength <= high * (1 + 1e-9):
@@ -323,7 +328,7 @@ class Medium:
         return math.sqrt(value)
 
 
-def _squared_index(formula, coefficients, l):
+def _squared_index(formula: str, coefficients: tuple, l: float) -> float:
     if formula == "constant":
         return coefficients[0] ** 2
     if formula == "sellmeier":
@@ -338,7 +343,7 @@ _LINE_D, _LINE_F, _LINE_C, _LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
 """Fraunhofer's lines d, F, C and g, um."""
 
 
-def _conrady(nd, vd):
+def _conrady(nd: float, vd: float) -> tuple[tuple[float, float], ...]:
     """Terms (a, p) of n = a + b/l + c/l^3.5 from nd and Vd = (nd - 1)/(nF - nC); the third
     condition is that of normal glasses, (ng - nF)/(nF - nC) = 0.6438 - 0.001682 Vd (Schott TIE-29).
     """
@@ -354,8 +359,11 @@ def _conrady(nd, vd):
 AIR = Medium("air", "constant", (1.0,))
 
 
-def medium(name):
-    """The catalogue's Medium of glass `name`, or AIR; ConfigError for a name that is not known."""
+def medium(name: str) -> Medium:
+    """The catalogue's Medium of a glass, or AIR.
+
+    Raises ConfigError for a name that is not known.
+    """
     if name.lower() == "air":
         return AIR
     key = next((g for g in GLASSES if g.upper() == name.upper()), _ALIASES.get(name.upper()))
@@ -367,20 +375,26 @@ def medium(name):
     return Medium(key, "sellmeier", terms, (low * 1e-6, high * 1e-6))
 
 
-def refractive_index(name, wavelength):
-    """Index of refraction of glass `name` at `wavelength` (m), in air to the accuracy of
-    the Sellmeier fit.
+def refractive_index(name: str, wavelength: float) -> float:
+    """Index of refraction of a glass, in air, to the accuracy of the Sellmeier fit.
 
-    ConfigError for a name that is not known or a wavelength outside the fitted range.
+    wavelength: m.
+
+    Raises ConfigError for a name that is not known or a wavelength outside the fitted range.
     """
     return medium(name).index(wavelength)
 
 
-def focal_length(f0, glass, design_wavelength, wavelength):
-    """Focal length (m) at `wavelength` of a thin singlet that has `f0` at `design_wavelength`.
+def focal_length(f0: float, glass: str, design_wavelength: float, wavelength: float) -> float:
+    """Focal length of a thin singlet, by the lensmaker's equation for fixed curvatures:
+    f(l) = f0 (n(l0) - 1)/(n(l) - 1).
 
-    f(l) = f0 (n(l0) - 1)/(n(l) - 1), the lensmaker's equation for fixed curvatures;
-    `glass` = "none" keeps f0.
+    f0: at the design wavelength, m;
+    glass: its name, "none" keeps f0;
+    design_wavelength, wavelength: m.
+
+    Returns m.
+    Raises ConfigError as refractive_index.
     """
     if glass.lower() == "none":
         return f0

@@ -6,16 +6,22 @@ fields are angles (rad) of the paraxial chief ray in object space, towards +y; i
 distances (m) from the last vertex. docs/model.md, "Real lenses".
 """
 
+from __future__ import annotations
+
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError
+from plenocli.forward.camera.prescription import Prescription
 from plenocli.forward.camera.pupil import unit_radius, zernike
 from plenocli.forward.camera.raytrace import (
     Pupil,
+    Rays,
     aim,
     entrance_pupil,
     exit_pupil,
@@ -24,14 +30,21 @@ from plenocli.forward.camera.raytrace import (
     trace,
 )
 
-# --- first order ----------------------------------------------------------------------------------
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+
+# first order
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FirstOrder:
-    """Paraxial data at one wavelength, m: effective focal length, back focus (last vertex to rear
-    focus), principal points (from the first and from the last vertex), pupils, and the F-number
-    f/(2 entrance pupil radius), NaN where that pupil lies at infinity.
+    """Paraxial data at one wavelength, m.
+
+    focal_length: effective;
+    back_focus: from the last vertex to the rear focus;
+    front_principal, rear_principal: principal points, from the first and from the last vertex;
+    entrance_pupil, exit_pupil: images of the stop;
+    f_number: f/(2 entrance pupil radius), NaN where that pupil lies at infinity.
     """
 
     focal_length: float
@@ -43,8 +56,13 @@ class FirstOrder:
     f_number: float
 
 
-def first_order(lens, wavelength):
-    """The FirstOrder of `lens` at `wavelength` (m). NumericsError for a lens without power."""
+def first_order(lens: Prescription, wavelength: float) -> FirstOrder:
+    """The FirstOrder of a lens.
+
+    wavelength: m.
+
+    Raises NumericsError for a lens without power.
+    """
     (a, _), (c, d) = paraxial_matrix(lens.surfaces, wavelength)
     if abs(c) < 1e-9:
         raise NumericsError(
@@ -52,20 +70,27 @@ def first_order(lens, wavelength):
         )
     n = _last_index(lens, wavelength)
     entrance = entrance_pupil(lens, wavelength)
+    known = math.isfinite(entrance.radius)
     return FirstOrder(
-        float(-n / c),
-        float(-n * a / c),
-        float((d - 1) / c),
-        float(n * (1 - a) / c),
-        entrance,
-        exit_pupil(lens, wavelength),
-        float(abs(n / c) / (2 * entrance.radius)) if math.isfinite(entrance.radius) else math.nan,
+        focal_length=float(-n / c),
+        back_focus=float(-n * a / c),
+        front_principal=float((d - 1) / c),
+        rear_principal=float(n * (1 - a) / c),
+        entrance_pupil=entrance,
+        exit_pupil=exit_pupil(lens, wavelength),
+        f_number=float(abs(n / c) / (2 * entrance.radius)) if known else math.nan,
     )
 
 
-def paraxial_image(lens, wavelength, object_distance=math.inf):
-    """Distance (m) from the last vertex to the paraxial image of an axial point
-    `object_distance` (m) before the first.
+def paraxial_image(
+    lens: Prescription, wavelength: float, object_distance: float = math.inf
+) -> float:
+    """Distance from the last vertex to the paraxial image of an axial point.
+
+    wavelength: m;
+    object_distance: m before the first vertex.
+
+    Returns m.
     """
     (a, b), (c, d) = paraxial_matrix(lens.surfaces, wavelength)
     top, bottom = (
@@ -76,34 +101,58 @@ def paraxial_image(lens, wavelength, object_distance=math.inf):
     return float(-_last_index(lens, wavelength) * top / bottom) if bottom else math.inf
 
 
-def focal_shift(lens, wavelengths, object_distance=math.inf):
-    """Paraxial image distances at `wavelengths` minus that at the design
-    wavelength, (wavelength,) m.
+def focal_shift(
+    lens: Prescription, wavelengths: Sequence[float], object_distance: float = math.inf
+) -> np.ndarray:
+    """Paraxial image distances minus that at the design wavelength.
+
+    wavelengths: m;
+    object_distance: m before the first vertex.
+
+    Returns (wavelength,) m.
     """
     at_design = paraxial_image(lens, lens.design_wavelength, object_distance)
     return np.array([paraxial_image(lens, w, object_distance) - at_design for w in wavelengths])
 
 
-def image_plane(lens, object_distance=math.inf):
-    """Where the sensor stands: the image distance the description gives for its own object
+def image_plane(lens: Prescription, object_distance: float = math.inf) -> float:
+    """Where the sensor stands: the image distance that the description gives for its own object
     distance, or else the paraxial image at the design wavelength.
+
+    object_distance: m before the first vertex.
+
+    Returns m from the last vertex.
     """
     if lens.image_distance and object_distance == lens.object_distance:
         return lens.image_distance
     return paraxial_image(lens, lens.design_wavelength, object_distance)
 
 
-def _last_index(lens, wavelength):
+def _last_index(lens: Prescription, wavelength: float) -> float:
     return lens.surfaces[-1].medium.index(wavelength)
 
 
-# --- fields ---------------------------------------------------------------------------------------
+# fields
 
 _CENTRE = np.zeros((2, 1))
 
 
-def chief_height(lens, wavelength, angle, object_distance=math.inf, image_distance=None):
-    """Height y (m) at which the ray through the stop's centre meets the image plane."""
+def chief_height(
+    lens: Prescription,
+    wavelength: float,
+    angle: float,
+    object_distance: float = math.inf,
+    image_distance: float | None = None,
+) -> float:
+    """Height at which the ray through the stop's centre meets the image plane.
+
+    wavelength: m;
+    angle: of the field, rad;
+    object_distance: m before the first vertex;
+    image_distance: m from the last vertex, None: that of image_plane.
+
+    Returns y, m.
+    """
     distance = image_plane(lens, object_distance) if image_distance is None else image_distance
     rays = trace(
         lens.surfaces,
@@ -113,12 +162,24 @@ def chief_height(lens, wavelength, angle, object_distance=math.inf, image_distan
     return float(to_plane(rays, distance).position[1, 0])
 
 
-def lateral_colour(lens, wavelengths, angle, object_distance=math.inf, image_distance=None):
-    """Chief-ray heights at `wavelengths` minus that at the design wavelength, on one image
-    plane, (wavelength,) m.
+def lateral_colour(
+    lens: Prescription,
+    wavelengths: Sequence[float],
+    angle: float,
+    object_distance: float = math.inf,
+    image_distance: float | None = None,
+) -> np.ndarray:
+    """Chief-ray heights minus that at the design wavelength, on one image plane.
 
-    The object point is the same for all: its angle is that of the paraxial chief ray at the
-    design wavelength.
+    The object point is the same for all: its angle is that of the paraxial chief ray at the design
+    wavelength.
+
+    wavelengths: m;
+    angle: of the field, rad;
+    object_distance: m before the first vertex;
+    image_distance: m from the last vertex, None: that of image_plane.
+
+    Returns (wavelength,) m.
     """
     heights = []
     for w in (lens.design_wavelength, *wavelengths):
@@ -134,7 +195,9 @@ def lateral_colour(lens, wavelengths, angle, object_distance=math.inf, image_dis
     return np.array(heights[1:]) - heights[0]
 
 
-def _same_point(lens, wavelength, angle, object_distance):
+def _same_point(
+    lens: Prescription, wavelength: float, angle: float, object_distance: float
+) -> float:
     """The field angle at `wavelength` of the object point that has `angle` at the design
     wavelength: for a near object it changes with the entrance pupil's place.
     """
@@ -147,9 +210,22 @@ def _same_point(lens, wavelength, angle, object_distance):
     return math.atan(math.tan(angle) * here / there)
 
 
-def distortion(lens, wavelength, angle, object_distance=math.inf, image_distance=None):
+def distortion(
+    lens: Prescription,
+    wavelength: float,
+    angle: float,
+    object_distance: float = math.inf,
+    image_distance: float | None = None,
+) -> float:
     """Relative excess of the chief ray's height over the paraxial one, (h - h_p)/h_p; h_p = f
     tan(angle) in the rear focal plane. Positive: pincushion.
+
+    wavelength: m;
+    angle: of the field, rad;
+    object_distance: m before the first vertex;
+    image_distance: m from the last vertex, None: that of image_plane.
+
+    Raises NumericsError on the axis.
     """
     pupil = exit_pupil(lens, wavelength)
     entrance = entrance_pupil(lens, wavelength)
@@ -163,9 +239,21 @@ def distortion(lens, wavelength, angle, object_distance=math.inf, image_distance
     return chief_height(lens, wavelength, angle, object_distance, distance) / ideal - 1
 
 
-def transmitted(lens, wavelength, angle, object_distance=math.inf, rings=32):
-    """Share (0 to 1) of the stop's area through which light from `angle` gets past every clear
-    aperture; cos^4 is not in it.
+def transmitted(
+    lens: Prescription,
+    wavelength: float,
+    angle: float,
+    object_distance: float = math.inf,
+    rings: int = 32,
+) -> float:
+    """Share of the stop's area through which light gets past every clear aperture, without cos^4.
+
+    wavelength: m;
+    angle: of the field, rad;
+    object_distance: m before the first vertex;
+    rings: of the rule by which the stop is sampled.
+
+    Returns 0 to 1.
     """
     points, weights = disc_points(rings, 4 * rings)
     rays = trace(
@@ -177,9 +265,10 @@ def transmitted(lens, wavelength, angle, object_distance=math.inf, rings=32):
     return float(weights[rays.alive].sum() / weights.sum())
 
 
-def disc_points(rings, spokes):
-    """Points (2, n) of the unit disc and weights (n,) that integrate polynomials over it:
-    Gauss-Legendre in rho^2 times equal angles.
+def disc_points(rings: int, spokes: int) -> tuple[np.ndarray, np.ndarray]:
+    """A rule for polynomials over the unit disc: Gauss-Legendre in rho^2 times equal angles.
+
+    Returns points (2, n) and weights (n,).
     """
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     rho, theta = np.sqrt((nodes + 1) / 2), (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
@@ -187,19 +276,19 @@ def disc_points(rings, spokes):
     return points, np.repeat(weights / 2 * math.pi / spokes, spokes)
 
 
-# --- wavefront ------------------------------------------------------------------------------------
+# wavefront
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Wavefront:
     """The wavefront error of one field and wavelength on a sphere through the exit pupil's centre.
 
-    points: (2, ray) x, y over the stop's radius.
+    points: (2, ray) x, y over the stop's radius;
     error: (ray,) W in m, optical path from the object to the sphere minus that of the chief ray;
-        W > 0 is a later wave, a phase exp(+jkW); NaN where no light comes through.
+        W > 0 is a later wave, a phase exp(+jkW); NaN where no light comes through;
     cosines: (2, ray) x, y of the unit vectors from the rays' places on the sphere to its centre;
-        minus these, times the image distance, are pupil coordinates.
-    centre: (3,) m, the chief ray's image, from the last vertex.
+        minus these, times the image distance, are pupil coordinates;
+    centre: (3,) m, the chief ray's image, from the last vertex;
     radius: m, signed, positive where the exit pupil lies before the image.
     """
 
@@ -209,9 +298,10 @@ class Wavefront:
     centre: np.ndarray
     radius: float
 
-    def rms(self, weights=None):
-        """Root mean square (m) of W about its mean over the points that light reaches; `weights`
-        (ray,) as of disc_points.
+    def rms(self, weights: np.ndarray | None = None) -> float:
+        """Root mean square (m) of W about its mean over the points that light reaches.
+
+        weights: (ray,) as of disc_points, None: all the same.
         """
         lit = np.isfinite(self.error)
         weights = None if weights is None else weights[lit]
@@ -220,16 +310,30 @@ class Wavefront:
 
 
 def wavefront(
-    lens, wavelength, points, angle=0.0, object_distance=math.inf, image_distance=None, clip=True
-):
-    """The Wavefront of `lens` at `points` (2, ray) of the stop, about the chief ray's own image
-    on the image plane.
+    lens: Prescription,
+    wavelength: float,
+    points: np.ndarray,
+    angle: float = 0.0,
+    object_distance: float = math.inf,
+    image_distance: float | None = None,
+    clip: bool = True,
+) -> Wavefront:
+    """The Wavefront about the chief ray's own image on the image plane.
 
     Each wavelength has its own centre, so lateral colour is no part of W (see `lateral_colour`);
     the exit pupil is that of the design wavelength. Sphere and path in a form that does not cancel,
     valid for telecentric pupils too: with D the ray's direction, d its distance from the centre on
     the image plane and q = d^2 - (d.D)^2, the way back to the sphere is R + d.D -
     q/(R + sqrt(R^2 - q)).
+
+    wavelength: m;
+    points: (2, ray) of the stop, over its radius;
+    angle: of the field, rad;
+    object_distance: m before the first vertex;
+    image_distance: m from the last vertex, None: that of image_plane;
+    clip: whether light outside of clear apertures is lost.
+
+    Raises NumericsError where the chief ray does not get through.
     """
     distance = image_plane(lens, object_distance) if image_distance is None else image_distance
     both = np.concatenate([_CENTRE, np.asarray(points, dtype=float)], axis=1)
@@ -250,6 +354,25 @@ def wavefront(
         if math.isfinite(pupil)
         else math.inf
     )
+    error, cosines = _on_sphere(rays, centre, radius, n)
+    error = error - error[0]
+    if clip:
+        error = np.where(trace(lens.surfaces, start, wavelength, clip=True).alive, error, np.nan)
+    return Wavefront(
+        points=both[:, 1:],
+        error=error[1:],
+        cosines=cosines[:, 1:] - cosines[:, :1],
+        centre=np.array([*centre[:2, 0], distance]),
+        radius=radius,
+    )
+
+
+def _on_sphere(
+    rays: Rays, centre: np.ndarray, radius: float, n: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Paths (ray,) of rays in the image plane back to the sphere about `centre` (3, 1), less its
+    radius, and x, y of the unit vectors (2, ray) from there to its centre.
+    """
     offset = rays.position - centre
     along = (offset * rays.direction).sum(axis=0)
     square = (offset * offset).sum(axis=0) - along * along
@@ -259,27 +382,24 @@ def wavefront(
         else 0.0
     )
     back = along - bent  # way back to the sphere, less its radius
-    error = rays.path - n * back
     cosines = (
         rays.direction[:2]
         if math.isinf(radius)
         else ((radius + back) * rays.direction - offset)[:2] / radius
     )
-    error = error - error[0]
-    if clip:
-        error = np.where(trace(lens.surfaces, start, wavelength, clip=True).alive, error, np.nan)
-    return Wavefront(
-        both[:, 1:],
-        error[1:],
-        cosines[:, 1:] - cosines[:, :1],
-        np.array([*centre[:2, 0], distance]),
-        radius,
-    )
+    return rays.path - n * back, cosines
 
 
-def wavefront_grid(lens, wavelength, samples=64, **field):
-    """(samples, samples) W in m on a square grid of pixel centres over the stop's diameter, rows
-    along y; NaN outside. `field` as `wavefront`.
+def wavefront_grid(
+    lens: Prescription, wavelength: float, samples: int = 64, **field: Any
+) -> np.ndarray:
+    """Wavefront error on a square grid of pixel centres over the stop's diameter.
+
+    wavelength: m;
+    samples: of a side;
+    field: as `wavefront`.
+
+    Returns (samples, samples) W in m, rows along y; NaN outside.
     """
     axis = (np.arange(samples) + 0.5) * (2 / samples) - 1
     x, y = np.meshgrid(axis, axis)
@@ -289,13 +409,26 @@ def wavefront_grid(lens, wavelength, samples=64, **field):
     return out
 
 
-def noll_coefficients(lens, wavelength, terms=37, pupil="stop", rings=16, **field):
-    """(terms,) coefficients (m rms) of Noll's Zernike polynomials 1 ... `terms` in W, and the rms
-    (m) of what they leave.
+def noll_coefficients(
+    lens: Prescription,
+    wavelength: float,
+    terms: int = 37,
+    pupil: str = "stop",
+    rings: int = 16,
+    **field: Any,
+) -> tuple[np.ndarray, float]:
+    """Coefficients of Noll's Zernike polynomials in W.
 
-    `pupil` = "stop" expands over the stop's coordinates, "exit" over direction cosines in image
-    space, relative to the chief ray and in units of the largest; where the lens obeys the sine
-    condition these are the same on axis. `field` as `wavefront`.
+    wavelength: m;
+    terms: polynomials 1 ... `terms`;
+    pupil: "stop" expands over the stop's coordinates, "exit" over direction cosines in image
+        space, relative to the chief ray and in units of the largest; where the lens obeys the sine
+        condition these are the same on axis;
+    rings: of the rule by which the stop is sampled;
+    field: as `wavefront`.
+
+    Returns (terms,) m rms, and the rms (m) of what they leave.
+    Raises NumericsError where too few rays get through.
     """
     points, weights = disc_points(rings, 4 * rings)
     if pupil == "exit":  # one more ring, the rim itself, to know the unit
@@ -322,7 +455,7 @@ def noll_coefficients(lens, wavelength, terms=37, pupil="stop", rings=16, **fiel
     return found, float(np.sqrt(np.sum((root * (values - basis @ found)) ** 2)))
 
 
-# --- in a camera ----------------------------------------------------------------------------------
+# in a camera
 
 
 @dataclass(frozen=True)
@@ -330,26 +463,38 @@ class CameraLens:
     """A traced lens in the place of a camera's thin main lens, for one object distance and
     aperture, on axis.
 
-    Its principal planes stand for the thin lens: `z1` (m) from the object to the front one, `z2`
-    (m) from the rear one to the image at the design wavelength; the beam is aperture_diameter wide
-    there, so that its paraxial half angle is D1/(2 z2).
+    Its principal planes stand for the thin lens; the beam is aperture_diameter wide there, so that
+    its paraxial half angle is D1/(2 z2).
+
+    lens: stopped down;
+    object_distance: m from the first vertex;
+    z1: m from the object to the front principal plane;
+    z2: m from the rear one to the image at the design wavelength.
     """
 
-    lens: object
+    lens: Prescription
     object_distance: float
     z1: float
     z2: float
 
-    def focal_length(self, wavelength):
+    def focal_length(self, wavelength: float) -> float:
         """f1 (m) of the thin lens that focuses where this one does: 1/f1 = 1/z1 +
         1/(z2 + focal shift).
+
+        wavelength: m.
         """
         shift = focal_shift(self.lens, [wavelength], self.object_distance)[0]
         return 1 / (1 / self.z1 + 1 / (self.z2 + shift))
 
-    def aberrations(self, wavelength, order=10):
-        """((Noll index, coefficient in m), ...) of W about this wavelength's own paraxial image,
-        defocus and spherical terms up to radial `order`; the focal shift is in `focal_length`.
+    def aberrations(self, wavelength: float, order: int = 10) -> tuple[tuple[int, float], ...]:
+        """Defocus and spherical terms of W about this wavelength's own paraxial image; the focal
+        shift is in `focal_length`.
+
+        wavelength: m;
+        order: highest radial order.
+
+        Returns ((Noll index, coefficient in m), ...).
+        Raises NumericsError where rays at the rim do not get through.
         """
         radial = [n * (n + 1) // 2 + 1 for n in range(2, order + 1, 2)]
         points, weights = disc_points(32, 1)
@@ -380,10 +525,16 @@ class CameraLens:
         return tuple((j, float(c)) for j, c in zip(radial, found[1:]))
 
 
-def camera_lens(lens, object_distance, aperture_diameter, design_wavelength):
-    """The CameraLens of `lens` for an object `object_distance` (m) before its front principal
-    point, stopped down to `aperture_diameter` (m). ConfigError where the lens cannot be opened that
-    far or forms no real image.
+def camera_lens(
+    lens: Prescription, object_distance: float, aperture_diameter: float, design_wavelength: float
+) -> CameraLens:
+    """The CameraLens of a lens.
+
+    object_distance: m before its front principal point;
+    aperture_diameter: that it is stopped down to, m;
+    design_wavelength: m.
+
+    Raises ConfigError where the lens cannot be opened that far or forms no real image.
     """
     lens = replace(lens, design_wavelength=design_wavelength)
     data = first_order(lens, design_wavelength)
@@ -414,13 +565,16 @@ def camera_lens(lens, object_distance, aperture_diameter, design_wavelength):
     return CameraLens(stopped, from_vertex, object_distance, z2)
 
 
-def at_wavelength(camera, wavelength):
-    """`camera` (plenocli.forward.camera.model.Camera) with its lens prescription, if it names one,
-    resolved for `wavelength` (m): a thin main lens of the traced focal length, whose aberrations
-    are those of the description and the traced ones together.
+def at_wavelength(camera: Camera, wavelength: float) -> Camera:
+    """A camera with its lens prescription, if it names one, resolved for one wavelength.
 
-    ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be used
-    so (see camera_lens).
+    A thin main lens of the traced focal length takes its place, whose aberrations are those of the
+    description and the traced ones together.
+
+    wavelength: m.
+
+    Raises ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be
+    used so (see camera_lens).
     """
     thin = camera.main_lens
     if thin.prescription is None:
@@ -447,7 +601,14 @@ def at_wavelength(camera, wavelength):
 
 
 @functools.lru_cache(maxsize=512)
-def _resolved(lens, object_distance, aperture_diameter, design_wavelength, wavelength, nominal):
+def _resolved(
+    lens: Prescription,
+    object_distance: float,
+    aperture_diameter: float,
+    design_wavelength: float,
+    wavelength: float,
+    nominal: float,
+) -> tuple[float, tuple[tuple[int, float], ...]]:
     """(focal length (m), Noll terms) of a prescription in a camera whose description
     says `nominal` (m).
     """

@@ -6,9 +6,11 @@ each with its path.
 """
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from plenocli.base.errors import ConfigError
@@ -33,19 +35,34 @@ ROW_SPACING = math.sqrt(3) / 2
 """Spacing of the rows of a hexagonal lattice, in units of its pitch."""
 
 
+if TYPE_CHECKING:
+    _T = TypeVar("_T")
+    Resolved = Annotated[_T, "may be left out of a file"]
+else:
+
+    class Resolved:
+        """What a file may leave out or give in another way, and a Camera always has."""
+
+        def __class_getitem__(cls, kind):
+            return kind | None
+
+
+_LEFT_OUT: Any = None
+
+
 class Samples:
     """Values on a square grid that a camera carries beside its description: float64, read-only;
     equal where the values are.
     """
 
-    def __init__(self, values):
+    def __init__(self, values: ArrayLike) -> None:
         self.values = np.array(values, float)
         self.values.flags.writeable = False
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Samples) and np.array_equal(self.values, other.values)
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash(self.values.tobytes())
 
 
@@ -58,7 +75,7 @@ class Aberration(Section):
     coefficient: SignedLength
 
 
-def _known_glass(name):
+def _known_glass(name: str) -> str:
     from plenocli.forward.camera.glass import medium
 
     try:
@@ -86,9 +103,9 @@ class MainLens(Section):
     """
 
     focal_length: Length
-    aperture_diameter: Length | None = None
+    aperture_diameter: Resolved[Length] = _LEFT_OUT
     f_number: Annotated[float, Field(gt=0.1, le=1000)] | None = None
-    aperture_shape: Literal["circle", "square", "annulus", "image"] | None = None
+    aperture_shape: Resolved[Literal["circle", "square", "annulus", "image"]] = _LEFT_OUT
     aperture_image: FileName | None = None
     obscuration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     glass: Glass = "none"
@@ -99,11 +116,12 @@ class MainLens(Section):
     _samples: dict = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
-    def _one_aperture(self):
+    def _one_aperture(self) -> Self:
         if (self.aperture_diameter is None) == (self.f_number is None):
             raise ValueError("give exactly one of aperture_diameter and f_number")
         if self.aperture_shape is None:
-            self.__dict__["aperture_shape"] = "circle" if self.aperture_image is None else "image"
+            plain = self.aperture_image is None
+            self.__dict__.update(aperture_shape="circle" if plain else "image")
         if (self.aperture_shape == "image") != (self.aperture_image is not None):
             raise ValueError(
                 'aperture_image is the whole aperture: it goes with aperture_shape = "image" (or '
@@ -119,11 +137,14 @@ class MainLens(Section):
             )
         return self
 
-    def samples(self, name):
-        """What the file that key `name` names holds: the values (rows, columns) of "aperture_image"
-        and "wavefront", the Prescription of "prescription"; None where it names none.
+    def samples(self, name: str) -> Any:
+        """What the file that a key names holds.
 
-        ConfigError where they have not been attached.
+        name: "aperture_image", "wavefront" or "prescription".
+
+        Returns the values (row, column), of "prescription" the Prescription; None without
+            a name.
+        Raises ConfigError where they have not been attached.
         """
         if getattr(self, name) is None:
             return None
@@ -149,24 +170,25 @@ class LensletArray(Section):
     """
 
     distance: Length
-    pitch: Length | None = None
+    pitch: Resolved[Length] = _LEFT_OUT
     superpixel_pitch: Length | None = None
     focal_length: Length
     glass: Glass = "none"
     lattice: Literal["square", "hexagonal"] = "square"
-    aperture_shape: Literal["square", "circle", "hexagon"] | None = None
+    aperture_shape: Resolved[Literal["square", "circle", "hexagon"]] = _LEFT_OUT
     fill_factor: Unit = 1.0
     profile: Literal["hyperbolic", "parabolic"] = "hyperbolic"
     count: Pair = (11, 11)
 
     @model_validator(mode="after")
-    def _one_pitch(self):
+    def _one_pitch(self) -> Self:
         if (self.pitch is None) == (self.superpixel_pitch is None):
             raise ValueError(
                 "give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)"
             )
         if self.aperture_shape is None:
-            self.__dict__["aperture_shape"] = "square" if self.lattice == "square" else "hexagon"
+            square = self.lattice == "square"
+            self.__dict__.update(aperture_shape="square" if square else "hexagon")
         other = {"square": "hexagon", "hexagonal": "square"}[self.lattice]
         if self.aperture_shape == other and self.fill_factor > ROW_SPACING:
             raise ValueError(
@@ -176,7 +198,7 @@ class LensletArray(Section):
         return self
 
     @property
-    def row_spacing(self):
+    def row_spacing(self) -> float:
         """Distance of neighbouring rows of lenslets over the pitch: 1, or sqrt(3)/2 on a
         hexagonal lattice.
         """
@@ -198,7 +220,7 @@ class Sensor(Section):
     black_level: Annotated[int, Field(ge=0, le=65534)] = 0
 
     @model_validator(mode="after")
-    def _levels(self):
+    def _levels(self) -> Self:
         if self.black_level >= 2**self.bits - 1:
             raise ValueError(f"black_level {self.black_level} leaves no range in {self.bits} bits")
         if self.cfa != "mono" and self.camera is None:
@@ -221,7 +243,7 @@ class Band(Section):
     shape: Literal["gaussian", "box"] = "gaussian"
 
     @model_validator(mode="after")
-    def _narrow(self):
+    def _narrow(self) -> Self:
         if self.fwhm > self.center / 3:
             raise ValueError(
                 f"fwhm {format_length(self.fwhm)} is more than a third of the centre, "
@@ -238,18 +260,18 @@ class Light(Section):
     resolves to its centre.
     """
 
-    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)] | None = (
-        None
-    )
+    wavelengths: Resolved[
+        Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=1000)]
+    ] = _LEFT_OUT
     band: Band | None = None
-    design_wavelength: Wavelength | None = None
+    design_wavelength: Resolved[Wavelength] = _LEFT_OUT
     illuminant: str = "D65"
     white_exposure: Duration = 0.01
 
     @model_validator(mode="after")
-    def _ascending(self):
+    def _ascending(self) -> Self:
         if self.band is not None and self.wavelengths is None:
-            self.__dict__["wavelengths"] = (self.band.center,)
+            self.__dict__.update(wavelengths=(self.band.center,))
         if self.wavelengths is None or (
             self.band is not None and self.wavelengths != (self.band.center,)
         ):
@@ -273,11 +295,11 @@ class Filter(Section):
 class FilterArray(Section):
     layout: Pair
     gap: Gap = 0.0
-    size: Length | None = None
+    size: Resolved[Length] = _LEFT_OUT
     filters: tuple[Filter, ...]
 
     @model_validator(mode="after")
-    def _one_filter_a_cell(self):
+    def _one_filter_a_cell(self) -> Self:
         rows, columns = self.layout
         if len(self.filters) != rows * columns:
             raise ValueError(
@@ -287,7 +309,7 @@ class FilterArray(Section):
         return self
 
 
-def _check_range(section, glass, wavelengths):
+def _check_range(section: str, glass: str, wavelengths: Sequence[float]) -> None:
     """ValueError where a glass is not described at one of the wavelengths (m)."""
     from plenocli.forward.camera.glass import medium
 
@@ -312,56 +334,49 @@ class Camera(Section):
     _text: str = PrivateAttr("")
 
     @model_validator(mode="after")
-    def _resolve(self):
-        lens, array, sensor, light, cells = (
-            self.main_lens,
-            self.lenslet_array,
-            self.sensor,
-            self.light,
-            self.filter_array,
-        )
+    def _resolve(self) -> Self:
+        lens, array, light = self.main_lens, self.lenslet_array, self.light
         if lens.aperture_diameter is None:
-            self.__dict__["main_lens"] = lens = lens.model_copy(
-                update={"aperture_diameter": array.distance / lens.f_number, "f_number": None}
-            )
+            width = {"aperture_diameter": array.distance / lens.f_number, "f_number": None}
+            self.__dict__.update(main_lens=lens.model_copy(update=width))
         if array.pitch is None:
-            pitch = array.superpixel_pitch / (1 + sensor.distance / array.distance)
-            self.__dict__["lenslet_array"] = array.model_copy(
-                update={"pitch": pitch, "superpixel_pitch": None}
-            )
+            pitch = array.superpixel_pitch / (1 + self.sensor.distance / array.distance)
+            pitches = {"pitch": pitch, "superpixel_pitch": None}
+            self.__dict__.update(lenslet_array=array.model_copy(update=pitches))
         if light.design_wavelength is None:
             middle = light.wavelengths[len(light.wavelengths) // 2]
-            self.__dict__["light"] = light.model_copy(update={"design_wavelength": middle})
-        for section in ("main_lens", "lenslet_array"):
-            _check_range(
-                section,
-                getattr(self, section).glass,
-                (self.light.design_wavelength, *light.wavelengths),
-            )
-        if cells is not None:
-            side = lens.aperture_diameter * (
-                1 if lens.aperture_shape == "square" else math.sqrt(0.5)
-            )
-            if cells.size is None:
-                self.__dict__["filter_array"] = cells = cells.model_copy(update={"size": side})
-            elif cells.size > lens.aperture_diameter * (1 + 1e-9):
-                raise ValueError(
-                    f"filter_array.size {format_length(cells.size)} is wider than the pupil, "
-                    f"{format_length(lens.aperture_diameter)}"
-                )
-            if cells.gap * max(cells.layout) >= cells.size:
-                raise ValueError("filter_array.gap leaves no room for the filters")
+            self.__dict__.update(light=light.model_copy(update={"design_wavelength": middle}))
+        used = (self.light.design_wavelength, *light.wavelengths)
+        _check_range("main_lens", self.main_lens.glass, used)
+        _check_range("lenslet_array", self.lenslet_array.glass, used)
+        if self.filter_array is not None:
+            self.__dict__.update(filter_array=self._fitting(self.filter_array))
         return self
 
+    def _fitting(self, cells: FilterArray) -> FilterArray:
+        """The filter array with its size; ValueError where it does not fit into the pupil."""
+        lens = self.main_lens
+        if cells.size is None:
+            within = 1 if lens.aperture_shape == "square" else math.sqrt(0.5)
+            cells = cells.model_copy(update={"size": lens.aperture_diameter * within})
+        elif cells.size > lens.aperture_diameter * (1 + 1e-9):
+            raise ValueError(
+                f"filter_array.size {format_length(cells.size)} is wider than the pupil, "
+                f"{format_length(lens.aperture_diameter)}"
+            )
+        if cells.gap * max(cells.layout) >= cells.size:
+            raise ValueError("filter_array.gap leaves no room for the filters")
+        return cells
+
     @property
-    def superpixel_pitch(self):
+    def superpixel_pitch(self) -> float:
         """Spacing of superpixel centres on the sensor, m: pitch (1 + z3/z2), by similar
         triangles from the pupil's centre.
         """
         return self.lenslet_array.pitch * (1 + self.sensor.distance / self.lenslet_array.distance)
 
     @property
-    def pixel_mismatch(self):
+    def pixel_mismatch(self) -> tuple[float, float]:
         """(rows, columns): spacing of superpixels in pixels minus pixels_per_lenslet; zero when
         they tile whole pixels.
         """
@@ -369,9 +384,10 @@ class Camera(Section):
         rows, columns = self.sensor.pixels_per_lenslet
         return pitch * self.lenslet_array.row_spacing - rows, pitch - columns
 
-    def replace(self, **changes):
-        """A camera with dotted keys changed to SI values, checked again:
-        replace(**{"object.distance": 0.6}).
+    def replace(self, **changes: Any) -> "Camera":
+        """A camera with dotted keys changed to SI values: replace(**{"object.distance": 0.6}).
+
+        Raises ConfigError where the changed description does not hold.
         """
         data = self.model_dump()
         for path, value in changes.items():
@@ -388,14 +404,15 @@ class Camera(Section):
         }
         return changed.attach(**{name: getattr(old, "values", old) for name, old in kept.items()})
 
-    def attach(self, **samples):
-        """A camera that carries what its files hold: attach(aperture_image=...,
-        wavefront=..., prescription=...).
+    def attach(self, **samples: Any) -> "Camera":
+        """A camera that carries what its files hold: attach(aperture_image=..., wavefront=...,
+        prescription=...).
 
-        aperture_image: square array, intensity transmittance 0..1; wavefront: square array, m,
-        positive for phase advance, at least 4 x 4; prescription: a
-        plenocli.forward.camera.prescription.Prescription. ConfigError for keys that the description
-        does not have and for values that cannot be.
+        aperture_image: square array, intensity transmittance 0..1;
+        wavefront: square array, m, positive for phase advance, at least 4 x 4;
+        prescription: a Prescription.
+
+        Raises ConfigError for keys that the description lacks and for values that cannot be.
         """
         lens = self.main_lens.model_copy()
         lens._samples = dict(lens._samples)
@@ -422,7 +439,7 @@ MAX_WAVEFRONT = 1e-3
 """Largest wavefront error, m."""
 
 
-def _trouble(name, values):
+def _trouble(name: str, values: np.ndarray) -> str | None:
     """Why values cannot be an aperture image or a wavefront, in words; None where they can."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.dtype.kind not in "biuf":
         return f"must be a square grid of numbers, not {by(values.shape)}"

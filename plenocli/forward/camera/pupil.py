@@ -1,5 +1,4 @@
-"""The main lens's pupil: shape, filter array, aberrations; its generalised pupil function as
-a quadrature rule.
+"""The main lens's pupil: shape, filter array, aberrations.
 
 P(x, y) = P1 sqrt(T) exp(+j k W) exp(+j k eps (x^2 + y^2)/2): P1 the aperture, T the INTENSITY
 transmittance of the filter cell, W the wavefront error in metres (W > 0 advances the phase), eps
@@ -12,16 +11,24 @@ holds W at the centres of such cells; between them it is the interpolating cubic
 on by half a cell to the edge of the square.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.forward.camera.quadrature import Rows, cell_rows, disc_rows, gauss, smooth_nodes
+from plenocli.forward.camera.quadrature import Cell
+
+if TYPE_CHECKING:
+    from scipy.interpolate import NdBSpline
+
+    from plenocli.forward.camera.model import Aberration, Camera, Filter, MainLens
 
 
-def aperture_area(lens):
-    """Area (m^2) of the open main-lens aperture P1, filters not counted; of an aperture image
-    the integral of its values.
+def aperture_area(lens: MainLens) -> float:
+    """Area (m^2) of the open main-lens aperture P1, filters not counted; of an aperture image the
+    integral of its values.
     """
     radius = lens.aperture_diameter / 2
     if lens.aperture_shape == "image":
@@ -31,9 +38,10 @@ def aperture_area(lens):
     return math.pi * radius**2 * (1 - (lens.obscuration or 0.0) ** 2)
 
 
-def aperture_picture(lens, y, x):
-    """Intensity transmittance of the open aperture at pupil coordinates y, x (m), broadcasting;
-    filters not counted.
+def aperture_picture(lens: MainLens, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Intensity transmittance of the open aperture, filters not counted.
+
+    y, x: pupil coordinates, m, broadcast against each other.
     """
     half = lens.aperture_diameter / 2
     edge = half * (1 + 1e-9)
@@ -52,9 +60,10 @@ def aperture_picture(lens, y, x):
     return 1.0 * ((r <= edge) & (r >= half * (lens.obscuration or 0.0)))
 
 
-def filter_transmittance(filter_, wavelength):
-    """Intensity transmittance of one filter at `wavelength` (m): peak exp(-4 ln2 ((l -
-    center)/fwhm)^2) + blocking.
+def filter_transmittance(filter_: Filter, wavelength: float) -> float:
+    """Intensity transmittance of one filter: peak exp(-4 ln2 ((l - center)/fwhm)^2) + blocking.
+
+    wavelength: m.
     """
     arg = (wavelength - filter_.center) / filter_.fwhm
     return min(
@@ -62,9 +71,12 @@ def filter_transmittance(filter_, wavelength):
     )
 
 
-def filter_cells(camera, wavelength):
-    """List of ((y0, y1, x0, x1) in m, intensity transmittance) of the filter array, or None
-    where there is no array.
+def filter_cells(camera: Camera, wavelength: float) -> list[tuple[Cell, float]] | None:
+    """Cells of the filter array.
+
+    wavelength: m.
+
+    Returns [((y0, y1, x0, x1) m, intensity transmittance)], None where there is no array.
     """
     array = camera.filter_array
     if array is None:
@@ -85,9 +97,11 @@ def filter_cells(camera, wavelength):
     return cells
 
 
-def noll_indices(j):
+def noll_indices(j: int) -> tuple[int, int]:
     """Radial and signed azimuthal order (n, m) of Noll's Zernike polynomial j >= 1; m < 0 is the
-    sine term (Noll 1976).
+    sine term.
+
+    Noll 1976.
     """
     n = int((math.sqrt(8 * j - 7) - 1) / 2)
     rest = j - n * (n + 1) // 2 - 1
@@ -95,9 +109,10 @@ def noll_indices(j):
     return n, (-m if j % 2 else m)
 
 
-def zernike(j, y, x):
-    """Noll's Zernike polynomial j, unit root mean square over the unit disc, at (y, x); the
-    angle runs from +x to +y.
+def zernike(j: int, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Noll's Zernike polynomial j, of unit root mean square over the unit disc.
+
+    y, x: over the disc's radius; the angle runs from +x to +y.
     """
     n, m = noll_indices(j)
     rho, theta = np.hypot(y, x), np.arctan2(y, x)
@@ -120,16 +135,19 @@ def zernike(j, y, x):
     )
 
 
-def unit_radius(lens):
-    """Radius (m) on which the Zernike polynomials are defined: that of the smallest disc
-    around the aperture.
+def unit_radius(lens: MainLens) -> float:
+    """Radius (m) on which the Zernike polynomials are defined: that of the smallest disc around the
+    aperture.
     """
     return lens.aperture_diameter / 2 * (math.sqrt(2) if lens.aperture_shape == "square" else 1)
 
 
-def wavefront(lens, y, x):
-    """Wavefront error W (m) at pupil coordinates y, x (m): the lens's wavefront grid plus its
-    Noll terms, coefficients in m rms.
+def wavefront(lens: MainLens, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Wavefront error: the lens's wavefront grid plus its Noll terms, coefficients in m rms.
+
+    y, x: pupil coordinates, m, broadcast against each other.
+
+    Returns W, m.
     """
     unit = unit_radius(lens)
     total = np.zeros(np.broadcast(y, x).shape)
@@ -137,12 +155,11 @@ def wavefront(lens, y, x):
     if spline is not None:
         total = total + spline(np.stack(np.broadcast_arrays(y, x), axis=-1))
     for term in _terms(lens):
-        noll, coefficient = (term.noll, term.coefficient) if hasattr(term, "noll") else term
-        total = total + coefficient * zernike(noll, y / unit, x / unit)
+        total = total + term.coefficient * zernike(term.noll, y / unit, x / unit)
     return total
 
 
-def _spline(lens):
+def _spline(lens: MainLens) -> NdBSpline | None:
     """The interpolating cubic spline W(y, x) through the lens's wavefront grid, or None
     where it has none.
     """
@@ -160,25 +177,25 @@ def _spline(lens):
     )
 
 
-def _terms(lens):
+def _terms(lens: MainLens) -> tuple[Aberration, ...]:
     """The lens's Noll terms.
 
     A real lens has others at every wavelength:
     plenocli.forward.camera.lens.at_wavelength comes first.
     """
-    if getattr(lens, "prescription", None) is not None:
+    if lens.prescription is not None:
         raise RuntimeError(
             "the wavefront error of a lens prescription was asked for without a wavelength"
         )
     return lens.aberrations or ()
 
 
-def has_wavefront(lens):
+def has_wavefront(lens: MainLens) -> bool:
     """Whether the lens has any wavefront error."""
     return bool(_terms(lens)) or lens.wavefront is not None
 
 
-def _sampled_slopes(lens):
+def _sampled_slopes(lens: MainLens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(y, x, dW/dy, dW/dx) at points over the open aperture, for bounds; flat arrays, m
     and dimensionless.
     """
@@ -199,7 +216,7 @@ def _sampled_slopes(lens):
     return y[inside], x[inside], slopes[0][inside], slopes[1][inside]
 
 
-def wavefront_slope(lens):
+def wavefront_slope(lens: MainLens) -> float:
     """An upper estimate of |grad W| over the aperture (dimensionless), for sizing quadratures."""
     if not has_wavefront(lens):
         return 0.0
@@ -207,12 +224,14 @@ def wavefront_slope(lens):
     return 1.1 * float(np.hypot(down, across).max(initial=0.0))
 
 
-def ray_reach(lens, eps, distance):
-    """Farthest that a ray lands from the image point along rows or columns (m), `distance` behind a
-    pupil of defocus eps (1/m).
+def ray_reach(lens: MainLens, eps: float, distance: float) -> float | None:
+    """Farthest that a ray lands from the image point along rows or columns: a ray through (y, x) of
+    the pupil lands at distance * (eps y + dW/dy, eps x + dW/dx).
 
-    A ray through (y, x) lands at distance * (eps y + dW/dy, eps x + dW/dx). None for a lens
-    without wavefront error.
+    eps: defocus of the pupil, 1/m;
+    distance: to the image behind it, m.
+
+    Returns m, None for a lens without wavefront error.
     """
     if not has_wavefront(lens):
         return None
@@ -220,84 +239,3 @@ def ray_reach(lens, eps, distance):
     return distance * float(
         max(np.abs(eps * y + down).max(initial=0.0), np.abs(eps * x + across).max(initial=0.0))
     )
-
-
-def pupil_rows(camera, geometry, slope):
-    """The generalised pupil as a list of Rows with complex weights; integrating exp(-j k x.d/z2)
-    over it gives the field.
-
-    `slope` (rad/m) bounds the phase gradient of the kernel it will be integrated with; defocus and
-    W are added here. Weights carry sqrt(T), exp(j k W) and exp(j k eps r^2/2) and the sign -1 over
-    a central obscuration.
-    """
-    lens, k, eps = camera.main_lens, geometry.k, geometry.eps
-    radius = lens.aperture_diameter / 2
-    corner = radius * (1 if lens.aperture_shape in ("circle", "annulus") else math.sqrt(2))
-    slope = slope + k * (abs(eps) * corner + wavefront_slope(lens))
-    cells = filter_cells(camera, geometry.wavelength)
-    panels = []
-    if lens.aperture_shape == "image":
-        panels = [(1.0, _image_rows(lens, cells, slope))]
-    elif lens.aperture_shape == "square":
-        for (y0, y1, x0, x1), t in cells or [((-radius, radius, -radius, radius), 1.0)]:
-            box = (max(y0, -radius), min(y1, radius), max(x0, -radius), min(x1, radius))
-            panels += [(math.sqrt(t), rows) for rows in cell_rows(box, None, slope)]
-    else:
-        discs = [(1.0, radius)]
-        if lens.obscuration:
-            discs.append((-1.0, radius * lens.obscuration))
-        for sign, r in discs:
-            if cells is None:
-                panels.append((sign, disc_rows(r, slope)))
-            else:
-                panels += [
-                    (sign * math.sqrt(t), rows)
-                    for cell, t in cells
-                    for rows in cell_rows(cell, r, slope)
-                ]
-    return [_weighted(lens, k, eps, amplitude, rows) for amplitude, rows in panels]
-
-
-def _image_rows(lens, cells, slope):
-    """Rows over an aperture image, exact for its constant cells (and those of a filter array),
-    weighted with sqrt(T).
-
-    Neighbouring rows or columns of cells that do not differ are one panel; dark
-    margins are left out.
-    """
-    image, radius = lens.samples("aperture_image"), lens.aperture_diameter / 2
-    grid = np.linspace(-radius, radius, len(image) + 1)
-    edges = []
-    for axis in (0, 1):
-        line = np.moveaxis(image, axis, 0)
-        steps = np.any(line[1:] != line[:-1], axis=1)
-        lit = np.flatnonzero(line.any(axis=1))
-        low, high = grid[lit[0]], grid[lit[-1] + 1]
-        inner = np.concatenate(
-            [grid[1:-1][steps], *([c[2 * axis : 2 * axis + 2] for c, _ in cells or ()])]
-        )
-        edges.append(np.unique(np.r_[low, inner[(inner > low) & (inner < high)], high]))
-    middle = [(e[:-1] + e[1:]) / 2 for e in edges]
-    where = [np.clip(np.searchsorted(grid, m) - 1, 0, len(image) - 1) for m in middle]
-    transmittance = image[np.ix_(*where)]
-    if cells is not None:
-        y, x = middle[0][:, None], middle[1][None, :]
-        transmittance = transmittance * sum(
-            t * ((y > y0) & (y < y1) & (x > x0) & (x < x1)) for (y0, y1, x0, x1), t in cells
-        )
-    axes = []
-    for e in edges:
-        t, w = gauss(smooth_nodes(slope * float(np.diff(e).max()) / 2))
-        half = np.diff(e)[:, None] / 2
-        axes.append(
-            (((e[:-1] + e[1:])[:, None] / 2 + half * t).ravel(), (half * w).ravel(), len(t))
-        )
-    (y, wy, py), (x, wx, px) = axes
-    amplitude = np.sqrt(transmittance).repeat(py, axis=0).repeat(px, axis=1)
-    return Rows(y, np.broadcast_to(x, amplitude.shape), amplitude * np.outer(wy, wx))
-
-
-def _weighted(lens, k, eps, amplitude, rows):
-    y = rows.y[:, None]
-    phase = k * wavefront(lens, y, rows.x) + k * eps / 2 * (y * y + rows.x * rows.x)
-    return Rows(rows.y, rows.x, amplitude * rows.weight * np.exp(1j * phase))

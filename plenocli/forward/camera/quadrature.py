@@ -6,19 +6,26 @@ see docs/model.md).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+Cell = tuple[float, float, float, float]
+"""A rectangle (y0, y1, x0, x1), m."""
+Chords = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 RULE_STEP = 0.1
 """Cycles over [-1, 1] for each node by which the bands of band_rule grow."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Nodes of a region scanned row by row: `y` (rows,), `x` and `weight` (rows, nodes), all in
-    metres and square metres.
+    """Nodes of a region scanned row by row.
+
+    y: (row,) m;
+    x: (row, node) m;
+    weight: (row, node) m^2.
     """
 
     y: np.ndarray
@@ -27,9 +34,11 @@ class Rows:
 
 
 @lru_cache(maxsize=64)
-def gauss(n):
-    """Nodes and weights (read-only) of n-point Gauss-Legendre on [-1, 1]: Newton's method from
-    Tricomi's first guess.
+def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss and Legendre's rule of n points on [-1, 1], by Newton's method from Tricomi's
+    first guess.
+
+    Returns nodes and weights, (n,) each, read-only.
     """
     count = (n + 1) // 2
     t = np.cos(np.pi * (np.arange(count) + 0.75) / (n + 0.5)) * (1 - (n - 1) / (8 * n**3))
@@ -54,13 +63,15 @@ def gauss(n):
 
 
 @lru_cache(maxsize=512)
-def band_rule(n, step=0):
-    """Nodes and weights (read-only) of an n-point rule on [-1, 1] made for frequencies: cos(pi c
-    t), c up to RULE_STEP step n.
+def band_rule(n: int, step: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A rule of n points on [-1, 1] made for frequencies: cos(pi c t), c up to RULE_STEP step n.
 
     Least squares over the band by Gauss and Newton, from the rule of the next narrower band; step 0
     is Gauss and Legendre's, which spends its nodes on polynomials. Constants are integrated
-    exactly. Such rules exist for every band (Xiao, Rokhlin and Yarvin, Inverse Problems 17, 2001).
+    exactly.
+
+    Returns nodes and weights, (n,) each, read-only; those of a narrower band where none are found.
+    Such rules exist for every band (Xiao, Rokhlin and Yarvin, Inverse Problems 17, 2001).
     """
     if step == 0:
         return gauss(n)
@@ -97,17 +108,20 @@ def band_rule(n, step=0):
     return nodes, weights
 
 
-def nodes_for(phase):
+def nodes_for(phase: float) -> int:
     """Number of Gauss-Legendre nodes on [-1, 1] for a phase slope of `phase` rad per unit of t."""
     return int(np.ceil(phase / 2 + 3 * np.cbrt(phase) + 4))
 
 
-def smooth_nodes(phase, error=1e-10):
-    """Fewest Gauss-Legendre nodes that integrate exp(j phase t) on [-1, 1] to `error`, for panels
-    of little phase each.
+def smooth_nodes(phase: float, error: float = 1e-10) -> int:
+    """Fewest Gauss-Legendre nodes that integrate exp(j phase t) on [-1, 1], for panels of little
+    phase each.
 
-    Where the remainder 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) phase^(2n) of the rule falls below it;
-    never more than nodes_for.
+    phase: rad per unit of t;
+    error: of the integral.
+
+    Returns the count where the remainder 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) phase^(2n) of the rule
+    falls below the error, never more than nodes_for.
     """
     for count in range(1, nodes_for(phase)):
         log = (
@@ -121,12 +135,12 @@ def smooth_nodes(phase, error=1e-10):
     return nodes_for(phase)
 
 
-def disc_rows(radius, slope):
-    """Rows over a disc for integrands whose phase changes by at most `slope`
-    rad/m in any direction.
+def disc_rows(radius: float, slope: float) -> Rows:
+    """Rows over a disc: y = radius sin(theta) with equidistant theta, which converges spectrally
+    because the integrand is periodic in theta.
 
-    y = radius sin(theta) with equidistant theta, which converges spectrally because the integrand
-    is periodic in theta.
+    radius: m;
+    slope: rad/m that the integrand's phase changes by at most in any direction.
     """
     phase = slope * radius
     count = int(np.ceil(phase / 2 + 3 * np.cbrt(phase) + 5))
@@ -138,11 +152,14 @@ def disc_rows(radius, slope):
     )
 
 
-def cell_rows(cell, radius, slope):
-    """Rows over the part of the rectangle `cell` = (y0, y1, x0, x1) inside a centred disc, as a
-    list (maybe empty).
+def cell_rows(cell: Cell, radius: float | None, slope: float) -> list[Rows]:
+    """Rows over the part of a rectangle inside a centred disc.
 
-    `radius` None means no disc. Panels end where the circle meets the rectangle's sides, so every
+    cell: (y0, y1, x0, x1) m;
+    radius: of the disc, m; None: no disc;
+    slope: as in disc_rows.
+
+    Returns panels, maybe none; they end where the circle meets the rectangle's sides, so that every
     integrand is smooth.
     """
     panels = []
@@ -153,9 +170,10 @@ def cell_rows(cell, radius, slope):
     return panels
 
 
-def cell_chords(cell, radius, slope):
-    """The same region as chords: panels (y, weight, left, right), (rows,) each; weights
-    integrate over y alone, m.
+def cell_chords(cell: Cell, radius: float | None, slope: float) -> list[Chords]:
+    """The region of cell_rows as chords.
+
+    Returns panels (y, weight, left, right), (row,) each; weights integrate over y alone, m.
     """
     y0, y1, x0, x1 = cell
     if radius is None:
@@ -166,7 +184,7 @@ def cell_chords(cell, radius, slope):
     cuts = [s * np.sqrt(radius**2 - x * x) for x in (x0, x1) if abs(x) < radius for s in (-1, 1)]
     edges = [y0, *sorted(c for c in cuts if y0 < c < y1), y1]
 
-    def ends(y):
+    def ends(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         half = np.sqrt(np.maximum(radius**2 - y * y, 0))
         return np.maximum(x0, -half), np.minimum(x1, half)
 
@@ -178,7 +196,7 @@ def cell_chords(cell, radius, slope):
     return panels
 
 
-def _panel(low, high, ends, radius, slope):
+def _panel(low: float, high: float, ends: Callable, radius: float | None, slope: float) -> Chords:
     """Chords between y = low and high at Gauss-Legendre nodes; on a disc in theta =
     asin(y/radius), where its rim is smooth.
     """

@@ -7,20 +7,29 @@ bundle of rays holds positions and unit directions as arrays (3, ray) and optica
 outside a clear aperture carry NaN.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.prescription import Prescription, Surface
 
-_NEWTON_STEPS, _AIM_STEPS, _BLOCK = 50, 40, 8192
+_NEWTON_STEPS, _AIM_STEPS = 50, 40
+_BLOCK = 8192
+"""Rays that are traced at a time: what a cache holds."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """A bundle: position (3, ray) m, direction (3, ray) unit vectors, path (ray,) m of
-    index times distance.
+    """A bundle of rays.
+
+    position: (3, ray) m;
+    direction: (3, ray) unit vectors;
+    path: (ray,) m of index times distance, NaN for rays that are lost.
     """
 
     position: np.ndarray
@@ -28,17 +37,20 @@ class Rays:
     path: np.ndarray
 
     @property
-    def alive(self):
+    def alive(self) -> np.ndarray:
         """(ray,) bool: which rays got here."""
         return np.isfinite(self.path)
 
 
-# --- exact rays -----------------------------------------------------------------------------------
+# exact rays
 
 
-def sag(surface, square):
-    """Height z (m) of `surface` above its vertex plane at squared distance r^2 (m^2) from the
-    axis; NaN beyond its rim.
+def sag(surface: Surface, square: np.ndarray) -> np.ndarray:
+    """Height of a surface above its vertex plane.
+
+    square: squared distance from the axis, m^2.
+
+    Returns m, NaN beyond the surface's rim.
     """
     c, conic = surface.curvature, 1 + surface.conic
     with np.errstate(invalid="ignore"):
@@ -46,27 +58,36 @@ def sag(surface, square):
     return z + _polynomial(surface.asphere, square) * square
 
 
-def sag_slope(surface, square):
-    """dz/d(r^2) (1/m) of `surface` at squared distance r^2 (m^2) from the axis."""
+def sag_slope(surface: Surface, square: np.ndarray) -> np.ndarray:
+    """Slope dz/d(r^2) of a surface.
+
+    square: squared distance from the axis, m^2.
+
+    Returns 1/m.
+    """
     c, conic = surface.curvature, 1 + surface.conic
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = c / (2 * np.sqrt(1 - conic * c * c * square))
     return slope + _polynomial([i * a for i, a in enumerate(surface.asphere, 1)], square)
 
 
-def _polynomial(coefficients, square):
+def _polynomial(coefficients: Sequence[float], square: np.ndarray) -> np.ndarray:
     total = np.zeros_like(square)
     for a in reversed(coefficients):
         total = total * square + a
     return total
 
 
-def intersect(surface, position, direction):
-    """Signed distance (ray,) along each ray to `surface`, whose vertex is the origin of
-    `position` (3, ray).
+def intersect(surface: Surface, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Signed distance along each ray to a surface.
 
     Conics in closed form on the branch through the vertex, in the form that does not cancel; even
-    aspheres by Newton's method from there. NaN where a ray misses.
+    aspheres by Newton's method from there.
+
+    position: (3, ray) m from the surface's vertex;
+    direction: (3, ray) unit vectors.
+
+    Returns (ray,) m, NaN where a ray misses.
     """
     x, y, z = position
     l, m, n = direction
@@ -82,7 +103,9 @@ def intersect(surface, position, direction):
     return _newton(surface, position, direction, t) if any(surface.asphere) else t
 
 
-def _newton(surface, position, direction, t):
+def _newton(
+    surface: Surface, position: np.ndarray, direction: np.ndarray, t: np.ndarray
+) -> np.ndarray:
     """Distances to an even asphere from first guesses `t`; where there is none,
     from the vertex plane.
     """
@@ -102,12 +125,18 @@ def _newton(surface, position, direction, t):
     return np.where(done, t, np.nan)
 
 
-def refract(surface, position, direction, ratio):
-    """Directions (3, ray) behind `surface` of rays that meet it at `position` (3, ray); `ratio` is
-    n before over n behind.
+def refract(
+    surface: Surface, position: np.ndarray, direction: np.ndarray, ratio: float
+) -> np.ndarray:
+    """Directions behind a surface.
 
-    Snell's law as vectors, D' = r D + (cos t - r cos i) N with N the normal towards +z; NaN
-    for total reflection.
+    Snell's law as vectors, D' = r D + (cos t - r cos i) N with N the normal towards +z.
+
+    position: (3, ray) m, where rays meet the surface;
+    direction: (3, ray) unit vectors before it;
+    ratio: n before over n behind.
+
+    Returns (3, ray) unit vectors, NaN for total reflection.
     """
     x, y, _ = position
     slope = 2 * sag_slope(surface, x * x + y * y)
@@ -120,11 +149,21 @@ def refract(surface, position, direction, ratio):
     return out / np.sqrt((out * out).sum(axis=0))
 
 
-def trace(surfaces, rays, wavelength, *, clip=False, upto=None):
-    """Carry `rays`, given in the frame of the first vertex, in air, through `surfaces`.
+def trace(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    wavelength: float,
+    *,
+    clip: bool = False,
+    upto: int | None = None,
+) -> Rays:
+    """Carry rays, given in the frame of the first vertex, in air, through surfaces.
 
-    Returns Rays on the last surface, refracted, in the frame of ITS vertex; with `upto` = i the
-    rays on surface i, refracted too. With `clip` rays outside a surface's semi_diameter are lost.
+    wavelength: m;
+    clip: whether rays outside a surface's semi_diameter are lost;
+    upto: index of the surface to stop at, None: the last.
+
+    Returns Rays on that surface, refracted, in the frame of ITS vertex.
     """
     chosen = surfaces if upto is None else surfaces[: upto + 1]
     indices = [1.0] + [s.medium.index(wavelength) for s in chosen]
@@ -136,7 +175,14 @@ def trace(surfaces, rays, wavelength, *, clip=False, upto=None):
     return out
 
 
-def _trace_block(surfaces, indices, rays, clip, part, out):
+def _trace_block(
+    surfaces: Sequence[Surface],
+    indices: Sequence[float],
+    rays: Rays,
+    clip: bool,
+    part: slice,
+    out: Rays,
+) -> None:
     p, d, path = rays.position[:, part].copy(), rays.direction[:, part], rays.path[part]
     for i, surface in enumerate(surfaces):
         if i:
@@ -157,23 +203,34 @@ def _trace_block(surfaces, indices, rays, clip, part, out):
     out.path[part] = path
 
 
-def to_plane(rays, distance, index=1.0):
-    """`rays` carried on to the plane z = `distance` (m), in the frame of that plane."""
+def to_plane(rays: Rays, distance: float, index: float = 1.0) -> Rays:
+    """Rays carried on to a plane, in the frame of that plane.
+
+    distance: z of the plane, m;
+    index: of refraction on the way.
+    """
     t = (distance - rays.position[2]) / rays.direction[2]
     position = rays.position + t * rays.direction
     position[2] = 0.0
     return Rays(position, rays.direction, rays.path + index * t)
 
 
-# --- paraxial optics ------------------------------------------------------------------------------
+# paraxial optics
 
 
-def paraxial_matrix(surfaces, wavelength, index_before=1.0):
-    """System matrix [[A, B], [C, D]] from just before the first vertex to just behind the last: (y,
-    n u) -> (y', n' u').
+def paraxial_matrix(
+    surfaces: Sequence[Surface], wavelength: float, index_before: float = 1.0
+) -> np.ndarray:
+    """System matrix [[A, B], [C, D]] from just before the first vertex to just behind the last:
+    (y, n u) -> (y', n' u').
 
     Refraction [[1, 0], [-(n' - n) c, 1]] and transfer [[1, d/n], [0, 1]]; the determinant is 1
     (Lagrange's invariant).
+
+    wavelength: m;
+    index_before: of refraction before the first surface.
+
+    Returns (2, 2), B in m and C in 1/m.
     """
     matrix, n = np.eye(2), index_before
     for i, surface in enumerate(surfaces):
@@ -187,9 +244,11 @@ def paraxial_matrix(surfaces, wavelength, index_before=1.0):
 
 @dataclass(frozen=True)
 class Pupil:
-    """Paraxial image of the stop: position (m, from the first vertex for the entrance, from the
-    last for the exit pupil) and radius (m) for the lens's stop radius; `magnification` is radius
-    over stop radius, signed. Infinite if telecentric.
+    """Paraxial image of the stop; infinite if telecentric.
+
+    position: m, of the entrance pupil from the first vertex, of the exit pupil from the last;
+    radius: m, for the lens's stop radius;
+    magnification: radius over stop radius, signed.
     """
 
     position: float
@@ -200,7 +259,7 @@ class Pupil:
 _TELECENTRIC = Pupil(math.inf, math.inf, math.inf)
 
 
-def entrance_pupil(lens, wavelength):
+def entrance_pupil(lens: Prescription, wavelength: float) -> Pupil:
     """The stop as seen from the object, a Pupil."""
     front = paraxial_matrix(lens.surfaces[: lens.stop], wavelength) if lens.stop else np.eye(2)
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
@@ -210,7 +269,7 @@ def entrance_pupil(lens, wavelength):
     return _TELECENTRIC if abs(a) < 1e-12 else _pupil(b / a, 1 / a, lens.stop_radius)
 
 
-def exit_pupil(lens, wavelength):
+def exit_pupil(lens: Prescription, wavelength: float) -> Pupil:
     """The stop as seen from the image, a Pupil."""
     behind = lens.surfaces[lens.stop :]
     n = lens.surfaces[lens.stop - 1].medium.index(wavelength) if lens.stop else 1.0
@@ -219,22 +278,34 @@ def exit_pupil(lens, wavelength):
     return _TELECENTRIC if abs(d) < 1e-12 else _pupil(-b / d * last, 1 / d, lens.stop_radius)
 
 
-def _pupil(position, magnification, stop_radius):
+def _pupil(position: float, magnification: float, stop_radius: float) -> Pupil:
     return Pupil(float(position), abs(float(magnification)) * stop_radius, float(magnification))
 
 
-# --- aiming ---------------------------------------------------------------------------------------
+# aiming
 
 
-def aim(lens, wavelength, points, *, angle=0.0, object_distance=math.inf, real=True):
-    """Rays from one object point that meet the stop at `points` (2, ray), given as (x, y) over
-    the stop's radius.
+def aim(
+    lens: Prescription,
+    wavelength: float,
+    points: np.ndarray,
+    *,
+    angle: float = 0.0,
+    object_distance: float = math.inf,
+    real: bool = True,
+) -> Rays:
+    """Rays from one object point that meet the stop at given points.
 
-    The object lies at infinity in the direction whose rays climb towards +y by `angle` (rad), or at
-    `object_distance` (m) before the first vertex, that far off axis that its paraxial chief ray has
-    this angle. Paths are counted from the object point, from infinity from the wavefront through
-    the entrance pupil's centre. `real` = False aims at the paraxial entrance pupil instead of the
-    stop. Rays that reach no such point carry NaN. NumericsError where the chief ray fails.
+    wavelength: m;
+    points: (2, ray) x, y over the stop's radius;
+    angle: of the field, rad: the object lies at infinity in the direction whose rays climb towards
+        +y by it, or that far off axis that its paraxial chief ray has this angle;
+    object_distance: m before the first vertex;
+    real: aim at the stop, else at the paraxial entrance pupil.
+
+    Returns Rays with paths counted from the object point, from infinity from the wavefront through
+    the entrance pupil's centre; NaN where none reaches the point.
+    Raises NumericsError where the chief ray fails.
     """
     source = _Source(lens, wavelength, angle, object_distance)
     target = np.asarray(points, dtype=float) * lens.stop_radius
@@ -249,7 +320,14 @@ def aim(lens, wavelength, points, *, angle=0.0, object_distance=math.inf, real=T
     return source.rays(np.where(ok, aimed, np.nan))
 
 
-def _walk(lens, wavelength, source, chief, start, target):
+def _walk(
+    lens: Prescription,
+    wavelength: float,
+    source: _Source,
+    chief: np.ndarray,
+    start: np.ndarray,
+    target: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """`_solve` from the chief ray outwards in four steps, for strongly deformed pupils."""
     at, before = chief + start / 4, None
     for share in (0.25, 0.5, 0.75, 1.0):
@@ -263,7 +341,9 @@ def _walk(lens, wavelength, source, chief, start, target):
 class _Source:
     """The rays of one object point, named by where they meet the plane of the entrance pupil."""
 
-    def __init__(self, lens, wavelength, angle, object_distance):
+    def __init__(
+        self, lens: Prescription, wavelength: float, angle: float, object_distance: float
+    ) -> None:
         self.pupil = entrance_pupil(lens, wavelength)
         if not math.isfinite(self.pupil.position):
             raise NumericsError(
@@ -278,7 +358,7 @@ class _Source:
                 [0.0, -math.tan(angle) * (object_distance + self.pupil.position), -object_distance]
             )
 
-    def rays(self, crossing):
+    def rays(self, crossing: np.ndarray) -> Rays:
         """Rays through `crossing` (2, ray) (m) of the entrance pupil's plane, placed on the
         first vertex plane.
         """
@@ -298,7 +378,9 @@ class _Source:
         return Rays(self.point[:, None] + t * direction, direction, t)
 
 
-def _chief(lens, wavelength, angle, object_distance):
+def _chief(
+    lens: Prescription, wavelength: float, angle: float, object_distance: float
+) -> np.ndarray:
     """Where the ray to the stop's centre crosses the entrance pupil's plane, (2, 1) m; wide
     fields are reached in steps.
     """
@@ -321,7 +403,13 @@ def _chief(lens, wavelength, angle, object_distance):
     )
 
 
-def _solve(lens, wavelength, source, start, target):
+def _solve(
+    lens: Prescription,
+    wavelength: float,
+    source: _Source,
+    start: np.ndarray,
+    target: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Newton's method on the two pupil coordinates of every ray, with differences over 1e-4 of the
     pupil's radius and steps halved where they fail. Returns (crossings (2, ray), converged (ray,)).
     """
@@ -329,7 +417,7 @@ def _solve(lens, wavelength, source, start, target):
     tolerance = 1e-12 * lens.stop_radius
     h = 1e-4 * source.pupil.radius
 
-    def miss(crossing):
+    def miss(crossing: np.ndarray) -> np.ndarray:
         rays = trace(ahead, source.rays(crossing), wavelength)
         return rays.position[:2] - target
 

@@ -265,12 +265,12 @@ def import_lens(path):
     far = math.inf if math.isinf(object_z) or abs(object_z) > 1e4 else places[0] - object_z
     wavelength = float(optic.primary_wavelength) * 1e-6
     lens = Prescription(
-        tuple(found),
-        stops[0],
-        1.0,
-        wavelength,
-        far,
-        (getattr(optic, "name", "") or path.stem).strip(),
+        surfaces=tuple(found),
+        stop=stops[0],
+        stop_radius=1.0,
+        design_wavelength=wavelength,
+        object_distance=far,
+        name=(getattr(optic, "name", "") or path.stem).strip(),
     )
     radius = (
         _number(optic.paraxial.EPD())
@@ -377,12 +377,12 @@ def _surface(surface, number, path, thickness, name, model, notes):
         else math.inf
     )
     return Surface(
-        0.0 if math.isinf(radius) else 1 / radius,
-        thickness,
-        _medium(surface.material_post, where, name, model, notes),
-        _number(getattr(geometry, "k", 0.0) or 0.0),
-        asphere,
-        semi,
+        curvature=0.0 if math.isinf(radius) else 1 / radius,
+        thickness=thickness,
+        medium=_medium(surface.material_post, where, name, model, notes),
+        conic=_number(getattr(geometry, "k", 0.0) or 0.0),
+        asphere=asphere,
+        semi_diameter=semi,
     )
 
 

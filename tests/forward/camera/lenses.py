@@ -16,7 +16,12 @@ def singlet(r1, r2, thickness, n, stop_radius=1e-3, image_distance=0.0):
     """A lens of radii r1, r2 (m; infinite for a plane) with the stop at its first surface."""
     c1, c2 = (0.0 if math.isinf(r) else 1 / r for r in (r1, r2))
     return Prescription(
-        (Surface(c1, thickness, glass(n)), Surface(c2, image_distance)), 0, stop_radius
+        surfaces=(
+            Surface(curvature=c1, thickness=thickness, medium=glass(n)),
+            Surface(curvature=c2, thickness=image_distance),
+        ),
+        stop=0,
+        stop_radius=stop_radius,
     )
 
 
@@ -34,7 +39,13 @@ def triplet():
         (-18.39533, 42.2, None),
     ]
     surfaces = tuple(
-        Surface(0.0 if math.isinf(r) else 1e3 / r, t * 1e-3, medium(g) if g else AIR)
+        Surface(
+            curvature=0.0 if math.isinf(r) else 1e3 / r,
+            thickness=t * 1e-3,
+            medium=medium(g) if g else AIR,
+        )
         for r, t, g in rows
     )
-    return Prescription(surfaces, 4, 4.1e-3, D_LINE, name="triplet")
+    return Prescription(
+        surfaces=surfaces, stop=4, stop_radius=4.1e-3, design_wavelength=D_LINE, name="triplet"
+    )

@@ -38,9 +38,12 @@ def perfect_lens(n=1.7, focal_length=50e-3):
     aberration for infinity.
     """
     return Prescription(
-        (Surface(0.0, 5e-3, glass(n)), Surface(-1 / (focal_length * (n - 1)), 0.0, conic=-n * n)),
-        0,
-        10e-3,
+        surfaces=(
+            Surface(curvature=0.0, thickness=5e-3, medium=glass(n)),
+            Surface(curvature=-1 / (focal_length * (n - 1)), thickness=0.0, conic=-n * n),
+        ),
+        stop=0,
+        stop_radius=10e-3,
     )
 
 
@@ -131,7 +134,12 @@ def test_telecentric_and_distant_pupils_agree():
     first = first_order(lens, D_LINE)
     gap = first.focal_length - first.front_principal
     near, far = (
-        Prescription((Surface(0.0, gap + shift), *lens.surfaces), 0, 2e-3) for shift in (0.0, 1e-7)
+        Prescription(
+            surfaces=(Surface(curvature=0.0, thickness=gap + shift), *lens.surfaces),
+            stop=0,
+            stop_radius=2e-3,
+        )
+        for shift in (0.0, 1e-7)
     )
     a, b = (wavefront(lens, D_LINE, POINTS, math.radians(4)) for lens in (near, far))
     assert abs(b.radius) > 1e3
@@ -170,7 +178,14 @@ def test_the_grid_is_the_wavefront_and_upright():
 def test_focal_shift_of_a_thin_singlet():
     """f (n - 1) is constant: the back focus of a thin BK7 lens moves as 1/(n - 1)."""
     bk7 = medium("N-BK7")
-    lens = Prescription((Surface(1 / 40e-3, 1e-9, bk7), Surface(-1 / 40e-3)), 0, 2e-3)
+    lens = Prescription(
+        surfaces=(
+            Surface(curvature=1 / 40e-3, thickness=1e-9, medium=bk7),
+            Surface(curvature=-1 / 40e-3),
+        ),
+        stop=0,
+        stop_radius=2e-3,
+    )
     f = {w: 1 / ((bk7.index(w) - 1) * 2 / 40e-3) for w in (450e-9, 650e-9, D_LINE)}
     assert focal_shift(lens, [450e-9, 650e-9]) == pytest.approx(
         [f[450e-9] - f[D_LINE], f[650e-9] - f[D_LINE]], rel=1e-5
@@ -184,7 +199,14 @@ def test_lateral_colour_of_a_plate_and_a_prism_like_field():
     difference of its chief rays, object held.
     """
     bk7 = medium("N-BK7")
-    thin = Prescription((Surface(1 / 40e-3, 1e-9, bk7), Surface(-1 / 40e-3)), 0, 1e-3)
+    thin = Prescription(
+        surfaces=(
+            Surface(curvature=1 / 40e-3, thickness=1e-9, medium=bk7),
+            Surface(curvature=-1 / 40e-3),
+        ),
+        stop=0,
+        stop_radius=1e-3,
+    )
     assert abs(lateral_colour(thin, [450e-9], 0.01)[0]) < 1e-12
     lens = triplet()
     heights = [chief_height(lens, w, 0.2) for w in (486e-9, D_LINE)]
@@ -200,17 +222,20 @@ def test_lateral_colour_of_a_plate_and_a_prism_like_field():
 def test_distortion_vanishes_for_a_stop_at_a_thin_lens_and_for_symmetry_at_unit_magnification():
     lens = singlet(40e-3, -40e-3, 1e-9, 1.5)
     assert abs(distortion(lens, D_LINE, 0.2)) < 1e-7
-    half = (Surface(1 / 20e-3, 4e-3, medium("N-SK16")), Surface(1 / 60e-3, 3e-3))
-    turned = Prescription(half, 0, 2e-3).reversed().surfaces
+    half = (
+        Surface(curvature=1 / 20e-3, thickness=4e-3, medium=medium("N-SK16")),
+        Surface(curvature=1 / 60e-3, thickness=3e-3),
+    )
+    turned = Prescription(surfaces=half, stop=0, stop_radius=2e-3).reversed().surfaces
     whole = Prescription(
-        (
+        surfaces=(
             *half,
-            Surface(0.0, 3e-3),
+            Surface(curvature=0.0, thickness=3e-3),
             replace(turned[0], thickness=4e-3),
             replace(turned[1], thickness=0.0),
         ),
-        2,
-        1e-3,
+        stop=2,
+        stop_radius=1e-3,
     )
     data = first_order(whole, D_LINE)
     unit = 2 * data.focal_length - data.front_principal
@@ -226,7 +251,13 @@ def test_vignetting_is_the_overlap_of_two_circles():
     """
     r, d, angle = 2e-3, 5e-3, 0.3
     lens = Prescription(
-        (Surface(0.0, d, semi_diameter=r), Surface(1 / 40e-3, 1e-9, glass(1.5)), Surface()), 1, r
+        surfaces=(
+            Surface(curvature=0.0, thickness=d, semi_diameter=r),
+            Surface(curvature=1 / 40e-3, thickness=1e-9, medium=glass(1.5)),
+            Surface(),
+        ),
+        stop=1,
+        stop_radius=r,
     )
     # the stop is on the first curved vertex; its sag is 0.05 mm at the rim
     shift = d * math.tan(angle) / r
@@ -253,7 +284,14 @@ def test_the_image_plane_is_the_described_one_for_the_described_object_only():
 def test_a_thin_lens_in_a_camera_is_itself():
     bk7 = medium("N-BK7")
     f = {w: 1 / ((bk7.index(w) - 1) * 2 / 100e-3) for w in (450e-9, 550e-9, 650e-9)}
-    lens = Prescription((Surface(1 / 100e-3, 1e-9, bk7), Surface(-1 / 100e-3)), 0, 5e-3)
+    lens = Prescription(
+        surfaces=(
+            Surface(curvature=1 / 100e-3, thickness=1e-9, medium=bk7),
+            Surface(curvature=-1 / 100e-3),
+        ),
+        stop=0,
+        stop_radius=5e-3,
+    )
     inside = camera_lens(lens, 1.0, 6e-3, 550e-9)
     assert inside.z2 == pytest.approx(1 / (1 / f[550e-9] - 1), rel=1e-6)
     for w in f:
@@ -305,7 +343,13 @@ def test_rays_that_do_not_get_through_are_told_with_their_number_and_angle():
     with pytest.raises(NumericsError, match="chief ray at 80 degrees"):
         wavefront(singlet(math.inf, 6e-3, 4e-3, 1.5, 1e-4), D_LINE, POINTS, angle=math.radians(80))
     telecentric = Prescription(
-        (Surface(100.0, 0.0, glass(1.5)), Surface(0.0, 0.02), Surface(0.0, 5e-3)), 2, 1e-3
+        surfaces=(
+            Surface(curvature=100.0, thickness=0.0, medium=glass(1.5)),
+            Surface(curvature=0.0, thickness=0.02),
+            Surface(curvature=0.0, thickness=5e-3),
+        ),
+        stop=2,
+        stop_radius=1e-3,
     )
     with pytest.raises(NumericsError, match="telecentric entrance pupils"):
         wavefront(telecentric, D_LINE, POINTS)

@@ -43,14 +43,14 @@ def parallel(heights):
 @pytest.mark.parametrize(
     "surface",
     [
-        Surface(1 / 20e-3),
-        Surface(-1 / 20e-3),
+        Surface(curvature=1 / 20e-3),
+        Surface(curvature=-1 / 20e-3),
         Surface(),
-        Surface(1 / 20e-3, conic=-1.0),
-        Surface(1 / 20e-3, conic=-3.2),
-        Surface(-1 / 20e-3, conic=2.5),
-        Surface(1 / 13.255e-3, conic=-2.364143, asphere=(0.0, 9.556697e4, -2.609526e8)),
-        Surface(0.0, asphere=(3.0, 2e4)),
+        Surface(curvature=1 / 20e-3, conic=-1.0),
+        Surface(curvature=1 / 20e-3, conic=-3.2),
+        Surface(curvature=-1 / 20e-3, conic=2.5),
+        Surface(curvature=1 / 13.255e-3, conic=-2.364143, asphere=(0.0, 9.556697e4, -2.609526e8)),
+        Surface(curvature=0.0, asphere=(3.0, 2e4)),
     ],
 )
 def test_rays_end_on_the_surface(surface):
@@ -63,20 +63,22 @@ def test_rays_end_on_the_surface(surface):
 
 def test_a_ray_beside_the_sphere_or_on_the_hyperboloid_s_other_sheet_is_lost():
     rays = parallel([0.0, 9.9e-3, 10.1e-3])
-    assert np.isnan(intersect(Surface(1 / 10e-3), rays.position, rays.direction)).tolist() == [
+    assert np.isnan(
+        intersect(Surface(curvature=1 / 10e-3), rays.position, rays.direction)
+    ).tolist() == [
         False,
         False,
         True,
     ]
     steep = Rays(np.array([[0.0], [5e-3], [-1.0]]), np.array([[0.0], [0.0], [-1.0]]), np.zeros(1))
-    assert intersect(Surface(1 / 10e-3, conic=-2.0), steep.position, steep.direction)[
+    assert intersect(Surface(curvature=1 / 10e-3, conic=-2.0), steep.position, steep.direction)[
         0
-    ] == pytest.approx(-1 - sag(Surface(1 / 10e-3, conic=-2.0), np.array(25e-6)))
+    ] == pytest.approx(-1 - sag(Surface(curvature=1 / 10e-3, conic=-2.0), np.array(25e-6)))
 
 
 def test_an_asphere_without_polynomial_is_its_conic():
     """Newton's way must find the closed form's point."""
-    rays, conic = bundle(), Surface(1 / 15e-3, conic=-0.7)
+    rays, conic = bundle(), Surface(curvature=1 / 15e-3, conic=-0.7)
     newton = replace(conic, asphere=(0.0, 1e-30))
     assert (
         np.abs(
@@ -88,7 +90,7 @@ def test_an_asphere_without_polynomial_is_its_conic():
 
 
 def test_snell_s_law_as_angles():
-    surface, ratio = Surface(1 / 30e-3, conic=0.4, asphere=(0.0, 1e3)), 1 / 1.7
+    surface, ratio = Surface(curvature=1 / 30e-3, conic=0.4, asphere=(0.0, 1e3)), 1 / 1.7
     rays = bundle()
     t = intersect(surface, rays.position, rays.direction)
     at = rays.position + t * rays.direction
@@ -123,13 +125,13 @@ def test_total_reflection_ends_a_ray():
         np.zeros((3, 2)), np.stack([0 * angles, np.sin(angles), np.cos(angles)]), np.zeros(2)
     )
     out = trace(
-        (Surface(0.0, 1e-3, glass(1.5)), Surface(0.0)),
+        (Surface(curvature=0.0, thickness=1e-3, medium=glass(1.5)), Surface(curvature=0.0)),
         Rays(rays.position, rays.direction, rays.path),
         D_LINE,
         upto=1,
     )
     assert out.alive.all()  # a plate lets everything out again
-    inside = refract(Surface(0.0), rays.position, rays.direction, 1.5)
+    inside = refract(Surface(curvature=0.0), rays.position, rays.direction, 1.5)
     assert np.isnan(inside[2]).tolist() == [False, True]
 
 
@@ -138,7 +140,9 @@ def test_axial_crossing_of_one_sphere_is_the_law_of_sines():
     t) from the vertex.
     """
     radius, n, h = 20e-3, 1.6, 7e-3
-    rays = trace((Surface(1 / radius, 0.0, glass(n)),), parallel([h]), D_LINE)
+    rays = trace(
+        (Surface(curvature=1 / radius, thickness=0.0, medium=glass(n)),), parallel([h]), D_LINE
+    )
     crossing = (
         rays.position[2, 0] - rays.position[1, 0] * rays.direction[2, 0] / rays.direction[1, 0]
     )
@@ -152,7 +156,7 @@ def test_an_ellipsoid_of_conic_constant_minus_1_over_n2_brings_parallel_light_to
     paths equal (Malus-Dupin).
     """
     n, radius = 1.7, 10e-3
-    surface = Surface(1 / radius, 0.0, glass(n), conic=-1 / n**2)
+    surface = Surface(curvature=1 / radius, thickness=0.0, medium=glass(n), conic=-1 / n**2)
     rays = trace((surface,), parallel(np.linspace(-8e-3, 8e-3, 33)), D_LINE)
     focus = to_plane(rays, n * radius / (n - 1), n)
     assert np.abs(focus.position[1]).max() < 1e-16 and np.ptp(focus.path) < 1e-16
@@ -163,7 +167,7 @@ def test_the_aplanatic_points_of_a_sphere_image_perfectly():
     sine condition n^2 (Weierstrass).
     """
     n, radius = 1.52, 5e-3
-    surface = Surface(-1 / radius, 0.0, AIR)
+    surface = Surface(curvature=-1 / radius, thickness=0.0, medium=AIR)
     angles = np.radians(np.linspace(-55, 55, 29))
     start = np.stack([0 * angles, 0 * angles, np.full_like(angles, -radius * (1 + 1 / n))])
     direction = np.stack([0 * angles, np.sin(angles), np.cos(angles)])
@@ -259,14 +263,17 @@ def test_rays_and_their_wavefront_are_normal_to_each_other():
 
 
 def test_a_symmetric_lens_has_mirrored_pupils_and_no_chief_ray_shift():
-    half = (Surface(1 / 20e-3, 4e-3, medium("N-SK16")), Surface(1 / 60e-3, 3e-3))
-    lens = Prescription(half, 0, 2e-3)
+    half = (
+        Surface(curvature=1 / 20e-3, thickness=4e-3, medium=medium("N-SK16")),
+        Surface(curvature=1 / 60e-3, thickness=3e-3),
+    )
+    lens = Prescription(surfaces=half, stop=0, stop_radius=2e-3)
     surfaces = (
         *half,
-        Surface(0.0, 3e-3),
+        Surface(curvature=0.0, thickness=3e-3),
         *(replace(s, thickness=t) for s, t in zip(lens.reversed().surfaces, (4e-3, 0.0))),
     )
-    whole = Prescription(surfaces, 2, 2e-3)
+    whole = Prescription(surfaces=surfaces, stop=2, stop_radius=2e-3)
     front, back = entrance_pupil(whole, D_LINE), exit_pupil(whole, D_LINE)
     assert front.position == pytest.approx(
         -back.position, rel=1e-12

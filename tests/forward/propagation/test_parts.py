@@ -11,9 +11,9 @@ from plenocli.forward.camera.pupil import (
     filter_cells,
     filter_transmittance,
     noll_indices,
-    pupil_rows,
     zernike,
 )
+from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import cell_rows, disc_rows
 from plenocli.forward.propagation.fresnel.spread_function import sampled_field, separable_field
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera

@@ -21,7 +21,8 @@ import math
 
 import numpy as np
 
-from plenocli.forward.camera.pupil import pupil_rows, wavefront, wavefront_slope
+from plenocli.forward.camera.pupil import wavefront, wavefront_slope
+from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import hankel_series, is_radial, radial_field
 from plenocli.forward.propagation.fresnel.spread_function import mirrored

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.camera.pupil import aperture_area, pupil_rows
+from plenocli.forward.camera.pupil import aperture_area
+from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import Rows, gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import is_radial, radial_field
 

@@ -11,6 +11,7 @@ from functools import partial
 
 import pytest
 
+from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import heard, note
 from plenocli.execution.pool import Lost, open_pool, run_all
@@ -28,6 +29,10 @@ def square(n):
 
 def refuse(n):
     raise InputError("is odd", f"number {n}", "take another")
+
+def memory(n):
+    from plenocli.base.budget import budget
+    return budget().memory
 
 def fault(n):
     return 1 / 0
@@ -81,6 +86,12 @@ def test_results_and_what_was_said_come_back_from_everywhere(tasks):
         assert isinstance(refused, InputError) and str(refused) == "number 5: is odd; take another"
         if "threads" not in options:
             assert sorted(said) == [f"squaring {n}" for n in range(9)]
+
+
+def test_a_task_has_the_budget_of_who_hands_it_in(tasks):
+    for options in ({"workers": 1}, {"workers": 2}, {"workers": 2, "threads": True}):
+        with within(Budget(12345)), open_pool(**options) as pool:
+            assert results(pool, tasks.memory, range(3)) == {0: 12345, 1: 12345, 2: 12345}
 
 
 def test_a_fault_of_ours_is_not_a_result(tasks):

@@ -128,7 +128,7 @@ def _exr(width, height, channels=("Y",), tail=b""):
     )
 
 
-def _png(width, height, data=b""):
+def _png(width, height, data=b"", bits=8, colours=2):
     def chunk(kind, content):
         return (
             struct.pack(">I", len(content))
@@ -139,7 +139,7 @@ def _png(width, height, data=b""):
 
     return (
         b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colours, 0, 0, 0))
         + chunk(b"IDAT", data)
         + chunk(b"IEND", b"")
     )

@@ -10,12 +10,18 @@ import os
 import re
 import subprocess
 import sys
+import zlib
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from plenocli.base.memory import base_memory
+from plenocli.cli.commands import COMMANDS, load_command
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from tests.faults.test_bombs import _png
 from tests.peak import PEAK
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -240,17 +246,85 @@ def test_nobody_gets_more_than_the_limit_and_the_base():
         ["learn-dict", "photo.png", "--pif", "pif.h5", "-o", "a.h5"],
         ["capture-sim", "camera.toml", "--scene", "photo.png", "-o", "a.h5"],
         ["simulate-pif", "camera.toml", "-o", "a.h5"],
+        ["simulate-response", "colour.toml", "--grid", "calibration.h5", "-o", "a.h5"],
+        ["calibrate", "--white", "white.dng", "-o", "a.h5"],
+        ["calibrate", "--white", "zeros.png", "-o", "a.h5"],
+        ["demux", "colorchecker.dng", "--calibration", "calibration.h5", "-o", "a.h5"],
+        ["report", ".", "-o", "a.html"],
+        ["colorchecker", ".", "-o", "a.h5"],
+        ["sweep", "designs.toml", "-o", "b.h5"],
     ],
     ids=lambda w: w[0],
 )
-def test_every_stage_with_the_option_refuses_what_cannot_fit(runner, stages, tmp_path, words):
+def test_every_command_refuses_what_cannot_fit(runner, stages, tmp_path, words):
     source, _ = stages
     for path in source.iterdir():
         (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "zeros.png").write_bytes(png_of_zeros(3000))
+    (tmp_path / "chart_550nm_25ms.png").symlink_to(source / "photo.png")
     outcome = runner.run([*words, "--mem-limit", "1KiB"], tmp_path)
     assert (
-        outcome.code in (3, 5)
+        outcome.code == 5
         and "raise --mem-limit" in outcome.text
         and not (tmp_path / "a.h5").exists()
     ), outcome
     assert outcome.cpu < 2
+
+
+def test_every_command_has_the_option():
+    for name in COMMANDS:
+        found = load_command(name)
+        for one in getattr(found, "commands", {"": found}).values():
+            assert "--mem-limit" in {flag for p in one.params for flag in p.opts}, (name, one.name)
+
+
+def png_of_zeros(size):
+    """A whole PNG of (size, size) zeros of 16 bits, a thousandth of what it declares."""
+    return _png(size, size, zlib.compress(bytes(size * (1 + 2 * size)), 9), bits=16, colours=0)
+
+
+def test_a_small_file_of_a_huge_picture_is_refused_before_it_is_decoded(runner, tmp_path):
+    """In calibrate it once took 18.7 GB."""
+    content = png_of_zeros(8000)
+    (tmp_path / "zeros.png").write_bytes(content)
+    assert len(content) < 130_000
+    arguments = ["calibrate", "--white", "zeros.png", "-o", "a.h5", "--mem-limit", "300MiB"]
+    outcome = runner.run(arguments, tmp_path)
+    assert outcome.code == 5 and outcome.grown < 20e6 and outcome.cpu < 1, outcome
+    assert "zeros.png: needs about 367MiB to be read, more than the limit of 300MiB" in outcome.text
+
+
+@pytest.mark.parametrize("limit", [1, 20, 35])
+def test_a_healthy_capture_is_told_what_it_needs_not_that_it_is_damaged(
+    runner, stages, tmp_path, limit
+):
+    """HDF5 that gets no memory says that the file cannot be opened."""
+    values = np.random.default_rng(0).random((1500, 1500))
+    data = {"capture/mosaic": values, "capture/cfa": "mono"}
+    write_artefact(tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance("made up")))
+    outcome = runner.run(
+        ["reconstruct", "capture.h5", "--calibration", str(stages[0] / "calibration.h5")]
+        + ["--method", "block-mean", "-o", "a.h5", "--mem-limit", f"{limit}MiB"],
+        tmp_path,
+    )
+    assert outcome.code == 5 and "capture.h5: needs about" in outcome.text, outcome
+    assert "to be read, more than the limit of" in outcome.text
+
+
+def test_hdf5_without_memory_is_no_damage(tmp_path):
+    """Within the budget, but what else there is has taken the memory."""
+    values = np.random.default_rng(0).random((2500, 2500))
+    data = {"capture/mosaic": values, "capture/cfa": "mono"}
+    write_artefact(tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance("made up")))
+    code = (
+        "import resource\n"
+        "from plenocli.files.artefacts.container import read_artefact\n"
+        "used = int(open('/proc/self/statm').read().split()[5]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_DATA, (used + (90 << 20), used + (90 << 20)))\n"
+        "try: read_artefact('capture.h5')\n"
+        "except MemoryError: raise SystemExit(7)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 7

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.errors import InputError
 
 _PATTERNS = ("*.h5", "*.exr", "*.dng", "*.json")
 _KEPT_BYTES = 32 << 20  # larger artefacts are read again when they are drawn
@@ -42,7 +42,10 @@ class RunFile:
 
 
 class RunFolder:
-    """All files below a folder, by name; `unreadable` holds (name, what is wrong)."""
+    """All files below a folder, by name; `unreadable` holds (name, what is wrong).
+
+    Raises NumericsError where one does not fit the memory: a page without it would look complete.
+    """
 
     def __init__(self, root):
         root = Path(root)
@@ -57,7 +60,7 @@ class RunFolder:
                 continue
             try:
                 found = _survey(path, name)
-            except PlenoError as error:
+            except InputError as error:
                 self.unreadable.append((name, error.what))
             else:
                 self.files += [found] if found else []

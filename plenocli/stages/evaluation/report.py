@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plenocli.base.errors import PlenoError
+from plenocli.base.errors import InputError, PlenoError
 from plenocli.files.read.results import block_of, read_result, read_truth
 from plenocli.files.read.run_folder import RunFolder
 from plenocli.report.page import Page
@@ -223,7 +223,7 @@ def _capture(page, run, file):
 
     try:
         mosaic = read_mosaic(file.path)
-    except PlenoError as error:
+    except InputError as error:
         page.warning(str(error))
         return
     centres = None

@@ -91,7 +91,7 @@ def bench(tmp_path_factory):
 
 def test_prediction_and_calibration_agree_pixel_by_pixel(bench):
     folder, toml, report = bench
-    assert report["model"] == "fresnel" and report["closed_form"]
+    assert report.notes.model == "fresnel" and report.notes.closed_form
     run_simulate_response(toml, folder / "rays.h5", Settings(model="ray"))
     document = run_score(
         [folder / "predicted.h5", folder / "rays.h5"],
@@ -107,7 +107,7 @@ def test_prediction_and_calibration_agree_pixel_by_pixel(bench):
     assert min(rays["response_error_per_band"]) > 2 * max(waves["response_error_per_band"])
     # the singlet blurs 450 nm over lenslets: the response does not change, where its
     # light comes from does
-    own = dict(zip(BANDS, report["own_light"]))
+    own = dict(zip(BANDS, report.notes.own_light))
     assert own[450e-9] < 0.5 < 0.8 < own[540e-9]
 
 
@@ -190,7 +190,7 @@ def test_colour_filters_of_the_sensor_are_part_of_the_response(bench, tmp_path):
     report = run_simulate_response(bayer, tmp_path / "bayer.h5", Settings(spectral_step=75e-9))
     data = read_artefact(tmp_path / "bayer.h5", "calibration").data
     # 15 is odd: windows begin on all four colours
-    assert report["kinds"] == 4 and data["response/F"].shape == (5, 7, 225, 4)
+    assert report.kinds == 4 and data["response/F"].shape == (5, 7, 225, 4)
     curves = camera_sensitivity("Nikon 5100 (NPL)", np.array(BANDS))
     for row, column in ((0, 0), (0, 1), (3, 2), (4, 5)):
         letters = cfa_map((15, 15), "RGGB", data["response/origin"][row, column]).ravel()
@@ -205,7 +205,7 @@ def test_lenslets_off_the_raster_have_a_response_each(tmp_path):
     report = run_simulate_response(toml, tmp_path / "off.h5", Settings(spectral_step=75e-9))
     data = read_artefact(tmp_path / "off.h5", "calibration").data
     # some windows reach over the edge
-    assert report["kinds"] > 8 and data["grid/valid"].sum() == report["lenslets"] < 35
+    assert report.kinds > 8 and data["grid/valid"].sum() == report.lenslets < 35
     response = data["response/F"].reshape(5, 7, 15, 15, 4)
     offsets = []
     for row, column in np.argwhere(data["grid/valid"]):
@@ -258,7 +258,7 @@ def test_the_exact_model_gives_the_same(focused, tmp_path):
         read_artefact(tmp_path / f"{name}.h5", "calibration") for name in ("closed", "exact")
     )
     assert (
-        report["model"] == "exact"
+        report.notes.model == "exact"
         and summed.provenance.accuracy["model"] == "exact"
         and closed.provenance.accuracy["model"] == "fresnel"
     )

@@ -93,7 +93,7 @@ def command(ctx, camera, output, grid, overwrite, as_json, **settings):
     from plenocli.stages.forward.simulate_response import Settings, run_simulate_response
 
     settings["bandwidth"] = settings["bandwidth"] or 0.0
-    report = run_simulate_response(
+    summary = run_simulate_response(
         camera,
         output,
         Settings(**settings),
@@ -101,18 +101,19 @@ def command(ctx, camera, output, grid, overwrite, as_json, **settings):
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
+    notes = summary.notes
     line = (
-        f"{output}: F of {len(report['bands_nm'])} bands, {report['lenslets']} lenslets, "
-        f"{report['model']}, condition {report['condition']:.3g}"
+        f"{output}: F of {len(summary.bands_nm)} bands, {summary.lenslets} lenslets, "
+        f"{notes.model}, condition {summary.condition:.3g}"
     )
-    if report["smallest_angle_deg"] is not None:
-        line += f", smallest angle between two columns {report['smallest_angle_deg']:.2f} deg"
+    if summary.smallest_angle_deg is not None:
+        line += f", smallest angle between two columns {summary.smallest_angle_deg:.2f} deg"
     line += "; light from a lenslet's own field " + ", ".join(
-        f"{share:.0%}" for share in report["own_light"]
+        f"{share:.0%}" for share in notes.own_light
     )
-    line += f"; taken to be known to {max(report['error']):.0%}"
-    if "rays_against_waves" in report:
+    line += f"; taken to be known to {max(notes.error):.0%}"
+    if notes.rays_against_waves is not None:
         line += "; rays differ from waves by " + ", ".join(
-            f"{share:.1%}" for share in report["rays_against_waves"]
+            f"{share:.1%}" for share in notes.rays_against_waves
         )
-    options.summary(report, as_json, line)
+    options.summary(summary.as_json(), as_json, line)

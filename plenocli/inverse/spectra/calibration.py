@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.base.errors import NumericsError
 from plenocli.forward.sensor import superpixel
 from plenocli.forward.sensor.frames import Dark
+from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 
@@ -79,6 +80,22 @@ class White:
             part = (slice(row, row + rows), slice(column, column + columns))
             flat[part] = signal[part] / peak
         return cls(superpixels, level, flat)
+
+    @classmethod
+    def predicted(cls, signal: np.ndarray, kinds: SuperpixelKinds) -> White:
+        """The white reference of a description.
+
+        signal: (kind, pixel), without noise.
+        kinds: of the superpixels.
+        """
+        (rows, columns), valid = kinds.window, kinds.valid
+        peak = signal.max(axis=1)
+        flat = np.full(kinds.sensor_shape, np.nan, np.float32)
+        for (row, column), kind in zip(kinds.origin[valid], kinds.kind[valid]):
+            part = (slice(row, row + rows), slice(column, column + columns))
+            flat[part] = (signal[kind] / peak[kind]).reshape(kinds.window)
+        level = np.where(valid, peak[kinds.kind], np.nan).astype(np.float32)
+        return cls(kinds.by_lenslet(signal).astype(np.float32), level, flat)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.spectra.calibration import Quality, Response, Windows
+from plenocli.inverse.spectra.calibration import Response, Windows
+from plenocli.inverse.spectra.quality import mean_of_known, quality_of
 
 KINDS = ("auto", "shared", "own", "low-rank")
 SAME_PLACE = 0.1
@@ -20,15 +21,6 @@ still share a response.
 OUTLIER = 10.0
 """Excess of a single lenslet (plenocli.inverse.spectra.sharing) that is worth a word."""
 BLOCK = 256
-
-
-def mean_of_known(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of the values known; NaN where none is."""
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return (np.where(known, values, 0).sum(axis=0, dtype=float) / known.sum(axis=0)).astype(
-            np.float32
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +157,10 @@ def measured_response(
     Raises NumericsError where what is asked for cannot be.
     """
     matrix, variance, verdict = _decided(asked, gathered, variance, centres, cfa)
-    quality, least = _quality(matrix, variance, gathered.valid)
+    quality, angle = quality_of(matrix, variance, gathered.valid)
+    least = (
+        "one band" if angle is None else f"smallest angle between two columns of F {angle:.2f} deg"
+    )
     return Response(
         matrix=matrix,
         variance=variance,
@@ -280,43 +275,4 @@ def _low_rank(
         _whole(gathered),
         variance * left,
         Verdict(response="low-rank", text=text, rank=rank, noise_left=left),
-    )
-
-
-def _quality(
-    response: np.ndarray, variance: np.ndarray | None, valid: np.ndarray
-) -> tuple[Quality, str]:
-    """(Quality of F, what its smallest angle between columns is in words)."""
-    from plenocli.inverse.spectra.demultiplex import (
-        calibration_bias,
-        choose_pixels,
-        column_angles,
-        condition_number,
-    )
-
-    sample = (
-        response[None]
-        if response.ndim == 2
-        else response[valid]
-        if not valid.all()
-        else response.reshape(-1, *response.shape[-2:])
-    )
-    blocks = [sample[first : first + BLOCK] for first in range(0, len(sample), BLOCK)]
-    condition = np.concatenate([condition_number(one) for one in blocks])
-    angles = np.concatenate([column_angles(one) for one in blocks])
-    between = angles[(slice(None), *np.triu_indices(response.shape[-1], 1))]
-    bias = None
-    if variance is not None:
-        matrices = calibration_bias(sample[:: max(1, len(sample) // 32)], variance)
-        bias = np.median(np.diagonal(matrices, axis1=-2, axis2=-1), axis=0).tolist()
-    quality = Quality(
-        condition=float(np.median(condition)),
-        angles=np.median(angles, axis=0).tolist(),
-        single_pixel=[int(p) for p in choose_pixels(mean_of_known(sample))],
-        bias=bias,
-    )
-    return quality, (
-        f"smallest angle between two columns of F {between.min():.2f} deg"
-        if between.size
-        else "one band"
     )

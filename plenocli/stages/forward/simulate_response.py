@@ -2,135 +2,150 @@
 description of the camera.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import ConfigError, InputError, UsageError
+from plenocli.base.errors import InputError
 from plenocli.base.progress import bar, note
-from plenocli.stages.forward.capture_sim import WHITE_LEVEL
 
-WAVES_ERR = 0.03
-"""What F by waves is taken to be known to, relative (L2) in every band: it agrees with simulated
-captures within 2 %, and scenes have light over the whole width of a filter.
-"""
-RAYS_ERR = 0.12
-"""The same for F by rays, where there is nothing by waves beside it."""
-DARK = 1e-12
-"""Share of an object point's light on the brightest pixel that is none at all."""
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.scene.light import Quadrature
+    from plenocli.forward.sensor.response_prediction import (
+        PredictionNotes,
+        PredictionOptions,
+        ResponsePrediction,
+    )
+    from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
+    from plenocli.inverse.spectra.calibration import Calibration
+
+Name = str | os.PathLike[str]
+SAME_PITCH = 0.02
+"""Share by which the pitch of a grid may differ from the description's without a word."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What the command line says beyond the camera: wavelengths and bandwidth (fwhm of each band)
-    in m, exposure in s (None: the camera's white exposure);
+    """What the command line says beyond the camera.
 
-    own_field: light of the lenslet's own object points alone;
-    accuracy, superpixels and coherent_ring: of the system matrices, where those are summed.
+    wavelengths: m, centres of the bands (empty: the camera's).
+    bandwidth: m, full width at half maximum of each band.
+    spectral_step: m, of white light; None: as the filters need.
+    exposure: s; None: the camera's white exposure.
+    model, own_field, accuracy, superpixels, coherent_ring:
+        plenocli.forward.sensor.response_prediction.PredictionOptions.
     """
 
-    wavelengths: tuple = ()
+    wavelengths: tuple[float, ...] = ()
     bandwidth: float = 0.0
     spectral_step: float | None = None
     exposure: float | None = None
     model: str = "auto"
     own_field: bool = False
     accuracy: float | None = None
-    superpixels: object = "auto"
-    coherent_ring: object = "auto"
+    superpixels: Any = "auto"
+    coherent_ring: Any = "auto"
+
+    def options(self) -> PredictionOptions:
+        """How F is computed."""
+        from plenocli.forward.sensor.response_prediction import PredictionOptions
+
+        return PredictionOptions(
+            **{one.name: getattr(self, one.name) for one in fields(PredictionOptions)}
+        )
 
 
-@dataclass(frozen=True)
-class Places:
-    """Superpixel windows on the sensor.
+@dataclass(frozen=True, kw_only=True)
+class ResponseSummary:
+    """What was predicted.
 
-    centre (R, C, 2) px;
-    origin (R, C, 2) first pixels;
-    window (rows, columns);
-    valid (R, C);
-    shape of the mosaic;
-    shifts (kind, 2): px from a superpixel's centre to its window's middle;
-    phases (kind, 2): of the colour filter array at the first pixel;
-    kind (R, C): which of these a lenslet has.
+    output: the calibration file.
+    bands_nm: (band,) nm.
+    lenslets: how many can be used.
+    array: rows and columns of lenslets.
+    window: rows and columns of a superpixel, px.
+    kinds: how many kinds of superpixels there are.
+    condition, angles_deg: plenocli.inverse.spectra.calibration.Quality.
+    smallest_angle_deg: between two columns of F; None: there is one band.
+    notes: plenocli.forward.sensor.response_prediction.PredictionNotes.
     """
 
-    centre: np.ndarray
-    origin: np.ndarray
-    window: tuple
-    valid: np.ndarray
-    shape: tuple
-    shifts: np.ndarray
-    phases: np.ndarray
-    kind: np.ndarray
+    output: str
+    bands_nm: list[float]
+    lenslets: int
+    array: list[int]
+    window: list[int]
+    kinds: int
+    condition: float
+    angles_deg: list[list[float]]
+    smallest_angle_deg: float | None
+    notes: PredictionNotes
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary as --json prints it: one flat object."""
+        flat = {one.name: getattr(self, one.name) for one in fields(self)}
+        return flat | flat.pop("notes").as_json()
 
 
-def run_simulate_response(camera_path, output, settings, *, grid=None, overwrite=False, command=""):
-    """Predict F and write it as a calibration artefact that demux takes; returns a summary dict.
+def run_simulate_response(
+    camera_path: Name,
+    output: Name,
+    settings: Settings,
+    *,
+    grid: Name | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> ResponseSummary:
+    """Predict F and write it as a calibration that demux takes.
 
+    Columns are scaled as captures of simulated narrow-band light are: each band by itself fills the
+    brightest pixel to 80 % of full well in the white exposure.
     grid: a calibration whose lenslets, white, dark and noise are kept; without one they follow from
-        the camera. Columns are scaled as captures of simulated narrow-band light are: each band by
-        itself fills the brightest pixel to 80 % of full well in the white exposure. Errors:
-        ConfigError for the camera, InputError for the grid, UsageError for options that
-        exclude each other.
+        the camera.
+
+    Raises ConfigError for the camera, InputError for the grid, UsageError for options that exclude
+    each other.
     """
-    from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
     from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.read.calibrations import read_calibration, write_calibration
     from plenocli.files.read.cameras import camera_files, read_camera
+    from plenocli.forward.sensor.response_prediction import ResponsePrediction
+    from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
 
     check_output(output, overwrite=overwrite, inputs=[camera_path, grid], suffixes=(".h5",))
     camera = read_camera(camera_path)
-    measured = read_artefact(grid, "calibration") if grid else None
-    places = _measured_places(measured, camera, grid) if measured else _places(camera)
-    optics = _Optics(camera, settings, places, camera_path)
-    bands = tuple(sorted(set(settings.wavelengths))) or camera.light.wavelengths
-    response = np.stack(
-        [
-            _electrons(camera, source, optics, places, settings)
-            for source in _narrow(bands, settings)
-        ],
-        axis=-1,
+    measured = read_calibration(grid, response=False) if grid else None
+    kinds = (
+        _measured_kinds(measured, camera, grid) if measured else SuperpixelKinds.of_camera(camera)
     )
-    if measured:
-        data, attrs = (
-            dict(measured.data),
-            {name: dict(values) for name, values in measured.attrs.items()},
-        )
-        for name in ("response/F", "response/covariance", "response/energy"):
-            data.pop(name, None)
-        levels = attrs.get("white", {})
-        attrs["response"] = {
-            name: levels[name] for name in ("cfa", "gain_e_per_dn", "read_noise") if name in levels
-        } | {"units": "DN"}
-        if "exposure" in levels:
-            attrs["response"]["exposure_s"] = levels["exposure"]
-    else:
-        white = _electrons(camera, _white(camera, settings), optics, places, settings)
-        data, attrs = _ideal(camera, places, white, settings)
-    shared = len(places.shifts) == 1
-    notes = optics.notes(bands)
-    # what a description leaves out is spread evenly over the superpixel: it is not
-    # known where it lies
-    known = np.array(notes["error"]) * np.sqrt(np.mean(response.astype(float) ** 2, axis=(0, 1)))
-    data |= {
-        "response/F": response[0] if shared else _spread(response, places),
-        "response/wavelength": np.array(bands),
-        "response/covariance": np.tile(known**2, (response.shape[1], 1)),
-    }
-    attrs["response"] |= _conditions(response[_commonest(places)]) | {"notes": notes}
+    prediction = ResponsePrediction(camera, settings.options(), kinds, camera_path)
+    bands = tuple(sorted(set(settings.wavelengths))) or camera.light.wavelengths
+    sources = _narrow(bands, settings)
+    matrix = np.stack(
+        [prediction.white_signal(source, settings.exposure) for source in sources], axis=-1
+    )
+    known = measured or _described(camera, prediction, settings)
+    notes = prediction.notes(bands)
+    calibration = _with_response(known, kinds, matrix, bands, notes)
     provenance = Provenance(
         command,
         describe_inputs(camera_files(camera_path, camera) | {"grid": grid}),
         None,
         to_toml(camera),
-        optics.record(),
+        prediction.accuracy.as_json(),
     )
-    write_artefact(output, Artefact("calibration", data, attrs, provenance), overwrite=overwrite)
-    return _report(output, attrs, places, bands, optics)
+    write_calibration(output, calibration, provenance, overwrite=overwrite)
+    return _summary(output, calibration, kinds, notes)
 
 
-def _narrow(bands, settings):
+def _narrow(bands: tuple[float, ...], settings: Settings) -> list[Quadrature]:
     from plenocli.forward.scene.light import narrow_band
 
     return bar(
@@ -138,7 +153,7 @@ def _narrow(bands, settings):
     )
 
 
-def _white(camera, settings):
+def _white(camera: Camera, settings: Settings) -> Quadrature:
     from plenocli.forward.scene.light import broadband
     from plenocli.forward.scene.tables import illuminant
 
@@ -149,324 +164,132 @@ def _white(camera, settings):
     )
 
 
-# where the superpixels lie
-
-
-def _places(camera):
-    """The windows of all lenslets of the description on the sensor's raster, nearest
-    to their chief rays.
-    """
-    from plenocli.forward.camera.geometry import lenslet_shift
-    from plenocli.forward.sensor.superpixel import inside
-
-    count, window = camera.lenslet_array.count, tuple(camera.sensor.pixels_per_lenslet)
-    found = [lenslet_shift(camera, r, c) for r in range(count[0]) for c in range(count[1])]
-    origin = np.array([(row, column) for row, column, _ in found]).reshape(*count, 2)
-    shift = np.array([shift for *_, shift in found]).reshape(*count, 2)
-    shape = tuple(n * k for n, k in zip(count, window))
-    return _sorted_by_kind(
-        origin + (np.array(window) - 1) / 2 - shift,
-        origin,
-        window,
-        inside(origin, window, shape),
-        shape,
-        shift,
-        camera.sensor.cfa,
-    )
-
-
-def _measured_places(measured, camera, path):
+def _measured_kinds(measured: Calibration, camera: Camera, path: Name) -> SuperpixelKinds:
     """The windows of a calibration's lenslets."""
-    data, cfa = measured.data, measured.attrs.get("white", {}).get("cfa", "mono")
+    from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
+
+    cfa = measured.sensor.cfa
     if cfa != camera.sensor.cfa:
         raise InputError(
             f"has the colour filter array {cfa}, the camera {camera.sensor.cfa}",
             path,
             "correct sensor.cfa",
         )
-    if "response/origin" not in data or data["dark/mean"].ndim != 2:
+    grid, windows, dark = measured.grid, measured.windows, measured.dark
+    if windows is None or dark is None or dark.mean.ndim != 2:
         raise InputError(
             "does not say where its windows and its dark image are", path, "make it with calibrate"
         )
-    centre, origin, window = (
-        data["grid/centre"],
-        data["response/origin"],
-        tuple(int(n) for n in data["response/window"]),
-    )
     for measured_pitch, pitch in zip(
-        np.ravel(measured.attrs["grid"]["pitch"]),
+        grid.pitch,
         (camera.superpixel_pitch * camera.lenslet_array.row_spacing, camera.superpixel_pitch),
     ):
-        if abs(measured_pitch * camera.sensor.pixel_pitch / pitch - 1) > 0.02:
+        if abs(measured_pitch * camera.sensor.pixel_pitch / pitch - 1) > SAME_PITCH:
             note(
                 f"warning: lenslets are {measured_pitch:.4g} px apart in the grid, "
                 f"{pitch / camera.sensor.pixel_pitch:.4g} px by the camera's description"
             )
-    valid = data["grid/valid"].astype(bool)
-    shift = np.where(valid[..., None], origin + (np.array(window) - 1) / 2 - centre, 0.0)
-    return _sorted_by_kind(centre, origin, window, valid, data["dark/mean"].shape, shift, cfa)
-
-
-def _sorted_by_kind(centre, origin, window, valid, shape, shift, cfa):
-    phase = np.zeros_like(origin) if cfa == "mono" else origin % 2
-    # a thousandth of a pixel is far below what a grid is known to
-    keys = np.concatenate([np.round(shift, 3), phase], axis=-1).reshape(-1, 4)
-    kinds, kind = np.unique(keys[valid.ravel()], axis=0, return_inverse=True)
-    where = np.zeros(valid.shape, int)
-    where[valid] = kind.ravel()
-    return Places(
-        centre, origin, window, valid, shape, kinds[:, :2] + 0.0, kinds[:, 2:].astype(int), where
+    middles = windows.origin + (np.array(windows.shape) - 1) / 2
+    return SuperpixelKinds.sorted(
+        centres=grid.centres,
+        origin=windows.origin,
+        window=windows.shape,
+        valid=grid.valid,
+        sensor_shape=dark.mean.shape,
+        shift=np.where(grid.valid[..., None], middles - grid.centres, 0.0),
+        cfa=cfa,
     )
 
 
-def _commonest(places):
-    return int(np.argmax(np.bincount(places.kind[places.valid])))
-
-
-def _spread(response, places):
-    """(kind, pixel[, band]) over the lenslets, NaN where they are not valid."""
-    out = response[places.kind].astype(np.float32)
-    out[~places.valid] = np.nan
-    return out
-
-
-# light
-
-
-class _Optics:
-    """Response of the superpixels at single wavelengths: by the closed form where it holds, else
-    by summing a system matrix.
-    """
-
-    def __init__(self, camera, settings, places, where):
-        from plenocli.forward.propagation.response import valid_for
-
-        self.camera, self.settings, self.places = camera, settings, places
-        asked = "fresnel" if settings.model == "auto" else settings.model
-        why = (
-            "the exact model has none"
-            if asked == "exact"
-            else "the lenslet's own field was asked for"
-            if settings.own_field
-            else valid_for(camera, asked)
-        )
-        self.closed, self.model = why is None, asked if why is None else settings.model
-        self.plan = None
-        options = ("accuracy", "superpixels", "coherent_ring")
-        if self.closed:
-            if given := [name for name in options if getattr(settings, name) not in (None, "auto")]:
-                raise UsageError(
-                    (
-                        f"--{given[0].replace('_', '-')} is of the sum over a system matrix, which "
-                        "this response needs none of"
-                    ),
-                    fix="leave it out, or take --model exact",
-                )
-            return
-        if np.abs(places.shifts).max() > 1e-3:
-            raise ConfigError(
-                (
-                    f"lenslets lie at {len(places.shifts)} different places within their pixels, "
-                    f"and there is no closed form: {why}"
-                ),
-                where,
-                "take --model ray, or a superpixel pitch of whole pixels",
-            )
-        self.request = {name: getattr(settings, name) for name in options} | {"model": self.model}
-
-    def at(self, wavelength):
-        """(shift of a kind, pixel), share of the light of one object point."""
-        from plenocli.forward.accuracy.dial import pif_builder
-        from plenocli.forward.propagation.response import field_response, uniform_response
-
-        if self.closed:
-            return uniform_response(self.camera, wavelength, self.model, self.places.shifts)
-        builder = pif_builder(self._finely(wavelength), wavelength, **self.request)
-        self.plan = builder.plan
-        found = field_response(builder)
-        own = found[(builder.offsets == 0).all(axis=1)] if self.settings.own_field else found
-        return np.broadcast_to(own.sum(axis=0), (len(self.places.shifts), found.shape[1]))
-
-    def _finely(self, wavelength):
-        """The camera with as many object points as an even object has diffraction cells: fewer
-        leave fringes that an even object has not.
-        """
-        from plenocli.forward.camera.geometry import geometry
-
-        least = int(np.ceil(geometry(self.camera, wavelength).diffraction_cells)) + 1
-        return self.camera.replace(
-            **{
-                "object.samples_per_lenslet": tuple(
-                    max(n, least) for n in self.camera.object.samples_per_lenslet
-                )
-            }
-        )
-
-    def notes(self, bands):
-        """What the response's notes record: model, share of light from a lenslet's own field by
-        band, rays against waves (relative L2) where both are there, and what F is
-        taken to be known to.
-        """
-        from plenocli.forward.propagation.response import own_light, uniform_response, valid_for
-
-        found = {
-            "source": "predicted",
-            "model": self.model if self.plan is None else self.plan.model,
-            "closed_form": self.closed,
-            "own_field": self.settings.own_field,
-            "own_light": [own_light(self.camera, w) for w in bands],
-        }
-        if valid_for(self.camera, "fresnel") is None:
-            pairs = [
-                [uniform_response(self.camera, w, model)[0] for model in ("ray", "fresnel")]
-                for w in bands
-            ]
-            found["rays_against_waves"] = [
-                float(np.linalg.norm(ray - wave) / np.linalg.norm(wave)) for ray, wave in pairs
-            ]
-        apart = (
-            found.get("rays_against_waves", [RAYS_ERR] * len(bands))
-            if found["model"] == "ray"
-            else np.zeros(len(bands))
-        )
-        return found | {"error": [float(np.hypot(WAVES_ERR, one)) for one in apart]}
-
-    def record(self):
-        from plenocli.forward.propagation.accuracy_record import AccuracyRecord
-
-        if self.closed:
-            record = AccuracyRecord(model=self.model, rung="closed form, even object")
-        else:
-            record = self.plan.accuracy_record()
-        return record.as_json()
-
-
-def _electrons(camera, source, optics, places, settings):
-    """Expected signal (kind, pixel), DN, of the white reference under `source` (a Quadrature)."""
-    from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-    from plenocli.forward.sensor.cfa import cfa_map, sensitivity
-
-    letters, efficiency = sensitivity(camera, source.wavelengths)
-    light = 0.0
-    for index, wavelength in enumerate(source.wavelengths):
-        light = (
-            light
-            + (source.photons[index] * efficiency[:, index])[:, None, None]
-            * optics.at(wavelength)[None]
-        )
-    peak = float(light.max())
-    if not peak > DARK:
-        raise ConfigError(
-            f"no light of {source.wavelengths[0] * 1e9:g} nm reaches the sensor",
-            "camera",
-            "check filters, wavelengths and sensitivities",
-        )
-    seen = np.stack(
-        [
-            sum(
-                np.where(
-                    cfa_map(places.window, camera.sensor.cfa, phase).ravel() == letter,
-                    light[n, kind],
-                    0.0,
-                )
-                for n, letter in enumerate(letters)
-            )
-            for kind, phase in enumerate(places.phases)
-        ]
-    )
-    exposure = settings.exposure or camera.light.white_exposure
-    scale = WHITE_LEVEL * camera.sensor.full_well / peak * exposure / camera.light.white_exposure
-    return seen * (scale * REFERENCE_REFLECTANCE * camera.sensor.gain)
-
-
-# the rest of a calibration
-
-
-def _ideal(camera, places, white, settings):
-    """(datasets, attributes) of a calibration without errors: the grid of the description, its
+def _described(camera: Camera, prediction: ResponsePrediction, settings: Settings) -> Calibration:
+    """A calibration without errors, and without a response: the grid of the description, its
     white, its black level.
     """
+    from plenocli.forward.sensor.frames import Dark
     from plenocli.forward.sensor.noise import SensorModel
+    from plenocli.inverse.grid.lenslet_grid import LensletGrid
+    from plenocli.inverse.spectra.calibration import Calibration, Sensor, White, Windows
 
-    sensor, array = camera.sensor, camera.lenslet_array
+    sensor, array, kinds = camera.sensor, camera.lenslet_array, prediction.kinds
+    signal = prediction.white_signal(_white(camera, settings), settings.exposure)
     pitch = (
         np.array([camera.superpixel_pitch * array.row_spacing, camera.superpixel_pitch])
         / sensor.pixel_pitch
     )
-    vectors = [[pitch[0], 0.0 if array.lattice == "square" else pitch[1] / 2], [0.0, pitch[1]]]
-    level = white.max(axis=1)
-    flat = np.full(places.shape, np.nan, np.float32)
-    for (row, column), kind in zip(places.origin[places.valid], places.kind[places.valid]):
-        flat[row : row + places.window[0], column : column + places.window[1]] = (
-            white[kind] / level[kind]
-        ).reshape(places.window)
-    shared = len(places.shifts) == 1
-    data = {
-        "grid/centre": places.centre,
-        "grid/valid": places.valid,
-        "grid/residual": np.where(places.valid, 0.0, np.nan),
-        "response/origin": places.origin,
-        "response/window": np.array(places.window),
-        "white/flat": flat,
-        "white/level": np.where(places.valid, level[places.kind], np.nan).astype(np.float32),
-        "response/white": white[0].astype(np.float32) if shared else _spread(white, places),
-        "dark/mean": np.full(places.shape, sensor.black_level, np.float32),
-    }
-    exposure = settings.exposure or camera.light.white_exposure
+    right = 0.0 if array.lattice == "square" else pitch[1] / 2
     model = SensorModel.from_camera(camera)
-    read = model.noise.sigma
-    noise = {"gain_e_per_dn": 1 / sensor.gain, "read_noise": read, "cfa": sensor.cfa}
-    attrs = {
-        "grid": dict(
+    exposure, read_noise = settings.exposure or camera.light.white_exposure, model.noise.sigma
+    return Calibration(
+        grid=LensletGrid(
             lattice=array.lattice,
-            pitch=pitch.tolist(),
+            pitch=pitch,
             angle=0.0,
+            basis=np.array([[pitch[0], right], [0.0, pitch[1]]]),
+            model="description",
+            centres=kinds.centres,
+            valid=kinds.valid,
+            residual=np.where(kinds.valid, 0.0, np.nan),
             rms=0.0,
-            lenslets=int(places.valid.sum()),
-            offset=places.centre[0, 0].tolist(),
-            model={"kind": "description", "vectors": [[float(v) for v in row] for row in vectors]},
         ),
-        "white": noise
-        | dict(
+        sensor=Sensor(
+            cfa=sensor.cfa,
+            units="DN",
+            white_level=float(model.white_level),
             exposure=exposure,
-            black=[float(sensor.black_level)] * 4,
-            white=float(model.white_level),
+            gain_e_per_dn=1 / sensor.gain,
+            read_noise=read_noise,
             notes="predicted",
         ),
-        "dark": dict(exposure=exposure, sigma=read),
-        "response": noise | dict(units="DN", exposure_s=exposure),
-    }
-    return data, attrs
-
-
-def _conditions(response):
-    """What calibrate says of a measured F: condition, angles between columns
-    (degrees), brightest pixels.
-    """
-    from plenocli.inverse.spectra.demultiplex import choose_pixels, column_angles, condition_number
-
-    angles = np.asarray(column_angles(response), float)
-    return dict(
-        condition=float(condition_number(response)),
-        angles=[[float(a) for a in row] for row in angles],
-        single_pixel=[int(p) for p in choose_pixels(response)],
+        windows=Windows(kinds.origin, kinds.window),
+        white=White.predicted(signal, kinds),
+        dark=Dark(
+            mean=np.full(kinds.sensor_shape, sensor.black_level, np.float32),
+            black=np.full((2, 2), float(sensor.black_level)),
+            exposure=exposure,
+            sigma=read_noise,
+        ),
     )
 
 
-def _report(output, attrs, places, bands, optics):
-    found = attrs["response"]
-    angles = np.array(found["angles"])
-    return {
-        "output": str(output),
-        "bands_nm": [float(w * 1e9) for w in bands],
-        "lenslets": int(places.valid.sum()),
-        "array": list(places.valid.shape),
-        "window": list(places.window),
-        "kinds": len(places.shifts),
-        "condition": found["condition"],
-        "angles_deg": found["angles"],
-        "smallest_angle_deg": float(angles[np.triu_indices(len(bands), 1)].min())
-        if len(bands) > 1
-        else None,
-        **found["notes"],
-    }
+def _with_response(
+    known: Calibration,
+    kinds: SuperpixelKinds,
+    matrix: np.ndarray,
+    bands: tuple[float, ...],
+    notes: PredictionNotes,
+) -> Calibration:
+    """The calibration with F = `matrix` (kind, pixel, band)."""
+    from plenocli.inverse.spectra.calibration import Response
+    from plenocli.inverse.spectra.quality import quality_of_one
+
+    # what a description leaves out is spread evenly over the superpixel: it is not
+    # known where it lies
+    error = np.array(notes.error) * np.sqrt(np.mean(matrix.astype(float) ** 2, axis=(0, 1)))
+    response = Response(
+        matrix=kinds.by_lenslet(matrix),
+        variance=np.tile(error**2, (matrix.shape[1], 1)),
+        wavelengths=np.array(bands),
+        quality=quality_of_one(matrix[kinds.commonest]),
+        notes=notes.as_json(),
+    )
+    return replace(known, response=response)
+
+
+def _summary(
+    output: Name, calibration: Calibration, kinds: SuperpixelKinds, notes: PredictionNotes
+) -> ResponseSummary:
+    response, valid = calibration.response, calibration.grid.valid
+    bands, quality = len(response.wavelengths), response.quality
+    between = np.array(quality.angles)[np.triu_indices(bands, 1)]
+    return ResponseSummary(
+        output=str(output),
+        bands_nm=[float(w * 1e9) for w in response.wavelengths],
+        lenslets=int(valid.sum()),
+        array=list(valid.shape),
+        window=list(kinds.window),
+        kinds=len(kinds.shifts),
+        condition=quality.condition,
+        angles_deg=quality.angles,
+        smallest_angle_deg=float(between.min()) if bands > 1 else None,
+        notes=notes,
+    )

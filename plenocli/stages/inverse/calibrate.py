@@ -212,7 +212,7 @@ def _calibrated(
     """(the grid as it was found, the calibration, the noise and where it is known from)."""
     from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge
     from plenocli.inverse.spectra.calibration import Calibration, Sensor, White, windows_on
-    from plenocli.inverse.spectra.measured_response import mean_of_known
+    from plenocli.inverse.spectra.quality import mean_of_known
 
     white = read_exposures(captures.whites, cfa=captures.cfa)
     dark_frames = read_exposures(captures.darks, white[0], captures.cfa)

@@ -245,7 +245,7 @@ def test_light_of_the_own_field_alone_is_the_block_of_the_system_matrix(focused,
     own = run_simulate_response(
         toml, tmp_path / "own.h5", Settings(model="fresnel", own_field=True, **options)
     )
-    assert own["own_field"] and not own["closed_form"] and own["own_light"] == [1.0]
+    assert own.notes.own_field and not own.notes.closed_form and own.notes.own_light == [1.0]
     # in focus the neighbours' points give a lenslet what diffraction takes from its own
     assert 0.04 < error(tmp_path, "own.h5") < 0.2
 

@@ -7,6 +7,7 @@ surfaces, usable from one band upwards, and the closer to the truth the more ban
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.forward.scene.tables import illuminant, observer
 
@@ -17,12 +18,14 @@ _BRADFORD = np.array(
 )
 
 
-def xyz_weights(wavelengths, light="D65"):
-    """Matrix (3, band) that takes reflectances at `wavelengths` (band,) m to XYZ under `light` (a
-    name, see tables).
+def xyz_weights(wavelengths: ArrayLike, light: str = "D65") -> np.ndarray:
+    """The linear map from reflectances to XYZ, integrated over the CIE 1931 observer's 1 nm table.
 
-    Rows sum to the XYZ of the light itself (Y = 1). Integrated over the 1 nm table of the
-    CIE 1931 observer.
+    wavelengths: (band,) m, ascending.
+    light: name of an illuminant, see tables.
+
+    Returns (3, band); the rows sum to the XYZ of the light itself (Y = 1).
+    Raises ValueError where the wavelengths do not ascend, ConfigError for an unknown light.
     """
     wavelengths = np.asarray(wavelengths, dtype=np.float64)
     if wavelengths.ndim != 1 or not wavelengths.size or np.any(np.diff(wavelengths) <= 0):
@@ -33,27 +36,45 @@ def xyz_weights(wavelengths, light="D65"):
     return weighted @ hats.T / weighted[1].sum()
 
 
-def xyz(wavelengths, spectra, light="D65"):
-    """XYZ (..., 3) of reflectances (..., band) under `light`."""
+def xyz(wavelengths: ArrayLike, spectra: ArrayLike, light: str = "D65") -> np.ndarray:
+    """XYZ of reflectances.
+
+    wavelengths: (band,) m, ascending.
+    spectra: (..., band) reflectance.
+    light: name of an illuminant, see tables.
+
+    Returns (..., 3), Y = 1 for the perfect diffuser.
+    Raises as xyz_weights.
+    """
     return np.asarray(spectra, dtype=np.float64) @ xyz_weights(wavelengths, light).T
 
 
-def white_point(light="D65"):
-    """XYZ (3,) of the perfect diffuser under `light`, Y = 1."""
+def white_point(light: str = "D65") -> np.ndarray:
+    """XYZ (3,) of the perfect diffuser under the illuminant `light`, Y = 1."""
     return xyz_weights([560e-9], light)[:, 0]
 
 
-def adapt(values, source, target):
-    """XYZ (..., 3) seen by an eye adapted to white `source` (3,) moved to white `target` (3,);
-    Bradford transform.
+def adapt(values: ArrayLike, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """XYZ as seen by an eye adapted to one white, moved to another; Bradford transform.
+
+    values: (..., 3) XYZ.
+    source: (3,) XYZ of the white the eye is adapted to.
+    target: (3,) XYZ of the white to move to.
+
+    Returns (..., 3) XYZ.
     """
     gain = (_BRADFORD @ target) / (_BRADFORD @ source)
     return np.asarray(values) @ (np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)).T
 
 
-def linear_srgb(values, white=None):
-    """Linear sRGB (..., 3), unclipped, of XYZ (..., 3) relative to `white` (3,), adapted to D65
-    (default: already D65).
+def linear_srgb(values: ArrayLike, white: np.ndarray | None = None) -> np.ndarray:
+    """Linear sRGB of XYZ, unclipped; (1, 1, 1) is the white exactly.
+
+    values: (..., 3) XYZ.
+    white: (3,) XYZ of the white that the values are relative to; None where it is D65 already.
+
+    Returns (..., 3).
+    IEC 61966-2-1.
     """
     d65 = white_point("D65")
     if white is not None:
@@ -62,7 +83,7 @@ def linear_srgb(values, white=None):
     return rgb / (_SRGB @ d65)  # the published matrix is rounded: make white exactly (1, 1, 1)
 
 
-def encode_srgb(linear):
+def encode_srgb(linear: ArrayLike) -> np.ndarray:
     """Display values 0..1 of linear sRGB, clipped; IEC 61966-2-1."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(
@@ -70,19 +91,29 @@ def encode_srgb(linear):
     )
 
 
-def preview_rgb(wavelengths, cube, light="D65"):
-    """A picture (3, row, col) float32, linear sRGB and unclipped, of a reflectance cube (band, row,
-    col) under `light`.
+def preview_rgb(wavelengths: ArrayLike, cube: ArrayLike, light: str = "D65") -> np.ndarray:
+    """A picture of a reflectance cube. White surfaces look white whatever the light.
 
-    White surfaces look white whatever the light. For radiance relative to a white surface
-    pass the quotient.
+    wavelengths: (band,) m, ascending.
+    cube: (band, row, column) reflectance; of radiance, pass the quotient by a white surface's.
+    light: name of an illuminant, see tables.
+
+    Returns (3, row, column) float32, linear sRGB, unclipped.
+    Raises as xyz_weights.
     """
     matrix = linear_srgb(xyz_weights(wavelengths, light).T, white_point(light)).T
     return np.tensordot(matrix, np.asarray(cube, dtype=np.float64), axes=1).astype(np.float32)
 
 
-def lab(values, white):
-    """CIELAB (..., 3) of XYZ (..., 3) relative to `white` (3,); CIE 15:2004."""
+def lab(values: ArrayLike, white: np.ndarray) -> np.ndarray:
+    """CIELAB of XYZ.
+
+    values: (..., 3) XYZ.
+    white: (3,) XYZ of the white that they are relative to.
+
+    Returns (..., 3): L*, a*, b*.
+    CIE 15:2004.
+    """
     ratio = np.asarray(values, dtype=np.float64) / white
     f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29)
     return np.stack(
@@ -91,10 +122,13 @@ def lab(values, white):
     )
 
 
-def delta_e_2000(first, second):
-    """CIEDE2000 colour difference (...) of two CIELAB arrays (..., 3), kL = kC = kH = 1.
+def delta_e_2000(first: ArrayLike, second: ArrayLike) -> np.ndarray:
+    """CIEDE2000 colour difference with kL = kC = kH = 1.
 
-    Formulae of Sharma, Wu and Dalal, Color Research & Application 30 (2005) 21-30.
+    first, second: (..., 3) CIELAB.
+
+    Returns (...).
+    Sharma, Wu and Dalal, Color Research & Application 30 (2005) 21-30.
     """
     (l1, a1, b1), (l2, a2, b2) = (
         np.moveaxis(np.asarray(v, dtype=np.float64), -1, 0) for v in (first, second)
@@ -126,5 +160,5 @@ def delta_e_2000(first, second):
     return np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rt * (dc / sc) * (dh / sh))
 
 
-def _cos(degrees):
+def _cos(degrees: np.ndarray) -> np.ndarray:
     return np.cos(np.radians(degrees))

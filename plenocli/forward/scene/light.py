@@ -5,33 +5,50 @@ A source of spectral radiance E(l) gives photo-electrons in proportion to E(l) l
 photon's h c / l). See docs/model.md, "From radiance to electrons".
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import UsageError
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
 
 VISIBLE = (400e-9, 700e-9)
 
 
 @dataclass(frozen=True)
 class Quadrature:
-    """Nodes of a source: wavelengths (node,) m ascending, photons (node,) relative photon
-    radiance, summing to 1.
+    """Nodes of a source.
+
+    wavelengths: (node,) m, ascending.
+    photons: (node,) relative photon radiance, summing to 1.
     """
 
     wavelengths: np.ndarray
     photons: np.ndarray
 
 
-def broadband(camera, power, step=None):
-    """Nodes of white light through `camera`; `power(wavelengths)` is the relative spectral power
-    of the illuminant.
+def broadband(
+    camera: Camera, power: Callable[[np.ndarray], np.ndarray], step: float | None = None
+) -> Quadrature:
+    """Nodes of white light as a camera must sample it.
 
     A camera with colour (filters in the pupil or on the sensor) is sampled uniformly over 400 to
-    700 nm, by default at half of the narrowest filter width: the trapezoidal rule on a Gaussian
-    band of FWHM w with step w/2 is exact to 1e-6. Without colour the camera sees the lines of
-    [light] wavelengths, equally strong.
+    700 nm. Without colour the camera sees the lines of [light] wavelengths, equally strong.
+
+    camera: whose filters and light count.
+    power: relative spectral power of the illuminant at wavelengths (n,) m.
+    step: m between nodes; by default half of the narrowest filter width: the trapezoidal rule on a
+        Gaussian band of FWHM w with step w/2 is exact to 1e-6.
+
+    Returns the nodes, weighted by power times wavelength.
+    Raises UsageError where the step does not resolve the range, or the light has no power in it.
     """
     if not has_colour(camera):
         lines = np.array(camera.light.wavelengths)
@@ -58,9 +75,12 @@ def broadband(camera, power, step=None):
     return _normalised(nodes, weights * power(nodes) * nodes)
 
 
-def narrow_band(centre, fwhm=0.0, nodes=5):
-    """Nodes of a narrow band around `centre` (m): one line, or a Gaussian band of width `fwhm`
-    (m) by Gauss-Hermite nodes.
+def narrow_band(centre: float, fwhm: float = 0.0, nodes: int = 5) -> Quadrature:
+    """Nodes of a narrow band of light.
+
+    centre: m.
+    fwhm: m; 0 is one line, else a Gaussian band by Gauss-Hermite nodes.
+    nodes: number of nodes of the Gaussian band.
     """
     if fwhm == 0:
         return Quadrature(np.array([centre]), np.ones(1))
@@ -69,9 +89,11 @@ def narrow_band(centre, fwhm=0.0, nodes=5):
     return _normalised(wavelengths, weights * wavelengths)
 
 
-def broadened(lines, fwhm):
-    """Each of several lines widened to a Gaussian band: the union of narrow_band()
-    nodes, equally strong.
+def broadened(lines: Iterable[float], fwhm: float) -> Quadrature:
+    """Several lines, each widened to a Gaussian band: the union of their narrow_band() nodes.
+
+    lines: centres, m; they are equally strong.
+    fwhm: m.
     """
     bands = [narrow_band(line, fwhm) for line in lines]
     order = np.argsort(np.concatenate([b.wavelengths for b in bands]))
@@ -79,16 +101,23 @@ def broadened(lines, fwhm):
     return _normalised(wavelengths, np.concatenate([b.photons for b in bands])[order])
 
 
-def band_weights(camera, wavelengths, power):
-    """What system matrices A_k at `wavelengths` (k,) m, ascending, make of a capture in white light
-    of the spectral `power`.
+def band_weights(
+    camera: Camera, wavelengths: ArrayLike, power: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What monochromatic system matrices A_k make of a capture in white light.
 
-    Returns (bands (band,) m, weights (band, k)): the capture is y = sum_b (sum_k weights[b, k] A_k)
-    x_b, in units where a mono sensor's efficiency is 1. A camera without filters in its pupil has
-    one band, its lines equally strong. Otherwise, where the wavelengths are nodes of `broadband` no
-    wider apart than a filter, bands are the [light] wavelengths, x is linear between them and
-    constant beyond; where they are not, each wavelength is a band and stands for all that its
-    filter lets through.
+    The capture is y = sum_b (sum_k weights[b, k] A_k) x_b, in units where a mono sensor's
+    efficiency is 1. A camera without filters in its pupil has one band, its lines equally strong.
+    Otherwise, where the wavelengths are nodes of `broadband` no wider apart than a filter, bands
+    are the [light] wavelengths, x is linear between them and constant beyond; where they are not,
+    each wavelength is a band and stands for all that its filter lets through.
+
+    camera: whose filters and light count.
+    wavelengths: (k,) m, ascending, of the matrices.
+    power: relative spectral power of the light at wavelengths (n,) m.
+
+    Returns (bands (band,) m, weights (band, k)).
+    Raises UsageError where no filter passes one of the wavelengths.
     """
     from plenocli.forward.camera.pupil import filter_transmittance
 
@@ -129,14 +158,12 @@ def band_weights(camera, wavelengths, power):
     return wavelengths, np.diag(through[behind] / passed.max(axis=0) / np.bincount(behind)[behind])
 
 
-def has_colour(camera):
-    """Whether the camera tells wavelengths apart: filters in the pupil, or a colour filter
-    array on the sensor.
-    """
+def has_colour(camera: Camera) -> bool:
+    """Whether the camera tells wavelengths apart: filters in the pupil, or on the sensor."""
     return camera.filter_array is not None or camera.sensor.cfa != "mono"
 
 
-def _normalised(wavelengths, photons):
+def _normalised(wavelengths: np.ndarray, photons: np.ndarray) -> Quadrature:
     total = photons.sum()
     if not (np.isfinite(total) and total > 0):
         raise UsageError(

@@ -3,17 +3,21 @@ exact area averaging.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import InputError
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709 / sRGB primaries, linear
 
 
-def luminance(picture):
-    """Linear luminance (rows, cols) of a linear picture (rows, cols[, channels]) with 1,
-    2, 3 or 4 channels.
+def luminance(picture: ArrayLike) -> np.ndarray:
+    """Linear luminance of a picture, by the weights of ITU-R BT.709.
 
-    Two and four channels carry alpha last, which is left out. Weights of ITU-R BT.709.
+    picture: (rows, cols[, channels]), linear, of 1 to 4 channels. Two and four channels carry
+        alpha last, which is left out.
+
+    Returns (rows, cols).
+    Raises ValueError for other numbers of channels.
     """
     picture = np.asarray(picture)
     if picture.ndim == 2:
@@ -28,13 +32,22 @@ def luminance(picture):
     raise ValueError(f"a picture of {channels} channels has no luminance")
 
 
-def area_average(values, count, axis=0, start=0.0, stop=None):
-    """Means of `values` over `count` equal cells that tile [start, stop) along `axis`, in
-    units of input samples.
+def area_average(
+    values: ArrayLike, count: int, axis: int = 0, start: float = 0.0, stop: float | None = None
+) -> np.ndarray:
+    """Means over equal cells that tile a part of one axis, in input samples.
 
     The input is piecewise constant, sample k covering [k, k+1); cells may begin and end inside
     samples, so that the sum of cell mean x cell width is exactly the integral of the input over
-    [start, stop). Returns float64.
+    [start, stop).
+
+    values: of any shape.
+    count: number of cells.
+    axis: along which they lie.
+    start, stop: ends of what they tile, in samples; by default the whole axis.
+
+    Returns float64, as values with `count` along the axis.
+    Raises ValueError where the cells do not fit.
     """
     values = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
     length = values.shape[0]
@@ -49,13 +62,16 @@ def area_average(values, count, axis=0, start=0.0, stop=None):
     return np.moveaxis(np.diff(at_edges, axis=0) / ((stop - start) / count), 0, axis)
 
 
-def sample_picture(picture, rows, cols, how="fit"):
-    """A picture (height, width[, channels]) on a grid of (rows, cols) object
-    points; float32, centred.
+def sample_picture(picture: ArrayLike, rows: int, cols: int, how: str = "fit") -> np.ndarray:
+    """A picture on a grid of object points, centred.
 
-    how="fit": the largest centred part with the grid's aspect ratio, averaged over equal cells
-    (edges may cut pixels). how="crop": the central rows x cols pixels at their native resolution;
-    InputError if the picture is smaller.
+    picture: (height, width[, channels]).
+    rows, cols: object points.
+    how: "fit" averages the largest centred part with the grid's aspect ratio over equal cells
+        (edges may cut pixels); "crop" takes the central rows x cols pixels as they are.
+
+    Returns (rows, cols[, channels]) float32.
+    Raises InputError where the picture is empty, or too small to crop.
     """
     picture = np.asarray(picture)
     height, width = picture.shape[:2]
@@ -81,9 +97,14 @@ def sample_picture(picture, rows, cols, how="fit"):
     return averaged.astype(np.float32)
 
 
-def block_mean(values, block):
-    """Mean over non-overlapping blocks (h, w) of the last two axes: (..., R h, C w) ->
-    (..., R, C) float64.
+def block_mean(values: ArrayLike, block: tuple[int, int]) -> np.ndarray:
+    """Mean over non-overlapping blocks of the last two axes.
+
+    values: (..., R h, C w).
+    block: (h, w) samples.
+
+    Returns (..., R, C) float64.
+    Raises ValueError where the samples are no whole number of blocks.
     """
     values = np.asarray(values, dtype=np.float64)
     (height, width), (rows, cols) = block, values.shape[-2:]

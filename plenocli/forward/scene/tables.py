@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import ConfigError
 
@@ -22,7 +23,7 @@ _NORMAL = 560e-9  # m: relative spectral powers are 1 here, the CIE's choice
 
 
 @cache
-def _tables():
+def _tables() -> dict[str, np.ndarray]:
     with np.load(Path(__file__).with_name("tables.npz"), allow_pickle=False) as file:
         tables = {key: file[key] for key in file.files}
     for table in tables.values():
@@ -30,31 +31,34 @@ def _tables():
     return tables
 
 
-def _names(kind):
+def _names(kind: str) -> tuple[str, ...]:
     return tuple(
         dict.fromkeys(key.split("/")[1] for key in _tables() if key.startswith(kind + "/"))
     )
 
 
-def illuminant_names():
+def illuminant_names() -> tuple[str, ...]:
     """Names of the tabulated illuminants; a blackbody is asked for by its
     temperature, as in "3200 K".
     """
     return _names("illuminant")
 
 
-def camera_names():
+def camera_names() -> tuple[str, ...]:
     """Names of the cameras whose spectral sensitivity is tabulated."""
     return _names("camera")
 
 
-def colorchecker(wavelengths=None):
-    """The 24 patches of the ColorChecker (spectra of N. Ohta, 1997): (names,
-    wavelengths, reflectance).
+def colorchecker(
+    wavelengths: ArrayLike | None = None,
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """The 24 patches of the ColorChecker (spectra of N. Ohta, 1997).
 
-    names: tuple of 24 strings, row by row from "dark skin" to "black 2 (1.5 D)". wavelengths (n,)
-    in m: the table's own, 380 to 780 nm by 5 nm, or those asked for. reflectance (24, n) float64 in
-    0..1, a fresh array; outside the table the end values hold.
+    wavelengths: (n,) m; None for the table's own, 380 to 780 nm by 5 nm.
+
+    Returns (names row by row from "dark skin" to "black 2 (1.5 D)", wavelengths (n,) m, reflectance
+    (24, n) float64 in 0..1); a fresh array, outside the table the end values hold.
+    Raises ValueError for wavelengths that are not in metres.
     """
     tables = _tables()
     own, reflectance = tables["chart/wavelength_nm"] * 1e-9, tables["chart/reflectance"]
@@ -65,19 +69,28 @@ def colorchecker(wavelengths=None):
     return names, wavelengths, np.array([np.interp(wavelengths, own, row) for row in reflectance])
 
 
-def surfaces(wavelengths):
-    """Reflectances (99, n) of natural and man-made surfaces at `wavelengths` (n,) m: nature, skin,
-    textiles, paints, plastics, prints (the colour evaluation samples of CIE 224:2017, selected
-    evenly from 105 000 measured spectra). 380 to 780 nm by 5 nm, end values beyond.
+def surfaces(wavelengths: ArrayLike) -> np.ndarray:
+    """Reflectances of natural and man-made surfaces: nature, skin, textiles, paints, plastics,
+    prints.
+
+    wavelengths: (n,) m; the table covers 380 to 780 nm by 5 nm, end values beyond.
+
+    Returns (99, n).
+    Raises ValueError for wavelengths that are not in metres.
+    The colour evaluation samples of CIE 224:2017, selected evenly from 105 000 measured spectra.
     """
     own, rows = _tables()["surfaces/wavelength_nm"] * 1e-9, _tables()["surfaces/reflectance"]
     wavelengths = _checked(wavelengths)
     return np.array([np.interp(wavelengths, own, row) for row in rows])
 
 
-def patch_index(name):
-    """Index 0..23 of a ColorChecker patch by its name or the first word of it
-    ("white", "black").
+def patch_index(name: str) -> int:
+    """Which patch of the ColorChecker is meant.
+
+    name: of the patch, or the first word of it ("white", "black").
+
+    Returns 0..23.
+    Raises ConfigError where no patch is called so.
     """
     names = colorchecker()[0]
     if name in names:
@@ -90,12 +103,15 @@ def patch_index(name):
     )
 
 
-def illuminant(name, wavelengths):
-    """Relative spectral power (n,) of a light at `wavelengths` (n,) m, per unit
-    wavelength, 1 at 560 nm.
+def illuminant(name: str, wavelengths: ArrayLike) -> np.ndarray:
+    """Relative spectral power of a light, per unit wavelength, 1 at 560 nm.
 
-    name: "A", "D50", "D65", "E", or a temperature such as "3200 K" for Planck's blackbody. Tables
-        are 5 nm apart over 300 to 780 nm (E: 360 to 830); beyond them the end values hold.
+    name: "A", "D50", "D65", "E", or a temperature such as "3200 K" for Planck's blackbody.
+    wavelengths: (n,) m. Tables are 5 nm apart over 300 to 780 nm (E: 360 to 830); beyond them the
+        end values hold.
+
+    Returns (n,).
+    Raises ConfigError for an unknown light, ValueError for wavelengths that are not in metres.
     """
     wavelengths = _checked(wavelengths)
     if match := re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*K\s*", str(name)):
@@ -109,8 +125,15 @@ def illuminant(name, wavelengths):
     return np.interp(wavelengths, own * 1e-9, power) / np.interp(_NORMAL, own * 1e-9, power)
 
 
-def blackbody(temperature, wavelengths):
-    """Planck's spectral radiance (n,) at `temperature` K, relative to that at 560 nm."""
+def blackbody(temperature: float, wavelengths: ArrayLike) -> np.ndarray:
+    """Planck's spectral radiance relative to that at 560 nm.
+
+    temperature: 500 to 1e6 K.
+    wavelengths: (n,) m.
+
+    Returns (n,).
+    Raises ConfigError for other temperatures.
+    """
     if not 500 <= temperature <= 1e6:
         raise ConfigError(
             f"a blackbody of {temperature:g} K is no light source for a camera",
@@ -123,13 +146,18 @@ def blackbody(temperature, wavelengths):
     return planck(_checked(wavelengths)) / planck(_NORMAL)
 
 
-def camera_sensitivity(name, wavelengths):
-    """Relative spectral sensitivity of a camera: dict letter ("R", "G", "B") -> (n,) array at
-    `wavelengths` (n,) m.
+def camera_sensitivity(name: str, wavelengths: ArrayLike) -> dict[str, np.ndarray]:
+    """Relative spectral sensitivity of a camera.
 
     Each channel's table has its peak at 1, as published by NPL (the ratio between channels is not
-    known from it); zero outside the table (380 to 780 nm for the Nikon, 400 to 680
-    nm for the Sigma).
+    known from it); zero outside the table (380 to 780 nm for the Nikon, 400 to 680 nm for the
+    Sigma).
+
+    name: one of camera_names().
+    wavelengths: (n,) m.
+
+    Returns letter ("R", "G", "B") -> (n,).
+    Raises ConfigError for an unknown camera.
     """
     if name not in camera_names():
         raise ConfigError(
@@ -147,11 +175,12 @@ def camera_sensitivity(name, wavelengths):
     }
 
 
-def observer(wavelengths=None):
-    """CIE 1931 2-degree colour matching functions: (wavelengths (n,) m, xyz (3, n)); zero
-    outside 360 to 830 nm.
+def observer(wavelengths: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """CIE 1931 2-degree colour matching functions; zero outside 360 to 830 nm.
 
-    Without `wavelengths` the table itself, every nanometre.
+    wavelengths: (n,) m; None for the table itself, every nanometre.
+
+    Returns (wavelengths (n,) m, xyz (3, n)).
     """
     own, xyz = _tables()["observer/wavelength_nm"] * 1e-9, _tables()["observer/xyz"]
     if wavelengths is None:
@@ -162,7 +191,7 @@ def observer(wavelengths=None):
     )
 
 
-def _checked(wavelengths):
+def _checked(wavelengths: ArrayLike) -> np.ndarray:
     wavelengths = np.asarray(wavelengths, dtype=np.float64)
     if wavelengths.size and not (1e-8 < wavelengths.min() and wavelengths.max() < 1e-3):
         raise ValueError("wavelengths are in metres: 550 nm is 550e-9")

@@ -6,7 +6,10 @@ of the frame around them, as in plenocli.forward.scene.chart. Picture coordinate
 pixel centres at integers.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.scene.chart import PATCH_COLS, PATCH_ROWS
@@ -21,8 +24,14 @@ UPPER = 0.9  # quantile with which the fit starts: paper is the brightest thing 
 TUKEY = 4.685
 
 
-def patch_cores(labels, erosion=5):
-    """The label map with `erosion` pixels taken off the edges of every patch (8-neighbours)."""
+def patch_cores(labels: ArrayLike, erosion: int = 5) -> np.ndarray:
+    """A label map without the edges of its patches.
+
+    labels: (row, column) int, 0 for nothing.
+    erosion: px taken off the edges of every patch (8-neighbours).
+
+    Returns (row, column) int.
+    """
     from scipy.ndimage import binary_erosion
 
     labels, core = np.asarray(labels, int), np.zeros(np.shape(labels), int)
@@ -35,13 +44,17 @@ def patch_cores(labels, erosion=5):
     return core
 
 
-def find_chart(labels):
-    """Projective map H (3, 3) from chart to picture coordinates, from the centres of the
-    labelled patches 1..24.
+def find_chart(labels: np.ndarray) -> np.ndarray:
+    """Projective map from chart to picture coordinates, from the centres of the labelled patches.
 
-    Least squares over the four or more patches seen (direct linear transformation with normalised
-    points: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2). NumericsError
-    where patches are missing or in a line.
+    Least squares over the four or more patches seen, by direct linear transformation with
+    normalised points.
+
+    labels: (row, column) int, 1..24 on the patches.
+
+    Returns H (3, 3).
+    Raises NumericsError where patches are missing or in a line.
+    R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2.
     """
     seen = [k for k in range(1, PATCH_ROWS * PATCH_COLS + 1) if (labels == k).any()]
     if len(seen) < 4:
@@ -65,7 +78,7 @@ def find_chart(labels):
     return found / found[2, 2]
 
 
-def _normalised(points):
+def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(similarity (3, 3), points moved by it) with their mean at 0 and their
     mean distance sqrt 2.
     """
@@ -76,14 +89,27 @@ def _normalised(points):
     ) * scale
 
 
-def project(chart, points):
-    """Points (..., 2) moved by the projective map `chart` (3, 3)."""
+def project(chart: np.ndarray, points: ArrayLike) -> np.ndarray:
+    """Points moved by a projective map.
+
+    chart: (3, 3) the map.
+    points: (..., 2).
+
+    Returns (..., 2).
+    """
     moved = np.asarray(points, float) @ chart[:, :2].T + chart[:, 2]
     return moved[..., :2] / moved[..., 2:]
 
 
-def outside(chart, shape, frame=FRAME):
-    """Mask (rows, columns) of the pixels beyond the chart and its frame."""
+def outside(chart: np.ndarray, shape: tuple[int, int], frame: float = FRAME) -> np.ndarray:
+    """Which pixels lie beyond the chart and its frame.
+
+    chart: (3, 3) map from chart to picture coordinates.
+    shape: (rows, columns) of the picture.
+    frame: share of a patch's pitch by which the chart reaches beyond its outer patches.
+
+    Returns (rows, columns) bool.
+    """
     place = np.stack(
         np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij"), axis=-1
     )
@@ -91,11 +117,20 @@ def outside(chart, shape, frame=FRAME):
     return ~((y > -frame) & (y < PATCH_ROWS + frame) & (x > -frame) & (x < PATCH_COLS + frame))
 
 
-def upright(picture, sites, chart, grid, finer=3):
-    """The chart in `picture` as (rows, cols) = grid cells that tile its 4 x 6 patches, float64.
+def upright(
+    picture: np.ndarray, sites: np.ndarray, chart: np.ndarray, grid: tuple[int, int], finer: int = 3
+) -> np.ndarray:
+    """The chart of a picture on cells that tile its 4 x 6 patches.
 
-    sites: mask of the pixels that count (one colour of a mosaic). Values between them are linear in
-        rows and columns, cells are means of finer x finer such values; NaN at a site leaves it out.
+    Values between sites are linear in rows and columns; NaN at a site leaves it out.
+
+    picture: (row, column).
+    sites: (row, column) bool, the pixels that count (one colour of a mosaic).
+    chart: (3, 3) map from chart to picture coordinates.
+    grid: (rows, cols) of cells.
+    finer: a cell is the mean of finer x finer such values.
+
+    Returns (rows, cols) float64, NaN where nothing was near.
     """
     from scipy.ndimage import map_coordinates
 
@@ -107,7 +142,7 @@ def upright(picture, sites, chart, grid, finer=3):
     place = project(chart, np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1))
     good = sites & np.isfinite(picture)
     tent = np.array([0.5, 1, 0.5])
-    total, weight = (_spread(np.where(good, v, 0.0), tent) for v in (picture, 1.0))
+    total, weight = (_smoothed(np.where(good, v, 0.0), tent) for v in (picture, 1.0))
     total, weight = (
         map_coordinates(v, np.moveaxis(place, -1, 0), order=1, mode="constant")
         for v in (total, weight)
@@ -116,22 +151,33 @@ def upright(picture, sites, chart, grid, finer=3):
     return fine.reshape(rows, finer, cols, finer).mean(axis=(1, 3))
 
 
-def _spread(values, tent):
+def _smoothed(values: np.ndarray, tent: np.ndarray) -> np.ndarray:
     from scipy.ndimage import convolve1d
 
     return convolve1d(convolve1d(values, tent, 0, mode="constant"), tent, 1, mode="constant")
 
 
-def paper_field(pictures, sites, where, degree=DEGREE, block=BLOCK):
-    """Relative illumination (band, rows, columns) from the white paper around a chart, and how
-    many blocks told it.
+def paper_field(
+    pictures: np.ndarray,
+    sites: np.ndarray,
+    where: np.ndarray,
+    degree: int = DEGREE,
+    block: int = BLOCK,
+) -> tuple[np.ndarray, int]:
+    """Relative illumination from the white paper around a chart.
 
-    pictures (band, rows, columns), sites (band, rows, columns) the pixels that count;
-    where: mask of the surroundings. The logarithm is a polynomial of total `degree` in rows and
-        columns, fitted to the PAPER percentile of blocks of `block` pixels that lie in `where`
-        entirely. It starts from the UPPER quantile (anything but paper is darker) and ends with
-        Tukey's weights, one weight a block for all bands.
-    NumericsError where there are too few blocks.
+    Its logarithm is a polynomial in rows and columns, fitted to the PAPER percentile of blocks that
+    lie in the surroundings entirely. The fit starts from the UPPER quantile (anything but paper is
+    darker) and ends with Tukey's weights, one weight a block for all bands.
+
+    pictures: (band, row, column).
+    sites: (band, row, column) bool, the pixels that count.
+    where: (row, column) bool, the surroundings.
+    degree: total degree of the polynomial.
+    block: px, side of a block.
+
+    Returns (illumination (band, row, column), number of blocks that told it).
+    Raises NumericsError where there are too few blocks.
     """
     place, level = _blocks(pictures, sites, where, block)
     shape = where.shape
@@ -168,7 +214,9 @@ def paper_field(pictures, sites, where, degree=DEGREE, block=BLOCK):
     return field, int((weight > 0).sum())
 
 
-def _blocks(pictures, sites, where, block):
+def _blocks(
+    pictures: np.ndarray, sites: np.ndarray, where: np.ndarray, block: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Centres (n, 2) of the blocks of surroundings, and the logarithm (n, band) of
     their bright part.
     """
@@ -192,7 +240,7 @@ def _blocks(pictures, sites, where, block):
     return np.array(place).reshape(-1, 2), np.array(level).reshape(len(level), len(pictures))
 
 
-def _polynomial(place, shape, degree):
+def _polynomial(place: np.ndarray, shape: Sequence[int], degree: int) -> np.ndarray:
     """Monomials (..., term) of rows and columns scaled to about -1..1 by the wider
     side of the picture.
     """

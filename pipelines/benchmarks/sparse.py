@@ -73,7 +73,7 @@ def problem(config, iterations, count, seed):
         print(
             (
                 f"learning: iteration {k + 1} of {iterations}, validation "
-                f"{state.history['validation_psnr'][-1]:.2f} dB"
+                f"{state.history[-1].validation_psnr:.2f} dB"
             ),
             flush=True,
         )

@@ -120,7 +120,7 @@ def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **
     """
     from plenocli.stages.inverse.learn_dict import Settings, run_learn_dict
 
-    report = run_learn_dict(
+    summary = run_learn_dict(
         images,
         output,
         Settings(**settings),
@@ -130,13 +130,4 @@ def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
-    verdict = "above" if report["beats_lmmse"] else "NOT above"
-    line = (
-        f"{output}: {report['atoms']} atoms, {report['iterations']} iterations, lambda "
-        f"{report['lambda']:.2e}, held out {report['validation_psnr_db']:.2f} dB, averaged over "
-        f"mirror images {report['averaged_psnr_db']:.2f} dB, {verdict} LMMSE "
-        f"{report['lmmse_psnr_db']:.2f} dB; coherence of A Phi: largest "
-        f"{report['coherence']['coherence_effective']:.3f}, mean "
-        f"{report['coherence']['coherence_effective_mean']:.3f}"
-    )
-    options.summary(report, as_json, line)
+    options.summary(summary.as_json(), as_json, f"{output}: {summary.line}")

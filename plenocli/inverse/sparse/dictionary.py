@@ -17,10 +17,14 @@ and delta mean nothing before that. Where the paper is silent or its pseudo-code
 - progress is measured on a fixed validation batch, since each iteration has another objective.
 """
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.prior.natural_images import draw_patches
 from plenocli.inverse.sparse.coherence import column_coherence
 from plenocli.inverse.sparse.dictionary_step import (
@@ -29,24 +33,36 @@ from plenocli.inverse.sparse.dictionary_step import (
     moments,
     ridge_of,
 )
-from plenocli.inverse.sparse.l1.solve import lambda_path, sparse_code
+from plenocli.inverse.sparse.l1.solve import SparseCode, lambda_path, sparse_code
 
-HISTORY = (
-    "objective",
-    "validation_psnr",
-    "dead_share",
-    "nonzeros",
-    "change",
-    "coherence_mean",
-    "coherence_max",
-    "worst_gap",
-    "step_residual",
-)
-"""After each iteration: validation objective (mean over patches), validation PSNR (dB, peak 1),
-share of atoms replaced, mean number of penalised atoms in use, |Phi - previous Phi|_F over kept
-atoms, mean and largest |cosine| of two columns of A Phi (kept atoms), largest relative duality gap,
-relative residual of the dictionary step's normal equations.
-"""
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """What an iteration left.
+
+    objective: mean over the validation patches.
+    validation_psnr: dB, peak 1.
+    dead_share: share of atoms replaced.
+    nonzeros: mean number of penalised atoms in use.
+    change: |Phi - previous Phi|_F over the atoms kept.
+    coherence_mean, coherence_max: |cosine| of two columns of A Phi, atoms kept.
+    worst_gap: largest relative duality gap.
+    step_residual: relative residual of the dictionary step's normal equations.
+    """
+
+    objective: float
+    validation_psnr: float
+    dead_share: float
+    nonzeros: float
+    change: float
+    coherence_mean: float
+    coherence_max: float
+    worst_gap: float
+    step_residual: float
+
+
+HISTORY = tuple(f.name for f in fields(Progress))
+"""Names under which artefacts keep the progress, one array each."""
 
 SYNTHESIS_WEIGHT = 4.0
 """Patches an atom that the learnt atoms are worth against the regression of those that paint."""
@@ -107,43 +123,83 @@ patches) are not coded.
 """
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
+class Validation:
+    """How a dictionary does on the validation patches.
+
+    objective: mean over the patches.
+    psnr: dB, peak 1.
+    nonzeros: mean number of penalised atoms in use.
+    worst_gap: largest relative duality gap.
+    """
+
+    objective: float
+    psnr: float
+    nonzeros: float
+    worst_gap: float
+
+
+@dataclass(frozen=True)
 class State:
-    """What a resumed run needs: iterations done, atoms (point, atom) float64 of unit norm,
-    history name -> list of floats.
+    """What a resumed run needs.
+
+    iteration: iterations done.
+    atoms: (point, atom) float64 of unit norm.
+    history: one a done iteration.
     """
 
     iteration: int
     atoms: np.ndarray
-    history: dict = field(default_factory=lambda: {name: [] for name in HISTORY})
+    history: tuple[Progress, ...] = ()
 
-    def save(self):
+    def column(self, name: str) -> np.ndarray:
+        """One of HISTORY after each iteration, float64."""
+        return np.array([getattr(done, name) for done in self.history], np.float64)
+
+    def save(self) -> dict[str, np.ndarray]:
         """{name: array}, from which `State.load` restores the same state bit for bit."""
-        return {"iteration": np.array(self.iteration), "atoms": self.atoms.astype(np.float64)} | {
-            f"history_{name}": np.array(values, np.float64) for name, values in self.history.items()
-        }
+        state = {"iteration": np.array(self.iteration), "atoms": self.atoms.astype(np.float64)}
+        return state | {f"history_{name}": self.column(name) for name in HISTORY}
 
     @classmethod
-    def load(cls, fields):
-        history = {name: np.asarray(fields[f"history_{name}"]).tolist() for name in HISTORY}
-        return cls(int(fields["iteration"]), np.array(fields["atoms"], np.float64), history)
+    def load(cls, saved: Mapping[str, np.ndarray]) -> State:
+        """The state that `save` gave; KeyError where something is missing."""
+        columns = [np.asarray(saved[f"history_{name}"]).tolist() for name in HISTORY]
+        history = tuple(Progress(**dict(zip(HISTORY, row))) for row in zip(*columns))
+        iteration, atoms = int(saved["iteration"]), np.array(saved["atoms"], np.float64)
+        return cls(iteration, atoms, history)
 
 
 class Learner:
     """Algorithm 1 for one system matrix and one set of training images.
 
-    svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which
-        everything is divided.
-    training, held_out: lists of 2-D linear images in [0, 1];
-    validation patches come from `held_out` (other scenes).
-    object_shape: points (rows, columns) of a patch. A appears only as S V^T / scale acting on
-        patches, `seen`: U^T y carries all that least squares can see, and noise in it is as white
-        as in y, so it is drawn there. `seen` ends where FAINT says: what follows is noise to the
-        coder, and half of its work.
+    A appears only as S V^T / scale acting on patches, `seen` (direction, point): U^T y carries all
+    that least squares can see, and noise in it is as white as in y, so it is drawn there. `seen`
+    ends where FAINT says: what follows is noise to the coder, and half of its work.
     """
 
-    def __init__(self, svd, object_shape, training, held_out, settings, *, workers=None):
-        self.svd, self.object_shape, self.training = svd, tuple(object_shape), training
+    def __init__(
+        self,
+        svd: Svd,
+        object_shape: tuple[int, int],
+        training: Sequence[np.ndarray],
+        held_out: Sequence[np.ndarray],
+        settings: Settings,
+        *,
+        workers: int | None = None,
+    ) -> None:
+        """For one matrix.
+
+        svd: of A (pixel, point), any scale; `scale` is its spectral norm, by which everything is
+            divided.
+        object_shape: (rows, columns) of a patch.
+        training, held_out: linear images (row, column) in [0, 1]; validation patches come from
+            `held_out`, which shows other scenes.
+        workers: threads, None for all cores.
+
+        Raises ValueError where the settings make no sense.
+        """
+        self.svd, self.object_shape, self.training = svd, object_shape, training
         self.settings, self.workers, self.scale = settings, workers, float(svd.s[0])
         kept = svd.rank()
         self.seen = (svd.s[:kept, None] / self.scale) * svd.vt[:kept]
@@ -154,9 +210,9 @@ class Learner:
         rng = np.random.default_rng([settings.seed, _DRAW_VALIDATION])
         self.validation = draw_patches(held_out, self.object_shape, settings.validation, rng)
         self.measured, self.sigma = self.measure(self.validation, rng)
-        self._step_basis = None
+        self._step_basis: tuple[np.ndarray, np.ndarray] | None = None
 
-    def _leave_out_faint(self):
+    def _leave_out_faint(self) -> None:
         patches = draw_patches(
             self.training,
             self.object_shape,
@@ -167,13 +223,13 @@ class Learner:
         strong = np.flatnonzero(power >= FAINT * self._noise_power(np.sum(power)))
         self.seen = np.ascontiguousarray(self.seen[: strong[-1] + 1 if len(strong) else 1])
 
-    def _noise_power(self, signal_power):
+    def _noise_power(self, signal_power: float) -> float:
         """sigma^2 from the signal's power summed over all directions, which is that
         summed over all pixels.
         """
         return signal_power / self.pixels * 10 ** (-self.settings.snr_db / 10)
 
-    def measure(self, patches, rng):
+    def measure(self, patches: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, float]:
         """(noisy U^T A X / scale, sigma) of patches (point, count)."""
         clean = self.seen @ patches
         sigma = np.sqrt(self._noise_power(np.einsum("ij,ij->", clean, clean) / patches.shape[1]))
@@ -182,7 +238,7 @@ class Learner:
         measured += clean
         return measured, float(sigma)
 
-    def start(self):
+    def start(self) -> State:
         """The state before the first iteration."""
         rng = np.random.default_rng([self.settings.seed, _DRAW_START])
         points, count = self.seen.shape[1], self.settings.atoms - 1
@@ -203,8 +259,10 @@ class Learner:
                 raise ValueError(f"unknown start {self.settings.initial!r}")
         return State(0, _with_constant(_unit(atoms, rng)))
 
-    def code(self, atoms, measured, tol=None):
-        """Sparse code (SparseCode) of measured patches with the atoms; atom 0 is free."""
+    def code(self, atoms: np.ndarray, measured: np.ndarray, tol: float | None = None) -> SparseCode:
+        """Sparse code of measured patches (direction, patch) with atoms (point, atom), the first of
+        which is free.
+        """
         return sparse_code(
             self.seen @ atoms,
             measured,
@@ -214,7 +272,7 @@ class Learner:
             workers=self.workers,
         )
 
-    def step(self, state):
+    def step(self, state: State) -> State:
         """One iteration; `state` is left as it was."""
         settings = self.settings
         rng = np.random.default_rng([settings.seed, _DRAW_ITERATION, state.iteration])
@@ -231,23 +289,24 @@ class Learner:
         )
         refitted[:, dead] = fresh
         atoms = _with_constant(_unit(refitted, rng))
-        after = State(state.iteration + 1, atoms, {k: list(v) for k, v in state.history.items()})
-        self._record(after, state, np.concatenate([[False], dead]), float(code.gap.max()), residual)
-        return after
+        done = self._progress(
+            atoms, state.atoms, np.concatenate([[False], dead]), float(code.gap.max()), residual
+        )
+        return State(state.iteration + 1, atoms, (*state.history, done))
 
-    def validate(self, atoms):
-        """(objective per validation patch, PSNR in dB with peak 1, mean non-zeros, worst
-        gap) of a dictionary.
-        """
+    def validate(self, atoms: np.ndarray) -> Validation:
+        """How atoms (point, atom) do on the validation patches."""
         code = self.code(atoms, self.measured)
-        return (
-            float(code.objective.mean()),
-            psnr(atoms @ code.c, self.validation),
-            float(np.count_nonzero(code.c[1:], axis=0).mean()),
-            float(code.gap.max()),
+        return Validation(
+            objective=float(code.objective.mean()),
+            psnr=psnr(atoms @ code.c, self.validation),
+            nonzeros=float(np.count_nonzero(code.c[1:], axis=0).mean()),
+            worst_gap=float(code.gap.max()),
         )
 
-    def validate_path(self, atoms, lams):
+    def validate_path(
+        self, atoms: np.ndarray, lams: Iterable[float]
+    ) -> list[tuple[float, float, float]]:
         """[(lambda, PSNR in dB, mean non-zeros)] on the validation batch for each lambda,
         from the largest down.
         """
@@ -269,37 +328,49 @@ class Learner:
             )
         return table
 
-    def _record(self, after, before, dead, gap, residual):
-        objective, quality, nonzeros, worst = self.validate(after.atoms)
-        largest, mean = (
-            value or 0.0 for value in column_coherence(self.seen @ after.atoms[:, 1:])[:2]
-        )
-        change = float(np.linalg.norm((after.atoms - before.atoms)[:, ~dead]))
-        values = (
-            objective,
-            quality,
-            float(dead[1:].mean()),
-            nonzeros,
-            change,
-            mean,
-            largest,
-            max(gap, worst),
-            residual,
-        )
-        for name, value in zip(HISTORY, values):
-            after.history[name].append(value)
+    def _progress(
+        self,
+        atoms: np.ndarray,
+        before: np.ndarray,
+        dead: np.ndarray,
+        gap: float,
+        residual: float,
+    ) -> Progress:
+        """Of an iteration from the atoms `before`.
 
-    def synthesis(self, state, batches=4):
-        """Atoms (point, atom) that give patches back best from codes of `state.atoms`: min |X -
-        Phi' C|^2 + e |Phi' - Phi|^2.
+        dead: (atom,) those replaced.
+        gap: the largest of its coding.
+        residual: of its dictionary step.
+        """
+        found = self.validate(atoms)
+        largest, mean, _ = column_coherence(self.seen @ atoms[:, 1:])
+        return Progress(
+            objective=found.objective,
+            validation_psnr=found.psnr,
+            dead_share=float(dead[1:].mean()),
+            nonzeros=found.nonzeros,
+            change=float(np.linalg.norm((atoms - before)[:, ~dead])),
+            coherence_mean=mean or 0.0,
+            coherence_max=largest or 0.0,
+            worst_gap=max(gap, found.worst_gap),
+            step_residual=residual,
+        )
+
+    def synthesis(self, state: State, batches: int = 4) -> np.ndarray:
+        """Atoms that give patches back best from codes of `state.atoms`: min |X - Phi' C|^2 + e
+        |Phi' - Phi|^2.
 
         They only paint; the coding keeps the learnt atoms. An l1 code is biased towards zero and
-        knows nothing of what the sensor does not see; the regression makes up for both. `batches`
-        fresh batches; e pulls towards the learnt atoms as strongly as SYNTHESIS_WEIGHT patches an
-        atom would, each with the median power of a coefficient.
+        knows nothing of what the sensor does not see; the regression makes up for both. e pulls
+        towards the learnt atoms as strongly as SYNTHESIS_WEIGHT patches an atom would, each with
+        the median power of a coefficient.
+
+        batches: fresh ones that are coded.
+
+        Returns (point, atom).
         """
         rng = np.random.default_rng([self.settings.seed, _DRAW_SYNTHESIS, state.iteration])
-        gram, right = 0.0, 0.0
+        gram, right = np.zeros(()), np.zeros(())
         for _ in range(batches):
             patches = draw_patches(self.training, self.object_shape, self.settings.batch, rng)
             part = moments(patches, self.code(state.atoms, self.measure(patches, rng)[0]).c)
@@ -311,7 +382,9 @@ class Learner:
             + np.linalg.solve(gram + ridge * np.eye(len(gram)), (right - state.atoms @ gram).T).T
         )
 
-    def _refit(self, patches, c, atoms):
+    def _refit(
+        self, patches: np.ndarray, c: np.ndarray, atoms: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """Zero-mean atoms (point, atom - 1) of the dictionary step, and the relative residual of
         its normal equations.
         """
@@ -333,7 +406,7 @@ class Learner:
         return dictionary_step(*self._step_basis, gram, right, self.settings.delta)
 
 
-def mirror_images(shape):
+def mirror_images(shape: tuple[int, int]) -> np.ndarray:
     """Permutations (image, point) that mirror an object of `shape` points (rows, columns): 4 of
     them; 8, with the transposes, of a square one.
     """
@@ -394,12 +467,12 @@ def averaged(
     return Averaged(x=total / len(images), worst_gap=worst, nonzeros=nonzeros)
 
 
-def psnr(estimate, truth):
+def psnr(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB of patches in [0, 1], nothing clipped."""
     return float(-10 * np.log10(max(np.mean((estimate - truth) ** 2), np.finfo(float).tiny)))
 
 
-def _unit(atoms, rng):
+def _unit(atoms: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Zero-mean atoms of unit norm; flat ones become random ones."""
     atoms = atoms - atoms.mean(axis=0)
     flat = np.linalg.norm(atoms, axis=0) < 1e-6 * np.sqrt(len(atoms))
@@ -409,5 +482,6 @@ def _unit(atoms, rng):
     return atoms / np.linalg.norm(atoms, axis=0)
 
 
-def _with_constant(atoms):
+def _with_constant(atoms: np.ndarray) -> np.ndarray:
+    """The atoms behind the constant one."""
     return np.concatenate([np.full((len(atoms), 1), 1 / np.sqrt(len(atoms))), atoms], axis=1)

@@ -1,18 +1,27 @@
 """learn-dict: a dictionary of object patches for one system matrix, from training pictures."""
 
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
-from plenocli.files.read.dictionaries import read_unfinished
+from plenocli.files.read.dictionaries import Unfinished, read_unfinished
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training, split_by_scene
 from plenocli.inverse.picture.footprint import require_learning
-from plenocli.inverse.prior.natural_images import at_scales
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
+from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales
+from plenocli.inverse.sparse.dictionary import HISTORY, Learner, State
+from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 
 LAMBDAS = np.logspace(-7, -4, 13)
 """Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
@@ -23,13 +32,21 @@ cheaper, for nothing.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """atoms: None means one an object point.
+    """Options of the command.
+
+    atoms: None for one an object point.
+    batch: patches an iteration, None for 4 an atom.
+    iterations: in all.
     lam: None chooses on the validation patches, "noise" takes it from the noise.
-    snr_db: noise of the measurement.
+    delta: weight of |A Phi|^2.
+    snr_db: noise of the measurements.
+    initial: patches, pca or random.
     gradient_steps: of the dictionary step; 0 is its closed form.
     synthesis: also regress atoms that paint.
+    seed: of every random stream.
+    workers: threads, None for all cores.
     """
 
     atoms: int | None = None
@@ -45,54 +62,122 @@ class Settings:
     workers: int | None = None
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What a dictionary comes from: for its provenance and its attributes.
+
+    command: of the command line.
+    pif: path.
+    images: paths of training pictures, None where they ship with scikit-image.
+    """
+
+    command: str
+    pif: Path
+    images: list[str] | None
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Training pictures at several scales, and those that judge."""
+
+    training: list[TrainingPicture]
+    held_out: list[TrainingPicture]
+
+    @property
+    def training_names(self) -> list[str]:
+        """File names, sorted."""
+        return sorted({Path(name).name for name, _ in self.training})
+
+    @property
+    def held_out_names(self) -> list[str]:
+        """File names, sorted."""
+        return sorted({Path(name).name for name, _ in self.held_out})
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnSummary:
+    """How a dictionary does.
+
+    iterations, atoms, batch, lam, delta: as it was learnt.
+    validation_psnr_db: of one coding of the held-out patches.
+    averaged_psnr_db: of the mean over mirror images, which reconstruct takes.
+    lmmse_psnr_db: of the LMMSE that reconstruct takes of a lenslet by itself.
+    nonzeros, worst_gap, objective: of the coding (Validation).
+    dead_share: of atoms replaced in the last iteration, None before the first.
+    coherence: measures of plenocli.evaluation.metrics.coherence by name.
+    output: the file.
+    """
+
+    iterations: int
+    atoms: int
+    batch: int
+    lam: float
+    delta: float
+    validation_psnr_db: float
+    averaged_psnr_db: float
+    lmmse_psnr_db: float
+    nonzeros: float
+    worst_gap: float
+    objective: float
+    dead_share: float | None
+    coherence: dict[str, Any]
+    output: str
+
+    @property
+    def beats_lmmse(self) -> bool:
+        """Whether it is better than LMMSE."""
+        return bool(self.averaged_psnr_db > self.lmmse_psnr_db)
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values of --json."""
+        told = {"lambda" if k == "lam" else k: v for k, v in asdict(self).items()}
+        return told | {"beats_lmmse": self.beats_lmmse}
+
+    @property
+    def line(self) -> str:
+        """For a person, without the file."""
+        verdict = "above" if self.beats_lmmse else "NOT above"
+        largest, mean = (self.coherence[f"coherence_effective{name}"] for name in ("", "_mean"))
+        return (
+            f"{self.atoms} atoms, {self.iterations} iterations, lambda {self.lam:.2e}, held out "
+            f"{self.validation_psnr_db:.2f} dB, averaged over mirror images "
+            f"{self.averaged_psnr_db:.2f} dB, {verdict} LMMSE {self.lmmse_psnr_db:.2f} dB; "
+            f"coherence of A Phi: largest {largest:.3f}, mean {mean:.3f}"
+        )
+
+
 def run_learn_dict(
-    images, output, settings, *, pif, resume=None, checkpoint=None, overwrite=False, command=""
-):
-    """Learn, or go on learning from `resume`, and write a dictionary artefact;
-    returns a summary dict.
+    images: Sequence[str],
+    output: Path,
+    settings: Settings,
+    *,
+    pif: Path,
+    resume: Path | None = None,
+    checkpoint: Path | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> LearnSummary:
+    """Learn, or go on learning, and write a dictionary artefact.
 
     `settings.iterations` counts all iterations, those of `resume` included, so that an interrupted
     run and its continuation end with the same atoms as one that was left alone.
+
+    images: training pictures, () for those of scikit-image.
+    pif: the system matrix.
+    resume: a dictionary to go on from.
     checkpoint: a file that keeps the state after every iteration, from which the run goes on where
         there is one; removed at the end.
+    command: for the provenance.
     """
-    from plenocli.files.atomic import check_output
-    from plenocli.inverse.picture.solvers.least_squares import decompose
-    from plenocli.inverse.sparse.dictionary import Learner
-
-    files = files_of(images)
-    check_output(
-        output,
-        overwrite=overwrite,
-        inputs=[
-            pif,
-            *(files or ()),
-            *([resume] if resume and Path(resume) != Path(output) else []),
-        ],
-        suffixes=(".h5",),
-    )
-    kept = checkpoint is not None and Path(checkpoint).exists()
-    if checkpoint is not None:
-        if Path(checkpoint).resolve() == Path(output).resolve():
-            raise UsageError(
-                f"{Path(checkpoint).name} is the result too",
-                "--checkpoint",
-                "give it another name; it is removed at the end",
-            )
-        check_output(
-            checkpoint,
-            overwrite=True,
-            inputs=[pif, output, *(files or ()), *([resume] if resume else [])],
-            suffixes=(".h5",),
-        )
-        resume = checkpoint if kept else resume
+    origin = Origin(command, pif, files_of(images))
+    kept = _check_files(output, origin, resume, checkpoint, overwrite)
+    resume = checkpoint if kept else resume
     system = read_lenslet_matrix(pif)
-    pictures = read_training(images, system.object_shape)
-    training, held = (at_scales(part, system.object_shape) for part in split_by_scene(pictures))
+    pictures = split_by_scene(read_training(images, system.object_shape))
+    scenes = Scenes(*(at_scales(part, system.object_shape) for part in pictures))
     earlier = read_unfinished(resume, system) if resume else None
     chosen = _resolve(settings, system, earlier, same=kept)
-    names = sorted({Path(n).name for n, _ in training})
-    if earlier and names != list(earlier.training):
+    if earlier and scenes.training_names != list(earlier.training):
         raise UsageError(
             f"the resumed dictionary was trained on {', '.join(earlier.training)}",
             "--resume",
@@ -100,109 +185,144 @@ def run_learn_dict(
         )
     require_learning(system, chosen, pif, synthesis=settings.synthesis)
     svd = decompose(system.own)
-
-    def learner(lam):
-        return Learner(
-            svd,
-            system.object_shape,
-            [p for _, p in training],
-            [p for _, p in held],
-            replace(chosen, lam=lam),
-            workers=settings.workers,
-        )
-
-    if not isinstance(chosen.lam, float):
-        chosen = replace(chosen, lam=_choose_lambda(learner(1.0), chosen.lam))
-    machine = learner(chosen.lam)
+    machine = _learner(svd, system, scenes, chosen, settings)
     state = earlier.state if earlier else machine.start()
     if state.iteration > settings.iterations:
         raise UsageError(
-            (
-                f"{Path(resume).name} has done {state.iteration} iterations, more than "
-                f"{settings.iterations}"
-            ),
+            f"{Path(resume or output).name} has done {state.iteration} iterations, more than "
+            f"{settings.iterations}",
             "--iterations",
             "ask for more",
         )
-    origin = dict(
-        command=command,
-        pif=pif,
-        files=files,
-        seed=chosen.seed,
-        names=[n for n, _ in training],
-        held=[n for n, _ in held],
-    )
-    for _ in bar(
-        range(settings.iterations - state.iteration),
-        settings.iterations - state.iteration,
-        "iterations",
-    ):
+    left = settings.iterations - state.iteration
+    for _ in bar(range(left), left, "iterations"):
         state = machine.step(state)
         _tell(state)
         if checkpoint is not None:
-            _write(checkpoint, state, None, machine, chosen, system, {}, origin, True)
+            _write(checkpoint, state, machine, scenes, origin, overwrite=True)
     synthesis = machine.synthesis(state) if settings.synthesis else None
-    summary = _judge(machine, state, synthesis, svd, training, chosen)
-    _write(output, state, synthesis, machine, chosen, system, summary, origin, overwrite)
+    summary = _judge(machine, state, synthesis, svd, scenes, output)
+    _write(
+        output,
+        state,
+        machine,
+        scenes,
+        origin,
+        synthesis=synthesis,
+        summary=summary,
+        overwrite=overwrite,
+    )
     if checkpoint is not None:
         Path(checkpoint).unlink(missing_ok=True)
-    if not summary["beats_lmmse"]:
+    if not summary.beats_lmmse:
         note(
             "the dictionary does NOT beat LMMSE with a contrast for every patch on held-out "
-            f"pictures ({summary['averaged_psnr_db']:.2f} against {summary['lmmse_psnr_db']:.2f} "
+            f"pictures ({summary.averaged_psnr_db:.2f} against {summary.lmmse_psnr_db:.2f} "
             "dB): reconstruct --method lmmse is the better choice"
         )
-    return summary | {"output": str(output)}
+    return summary
 
 
-def _resolve(settings, system, earlier, same=False):
-    """solvers.dictionary.Settings from the command line and, for a resumed run, from the file.
+def _check_files(
+    output: Path,
+    origin: Origin,
+    resume: Path | None,
+    checkpoint: Path | None,
+    overwrite: bool,
+) -> bool:
+    """Whether there is a checkpoint to go on from; refuses files that may not be written."""
+    from plenocli.files.atomic import check_output
+
+    read = [origin.pif, *(origin.images or ())]
+    check_output(
+        output,
+        overwrite=overwrite,
+        inputs=[*read, *([resume] if resume and Path(resume) != Path(output) else [])],
+        suffixes=(".h5",),
+    )
+    if checkpoint is None:
+        return False
+    kept = Path(checkpoint).exists()
+    if Path(checkpoint).resolve() == Path(output).resolve():
+        raise UsageError(
+            f"{Path(checkpoint).name} is the result too",
+            "--checkpoint",
+            "give it another name; it is removed at the end",
+        )
+    check_output(
+        checkpoint,
+        overwrite=True,
+        inputs=[*read, output, *([resume] if resume else [])],
+        suffixes=(".h5",),
+    )
+    return kept
+
+
+def _resolve(
+    settings: Settings, system: LensletMatrix, earlier: Unfinished | None, same: bool = False
+) -> LearnerSettings:
+    """What is learnt with, from the command line and, for a resumed run, from the file; lam is NaN
+    where it is still to be chosen.
 
     same: defaults may not differ either.
     """
-    from plenocli.inverse.sparse import dictionary
-
-    points = int(np.prod(system.object_shape))
-    if earlier:
-        stored = earlier.settings
-        wanted = {
-            name: getattr(settings, name)
-            for name in ("atoms", "batch", "lam")
-            if getattr(settings, name) not in (None, "noise")
-        }
-        wanted |= {
-            name: getattr(settings, name)
-            for name in ("delta", "snr_db", "seed", "initial", "gradient_steps")
-            if same or getattr(settings, name) != getattr(Settings, name)
-        }
-        for name, value in wanted.items():
-            if value != getattr(stored, name):
-                raise UsageError(
-                    (
-                        f"the resumed dictionary was learnt with {name} = "
-                        f"{getattr(stored, name)}, not {value}"
-                    ),
-                    *(
-                        ("--checkpoint", "give the same options, or remove the file")
-                        if same
-                        else ("--resume", "leave the option out")
-                    ),
-                )
-        return stored
-    atoms = settings.atoms or points
-    return dictionary.Settings(
-        atoms=atoms,
-        batch=settings.batch or 4 * atoms,
-        lam=settings.lam,
-        delta=settings.delta,
-        snr_db=settings.snr_db,
-        seed=settings.seed,
-        initial=settings.initial,
-        gradient_steps=settings.gradient_steps,
-    )
+    if earlier is None:
+        atoms = settings.atoms or int(np.prod(system.object_shape))
+        return LearnerSettings(
+            atoms=atoms,
+            batch=settings.batch or 4 * atoms,
+            lam=settings.lam if isinstance(settings.lam, float) else math.nan,
+            delta=settings.delta,
+            snr_db=settings.snr_db,
+            seed=settings.seed,
+            initial=settings.initial,
+            gradient_steps=settings.gradient_steps,
+        )
+    asked, stored, default = asdict(settings), asdict(earlier.settings), asdict(Settings())
+    wanted = [name for name in ("atoms", "batch", "lam") if asked[name] not in (None, "noise")]
+    wanted += [
+        name
+        for name in ("delta", "snr_db", "seed", "initial", "gradient_steps")
+        if same or asked[name] != default[name]
+    ]
+    for name in wanted:
+        if asked[name] != stored[name]:
+            raise UsageError(
+                f"the resumed dictionary was learnt with {name} = {stored[name]}, not "
+                f"{asked[name]}",
+                *(
+                    ("--checkpoint", "give the same options, or remove the file")
+                    if same
+                    else ("--resume", "leave the option out")
+                ),
+            )
+    return earlier.settings
 
 
-def _choose_lambda(machine, rule):
+def _learner(
+    svd: Svd,
+    system: LensletMatrix,
+    scenes: Scenes,
+    chosen: LearnerSettings,
+    asked: Settings,
+) -> Learner:
+    """The Learner, its lambda chosen as `asked` where it is not given."""
+
+    def learner(lam: float) -> Learner:
+        return Learner(
+            svd,
+            system.object_shape,
+            [p for _, p in scenes.training],
+            [p for _, p in scenes.held_out],
+            replace(chosen, lam=lam),
+            workers=asked.workers,
+        )
+
+    given = not math.isnan(chosen.lam)
+    return learner(chosen.lam if given else _choose_lambda(learner(1.0), asked.lam))
+
+
+def _choose_lambda(machine: Learner, rule: float | str | None) -> float:
     """The largest lambda with the best validation PSNR for the starting dictionary, or
     lambda by the noise.
     """
@@ -223,33 +343,40 @@ def _choose_lambda(machine, rule):
     return best
 
 
-def _tell(state):
-    last = {name: values[-1] for name, values in state.history.items()}
+def _tell(state: State) -> None:
+    """One line about the last iteration."""
+    last = state.history[-1]
     note(
-        f"iteration {state.iteration}: validation {last['validation_psnr']:.2f} dB, objective "
-        f"{last['objective']:.3e}, {last['nonzeros']:.0f} atoms a patch, {last['dead_share']:.1%} "
-        f"dead, coherence mean {last['coherence_mean']:.3f} max {last['coherence_max']:.4f}, gap "
-        f"{last['worst_gap']:.0e}, step residual {last['step_residual']:.0e}"
+        f"iteration {state.iteration}: validation {last.validation_psnr:.2f} dB, objective "
+        f"{last.objective:.3e}, {last.nonzeros:.0f} atoms a patch, {last.dead_share:.1%} "
+        f"dead, coherence mean {last.coherence_mean:.3f} max {last.coherence_max:.4f}, gap "
+        f"{last.worst_gap:.0e}, step residual {last.step_residual:.0e}"
     )
 
 
-def _judge(machine, state, synthesis, svd, training, chosen):
-    """Summary: validation PSNR of one coding, and of the mean over mirror images that reconstruct
-    takes, beside the LMMSE that reconstruct takes of a lenslet by itself: statistics of the same
-    training pictures, a contrast for every patch; coherence.
+def _judge(
+    machine: Learner,
+    state: State,
+    synthesis: np.ndarray | None,
+    svd: Svd,
+    scenes: Scenes,
+    output: Path,
+) -> LearnSummary:
+    """Validation PSNR of one coding, and of the mean over mirror images that reconstruct takes,
+    beside the LMMSE that reconstruct takes of a lenslet by itself: statistics of the same training
+    pictures, a contrast for every patch; coherence.
     """
     from plenocli.evaluation.metrics.coherence import coherence
-    from plenocli.inverse.picture.solvers.least_squares import Svd
     from plenocli.inverse.picture.solvers.lmmse import prepare
     from plenocli.inverse.prior.natural_images import draw_patches, mean_covariance
     from plenocli.inverse.prior.scene_prior import PATCHES_A_POINT
     from plenocli.inverse.sparse.dictionary import averaged, psnr
 
-    points = machine.seen.shape[1]
+    chosen = machine.settings
     patches = draw_patches(
-        [p for _, p in training],
+        [p for _, p in scenes.training],
         machine.object_shape,
-        PATCHES_A_POINT * points,
+        PATCHES_A_POINT * machine.seen.shape[1],
         stream(chosen.seed, "learn-dict"),
     )
     kept = len(machine.seen)
@@ -258,7 +385,7 @@ def _judge(machine, state, synthesis, svd, training, chosen):
         machine.measured
     )
     lmmse = psnr(linear, machine.validation)
-    objective, quality, nonzeros, gap = machine.validate(state.atoms)
+    found = machine.validate(state.atoms)
     mean = averaged(
         machine.seen,
         state.atoms,
@@ -269,84 +396,87 @@ def _judge(machine, state, synthesis, svd, training, chosen):
         tol=chosen.tol,
         workers=machine.workers,
     )
-    best = psnr(mean.x, machine.validation)
-    measures = coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)
-    return {
-        "iterations": state.iteration,
-        "atoms": state.atoms.shape[1],
-        "batch": chosen.batch,
-        "lambda": chosen.lam,
-        "delta": chosen.delta,
-        "validation_psnr_db": quality,
-        "averaged_psnr_db": best,
-        "lmmse_psnr_db": lmmse,
-        "beats_lmmse": bool(best > lmmse),
-        "nonzeros": nonzeros,
-        "worst_gap": gap,
-        "objective": objective,
-        "dead_share": state.history["dead_share"][-1] if state.iteration else None,
-        "coherence": measures,
-    }
+    return LearnSummary(
+        iterations=state.iteration,
+        atoms=state.atoms.shape[1],
+        batch=chosen.batch,
+        lam=chosen.lam,
+        delta=chosen.delta,
+        validation_psnr_db=found.psnr,
+        averaged_psnr_db=psnr(mean.x, machine.validation),
+        lmmse_psnr_db=lmmse,
+        nonzeros=found.nonzeros,
+        worst_gap=found.worst_gap,
+        objective=found.objective,
+        dead_share=state.history[-1].dead_share if state.history else None,
+        coherence=coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms),
+        output=str(output),
+    )
 
 
-def _write(output, state, synthesis, machine, chosen, system, summary, origin, overwrite):
-    """The artefact of a state;
+def _write(
+    output: Path,
+    state: State,
+    machine: Learner,
+    scenes: Scenes,
+    origin: Origin,
+    *,
+    synthesis: np.ndarray | None = None,
+    summary: LearnSummary | None = None,
+    overwrite: bool,
+) -> None:
+    """The artefact of a state.
 
-    summary: of `_judge`, {} where the run goes on.
+    synthesis: atoms that paint.
+    summary: None where the run goes on.
     """
-    from dataclasses import asdict
-
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
 
-    data = {"dictionary/atoms": state.atoms} | (
-        {} if synthesis is None else {"dictionary/synthesis": synthesis}
-    )
-    data |= {
-        f"dictionary/history/{name}": np.array(values) for name, values in state.history.items()
-    }
+    data = {"dictionary/atoms": state.atoms}
+    data |= {} if synthesis is None else {"dictionary/synthesis": synthesis}
+    data |= {f"dictionary/history/{name}": state.column(name) for name in HISTORY}
     data |= {f"dictionary/state/{name}": value for name, value in state.save().items()}
+    chosen = machine.settings
     attrs = {
         "delta": chosen.delta,
         "lambda": chosen.lam,
-        "object_shape": list(system.object_shape),
+        "object_shape": list(machine.object_shape),
         "iterations": state.iteration,
         "scale": machine.scale,
         "parameters": {
             "settings": asdict(chosen),
             "sigma": machine.sigma,
             "directions": len(machine.seen),
-            "training": sorted({Path(n).name for n in origin["names"]}),
-            "validation": sorted({Path(n).name for n in origin["held"]}),
+            "training": scenes.training_names,
+            "validation": scenes.held_out_names,
         },
-        "notes": {
-            k: summary[k]
-            for k in (
-                "validation_psnr_db",
-                "averaged_psnr_db",
-                "lmmse_psnr_db",
-                "beats_lmmse",
-                "worst_gap",
-            )
-            if k in summary
-        },
-    }
-    if summary:
-        measures = summary["coherence"]
-        attrs |= {
-            "coherence_effective": measures["coherence_effective"],
-            "coherence_average": measures["coherence_effective_mean"],
-            "coherence_raw": measures["coherence_raw"],
-            "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
-            "coherence_welch": measures["welch_bound"],
-            "coherence": measures,
-        }
-    attrs = {k: v for k, v in attrs.items() if v is not None}
+        "notes": {},
+    } | ({} if summary is None else _judgement(summary))
     provenance = Provenance(
-        origin["command"],
-        describe_inputs({"pif": origin["pif"], "image": origin["files"]}),
-        origin["seed"],
+        origin.command, describe_inputs({"pif": origin.pif, "image": origin.images}), chosen.seed
     )
+    attrs = {k: v for k, v in attrs.items() if v is not None}
     write_artefact(
         output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite
     )
+
+
+def _judgement(summary: LearnSummary) -> dict[str, Any]:
+    """Attributes of a dictionary that is done."""
+    measures = summary.coherence
+    return {
+        "notes": {
+            "validation_psnr_db": summary.validation_psnr_db,
+            "averaged_psnr_db": summary.averaged_psnr_db,
+            "lmmse_psnr_db": summary.lmmse_psnr_db,
+            "beats_lmmse": summary.beats_lmmse,
+            "worst_gap": summary.worst_gap,
+        },
+        "coherence_effective": measures["coherence_effective"],
+        "coherence_average": measures["coherence_effective_mean"],
+        "coherence_raw": measures["coherence_raw"],
+        "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
+        "coherence_welch": measures["welch_bound"],
+        "coherence": measures,
+    }

@@ -153,19 +153,20 @@ def test_atoms_keep_their_form(setting):
     np.testing.assert_allclose(state.atoms[:, 0], 1 / np.sqrt(30))
     assert np.abs(state.atoms[:, 1:].mean(axis=0)).max() < 1e-12
     assert all(
-        len(values) == 3 and np.all(np.isfinite(values)) for values in state.history.values()
+        len(values) == 3 and np.all(np.isfinite(values))
+        for values in map(state.column, dictionary.HISTORY)
     )
-    assert max(state.history["worst_gap"]) <= 1e-3 and max(state.history["step_residual"]) < 1e-10
+    assert max(state.column("worst_gap")) <= 1e-3 and max(state.column("step_residual")) < 1e-10
 
 
 def test_gradient_steps_learn_too_and_say_how_far_they_got(setting):
     exact, rough = (
         run(learner(setting, gradient_steps=n), learner(setting).start(), 2) for n in (0, 30)
     )
-    assert rough.history["step_residual"][0] > 1e-6 > exact.history["step_residual"][0]
+    assert rough.history[0].step_residual > 1e-6 > exact.history[0].step_residual
     assert (
-        rough.history["validation_psnr"][-1]
-        > learner(setting).validate(learner(setting).start().atoms)[1] - 1
+        rough.history[-1].validation_psnr
+        > learner(setting).validate(learner(setting).start().atoms).psnr - 1
     )
 
 
@@ -203,17 +204,16 @@ def test_path_of_lambda_is_what_single_values_give(setting):
     atoms = machine.start().atoms
     for lam, quality, nonzeros in machine.validate_path(atoms, [1e-5, 1e-3]):
         one = learner(setting, tol=1e-8, lam=lam).validate(atoms)
-        assert one[1] == pytest.approx(quality, abs=1e-3) and one[2] == pytest.approx(
-            nonzeros, rel=0.02
-        )
+        assert one.psnr == pytest.approx(quality, abs=1e-3)
+        assert one.nonzeros == pytest.approx(nonzeros, rel=0.02)
 
 
 def test_learning_beats_its_random_start(setting):
     machine = learner(setting, initial="random")
     start = machine.start()
     before, after = (
-        machine.validate(start.atoms)[1],
-        run(machine, start, 6).history["validation_psnr"][-1],
+        machine.validate(start.atoms).psnr,
+        run(machine, start, 6).history[-1].validation_psnr,
     )
     assert after > before + 3
 
@@ -235,7 +235,8 @@ def test_scale_of_the_matrix_does_not_matter(setting):
     one, other = (
         learner((s, pictures), tol=1e-8)
         .step(learner((s, pictures)).start())
-        .history["validation_psnr"][0]
+        .history[0]
+        .validation_psnr
         for s in (svd, louder)
     )
     assert one == pytest.approx(other, abs=1e-3)

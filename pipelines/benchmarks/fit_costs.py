@@ -48,6 +48,7 @@ from plenocli.forward.propagation.costs import Features, Law, priced
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact.term_counts import TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
+from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
 EXACT = "exact, low rank"
@@ -155,8 +156,8 @@ def measure(case: Case) -> Measured | None:
         seconds=seconds,
         bytes=_resident() - before - plan.bytes,
         rate=rate,
-        terms=float(builder.notes["separable_terms"]) if exact else 0.0,
-        products=float(builder.notes["products"]) if exact else 0.0,
+        terms=float(builder.notes.separable_terms) if exact else 0.0,
+        products=float(builder.notes.products) if exact else 0.0,
     )
 
 
@@ -175,7 +176,7 @@ def drawn(most: float, seed: int) -> Iterator[Case]:
                 known = case is not None and laws[case.model].cost(features_of(case))
             except NumericsError:
                 continue
-            if known and known.seconds + known.operations / dial.NOMINAL[False] <= most:
+            if known and known.seconds + known.operations / NOMINAL_RATE[False] <= most:
                 yield case
 
 

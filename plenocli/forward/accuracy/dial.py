@@ -3,18 +3,19 @@ cost (docs/model.md).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.needs import seen_wavelengths, sensor_noise, visible_accuracy
-from plenocli.forward.accuracy.rates import NOMINAL, product_rate
-from plenocli.forward.camera.geometry import geometry, lenslet_shift
+from plenocli.forward.accuracy.rates import product_rate
+from plenocli.forward.camera.geometry import geometry as geometry_of
+from plenocli.forward.camera.geometry import lenslet_shift
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
 from plenocli.forward.propagation.models import MODELS
+from plenocli.forward.propagation.plan import Candidate, PifPlan
 from plenocli.forward.propagation.sampling import (
-    PifPlan,
     blur_ring,
     coherent_window,
     predicted_outside,
@@ -50,37 +51,6 @@ SHARE = 0.2
 """Least share of the accuracy that must be left for sampling; below it the other errors count as
 the accuracy's whole.
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class Candidate:
-    """One model as it was considered.
-
-    `why`: why it was not chosen (None: it was);
-    split: error by its source; rings and bands as PifPlan; seconds: of one core at nominal rates;
-    bytes: result and work.
-    """
-
-    name: str
-    model: str
-    why: str | None
-    error: float = math.inf
-    split: dict | None = None
-    ring: int = 0
-    sampling: float = 0.0
-    double: bool = False
-    bands: tuple = ()
-    operations: float = 0.0
-    fixed_seconds: float = 0.0
-    bytes: int = 0
-    band_nodes: int = 0
-
-    def seconds(self, rate=None):
-        """Seconds of one core, at the nominal rate or at `rate` (a function of `double`)."""
-        return (
-            self.operations / (rate(self.double) if rate else NOMINAL[self.double])
-            + self.fixed_seconds
-        )
 
 
 def plan_pif(
@@ -168,7 +138,7 @@ class _Request:
                 f"{len(dropped)} wavelength(s) without light in the scene: no error"
             )
         self.pixel_shift, self.off_axis = _place(camera, lenslet)
-        self.views = [geometry(camera, w, self.pixel_shift) for w in kept]
+        self.geometries = [geometry_of(camera, w, self.pixel_shift) for w in kept]
         # a band goes by its centre
         self.band = (
             camera.light.band
@@ -183,7 +153,7 @@ class _Request:
             else dtype
         )
         self.depths = self._depths()
-        self.grid = _superpixels(superpixels, self.depths, self.accuracy, self.reasons)
+        self.superpixels = _superpixels(superpixels, self.depths, self.accuracy, self.reasons)
         self.rings = self._rings(coherent_ring)
         if needs is not None and needs.lenslets is not None:
             total, lit = int(np.prod(camera.lenslet_array.count)), int(np.prod(needs.lenslets))
@@ -218,8 +188,8 @@ class _Request:
         the scene's depth.
         """
         if self.needs is None or self.needs.depth is None:
-            return self.views
-        ends = [replace(view, z1=z) for view in self.views for z in self.needs.depth]
+            return self.geometries
+        ends = [replace(geometry, z1=z) for geometry in self.geometries for z in self.needs.depth]
         self.reasons.append(
             f"depth {self.needs.depth[0]:.4g} to {self.needs.depth[1]:.4g} m: neighbourhood sized "
             "for the blur at both ends"
@@ -236,12 +206,12 @@ class _Request:
     @property
     def shape(self):
         """(band, lenslet, pixel, point) of the matrix."""
-        count = int(np.prod(self.views[0].object_shape))
+        count = int(np.prod(self.geometries[0].object_shape))
         count = count if self.points is None else len(range(*self.points.indices(count)))
         return (
-            len(self.views),
-            self.grid[0] * self.grid[1],
-            int(np.prod(self.views[0].pixel_shape)),
+            len(self.geometries),
+            self.superpixels[0] * self.superpixels[1],
+            int(np.prod(self.geometries[0].pixel_shape)),
             count,
         )
 
@@ -267,7 +237,7 @@ def _consider(request, model):
     that it would take.
     """
     reason = next(
-        (r for r in (model.valid_for(request.camera, v) for v in request.views) if r), None
+        (r for r in (model.valid_for(request.camera, v) for v in request.geometries) if r), None
     )
     if request.off_axis and model.kind == "exact":
         reason = (
@@ -278,7 +248,7 @@ def _consider(request, model):
     fixed = {
         "model": 0.0
         if request.model != "auto"
-        else max(model.error_bound(request.camera, v) for v in request.views),
+        else max(model.error_bound(request.camera, v) for v in request.geometries),
         "storage": 3e-8 if request.dtype == np.float32 else 0.0,
     }
     tried = []
@@ -286,7 +256,7 @@ def _consider(request, model):
         outside = (
             0.0
             if model.kind == "ray"
-            else max(window_error(v, request.grid, ring) for v in request.depths)
+            else max(window_error(v, request.superpixels, ring) for v in request.depths)
         )
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, model, ring)
@@ -318,7 +288,9 @@ def _rings_of(request, model):
         ring
         for ring in request.rings
         if ring == 1
-        or max(coherent_window(v, request.grid, ring) * v.D2 / v.z3 for v in request.views)
+        or max(
+            coherent_window(v, request.superpixels, ring) * v.D2 / v.z3 for v in request.geometries
+        )
         <= STEEPEST
     ]
 
@@ -329,13 +301,13 @@ def _band_nodes(request, model, ring):
     """
     if request.band is None:
         return 0, 0.0
-    view = request.views[0]
-    window = None if ring == 0 else coherent_window(view, request.grid, ring)
+    geometry = request.geometries[0]
+    window = None if ring == 0 else coherent_window(geometry, request.superpixels, ring)
     try:
-        count = node_count(view, request.band, BAND_SHARE * request.accuracy, window)
+        count = node_count(geometry, request.band, BAND_SHARE * request.accuracy, window)
     except NumericsError:
         count = MAX_NODES
-    return count, spectral_error(view, request.band, count, window)
+    return count, spectral_error(geometry, request.band, count, window)
 
 
 def _sized(request, model, ring, split, nodes):
@@ -351,12 +323,12 @@ def _sized(request, model, ring, split, nodes):
     double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
         bands = tuple(
-            model.size(v, request.grid, ring, sampling, sampling / 2)
+            model.size(v, request.superpixels, ring, sampling, sampling / 2)
             for v in _finest(request, nodes)
         )
         costs = [
             model.cost(request.camera, v, b, request.shape, double)
-            for v, b in zip(request.views, bands)
+            for v, b in zip(request.geometries, bands)
         ]
     except NumericsError as error:
         return Candidate(name=model.name, model=model.kind, why=error.what)
@@ -384,9 +356,9 @@ def _sized(request, model, ring, split, nodes):
 def _finest(request, nodes):
     """The geometries that node counts must serve: of a band, that of its shortest wavelength."""
     if not nodes:
-        return request.views
+        return request.geometries
     return [
-        geometry(
+        geometry_of(
             request.camera, float(spectral_nodes(request.band, nodes)[0].min()), request.pixel_shift
         )
     ]
@@ -506,22 +478,21 @@ def _plan(request, found, best):
         for c in found
     )
     warnings = [*request.warnings, *_warnings(request, best)]
-    view_error = max(window_error(v, request.grid, best.ring) for v in request.depths)
+    window = max(window_error(v, request.superpixels, best.ring) for v in request.depths)
     if best.ring and best.model != "ray":
         request.left_out.append(
-            f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error "
-            f"about {view_error:.1g}"
+            f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {window:.1g}"
         )
-        if len(request.rings) == 1 and view_error > request.accuracy:
+        if len(request.rings) == 1 and window > request.accuracy:
             warnings.append(
-                f"lenslets beyond the coherent window change columns by about {view_error:.1g}, "
+                f"lenslets beyond the coherent window change columns by about {window:.1g}, "
                 f"more than the accuracy {request.accuracy:g}"
             )
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(
         model=best.model,
         rung=best.name,
-        superpixels=request.grid,
+        superpixels=request.superpixels,
         coherent_ring=best.ring,
         accuracy=request.accuracy,
         asked_by=request.asked_by,
@@ -546,7 +517,7 @@ def _plan(request, found, best):
 
 def _model_error(request, best):
     model = next(m for m in MODELS if m.name == best.name)
-    return max(model.error_bound(request.camera, v) for v in request.views)
+    return max(model.error_bound(request.camera, v) for v in request.geometries)
 
 
 def seconds_here(candidate):
@@ -554,7 +525,7 @@ def seconds_here(candidate):
     return candidate.seconds(product_rate)
 
 
-def _superpixels(asked, views, accuracy, reasons):
+def _superpixels(asked, geometries, accuracy, reasons):
     if asked != "auto":
         rows, columns = (int(n) for n in asked)
         if rows < 1 or columns < 1 or rows % 2 == 0 or columns % 2 == 0:
@@ -565,19 +536,19 @@ def _superpixels(asked, views, accuracy, reasons):
             )
         reasons.append(f"superpixels {rows}x{columns} as asked")
         return rows, columns
-    ring = max(blur_ring(view) for view in views)
+    ring = max(blur_ring(geometry) for geometry in geometries)
     reasons.append(
-        f"geometric blur {max(v.blur / v.D2 for v in views):.2f} lenslets: superpixels under "
+        f"geometric blur {max(v.blur / v.D2 for v in geometries):.2f} lenslets: superpixels under "
         f"it kept, ring {ring}"
     )
     if accuracy < 0.05:
         wanted = ring
-        while max(predicted_outside(v, wanted) for v in views) > 0.05 and wanted < ring + 4:
+        while max(predicted_outside(v, wanted) for v in geometries) > 0.05 and wanted < ring + 4:
             wanted += 1
         if wanted > ring:
             reasons.append(
                 f"ring {wanted} kept for diffraction: it leaves about "
-                f"{max(predicted_outside(v, wanted) for v in views):.3f} of a corner point's "
+                f"{max(predicted_outside(v, wanted) for v in geometries):.3f} of a corner point's "
                 "light outside (limit 0.05)"
             )
         ring = wanted
@@ -585,14 +556,14 @@ def _superpixels(asked, views, accuracy, reasons):
 
 
 def _warnings(request, best):
-    view, grid, found = request.views[0], request.grid, []
+    geometry, superpixels, found = request.geometries[0], request.superpixels, []
     for axis, name in ((0, "rows"), (1, "columns")):
-        size = view.pixel_shape[axis] * view.pixel_pitch
-        spacing = view.superpixel_pitch * (1.0 if axis else view.row_spacing)
+        size = geometry.pixel_shape[axis] * geometry.pixel_pitch
+        spacing = geometry.superpixel_pitch * (1.0 if axis else geometry.row_spacing)
         if request.pixel_shift is None and abs(size / spacing - 1) > 1e-4:
             found.append(
-                f"superpixels are {spacing / view.pixel_pitch:.3f} pixels apart, not "
-                f"{view.pixel_shape[axis]} ({name}): A is for the grid centred on each "
+                f"superpixels are {spacing / geometry.pixel_pitch:.3f} pixels apart, not "
+                f"{geometry.pixel_shape[axis]} ({name}): A is for the grid centred on each "
                 "superpixel, not for one sensor raster (--lenslet)"
             )
     if request.model != "auto" and best.model != "exact":
@@ -602,7 +573,7 @@ def _warnings(request, best):
                 f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; "
                 f"that model is off by about {error:.1g} itself"
             )
-    if max(v.blur / (2 * v.D2) for v in request.depths) > (min(grid) - 1) // 2 + 1e-9:
+    if max(v.blur / (2 * v.D2) for v in request.depths) > (min(superpixels) - 1) // 2 + 1e-9:
         found.append(
             "the geometric blur reaches beyond the superpixels kept: their light is "
             "missing from the columns"

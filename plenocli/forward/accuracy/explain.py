@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from plenocli.forward.accuracy.dial import seconds_here
 
 if TYPE_CHECKING:
-    from plenocli.forward.propagation.sampling import PifPlan
+    from plenocli.forward.propagation.plan import PifPlan
 
 LONG = 20.0
 """Seconds at nominal speed from which on a plan is told before the work starts."""

@@ -1,20 +1,14 @@
 """How fast this machine multiplies complex matrices: the unit in which plans are
 turned into seconds.
 
-Plans are chosen by counting operations at nominal rates, so that a file does not depend on the
-machine that made it; the rates measured here only turn the choice into the seconds
-that a user is told.
+Plans are chosen at nominal rates (plan.NOMINAL_RATE); the rates measured here only turn the choice
+into the seconds that a user is told.
 """
 
 import time
 from functools import lru_cache
 
 import numpy as np
-
-NOMINAL = {False: 60e9, True: 30e9}
-"""Real operations a second of one core in complex matrix products, single and double
-precision, for choosing.
-"""
 
 
 @lru_cache(maxsize=2)

@@ -1,9 +1,9 @@
 """Bands of light: A of a band is the sum of A at a few wavelengths, each with its share of
 the band's photons.
 
-A band has a Gaussian number of photons per wavelength, cut off at CUT times its full width at half
-maximum on either side (that keeps all but 4e-4 of an uncut one), or a constant one ("box"). The
-nodes are those of Gauss's rule for that shape. Fields of different wavelengths never add,
+A band has a Gaussian number of photons per wavelength, cut off at BAND_END times its full width at
+half maximum on either side (that keeps all but 4e-4 of an uncut one), or a constant one ("box").
+The nodes are those of Gauss's rule for that shape. Fields of different wavelengths never add,
 intensities do. As a function of the wave number the intensity is band-limited by the longest path
 difference, so a rule of n nodes is either enough or useless; see docs/model.md.
 """
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.models import Model
-    from plenocli.forward.propagation.sampling import BandPlan, PifPlan
+    from plenocli.forward.propagation.plan import BandPlan, PifPlan
 
 MAX_NODES = 64
 """More wavelengths than this in one band are a spectrum, not a band."""
-CUT = 1.5
+BAND_END = 1.5
 """Where a Gaussian band ends, in full widths at half maximum from its centre."""
 CORE, RIM = 1.0, 1.5e-2
 """Effect on a column of missing the fringes of a quarter of the longest path difference, and of all
@@ -56,7 +56,7 @@ def _rule(shape, count):
     # Stieltjes: the three-term recurrence of the polynomials orthogonal over the cut Gaussian,
     # then Golub and Welsch
     t, w = gauss(400)
-    t = 2 * CUT * t
+    t = 2 * BAND_END * t
     w = w * np.exp(-math.log(2) * t * t)
     previous, current, norms = np.zeros_like(t), np.ones_like(t), [w.sum()]
     for _ in range(count - 1):
@@ -75,8 +75,8 @@ def _transform(shape, phase):
     if shape == "box":
         return p, np.sinc(p / np.pi)
     t, w = gauss(400 + int(phase))
-    w = w * np.exp(-math.log(2) * (2 * CUT * t) ** 2)
-    return p, np.cos(np.outer(p, 2 * CUT * t)) @ w / w.sum()
+    w = w * np.exp(-math.log(2) * (2 * BAND_END * t) ** 2)
+    return p, np.cos(np.outer(p, 2 * BAND_END * t)) @ w / w.sum()
 
 
 def rule_error(shape, count, phase):
@@ -88,16 +88,16 @@ def rule_error(shape, count, phase):
     return float(np.abs(np.cos(np.outer(p, x)) @ w / w.sum() - exact).max())
 
 
-def spectral_error(view, band, count, window=None):
+def spectral_error(geometry, band, count, window=None):
     """Estimated relative L2 error of the worst column when `count` wavelengths stand for `band`.
 
-    view: Geometry at the centre;
+    geometry: at the centre;
     window: coherent lenslets on either side (None: isolated). The longest path difference within
         one lenslet's light is about N wavelengths, N = D2 D1/(lambda z2); the light of neighbours,
         which mostly meets next to its border, doubles it. Long paths carry little of the light,
         hence two weights.
     """
-    cells = view.diffraction_cells
+    cells = geometry.diffraction_cells
     phase = math.pi * cells * band.fwhm / band.center * (1 if window is None else 2)
     return (
         2
@@ -109,12 +109,12 @@ def spectral_error(view, band, count, window=None):
     )
 
 
-def node_count(view, band, accuracy, window=None):
+def node_count(geometry, band, accuracy, window=None):
     """Fewest wavelengths whose spectral_error is at most `accuracy`;
     NumericsError beyond MAX_NODES.
     """
     for count in range(1, MAX_NODES + 1):
-        if spectral_error(view, band, count, window) <= accuracy:
+        if spectral_error(geometry, band, count, window) <= accuracy:
             return count
     raise NumericsError(
         (

@@ -19,7 +19,10 @@ from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
 from plenocli.forward.propagation.lenslet_fields import LensletFields
-from plenocli.forward.propagation.sampling import BandPlan, PifPlan, size_band
+from plenocli.forward.propagation.plan import BandPlan, PifPlan
+from plenocli.forward.propagation.sampling import (
+    size_band,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -88,15 +91,15 @@ class Model(ABC):
         return self.lenslets(camera, geometry, plan, band)
 
 
-def _square_only(camera, view):
+def _square_only(camera, geometry):
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
         return f"{array.aperture_shape} lenslets on a {array.lattice} lattice are not separable"
     return None
 
 
-def _paraxial_error(camera, view):
-    return exact.fresnel_model_error(view, camera.lenslet_array.profile == "parabolic")
+def _paraxial_error(camera, geometry):
+    return exact.fresnel_model_error(geometry, camera.lenslet_array.profile == "parabolic")
 
 
 class Rays(Model):

@@ -31,44 +31,50 @@ from plenocli.forward.propagation.lenslet_fields import (
     LensletFields,
     PixelEnergies,
 )
-from plenocli.forward.propagation.sampling import BandPlan, blur_ring, distinct
+from plenocli.forward.propagation.plan import BandPlan
+from plenocli.forward.propagation.sampling import (
+    blur_ring,
+    distinct,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
-SLAB = 1 << 17
+WORK_CORNERS = 1 << 17
 """Corners of rectangles in a work array: about what a second-level cache holds."""
 FOCUSED = 1e-9
 """An image of a whole pupil smaller than this share of a pixel or a lenslet is a point."""
 
 
-def valid_for(camera, view):
-    """None, or one sentence why rays cannot serve this camera at the Geometry `view`."""
-    lens = at_wavelength(camera, view.wavelength).main_lens
+def valid_for(camera, geometry):
+    """None, or one sentence why rays cannot serve this camera at this geometry."""
+    lens = at_wavelength(camera, geometry.wavelength).main_lens
     if lens.wavefront is not None or any(term.noll > 4 for term in lens.aberrations or ()):
         return (
             "wavefront errors beyond tilt and defocus bend the pupil's image, which "
             "rays here take as affine"
         )
     if (
-        view.lenslet_shape != "square"
-        and abs(_affine(lens, view)[0]) * view.z2 * view.D1 > FOCUSED * view.D2
+        geometry.lenslet_shape != "square"
+        and abs(_affine(lens, geometry)[0]) * geometry.z2 * geometry.D1 > FOCUSED * geometry.D2
     ):
         return (
-            f"out of focus the rays of a {view.lenslet_shape} lenslet fill no "
+            f"out of focus the rays of a {geometry.lenslet_shape} lenslet fill no "
             "rectangle of the pupil"
         )
     return None
 
 
-def size_band(view, grid, ring, accuracy, tolerance):
+def size_band(geometry, superpixels, ring, accuracy, tolerance):
     """The BandPlan of this rung: no quadrature, every lenslet under the blur of every superpixel
     kept (ring 0: its own only).
     """
-    window = None if ring == 0 else math.ceil(max(view.reach(grid))) + blur_ring(view) + 1
+    window = (
+        None if ring == 0 else math.ceil(max(geometry.reach(superpixels))) + blur_ring(geometry) + 1
+    )
     return BandPlan(
-        wavelength=view.wavelength,
+        wavelength=geometry.wavelength,
         window=window,
         lenslet_nodes=0,
         pixel_nodes=0,
@@ -78,7 +84,7 @@ def size_band(view, grid, ring, accuracy, tolerance):
     )
 
 
-def error_bound(camera, view):
+def error_bound(camera, geometry):
     """Estimated relative L2 error of the worst column against the Fresnel model.
 
     Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2
@@ -87,10 +93,13 @@ def error_bound(camera, view):
     both. Out of focus that border cuts every image. Fitted to 132 cases of N from 3 to 47, c from
     0.06 to 16, blur from 0 to 3 lenslets: within 2.5 of the measured error (docs/model.md).
     """
-    cells, fit = view.diffraction_cells, view.D2 * view.pixel_active / (view.wavelength * view.z3)
-    border = cells / (2 * max(view.object_shape))
+    cells, fit = (
+        geometry.diffraction_cells,
+        geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3),
+    )
+    border = cells / (2 * max(geometry.object_shape))
     focused = math.hypot(0.9 / (cells * (1 + fit)) ** 0.7, 2 / (1 + 5 * border) / (1 + fit / 4))
-    blurred = (1 + 2 / cells) / (1 + fit) if view.blur * cells > view.D2 else 0.0
+    blurred = (1 + 2 / cells) / (1 + fit) if geometry.blur * cells > geometry.D2 else 0.0
     return min(2.0, max(focused, blurred))
 
 
@@ -114,7 +123,7 @@ def features(
     slivers = 1 + law("rays").counts["blur_weight"] * geometry.blur / geometry.D2
     lit = {"pixels_focused": pixels} if geometry.blur == 0 else {"pixels_blurred": pixels / slivers}
     edges = columns * lenslets * sum(geometry.pixel_shape)
-    return Features({}, {"process": 1.0, "edges": edges, **lit}, ({"corners": 8.0 * SLAB},))
+    return Features({}, {"process": 1.0, "edges": edges, **lit}, ({"corners": 8.0 * WORK_CORNERS},))
 
 
 class RayLenslets(LensletFields):
@@ -154,7 +163,7 @@ class RayLenslets(LensletFields):
     def _energies(self, place, rows, columns, out):
         """Pixel energies in the superpixel at `place` (pitches), as PixelEnergies."""
         g = self.geometry
-        step = max(1, SLAB // (4 * g.pixel_shape[0] * g.pixel_shape[1]))
+        step = max(1, WORK_CORNERS // (4 * g.pixel_shape[0] * g.pixel_shape[1]))
         products = (
             [([place[0]], [place[1]])] if self.window is None else g.neighbourhood(self.window)
         )

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, aperture_picture, filter_cells, wavefront
 from plenocli.forward.camera.quadrature import cell_chords, gauss, nodes_for
@@ -60,34 +60,37 @@ def uniform_response(camera, wavelength, model, shifts=((0.0, 0.0),)):
     shifts (lenslet, 2): rows and columns in pixels from the superpixel's centre to the middle of
         its window. At `wavelength` (m); both lenses by their glass.
     """
-    view, lens = geometry(camera, wavelength), at_wavelength(camera, wavelength).main_lens
+    geometry, lens = geometry_of(camera, wavelength), at_wavelength(camera, wavelength).main_lens
     shifts = np.atleast_2d(np.asarray(shifts, float))
     cells = filter_cells(camera, wavelength)
     half = lens.aperture_diameter / 2
     cells = [((-half, half, -half, half), 1.0)] if cells is None else cells
-    separable = view.lenslet_shape == "square" and (
+    separable = geometry.lenslet_shape == "square" and (
         model == "fresnel" or lens.aperture_shape == "square"
     )
-    spot = _spot(view, model) if separable else None
-    strips = _strips(view, lens, cells) if separable else None
-    reach, scale = _reach(view, model), 1 / (aperture_area(lens) * view.row_spacing * view.D2**2)
+    spot = _spot(geometry, model) if separable else None
+    strips = _strips(geometry, lens, cells) if separable else None
+    reach, scale = (
+        _reach(geometry, model),
+        1 / (aperture_area(lens) * geometry.row_spacing * geometry.D2**2),
+    )
     # lenslets of one row are often shifted alike
     lines, which = zip(*(np.unique(shifts[:, axis], return_inverse=True) for axis in (0, 1)))
     edges = [
         [
-            view.pixels(axis)
-            + (shift + np.array([[-0.5], [0.5]]) * view.pixel_active / view.pixel_pitch)
-            * view.pixel_pitch
+            geometry.pixels(axis)
+            + (shift + np.array([[-0.5], [0.5]]) * geometry.pixel_active / geometry.pixel_pitch)
+            * geometry.pixel_pitch
             for shift in lines[axis]
         ]
         for axis in (0, 1)
     ]
     if separable:
-        out = _through_spot(view, spot, strips, edges, which, reach)
+        out = _through_spot(geometry, spot, strips, edges, which, reach)
     else:
         out = np.stack(
             [
-                _through_opening(view, lens, cells, (edges[0][i], edges[1][j]), reach)
+                _through_opening(geometry, lens, cells, (edges[0][i], edges[1][j]), reach)
                 for i, j in zip(*which)
             ]
         )
@@ -117,7 +120,7 @@ def own_light(camera, wavelength, count=256):
     share to about 1/count.
     """
     lens = at_wavelength(camera, wavelength).main_lens
-    view = geometry(camera, wavelength)
+    geometry = geometry_of(camera, wavelength)
     axis = ((np.arange(count) + 0.5) / count - 0.5) * lens.aperture_diameter
     y, x, step = axis[:, None], axis[None, :], lens.aperture_diameter / count / 2
     weight = aperture_picture(lens, y, x)
@@ -126,23 +129,27 @@ def own_light(camera, wavelength, count=256):
             t * ((y > y0) & (y < y1) & (x > x0) & (x < x1))
             for (y0, y1, x0, x1), t in filter_cells(camera, wavelength)
         )
-    down = view.eps * y + (wavefront(lens, y + step, x) - wavefront(lens, y - step, x)) / (2 * step)
-    across = view.eps * x + (wavefront(lens, y, x + step) - wavefront(lens, y, x - step)) / (
+    down = geometry.eps * y + (wavefront(lens, y + step, x) - wavefront(lens, y - step, x)) / (
         2 * step
     )
-    stay = np.clip(1 - view.z2 * np.abs(down) / (view.D2 * view.row_spacing), 0, None) * np.clip(
-        1 - view.z2 * np.abs(across) / view.D2, 0, None
+    across = geometry.eps * x + (wavefront(lens, y, x + step) - wavefront(lens, y, x - step)) / (
+        2 * step
     )
+    stay = np.clip(
+        1 - geometry.z2 * np.abs(down) / (geometry.D2 * geometry.row_spacing), 0, None
+    ) * np.clip(1 - geometry.z2 * np.abs(across) / geometry.D2, 0, None)
     return float((weight * stay).sum() / weight.sum())
 
 
-def _reach(view, model):
+def _reach(geometry, model):
     """Lenslets, in pitches, whose light may meet the window of a superpixel."""
-    image = view.z3 / view.z2 * view.D1 / 2 + abs(view.z3 * view.kappa) * max(view.lenslet_extent)
-    windows = max(n * view.pixel_pitch / 2 + view.pixel_pitch for n in view.pixel_shape)
-    far = math.ceil((image + windows) / (view.superpixel_pitch * view.row_spacing) - 1e-9) - (
-        model == "ray"
+    image = geometry.z3 / geometry.z2 * geometry.D1 / 2 + abs(geometry.z3 * geometry.kappa) * max(
+        geometry.lenslet_extent
     )
+    windows = max(n * geometry.pixel_pitch / 2 + geometry.pixel_pitch for n in geometry.pixel_shape)
+    far = math.ceil(
+        (image + windows) / (geometry.superpixel_pitch * geometry.row_spacing) - 1e-9
+    ) - (model == "ray")
     return far + (TAIL if model == "fresnel" else 0)
 
 
@@ -154,8 +161,8 @@ class RaySpot:
     (odd and even part), in closed form.
     """
 
-    def __init__(self, view):
-        self.half = abs(view.z3 * view.kappa) * view.lenslet_width / 2
+    def __init__(self, geometry):
+        self.half = abs(geometry.z3 * geometry.kappa) * geometry.lenslet_width / 2
 
     def first(self, s):
         """Light below s (m), less one half."""
@@ -175,17 +182,27 @@ class WaveSpot:
     band, v = lambda z3 f, which Gauss-Legendre gives to rounding; it is tabulated.
     """
 
-    def __init__(self, view, reach):
+    def __init__(self, geometry, reach):
         from scipy.interpolate import make_interp_spline
 
-        width, cell = view.lenslet_width, view.wavelength * view.z3 / view.lenslet_width
+        width, cell = (
+            geometry.lenslet_width,
+            geometry.wavelength * geometry.z3 / geometry.lenslet_width,
+        )
         count = math.ceil(reach / cell * SAMPLES) + 8
         s = np.arange(-8, count) * cell / SAMPLES
-        t, w = gauss(nodes_for(math.pi * s[-1] / cell + abs(view.k * view.kappa) * width**2 / 4))
+        t, w = gauss(
+            nodes_for(math.pi * s[-1] / cell + abs(geometry.k * geometry.kappa) * width**2 / 4)
+        )
         v = (t + 1) / 2 * width
-        f = v / (view.wavelength * view.z3)
+        f = v / (geometry.wavelength * geometry.z3)
         # both signs of f
-        otf = (1 - v / width) * np.sinc(view.kappa * v * (width - v) / view.wavelength) * w / cell
+        otf = (
+            (1 - v / width)
+            * np.sinc(geometry.kappa * v * (width - v) / geometry.wavelength)
+            * w
+            / cell
+        )
         even = np.empty(len(s))
         for start in range(0, len(s), 4096):
             part = slice(start, start + 4096)
@@ -205,18 +222,18 @@ class WaveSpot:
         return self._second(np.abs(s))
 
 
-def _spot(view, model):
+def _spot(geometry, model):
     if model == "ray":
-        return RaySpot(view)
+        return RaySpot(geometry)
     far = (
-        view.z3 / view.z2 * view.D1 / 2
-        + max(view.pixel_shape) * view.pixel_pitch / 2
-        + 2 * view.pixel_pitch
+        geometry.z3 / geometry.z2 * geometry.D1 / 2
+        + max(geometry.pixel_shape) * geometry.pixel_pitch / 2
+        + 2 * geometry.pixel_pitch
     )
-    return WaveSpot(view, far + (_reach(view, model) + 1) * view.superpixel_pitch)
+    return WaveSpot(geometry, far + (_reach(geometry, model) + 1) * geometry.superpixel_pitch)
 
 
-def _strips(view, lens, cells):
+def _strips(geometry, lens, cells):
     """The pupil as [(weight, top, bottom, left, right)], arrays of m: rectangles, or chords at
     nodes (bottom None, weight times m).
     """
@@ -229,7 +246,9 @@ def _strips(view, lens, cells):
         return strips
     # the light of a pixel has the spot's band limit across the pupil, w/(lambda z2) cycles a metre,
     # along y and through the chord's ends
-    slope = 2 * math.pi * view.lenslet_width / (view.wavelength * view.z2) * math.sqrt(2)
+    slope = (
+        2 * math.pi * geometry.lenslet_width / (geometry.wavelength * geometry.z2) * math.sqrt(2)
+    )
     discs = [(1.0, half)] + ([(-1.0, half * lens.obscuration)] if lens.obscuration else [])
     for sign, radius in discs:
         for cell, t in cells:
@@ -240,42 +259,42 @@ def _strips(view, lens, cells):
     return strips
 
 
-def _through_spot(view, spot, strips, edges, which, reach):
+def _through_spot(geometry, spot, strips, edges, which, reach):
     """Light (lenslet, pixel row, pixel column) of separable lenslets, times pupil
     area and cell area.
 
     edges: for both axes a list of pixel edges (2, pixel);
     which: for both axes the number of each lenslet in it.
     """
-    minify = view.z3 / view.z2
+    minify = geometry.z3 / geometry.z2
     out = np.zeros((len(which[0]), *(line[0].shape[1] for line in edges)))
-    for rows, columns in view.neighbourhood(reach):
+    for rows, columns in geometry.neighbourhood(reach):
         for weight, top, bottom, left, right in strips:
             if bottom is None:
                 down = [
-                    _summed(spot.first, t, rows * view.superpixel_pitch, minify * top)
+                    _summed(spot.first, t, rows * geometry.superpixel_pitch, minify * top)
                     for t in edges[0]
                 ]
             else:
                 down = [
                     (
-                        _summed(spot.second, t, rows * view.superpixel_pitch, minify * bottom)
-                        - _summed(spot.second, t, rows * view.superpixel_pitch, minify * top)
+                        _summed(spot.second, t, rows * geometry.superpixel_pitch, minify * bottom)
+                        - _summed(spot.second, t, rows * geometry.superpixel_pitch, minify * top)
                     )
                     / minify
                     for t in edges[0]
                 ]
             across = [
                 (
-                    _summed(spot.second, t, columns * view.superpixel_pitch, minify * right)
-                    - _summed(spot.second, t, columns * view.superpixel_pitch, minify * left)
+                    _summed(spot.second, t, columns * geometry.superpixel_pitch, minify * right)
+                    - _summed(spot.second, t, columns * geometry.superpixel_pitch, minify * left)
                 )
                 / minify
                 for t in edges[1]
             ]
             for n, (i, j) in enumerate(zip(*which)):
                 out[n] += (weight[:, None] * down[i]).T @ across[j]
-    return out * view.lenslet_width**2
+    return out * geometry.lenslet_width**2
 
 
 def _summed(integral, t, far, place):
@@ -286,18 +305,22 @@ def _summed(integral, t, far, place):
     return np.subtract(*integral(s[::-1])).sum(axis=1)
 
 
-def _through_opening(view, lens, cells, edges, reach):
+def _through_opening(geometry, lens, cells, edges, reach):
     """The same by rays for any pupil and lenslet: exact areas of the pupil, summed over nodes in
     the lenslet's opening.
     """
-    below, minify = pupil_measure(lens), view.z3 / view.z2
+    below, minify = pupil_measure(lens), geometry.z3 / geometry.z2
     total = 0.0
-    for uy, ux, weight in _opening_nodes(view):
-        for rows, columns in view.neighbourhood(reach):
+    for uy, ux, weight in _opening_nodes(geometry):
+        for rows, columns in geometry.neighbourhood(reach):
             for m in rows:
                 for n in columns:
                     y, x = (
-                        -(edges[axis] - far * view.superpixel_pitch - view.z3 * view.kappa * u)
+                        -(
+                            edges[axis]
+                            - far * geometry.superpixel_pitch
+                            - geometry.z3 * geometry.kappa * u
+                        )
                         / minify
                         for axis, far, u in ((0, m, uy), (1, n, ux))
                     )
@@ -318,34 +341,34 @@ def _through_opening(view, lens, cells, edges, reach):
     return total * aperture_area(lens)
 
 
-def _opening_nodes(view):
+def _opening_nodes(geometry):
     """Nodes (y, x, area) over a lenslet's opening, enough for a spot z3 kappa times
     as large on pixels.
     """
-    high, wide = view.lenslet_extent
-    spread = abs(view.z3 * view.kappa) * view.lenslet_width / view.pixel_pitch
+    high, wide = geometry.lenslet_extent
+    spread = abs(geometry.z3 * geometry.kappa) * geometry.lenslet_width / geometry.pixel_pitch
     if spread < 1e-6:
-        return [(0.0, 0.0, _opening_area(view))]
+        return [(0.0, 0.0, _opening_area(geometry))]
     t, w = gauss(min(64, math.ceil(OPENING_STEPS * spread) + 4))
     nodes = []
     for y, wy in zip(high * t, high * w):
-        far = _opening_half(view, y)
+        far = _opening_half(geometry, y)
         nodes += [(y, far * s, wy * far * ws) for s, ws in zip(t, w)]
     # few nodes place the light well enough, but do not sum to a round opening
-    scale = _opening_area(view) / sum(weight for *_, weight in nodes)
+    scale = _opening_area(geometry) / sum(weight for *_, weight in nodes)
     return [(y, x, weight * scale) for y, x, weight in nodes]
 
 
-def _opening_half(view, y):
+def _opening_half(geometry, y):
     """Half the width (m) of the opening at height y."""
-    half = view.lenslet_width / 2
-    if view.lenslet_shape == "square":
+    half = geometry.lenslet_width / 2
+    if geometry.lenslet_shape == "square":
         return half
-    if view.lenslet_shape == "circle":
+    if geometry.lenslet_shape == "circle":
         return math.sqrt(max(half * half - y * y, 0.0))
     return min(half, 2 * half - math.sqrt(3) * abs(y))
 
 
-def _opening_area(view):
+def _opening_area(geometry):
     side = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(3) / 2}
-    return side[view.lenslet_shape] * view.lenslet_width**2
+    return side[geometry.lenslet_shape] * geometry.lenslet_width**2

@@ -6,7 +6,6 @@ Chosen before any work (plenocli.forward.accuracy).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -15,8 +14,8 @@ import numpy as np
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.pupil import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
-from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
+from plenocli.forward.propagation.plan import BandPlan
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -47,107 +46,17 @@ RULES, MAX_RULE = 8, 20
 """Steps of quadrature.band_rule that are tried, and the most nodes for which they are."""
 MANY = 512
 """Distances between lenslets of which fringes are looked at, evenly spaced where there are more."""
-CUT = 0.3
+PSF_CUT_EFFECT = 0.3
 """Effect of the spread function's cut on a column, over the cut's root energy
 (measured, worst column).
 """
-NARROW = 2.0
+NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
 over the spread function's cut.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class BandPlan:
-    """Node counts of one wavelength.
-
-    `window`: see coherent_window;
-    `half`: half width (m) on which the spread function is needed;
-    `sampling`: estimated relative error of the worst column from these counts;
-    `pixel_rule`: which rule the pixels' nodes follow (quadrature.band_rule);
-    `beside`: nodes and rule on superpixels beside the object's own, where these are fewer.
-    """
-
-    wavelength: float
-    window: int | None
-    lenslet_nodes: int
-    pixel_nodes: int
-    psf_nodes: int
-    terms: int
-    half: float
-    sampling: float = 0.0
-    pixel_rule: int = 0
-    beside: tuple | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class PifPlan:
-    """The chosen computation (plenocli.forward.accuracy.dial.plan_pif makes it).
-
-    model: ray, fresnel or exact;
-    rung: its name;
-    superpixels: (rows, columns) odd numbers;
-    accuracy: as asked or found, by `asked_by`;
-    tolerance: root-energy cut of the spread function;
-    double: precision of the fields;
-    shape: of the matrix;
-    bytes: of the result;
-    memory: with the work;
-    estimated: relative error of the worst column;
-    split: that error by source;
-    model_error: of the model itself against the finest one, whether asked for by name or not;
-    dtype: of the stored matrix;
-    reasons, left_out, warnings: a sentence each;
-    candidates: the rungs considered;
-    pixel_shift: of an off-axis lenslet on the sensor's own raster
-        (plenocli.forward.camera.geometry.lenslet_shift), None where windows are centred;
-    band_nodes: wavelengths that stand for the camera's band of light, 0 for lines.
-    """
-
-    model: str
-    rung: str
-    superpixels: tuple
-    coherent_ring: int
-    accuracy: float
-    asked_by: str
-    tolerance: float
-    double: bool
-    bands: tuple
-    shape: tuple
-    bytes: int
-    memory: int
-    estimated: float
-    split: dict
-    model_error: float
-    dtype: str = "float32"
-    reasons: tuple = ()
-    left_out: tuple = ()
-    warnings: tuple = ()
-    candidates: tuple = ()
-    pixel_shift: tuple | None = None
-    band_nodes: int = 0
-
-    @property
-    def chosen(self):
-        """The candidate that is carried out."""
-        return next(c for c in self.candidates if c.why is None)
-
-    def accuracy_record(self) -> AccuracyRecord:
-        """What a result of this plan says of its accuracy."""
-        return AccuracyRecord(
-            asked=self.accuracy,
-            asked_by=self.asked_by,
-            estimated=self.estimated,
-            by_source=self.split,
-            model=self.model,
-            model_error=self.model_error,
-            rung=self.rung,
-            reasons=(*self.reasons, *self.warnings),
-            left_out=tuple(self.left_out),
-        )
-
-
-def window_error(view, grid, ring):
+def window_error(geometry, superpixels, ring):
     """Estimated relative error of a column because lenslets beyond the coherent window are left
     out; 0 if ring is 0 by choice.
 
@@ -157,78 +66,94 @@ def window_error(view, grid, ring):
     """
     if ring == 0:
         return 0.0
-    blur = blur_ring(view)
+    blur = blur_ring(geometry)
     # light spread over several lenslets has no sharp peak at a border, whose
     # interference reaches furthest
-    window = coherent_window(view, grid, ring) - blur + (blur > 0)
-    fringes = view.D2 * view.pixel_active / (view.wavelength * view.z3) * (window + 1)
-    scale = 0.075 if max(grid) == 1 else 0.12
+    window = coherent_window(geometry, superpixels, ring) - blur + (blur > 0)
+    fringes = (
+        geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3) * (window + 1)
+    )
+    scale = 0.075 if max(superpixels) == 1 else 0.12
     return min(
         1.0,
         scale
         * (window - 0.29) ** -2
-        * view.diffraction_cells**-1.09
+        * geometry.diffraction_cells**-1.09
         * (1 + 3.5 * fringes) ** -1.34,
     )
 
 
-def blur_ring(view):
+def blur_ring(geometry):
     """Lenslets that the geometric blur of a point at the lenslet's edge reaches beyond
     its own, per side.
     """
-    return math.ceil(view.blur / (2 * view.D2 * view.row_spacing) - 1e-9)
+    return math.ceil(geometry.blur / (2 * geometry.D2 * geometry.row_spacing) - 1e-9)
 
 
-def predicted_outside(view, ring):
+def predicted_outside(geometry, ring):
     """Share of a corner point's light that falls outside a window of (2 ring + 1)^2 lenslets, from
     the asymptotic tail of an in-focus spread function beyond the geometric blur: 2/(pi v), v =
     pi r D1/(lambda z2).
     """
-    distance = ring * view.D2 - view.blur / 2
+    distance = ring * geometry.D2 - geometry.blur / 2
     if distance <= 0:
         return 1.0
-    return min(1.0, 2 * view.wavelength * view.z2 / (math.pi**2 * distance * view.D1))
+    return min(1.0, 2 * geometry.wavelength * geometry.z2 / (math.pi**2 * distance * geometry.D1))
 
 
-def coherent_window(view, grid, ring):
+def coherent_window(geometry, superpixels, ring):
     """Lenslets |m| <= window (from the object's own) whose fields add, or None for isolated
     lenslets (ring 0).
 
     All of them act on every superpixel kept: an image point on a border between lenslets would else
     lose the interference of its two halves, which cancels their edge diffraction far out.
     """
-    return None if ring == 0 else max(math.ceil(max(view.reach(grid))), blur_ring(view)) + ring
+    return (
+        None
+        if ring == 0
+        else max(math.ceil(max(geometry.reach(superpixels))), blur_ring(geometry)) + ring
+    )
 
 
-def size_band(view, grid, ring, accuracy, tolerance, dim=False):
+def size_band(geometry, superpixels, ring, accuracy, tolerance, dim=False):
     """Node counts at one wavelength; the phase across a lenslet counts the far edge of the
     outermost superpixel it lights.
 
     dim: whether superpixels beside the object's own may have fewer nodes, where so little light
         falls on them that it does not tell.
     """
-    half_width, window = max(view.lenslet_extent), coherent_window(view, grid, ring)
-    lit = max(view.reach(grid, window))
-    far = 0 if window is None else max(view.reach(grid)) + lit
-    raster = 0 if view.pixel_shift is None else 1
-    reach = (max(view.pixel_shape) + raster) * view.pixel_pitch / 2 + far * view.superpixel_pitch
+    half_width, window = max(geometry.lenslet_extent), coherent_window(geometry, superpixels, ring)
+    lit = max(geometry.reach(superpixels, window))
+    far = 0 if window is None else max(geometry.reach(superpixels)) + lit
+    raster = 0 if geometry.pixel_shift is None else 1
+    reach = (
+        max(geometry.pixel_shape) + raster
+    ) * geometry.pixel_pitch / 2 + far * geometry.superpixel_pitch
     slope = (
         half_width
-        * view.k
-        * (reach / view.z3 + view.D1 / 2 / view.z2 + abs(view.kappa) * half_width)
+        * geometry.k
+        * (reach / geometry.z3 + geometry.D1 / 2 / geometry.z2 + abs(geometry.kappa) * half_width)
     )
-    active = view.pixel_active / (view.wavelength * view.z3)
-    own, joint = 2 * half_width * active, (1 if window is None else 2 * lit + 1) * view.D2 * active
-    half = view.field_half(grid, window)
-    count = psf_nodes(view, half)
-    terms = expected_terms(view.k * view.D1 / 2 * half / view.z2, tolerance)
+    active = geometry.pixel_active / (geometry.wavelength * geometry.z3)
+    own, joint = (
+        2 * half_width * active,
+        (1 if window is None else 2 * lit + 1) * geometry.D2 * active,
+    )
+    half = geometry.field_half(superpixels, window)
+    count = psf_nodes(geometry, half)
+    terms = expected_terms(geometry.k * geometry.D1 / 2 * half / geometry.z2, tolerance)
     # a point between lenslets that do not touch is dim, and what is missed weighs
     # more in its column
-    faint = 1 + min(20.0, 80 * (1 - view.lenslet_width / view.D2))
-    light = own, joint, view.diffraction_cells, view.blur / view.D2
+    faint = 1 + min(20.0, 80 * (1 - geometry.lenslet_width / geometry.D2))
+    light = own, joint, geometry.diffraction_cells, geometry.blur / geometry.D2
     nodes, rule = pixel_nodes(accuracy / faint, *light)
-    errors, beside = [CUT * tolerance, faint * pixel_error(nodes, rule, *light)], None
-    if dim and window is not None and view.blur == 0 and view.diffraction_cells > BESIDE_CELLS:
+    errors, beside = [PSF_CUT_EFFECT * tolerance, faint * pixel_error(nodes, rule, *light)], None
+    if (
+        dim
+        and window is not None
+        and geometry.blur == 0
+        and geometry.diffraction_cells > BESIDE_CELLS
+    ):
         fewer = pixel_nodes(accuracy / faint, *light, BESIDE)
         if fewer[0] < nodes:  # a point at a corner lights two of them
             beside, errors = (
@@ -236,7 +161,7 @@ def size_band(view, grid, ring, accuracy, tolerance, dim=False):
                 [*errors, math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE)],
             )
     return BandPlan(
-        wavelength=view.wavelength,
+        wavelength=geometry.wavelength,
         window=window,
         lenslet_nodes=nodes_for(slope),
         pixel_nodes=nodes,
@@ -286,26 +211,26 @@ def field_features(camera: Camera, geometry: Geometry, band: BandPlan) -> dict[s
     return {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
 
 
-def grid_of(count):
+def superpixels_of(count):
     """(rows, columns) of so many superpixels: a square block, else one row."""
     side = math.isqrt(count)
     return (side, side) if side * side == count else (1, count)
 
 
-def distinct(camera, view, shape):
+def distinct(camera, geometry, shape):
     """What symmetry leaves to compute of a matrix of `shape` (band, superpixel, pixel, point):
     (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
     """
-    grid, (rows, columns) = grid_of(shape[1]), view.object_shape
+    superpixels, (rows, columns) = superpixels_of(shape[1]), geometry.object_shape
     if shape[3] < rows * columns or not is_symmetric(camera):
         return shape[3], shape[1] * shape[3]
-    flip_rows, flip_columns, turn = view.mirrors(grid)
+    flip_rows, flip_columns, turn = geometry.mirrors(superpixels)
     turn = (
         turn
         and flip_rows == flip_columns
         and rows == columns
-        and view.pixel_shape[0] == view.pixel_shape[1]
-        and grid[0] == grid[1]
+        and geometry.pixel_shape[0] == geometry.pixel_shape[1]
+        and superpixels[0] == superpixels[1]
     )
 
     def lines(flip, points, superpixels):
@@ -314,8 +239,8 @@ def distinct(camera, view, shape):
         return own + (superpixels // 2 if flip else superpixels - 1) * points, own
 
     (down, own_down), (across, own_across) = (
-        lines(flip_rows, rows, grid[0]),
-        lines(flip_columns, columns, grid[1]),
+        lines(flip_rows, rows, superpixels[0]),
+        lines(flip_columns, columns, superpixels[1]),
     )
     if turn:
         return own_down * (own_down + 1) // 2, down * (down + 1) // 2

@@ -31,7 +31,7 @@ from plenocli.forward.propagation.symmetry import (
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.lenslet_fields import FieldNotes
-    from plenocli.forward.propagation.sampling import PifPlan
+    from plenocli.forward.propagation.plan import PifPlan
 
 BLOCK_BYTES = 1 << 28
 """Size of a block of columns while a matrix is filled."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
     from plenocli.forward.propagation.diagnosis import Diagnosis
-    from plenocli.forward.propagation.sampling import PifPlan
+    from plenocli.forward.propagation.plan import PifPlan
     from plenocli.forward.propagation.system_matrix import LensletWindow, SystemMatrix
 
 

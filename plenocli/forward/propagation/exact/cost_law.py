@@ -22,7 +22,7 @@ from plenocli.forward.propagation.exact.term_counts import (
     term_law,
 )
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
-from plenocli.forward.propagation.sampling import distinct, grid_of, is_symmetric
+from plenocli.forward.propagation.sampling import distinct, is_symmetric, superpixels_of
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -110,7 +110,7 @@ def features(
     """
     n = numbers or term_law()
     even, item = is_symmetric(camera), 16 if double else 8
-    sizes = _sizes(camera, geometry, band, grid_of(shape[1]), n)
+    sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), n)
     written, columns = math.prod(shape[1:]), distinct(camera, geometry, shape)[1]
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
     mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
@@ -159,7 +159,7 @@ def expected_counts(
     numbers: TermLaw | None = None,
 ) -> tuple[float, float]:
     """Most terms, and most pairs of terms that they are compressed from, of any superpixel."""
-    sizes = _sizes(camera, geometry, band, grid_of(shape[1]), numbers or term_law())
+    sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), numbers or term_law())
     aside = [kind.aside for kind in sizes.kinds]
     return max(sizes.ranks[n] for n in aside), max(sizes.products[n] for n in aside)
 

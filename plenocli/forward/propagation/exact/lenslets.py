@@ -62,7 +62,7 @@ GAPS = 3.0
 """By how much finer fields are cut where lenslets leave gaps."""
 
 
-def exact_band(view, grid, ring, accuracy, tolerance):
+def exact_band(geometry, superpixels, ring, accuracy, tolerance):
     """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and
     accuracy as in size_band.
 
@@ -71,21 +71,21 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of
     # what was asked from 3e-3 to 5e-2, on 3 cameras
     finer = 1 + SIDES * min(1.0, max(0.0, math.log10(accuracy / 1e-3))) if ring else 1.0
-    base = size_band(view, grid, ring, accuracy / finer, tolerance)
+    base = size_band(geometry, superpixels, ring, accuracy / finer, tolerance)
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse
     # cuts hurt corners more
-    share = min(1.0, 4 / math.pi * (view.D2 / max(view.blur, view.D2)) ** 2)
+    share = min(1.0, 4 / math.pi * (geometry.D2 / max(geometry.blur, geometry.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
     # points beside a lenslet: edges are all that their columns have
-    if view.lenslet_width < 0.999 * view.D2:
+    if geometry.lenslet_width < 0.999 * geometry.D2:
         cut /= GAPS
-    count = prolate_count(_bandwidth(view, grid), cut / 100)
+    count = prolate_count(_bandwidth(geometry, superpixels), cut / 100)
     count = (
         count
-        if base.window is None and count < 0.8 * base.pixel_nodes * min(view.pixel_shape)
+        if base.window is None and count < 0.8 * base.pixel_nodes * min(geometry.pixel_shape)
         else 0
     )
-    require_sketch(field_terms(view, base.terms, cut, True))
+    require_sketch(field_terms(geometry, base.terms, cut, True))
     return ExactBand(
         **vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)},
         cut=cut,
@@ -93,27 +93,27 @@ def exact_band(view, grid, ring, accuracy, tolerance):
     )
 
 
-def _extent(view, pixels):
+def _extent(geometry, pixels):
     """Half width (m) of a superpixel of so many pixels, wherever the raster puts it."""
-    return (pixels + (view.pixel_shift is not None)) * view.pixel_pitch / 2
+    return (pixels + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2
 
 
-def _bandwidth(view, grid):
+def _bandwidth(geometry, superpixels):
     """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that
     of its middle's path taken out, among `grid` superpixels: steeper rays come from no point of the
     lenslet. Up to 5 % are added for slopes that change on the way: without them, prolate functions
     fall short of waves that reach the band's end.
     """
     reach, aside = (
-        _extent(view, max(view.pixel_shape)),
-        (max(grid) - 1) / 2 * (view.superpixel_pitch - view.D2),
+        _extent(geometry, max(geometry.pixel_shape)),
+        (max(superpixels) - 1) / 2 * (geometry.superpixel_pitch - geometry.D2),
     )
-    source = view.lenslet_width / 2 + aside
-    bent = 1.5 * ((source + reach) / (2 * view.z3)) ** 2
-    return view.k * source * reach / view.z3 * (1 + min(0.05, bent))
+    source = geometry.lenslet_width / 2 + aside
+    bent = 1.5 * ((source + reach) / (2 * geometry.z3)) ** 2
+    return geometry.k * source * reach / geometry.z3 * (1 + min(0.05, bent))
 
 
-def valid_for(camera, view):
+def valid_for(camera, geometry):
     """None, or one sentence why this rung cannot serve `camera` at the Geometry `view`."""
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
@@ -121,7 +121,7 @@ def valid_for(camera, view):
             "exact propagation is built for square lenslets on a square lattice, not for "
             f"{array.aperture_shape} ones on a {array.lattice} lattice"
         )
-    if view.z3 < 10 * view.wavelength:
+    if geometry.z3 < 10 * geometry.wavelength:
         return (
             "the sensor lies within ten wavelengths of the lenslets, where "
             "evanescent waves reach it"
@@ -129,7 +129,7 @@ def valid_for(camera, view):
     return None
 
 
-def fresnel_model_error(view, parabolic):
+def fresnel_model_error(geometry, parabolic):
     """Estimated relative L2 error of the worst column of the paraxial model against the exact one.
 
     Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P =
@@ -143,15 +143,17 @@ def fresnel_model_error(view, parabolic):
     times the error found (docs/model.md, "Exact propagation").
     """
     # where a lenslet has few cells, diffraction spreads light further than the pupil does
-    spread = view.wavelength / (2 * view.D2)
+    spread = geometry.wavelength / (2 * geometry.D2)
     pupil, lenslet = (
-        math.hypot(view.D1 / (2 * view.z2), spread),
-        math.hypot(view.D2 / (2 * view.f2), spread),
+        math.hypot(geometry.D1 / (2 * geometry.z2), spread),
+        math.hypot(geometry.D2 / (2 * geometry.f2), spread),
     )
     moved = 1.5 * lenslet * (pupil + lenslet) + (lenslet**3 / (2 * pupil) if parabolic else 0.0)
-    across = 2 * view.z3 * pupil / view.pixel_pitch
-    dim = 1 + 5 * (1 - view.lenslet_width / view.D2)
-    return min(1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, view.diffraction_cells))) * dim)
+    across = 2 * geometry.z3 * pupil / geometry.pixel_pitch
+    dim = 1 + 5 * (1 - geometry.lenslet_width / geometry.D2)
+    return min(
+        1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, geometry.diffraction_cells))) * dim
+    )
 
 
 class ExactSquareLenslets(LensletFields):

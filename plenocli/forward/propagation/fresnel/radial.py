@@ -21,7 +21,7 @@ from plenocli.forward.camera.pupil import (
 )
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 
-SLAB = 1 << 13
+SERIES_POINTS = 1 << 13
 """Points that go through the series together: three such arrays stay in the cache."""
 
 
@@ -107,8 +107,8 @@ def radial_field(camera, geometry, dy, dx, profile=profile):
 def _chebyshev(series, t):
     """sum_n series[n] T_n(t) for a flat array t, by Clenshaw's recurrence slab by slab."""
     out = np.empty_like(t)
-    for start in range(0, len(t), SLAB):
-        part = t[start : start + SLAB]
+    for start in range(0, len(t), SERIES_POINTS):
+        part = t[start : start + SERIES_POINTS]
         twice = 2 * part
         one, two, work = np.zeros_like(part), np.zeros_like(part), np.empty_like(part)
         for coefficient in series[:0:-1].tolist():
@@ -116,5 +116,5 @@ def _chebyshev(series, t):
             np.subtract(work, two, out=two)
             two += coefficient
             one, two = two, one
-        out[start : start + SLAB] = part * one - two + series[0]
+        out[start : start + SERIES_POINTS] = part * one - two + series[0]
     return out

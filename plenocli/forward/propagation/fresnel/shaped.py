@@ -25,13 +25,18 @@ from plenocli.forward.propagation.fresnel.array_to_sensor import (
 )
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
 from plenocli.forward.propagation.lenslet_fields import FieldNotes, LensletFields
-from plenocli.forward.propagation.sampling import BandPlan, distinct, field_features, grid_of
+from plenocli.forward.propagation.plan import BandPlan
+from plenocli.forward.propagation.sampling import (
+    distinct,
+    field_features,
+    superpixels_of,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
-SLAB = 1 << 20
+WORK_VALUES = 1 << 20
 """Complex numbers in the work arrays of a few points: about what the last-level cache holds."""
 KEPT_BYTES = 1 << 26
 """Values of terms along chords that are kept for the guard, which needs them a second time; as
@@ -247,7 +252,7 @@ class ShapedLenslets(LensletFields):
                 )
                 for index, n in sites
             ]
-            step = max(1, SLAB // max(a.size for _, a, _ in kernels))
+            step = max(1, WORK_VALUES // max(a.size for _, a, _ in kernels))
             for group in groups:
                 spread = [
                     self._spread(product, kernel, chord[group[0]])
@@ -425,7 +430,7 @@ def _slope(camera, geometry, grid, window):
     return g.k * (reach / g.z3 + rim / g.z2 + abs(g.kappa) * corner)
 
 
-def valid_for(camera, view):
+def valid_for(camera, geometry):
     """None: every lenslet shape and lattice of a camera description, and every pupil, can
     be cut into chords.
     """
@@ -486,7 +491,7 @@ def features(
     """What a matrix consists of, as `cost`: counted from the node rules, without the points that
     symmetry gives.
     """
-    grid, superpixels, item = grid_of(shape[1]), shape[1], 16 if double else 8
+    grid, superpixels, item = superpixels_of(shape[1]), shape[1], 16 if double else 8
     axis, count, on_scan, on_chords = _chord_counts(
         geometry.lenslet_shape,
         geometry.lenslet_width,

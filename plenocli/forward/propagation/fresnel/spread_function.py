@@ -28,7 +28,7 @@ answer the question.
 """
 EDGE = 2.0
 """Extra weight of points at a lenslet's edge in what is left out."""
-SLAB = 1 << 11
+BASIS_POINTS = 1 << 11
 """Positions at which the series are summed together: the basis of a slab stays in the cache."""
 
 
@@ -64,8 +64,8 @@ class SeparableField:
         coefficients = np.ascontiguousarray(self.columns if axis else self.rows)
         t, parts = d.ravel() / self.half, coefficients.view(float)
         out = np.empty((len(t), parts.shape[1]))
-        for start in range(0, len(t), SLAB):
-            part = slice(start, start + SLAB)
+        for start in range(0, len(t), BASIS_POINTS):
+            part = slice(start, start + BASIS_POINTS)
             np.matmul(
                 legendre(t[part], len(coefficients), 2 if self.even else 1), parts, out=out[part]
             )

@@ -24,9 +24,9 @@ from plenocli.forward.propagation.lenslet_fields import (
     LensletFields,
     PixelEnergies,
 )
-from plenocli.forward.propagation.sampling import NARROW
+from plenocli.forward.propagation.sampling import NARROWING_LOSS
 
-SLAB = 1 << 21
+TERM_VALUES = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
 
 
@@ -116,14 +116,14 @@ class SquareLenslets(LensletFields):
 
     def _least_term(self):
         """The terms up to which size (root energy of a mean point, points at the lenslet's edge
-        weighing more) all superpixels together lose NARROW self._cut without.
+        weighing more) all superpixels together lose NARROWING_LOSS self._cut without.
         """
         sizes = []
         for place in np.ndindex(*self.superpixels):
             left, right, _ = self._roots_of(*place)
             sizes.append(np.linalg.svd(left @ right.T, compute_uv=False))
         sizes = np.sort(np.concatenate(sizes))
-        lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROW * self._cut) ** 2))
+        lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROWING_LOSS * self._cut) ** 2))
         return sizes[lost - 1] if lost else 0.0
 
     def _roots_of(self, sy, sx):
@@ -229,7 +229,7 @@ class SquareLenslets(LensletFields):
                 )
         where = (self._x + np.array(lenslets)[:, None] * g.D2).ravel()
         weight = np.tile(self._w, len(lenslets))[:, None].astype(self._real)
-        step = max(1, SLAB // (len(where) * terms))
+        step = max(1, TERM_VALUES // (len(where) * terms))
         for start in range(0, half, step):
             block = field.evaluate(
                 where - points[start : min(start + step, half), None], axis

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.square import narrows
+from plenocli.forward.propagation.plan import BandPlan
 from plenocli.forward.propagation.sampling import (
-    BandPlan,
     distinct,
     field_features,
-    grid_of,
     is_symmetric,
+    superpixels_of,
 )
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def features(
     """What a matrix consists of, as `cost`: the tables that SquareLenslets fills and the products
     of its columns.
     """
-    grid = grid_of(shape[1])
+    grid = superpixels_of(shape[1])
     terms, even = 1 if _is_separable(camera) else band.terms, is_symmetric(camera)
     real, item = even and geometry.blur == 0, 16 if double else 8
     axes = 1 if real else 2

@@ -219,12 +219,17 @@ def fitted_counts(law: Law, cases: Mapping[Case, Measured], prior: float) -> dic
     def missed(logs: np.ndarray) -> np.ndarray:
         numbers = dict(law.counts) | dict(zip(names, start * np.exp(logs)))
         found = [math.sqrt(prior) * logs]
-        for case, took in cases.items():
+        for case, took in counting(cases).items():
             found.append(np.log(np.divide(expected(case, numbers), (took.terms, took.products))))
         return np.concatenate(found)
 
     logs = least_squares(missed, np.zeros(len(names)), loss="soft_l1", f_scale=0.2).x
     return dict(law.counts) | dict(zip(names, map(_rounded, start * np.exp(logs))))
+
+
+def counting(cases: Mapping[Case, Measured]) -> dict[Case, Measured]:
+    """Cases without filters in the pupil, whose cells have fewer terms than the laws expect."""
+    return {c: t for c, t in cases.items() if camera_named(c.camera).filter_array is None}
 
 
 HELD = {"coarsest_cut", "separable_pupil", "lenslets_coarse", "lenslets_a_decade", "nodes_beside"}
@@ -332,8 +337,8 @@ def residuals(model: str, law: Law, cases: Mapping[Case, Measured]) -> Residuals
         times.append((cost.operations / took.rate + cost.seconds) / took.seconds)
         if max(took.bytes, cost.bytes) > LEAST_BYTES:
             memory.append(cost.bytes / max(took.bytes, LEAST_BYTES))
-        if model == EXACT:
-            counts += list(np.divide(expected(case, law.counts), (took.terms, took.products)))
+    for case, took in counting(cases).items() if model == EXACT else ():
+        counts += list(np.divide(expected(case, law.counts), (took.terms, took.products)))
     return Residuals(times=np.array(times), memory=np.array(memory), counts=np.array(counts))
 
 

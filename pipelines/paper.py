@@ -15,7 +15,7 @@ from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.artefacts.shards import read_pif
 from plenocli.files.atomic import publish
 from plenocli.files.config.camera_file import parse_camera
-from plenocli.files.images.mosaic import read_mosaic
+from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.results import block_of, read_result, read_truth
 from plenocli.report import figures, pictures, spectral_pictures
 from plenocli.report.drawing import drawing, show_picture
@@ -87,7 +87,7 @@ def _columns(run):
 
 def _prototype(run):
     config = parse_camera(read_artefact(run / "measured.h5").provenance.config or _config(run))
-    chart = read_mosaic(run / "raw" / "chart-long.dng")
+    chart = read_capture(run / "raw" / "chart-long.dng")
     centres = read_artefact(run / "measured.h5").data["grid/centre"]
     return [
         (
@@ -108,7 +108,7 @@ def _bands(run):
         figure
         for nm in (540, 650)
         for figure in figures.capture_figures(
-            read_mosaic(run / "raw" / f"band-{nm}nm.dng"), f"band-{nm}nm.dng", centres
+            read_capture(run / "raw" / f"band-{nm}nm.dng"), f"band-{nm}nm.dng", centres
         )
     ]
 

@@ -59,7 +59,7 @@ def kit(tmp_path_factory):
     from PIL import Image
     from skimage import data
 
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
     from tests.reference.chart import paint_folder
 
     folder = tmp_path_factory.mktemp("kit")
@@ -118,7 +118,7 @@ def kit(tmp_path_factory):
         )
         made.rename(made.with_suffix(".nef"))
     shutil.copy(folder / "captures" / "a.nef", folder / "capture.nef")
-    Image.fromarray(read_mosaic(folder / "capture.nef").values.astype(np.uint16)).save(
+    Image.fromarray(read_capture(folder / "capture.nef").mosaic.astype(np.uint16)).save(
         folder / "lightfield.png"
     )
 

@@ -168,13 +168,13 @@ def superpixel(camera, target):
     from plenocli.stages.forward.capture_sim import Settings, _carry, _source
 
     settings = Settings(target=target, superpixels=(3, 3), model="fresnel", accuracy=1e-3)
-    (letters, _), whites, _ = _carry(camera, *_source(camera, settings, None), settings, None)
+    light = _carry(camera, *_source(camera, settings, None), settings, None)
     shape = camera.sensor.pixels_per_lenslet
     where = cfa_map(shape, camera.sensor.cfa)
-    planes = [plane.reshape(shape) for plane in whites]
+    planes = [plane.reshape(shape) for plane in light.white]
     moved = [np.maximum(shift(plane, SHIFT, order=5), 0) for plane in planes]
     return tuple(
-        sum(np.where(where == letter, plane, 0.0) for letter, plane in zip(letters, part))
+        sum(np.where(where == letter, plane, 0.0) for letter, plane in zip(light.colours, part))
         for part in (planes, moved)
     )
 
@@ -216,7 +216,7 @@ def measure(run, kind, rounds):
     import rawpy
 
     from plenocli.files.artefacts.provenance import describe_inputs
-    from plenocli.files.read.mosaics import read_exposure
+    from plenocli.files.images.mosaic import read_capture
     from plenocli.stages.inverse.demux import Demultiplexer, Settings
 
     clock, shot = Clock(), run / "shot.dng"
@@ -226,13 +226,13 @@ def measure(run, kind, rounds):
             return raw.raw_image_visible.copy()
 
     worker = clock.time("prepare", lambda: Demultiplexer(run / f"{kind}.h5", Settings(), True, ""))
-    exposure = read_exposure(shot, cfa=worker.responses.cfa)
+    exposure = read_capture(shot, cfa=worker.responses.cfa)
     # and what it leaves for the others
     clock.time("first", lambda: worker.estimate(exposure, shot))
     plain = replace(worker, "register", "off")
     for _ in range(rounds):
         clock.time("decode", decode)
-        exposure = clock.time("read", lambda: read_exposure(shot, cfa=worker.responses.cfa))
+        exposure = clock.time("read", lambda: read_capture(shot, cfa=worker.responses.cfa))
         found = clock.time("demux", lambda: worker.estimate(exposure, shot))
         clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
         clock.time(
@@ -241,7 +241,7 @@ def measure(run, kind, rounds):
                 (found, describe_inputs({"capture": shot})), shot, run / "shot.exr"
             ),
         )
-    elsewhere = read_exposure(run / "moved.dng", cfa=worker.responses.cfa)
+    elsewhere = read_capture(run / "moved.dng", cfa=worker.responses.cfa)
     for _ in range(2):
         away = clock.time("demux, moved", lambda: worker.estimate(elsewhere, run / "moved.dng"))
     parts = clock.medians()

@@ -5,27 +5,27 @@ page and for `show`.
 import numpy as np
 
 
-def capture_figures(mosaic, name, centres=None):
+def capture_figures(capture, name, centres=None):
     """A capture with its lenslet grid.
 
-    mosaic: what read_mosaic gives;
+    capture: plenocli.forward.sensor.capture.Capture;
     centres (R, C, 2) px, else the superpixels it tells of.
     """
     from plenocli.report.pictures import capture_picture
 
-    shape = mosaic.meta.get("superpixel_shape")
+    shape = capture.grid.shape if capture.grid else None
     pitch = (
         tuple(float(n) for n in np.ravel(shape)) if centres is None and shape is not None else None
     )
     words = [
         name,
-        mosaic.meta.get("target"),
-        None if mosaic.cfa == "mono" else f"colour filter array {mosaic.cfa}",
-        None if not mosaic.exposure_s else f"exposure {mosaic.exposure_s * 1e3:g} ms",
-        None if not mosaic.band_m else f"{mosaic.band_m * 1e9:g} nm light",
+        capture.metadata.target,
+        None if capture.cfa == "mono" else f"colour filter array {capture.cfa}",
+        None if not capture.exposure_s else f"exposure {capture.exposure_s * 1e3:g} ms",
+        None if not capture.metadata.band_m else f"{capture.metadata.band_m * 1e9:g} nm light",
     ]
     picture = capture_picture(
-        mosaic.values, mosaic.units, centres, pitch, float(np.mean(mosaic.black))
+        capture.mosaic, capture.units, centres, pitch, float(np.mean(capture.levels.black))
     )
     return [(picture, ", ".join(str(w) for w in words if w) + ".")]
 

@@ -525,13 +525,13 @@ def _artefacts(folder):
         "pif.h5",
         lambda a: a.data.update({"pif/object_shape": np.array([4, 16], np.int32)}),
     )
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
     for name in ("white", "dark", "450nm"):
         picture(
-            folder / f"{name}.tif", read_mosaic(folder / f"{name}.dng").values.astype(np.uint16)
+            folder / f"{name}.tif", read_capture(folder / f"{name}.dng").mosaic.astype(np.uint16)
         )
-    white = read_mosaic(folder / "white.dng").values.astype(np.uint16)
+    white = read_capture(folder / "white.dng").mosaic.astype(np.uint16)
     y, x = np.mgrid[:120, :140]
     lit = (np.indices(white.shape) % 2).any(axis=0)
     flicker = np.kron(np.random.default_rng(8).uniform(0.6, 1, (6, 7)), np.ones((20, 20)))

@@ -6,10 +6,12 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.images.exr import write_exr
-from plenocli.files.images.mosaic import read_mosaic, write_capture_exr
+from plenocli.files.images.mosaic import read_capture, write_capture
 from plenocli.files.images.pictures import read_picture, srgb_to_linear
+from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels
+from plenocli.forward.sensor.noise import Noise
 
 
 def save(path, values, **attributes):
@@ -33,9 +35,9 @@ def numbers(shape, dtype, seed=0):
 @pytest.mark.parametrize("dtype,white", [(np.uint8, 255), (np.uint16, 65535)])
 def test_mosaic_of_an_image_is_untouched(tmp_path, suffix, dtype, white):
     values = numbers((9, 13), dtype)
-    back = read_mosaic(save(tmp_path / f"x{suffix}", values), cfa="GBRG")
-    np.testing.assert_array_equal(back.values, values)
-    assert back.values.dtype == dtype and (back.cfa, back.white, back.source) == (
+    back = read_capture(save(tmp_path / f"x{suffix}", values), cfa="GBRG")
+    np.testing.assert_array_equal(back.mosaic, values)
+    assert back.mosaic.dtype == dtype and (back.cfa, back.levels.white, back.metadata.source) == (
         "GBRG",
         white,
         "image",
@@ -46,61 +48,57 @@ def test_twelve_bit_tiff_is_not_scaled(tmp_path):
     values = numbers((8, 8), np.uint16) >> 4
     full = (values << 4) | (values >> 8)
     path = save(tmp_path / "x.tif", full, oiio__BitsPerSample=12)
-    back = read_mosaic(path)
-    np.testing.assert_array_equal(back.values, values)
-    assert back.white == 4095
+    back = read_capture(path)
+    np.testing.assert_array_equal(back.mosaic, values)
+    assert back.levels.white == 4095
 
 
 def test_colour_pictures_are_no_mosaics_unless_their_channels_agree(tmp_path):
     grey = numbers((6, 7), np.uint8)
-    same = read_mosaic(save(tmp_path / "same.png", np.repeat(grey[..., None], 3, axis=2)))
-    np.testing.assert_array_equal(same.values, grey)
-    assert "identical" in same.meta["note"]
+    same = read_capture(save(tmp_path / "same.png", np.repeat(grey[..., None], 3, axis=2)))
+    np.testing.assert_array_equal(same.mosaic, grey)
+    assert "identical" in same.metadata.details["note"]
     colour = save(tmp_path / "colour.png", numbers((6, 7, 3), np.uint8))
     with pytest.raises(InputError, match="3 different channels"):
-        read_mosaic(colour)
+        read_capture(colour)
     jpeg = save(tmp_path / "x.jpg", numbers((16, 16, 3), np.uint8))
     with pytest.raises(InputError, match="JPEG"):
-        read_mosaic(jpeg)
+        read_capture(jpeg)
 
 
 def test_capture_as_artefact_and_as_exr_says_the_same(tmp_path):
     values = numbers((6, 8), np.uint16)
-    attrs = {
-        "black": 64.0,
-        "white": 4095.0,
-        "gain_e_per_dn": 2.0,
-        "exposure_s": 0.01,
-        "units": "DN",
-        "band_m": 450e-9,
-        "noise_sigma": 0.5,
-    }
-    write_artefact(
-        tmp_path / "c.h5",
-        Artefact("capture", {"capture/mosaic": values, "capture/cfa": "RGGB"}, {"capture": attrs}),
+    capture = Capture(
+        mosaic=values,
+        cfa="RGGB",
+        levels=Levels(black=np.full((2, 2), 64.0), white=4095.0, gain=0.5),
+        exposure_s=0.01,
+        noise=Noise.of_sigma(0.5),
+        metadata=CaptureMetadata(band_m=450e-9),
     )
-    write_capture_exr(tmp_path / "c.exr", values, attrs | {"cfa": "RGGB"}, attrs={"other": "text"})
+    for suffix in ("h5", "exr"):
+        write_capture(tmp_path / f"c.{suffix}", capture, Provenance(command="by hand"))
     for path, source in ((tmp_path / "c.h5", "capture"), (tmp_path / "c.exr", "exr")):
-        back = read_mosaic(path)
-        np.testing.assert_array_equal(back.values, values)
+        back = read_capture(path)
+        np.testing.assert_array_equal(back.mosaic, values)
         assert (
             back.cfa,
-            back.white,
-            back.gain,
+            back.levels.white,
+            back.levels.gain,
             back.exposure_s,
             back.units,
-            back.band_m,
-            back.source,
+            back.metadata.band_m,
+            back.metadata.source,
         ) == ("RGGB", 4095, 0.5, 0.01, "DN", 450e-9, source)
-        assert (back.black == 64).all() and back.meta["noise_sigma"] == 0.5
+        assert (back.levels.black == 64).all() and back.noise == Noise.of_sigma(0.5)
     with pytest.raises(InputError, match="RGGB, not mono"):
-        read_mosaic(tmp_path / "c.h5", cfa="mono")
+        read_capture(tmp_path / "c.h5", cfa="mono")
     write_exr(tmp_path / "nan.exr", {"Y": np.full((3, 3), np.nan)})
     with pytest.raises(InputError, match="NaN"):
-        read_mosaic(tmp_path / "nan.exr")
+        read_capture(tmp_path / "nan.exr")
     write_exr(tmp_path / "rgb.exr", dict.fromkeys("RGB", np.ones((3, 3))))
     with pytest.raises(InputError, match="3 channels"):
-        read_mosaic(tmp_path / "rgb.exr")
+        read_capture(tmp_path / "rgb.exr")
 
 
 def test_real_plenoptic_and_colour_filter_images(shared_data):
@@ -111,15 +109,15 @@ def test_real_plenoptic_and_colour_filter_images(shared_data):
         ("lfm_guv/Radiometry_GUVExperim1.tif", (436, 436), np.uint16),
         ("lfm_antleg/radiometry_frame.png", (2160, 2592), np.uint16),
     ):
-        back = read_mosaic(folder / name)
-        assert back.values.shape == shape and back.values.dtype == dtype and back.cfa == "mono"
+        back = read_capture(folder / name)
+        assert back.mosaic.shape == shape and back.mosaic.dtype == dtype and back.cfa == "mono"
     name = next(
         (
             shared_data
             / "spectra/colorchecker_filtered/captured_images/images_filtered_light/color_checker"
         ).glob("*550nm_100ms*.tif")
     )
-    assert read_mosaic(name, cfa="GBRG").values.shape == (342, 408)
+    assert read_capture(name, cfa="GBRG").mosaic.shape == (342, 408)
 
 
 # --- photographs ----------------------------------------------------------------------------------

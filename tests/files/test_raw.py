@@ -11,7 +11,7 @@ from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, OutputError
 from plenocli.files.images import raw as raw_module
 from plenocli.files.images.dng import read_notes, write_dng
-from plenocli.files.images.mosaic import read_mosaic
+from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.raw import read_raw
 
 
@@ -61,9 +61,16 @@ def test_our_reader_gives_back_everything(tmp_path, cfa):
         exposure_s=0.0125,
         xmp_json=notes,
     )
-    back = read_mosaic(tmp_path / "x.dng")
-    np.testing.assert_array_equal(back.values, values)
-    assert (back.cfa, back.white, back.gain, back.band_m, back.source, back.units) == (
+    back = read_capture(tmp_path / "x.dng")
+    np.testing.assert_array_equal(back.mosaic, values)
+    assert (
+        back.cfa,
+        back.levels.white,
+        back.levels.gain,
+        back.metadata.band_m,
+        back.metadata.source,
+        back.units,
+    ) == (
         cfa,
         16000,
         0.25,
@@ -71,9 +78,9 @@ def test_our_reader_gives_back_everything(tmp_path, cfa):
         "dng",
         "DN",
     )
-    np.testing.assert_array_equal(back.black, [[64.5, 65], [66, 67]])
+    np.testing.assert_array_equal(back.levels.black, [[64.5, 65], [66, 67]])
     assert back.exposure_s == pytest.approx(0.0125, rel=1e-6)
-    assert back.meta["target"] == notes["target"] and back.meta["verified"]
+    assert back.metadata.details["target"] == notes["target"] and back.metadata.details["verified"]
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
@@ -88,13 +95,13 @@ def test_levels_of_a_dng_without_our_notes_are_put_in_their_positions(tmp_path, 
     )
     content = (tmp_path / "x.dng").read_bytes().replace(b"mosaic_sha256", b"mosaic_sha25x")
     (tmp_path / "x.dng").write_bytes(content)
-    back = read_mosaic(tmp_path / "x.dng")
+    back = read_capture(tmp_path / "x.dng")
     assert (
         back.cfa == cfa
-        and not back.meta["verified"]
+        and not back.metadata.details["verified"]
         and back.exposure_s == pytest.approx(0.004, rel=1e-6)
     )
-    np.testing.assert_array_equal(back.black, [[512, 513], [514, 515]])
+    np.testing.assert_array_equal(back.levels.black, [[512, 513], [514, 515]])
 
 
 def test_independent_tiff_reader_agrees(tmp_path):
@@ -127,7 +134,7 @@ def test_same_input_same_bytes(tmp_path):
 
 def test_a_dark_frame_of_zeros_that_we_wrote_is_believed(tmp_path):
     write_dng(tmp_path / "x.dng", np.zeros((30, 30), np.uint16), cfa="mono", black=0, white=4095)
-    assert read_mosaic(tmp_path / "x.dng").values.max() == 0
+    assert read_capture(tmp_path / "x.dng").mosaic.max() == 0
 
 
 def test_a_changed_pixel_of_ours_is_found(tmp_path):
@@ -136,7 +143,7 @@ def test_a_changed_pixel_of_ours_is_found(tmp_path):
     content[-7] ^= 1
     (tmp_path / "x.dng").write_bytes(content)
     with pytest.raises(InputError, match="not the one it was written with"):
-        read_mosaic(tmp_path / "x.dng")
+        read_capture(tmp_path / "x.dng")
 
 
 def unsigned(path):
@@ -159,7 +166,7 @@ def unsigned(path):
 def test_implausible_mosaics_are_refused_with_the_reason(tmp_path, values, black, white, words):
     write_dng(tmp_path / "x.dng", values.astype(np.uint16), cfa="RGGB", black=black, white=white)
     with pytest.raises(InputError, match=words):
-        read_mosaic(unsigned(tmp_path / "x.dng"))
+        read_capture(unsigned(tmp_path / "x.dng"))
 
 
 def test_wrong_numbers_are_refused_by_the_writer(tmp_path):
@@ -189,7 +196,7 @@ def test_no_mutant_of_a_dng_ends_otherwise_than_whole_or_refused(tmp_path):
         bad[at] ^= 1 << int(rng.integers(8))
         (tmp_path / "x.dng").write_bytes(bad[:at] if number % 6 == 5 else bad)
         try:
-            np.testing.assert_array_equal(read_mosaic(tmp_path / "x.dng").values, values)
+            np.testing.assert_array_equal(read_capture(tmp_path / "x.dng").mosaic, values)
         except InputError:
             pass
 
@@ -271,17 +278,17 @@ def test_real_camera_files(shared_data, name):
     import rawpy
 
     shape, cfa, black, white, exposure, model = REAL[name]
-    back = read_mosaic(shared_data / "raw" / name)
+    back = read_capture(shared_data / "raw" / name)
     assert (
-        back.values.shape == shape
+        back.mosaic.shape == shape
         and back.cfa == cfa
-        and (back.black == black).all()
-        and back.white == white
+        and (back.levels.black == black).all()
+        and back.levels.white == white
     )
     assert back.exposure_s == (exposure and pytest.approx(exposure, rel=1e-3))
-    assert model is None or model in back.meta["model"]
+    assert model is None or model in back.metadata.details["model"]
     with rawpy.imread(str(shared_data / "raw" / name)) as file:
-        np.testing.assert_array_equal(back.values, file.raw_image_visible)
+        np.testing.assert_array_equal(back.mosaic, file.raw_image_visible)
         assert [file.color_desc.decode()[i] for i in file.raw_pattern.ravel()] == list(cfa)
 
 
@@ -307,5 +314,5 @@ def test_every_broken_or_mosaicless_file_says_why(shared_data):
         with pytest.raises(
             InputError, match=BROKEN.get(path.name, "values a pixel, not a colour filter mosaic")
         ) as caught:
-            read_mosaic(path)
+            read_capture(path)
         assert str(path) in str(caught.value) and caught.value.fix

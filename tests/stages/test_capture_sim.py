@@ -11,7 +11,7 @@ from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.config.camera_file import load_camera, parse_camera
-from plenocli.files.images.mosaic import read_mosaic
+from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.accuracy.dial import system_matrix
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
@@ -239,9 +239,9 @@ def test_raw_file_brings_back_every_pixel_and_setting(camera, tmp_path):
         )
         == 0
     )
-    outside = read_mosaic(tmp_path / "w.dng")
-    np.testing.assert_array_equal(outside.values, inside.data["capture/mosaic"])
-    assert outside.cfa == "mono" and outside.exposure_s == 0.01 and outside.gain == 0.25
+    outside = read_capture(tmp_path / "w.dng")
+    np.testing.assert_array_equal(outside.mosaic, inside.data["capture/mosaic"])
+    assert outside.cfa == "mono" and outside.exposure_s == 0.01 and outside.levels.gain == 0.25
 
 
 @pytest.mark.parametrize("cfa", ["mono", "GRBG"])
@@ -304,7 +304,7 @@ def test_exr_holds_the_mosaic(camera, tmp_path):
         == 0
     )
     np.testing.assert_array_equal(
-        read_mosaic(tmp_path / "w.exr").values, inside.data["capture/mosaic"]
+        read_capture(tmp_path / "w.exr").mosaic, inside.data["capture/mosaic"]
     )
 
 

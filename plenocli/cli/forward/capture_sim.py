@@ -137,15 +137,15 @@ def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **se
         command=options.command_line(ctx),
     )
     noise = (
-        f"SNR {settings['snr_db']:g} dB, sigma {report['noise_sigma']:.3g}"
+        f"SNR {settings['snr_db']:g} dB, sigma {report.noise_sigma:.3g}"
         if settings["snr_db"] is not None
-        else f"peak {report['peak']:.4g} {report['units']}"
+        else f"peak {report.peak:.4g} {report.units}"
     )
     options.summary(
-        report,
+        report.as_json(),
         as_json,
         (
-            f"{output}: {report['rows']} x {report['columns']} pixels, {report['wavelengths']} "
-            f"wavelength{'s'[: report['wavelengths'] > 1]}, {noise}"
+            f"{output}: {report.rows} x {report.columns} pixels, {report.wavelengths} "
+            f"wavelength{'s'[: report.wavelengths > 1]}, {noise}"
         ),
     )

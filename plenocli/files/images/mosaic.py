@@ -1,56 +1,42 @@
-"""A sensor's mosaic from whatever file holds one: capture artefact, EXR, camera
-RAW, DNG, PNG or TIFF.
+"""Captures in and out: a sensor's mosaic from whatever file holds one (capture artefact, EXR,
+camera RAW, DNG, PNG or TIFF), and simulated ones as artefact, EXR or DNG.
 """
 
+from __future__ import annotations
+
+import contextlib
 import json
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.provenance import first_bytes
+from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
+from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import read_exr, write_exr
 from plenocli.files.images.pictures import file_type, read_stored
-from plenocli.files.images.raw import read_raw
+from plenocli.files.images.raw import RawFile, read_raw
+from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+from plenocli.forward.sensor.noise import Noise
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 _CFA = re.compile(r"mono|[RGB]{4}")
 
 
-@dataclass
-class Mosaic:
-    """values: (row, column) as stored.
-    cfa: "mono" or four letters, row by row.
-    black: (2, 2) by position, and white: in the units of the values ("DN",
-        "electron" or "relative");
-    white is inf where nothing saturates.
-    gain: DN/e or None.
-    exposure_s: s or None.
-    band_m: centre of the narrow band that lit the scene, m, or None.
-    source: "raw", "dng", "image", "capture" or "exr".
-    meta: whatever else the file says; a simulated capture's attributes by their names,
-        whatever the file.
-    """
-
-    values: np.ndarray
-    cfa: str = "mono"
-    black: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
-    white: float = np.inf
-    gain: float | None = None
-    exposure_s: float | None = None
-    units: str = "DN"
-    band_m: float | None = None
-    source: str = "image"
-    meta: dict = field(default_factory=dict)
+# --- reading --------------------------------------------------------------------------------------
 
 
-def read_mosaic(path, *, cfa=None):
-    """Read the mosaic at `path`, never demosaiced.
+def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
+    """Read the capture at `path`, never demosaiced.
 
+    path: .h5, .exr, RAW, DNG, PNG or TIFF, known by its first bytes.
     cfa: colour filter array of a PNG or TIFF, which cannot say it (default mono); for other files
         it must agree with theirs.
+
     Raises InputError, saying why.
     """
     path = Path(path)
@@ -58,8 +44,7 @@ def read_mosaic(path, *, cfa=None):
     if kind == "exr":
         found = _from_exr(path)
     elif kind == "png" or (kind == "tiff" and path.suffix.lower() in (".tif", ".tiff")):
-        found = _from_image(path, kind)
-        found.cfa = cfa or "mono"
+        found = _from_image(path, kind, cfa or "mono")
     elif kind == "jpeg":
         raise InputError(
             "is a JPEG: its values were demosaiced, bent and compressed",
@@ -67,42 +52,26 @@ def read_mosaic(path, *, cfa=None):
             "give the RAW, a PNG or a TIFF of the sensor",
         )
     elif is_hdf5(path):
-        found = _from_capture(path)
+        found = _from_artefact(path)
     else:
-        found = Mosaic(
-            **read_raw(path),
-            source="dng" if kind == "tiff" and path.suffix.lower() == ".dng" else "raw",
-        )
+        is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
+        found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path))
     if cfa is not None and found.cfa != cfa:
         raise InputError(
             f"has the colour filter array {found.cfa}, not {cfa}",
             path,
             "leave the option out; the file knows it",
         )
-    if found.values.dtype.kind == "f" and not np.isfinite(found.values).all():
+    if found.mosaic.dtype.kind == "f" and not np.isfinite(found.mosaic).all():
         raise InputError(
-            f"holds {int((~np.isfinite(found.values)).sum())} values that are NaN or infinite",
+            f"holds {int((~np.isfinite(found.mosaic)).sum())} values that are NaN or infinite",
             path,
             "make it again",
         )
     return found
 
 
-def write_capture_exr(path, mosaic, description, *, attrs=None, overwrite=False):
-    """Write a simulated capture as EXR: channel Y and `description`, the attributes of a capture
-    artefact and "cfa", as JSON.
-
-    float32 keeps whole numbers up to 2^24 exactly.
-    attrs: more text attributes.
-    Raises ValueError, UsageError, OutputError.
-    """
-    text = json.dumps(description, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    write_exr(
-        path, {"Y": np.asarray(mosaic)}, {CAPTURE: text, **(attrs or {})}, overwrite=overwrite
-    )
-
-
-def is_hdf5(path):
+def is_hdf5(path: str | Path) -> bool:
     """Whether the file at `path` is an artefact or another HDF5 file, by its first bytes.
 
     Raises InputError.
@@ -113,25 +82,23 @@ def is_hdf5(path):
     return head.startswith(MAGIC) or HDF5_SIGNATURE in head
 
 
-def _from_capture(path):
+def _from_artefact(path: Path) -> Capture:
     from plenocli.files.artefacts.container import cfa_text, read_artefact
 
     artefact = read_artefact(path, "capture")
-    attrs = dict(artefact.attrs.get("capture", {}))
-    found = _described(
-        path,
-        artefact.data["capture/mosaic"],
-        {**attrs, "cfa": cfa_text(artefact.data["capture/cfa"])},
-        "capture",
+    said = {**artefact.attrs.get("capture", {}), "cfa": cfa_text(artefact.data["capture/cfa"])}
+    found = _described(path, artefact.data["capture/mosaic"], said, "capture")
+    origin = artefact.provenance
+    metadata = replace(
+        found.metadata,
+        accuracy=origin.accuracy,
+        matrix=origin.inputs.get("pif", {}).get("sha256"),
     )
-    found.meta["accuracy"], found.meta["inputs"] = (
-        artefact.provenance.accuracy,
-        artefact.provenance.inputs,
-    )
-    return found
+    grid = replace(found.grid, centre=artefact.data.get("capture/lenslet_centre"))
+    return replace(found, metadata=metadata, grid=grid)
 
 
-def _from_exr(path):
+def _from_exr(path: Path) -> Capture:
     channels, attrs = read_exr(path)
     if set(channels) != {"Y"} and len(channels) != 1:
         raise InputError(
@@ -140,50 +107,100 @@ def _from_exr(path):
             "give a capture",
         )
     try:
-        description = dict(json.loads(attrs.get(CAPTURE, "{}")))
+        said = dict(json.loads(attrs.get(CAPTURE, "{}")))
     except (TypeError, ValueError) as error:
         raise InputError(f"has a broken attribute {CAPTURE}", path, "make it again") from error
-    return _described(path, next(iter(channels.values())), description, "exr")
+    return _described(path, next(iter(channels.values())), said, "exr")
 
 
-def _described(path, values, description, source):
-    """Mosaic from the attributes of a capture, given by an artefact or an EXR."""
-    try:
-        black = np.broadcast_to(
-            np.asarray(description.get("black", 0.0), dtype=float), (2, 2)
-        ).copy()
-        white = float(description.get("white", np.inf))
-        gain = description.get("gain_e_per_dn")
-        found = Mosaic(
-            values,
-            str(description.get("cfa", "mono")),
-            black,
-            white,
-            1 / float(gain) if gain else None,
-            description.get("exposure_s"),
-            str(description.get("units", "relative" if source == "exr" else "DN")),
-            description.get("band_m"),
-            source,
-            description,
+def _described(path: Path, values: np.ndarray, said: dict[str, Any], source: str) -> Capture:
+    """A capture from its attributes, as an artefact or an EXR names them."""
+    with _sensible(path):
+        black = np.broadcast_to(np.asarray(said.get("black", 0.0), dtype=float), (2, 2)).copy()
+        per_dn = said.get("gain_e_per_dn")
+        gain = 1 / float(per_dn) if per_dn else None
+        found = Capture(
+            mosaic=values,
+            units=str(said.get("units", "relative" if source == "exr" else "DN")),
+            cfa=str(said.get("cfa", "mono")),
+            levels=Levels(black=black, white=float(said.get("white", np.inf)), gain=gain),
+            exposure_s=said.get("exposure_s"),
+            **_told(path, source, said, gain),
         )
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"describes its capture in a way that makes no sense ({error})", path, "make it again"
-        ) from error
     if not _CFA.fullmatch(found.cfa):
         raise InputError(f"names the colour filter array '{found.cfa}'", path, "make it again")
     return found
 
 
-def _from_image(path, kind):
+@contextlib.contextmanager
+def _sensible(path: Path) -> Iterator[None]:
+    """InputError for the errors that numbers make which are none."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"describes its capture in a way that makes no sense ({error})", path, "make it again"
+        ) from error
+
+
+def _told(path: Path, source: str, said: dict[str, Any], gain: float | None) -> dict[str, Any]:
+    """Noise, grid and metadata of a capture from what its file says; TypeError or ValueError
+    where that makes no sense.
+    """
+    sigma, notes = said.get("noise_sigma"), said.get("notes")
+    noise, origin = None, None
+    if sigma is not None:
+        noise, origin = Noise.of_sigma(sigma), "white noise of the simulation"
+    elif gain is not None:
+        noise, origin = Noise(gain=gain), "file"
+    electrons = said.get("electrons_per_unit") or (
+        notes.get("electrons_per_unit") if isinstance(notes, dict) else None
+    )
+    maker = " ".join(str(said.get(name)) for name in ("make", "model") if said.get(name))
+    metadata = CaptureMetadata(
+        source=source,
+        path=path,
+        camera=maker or said.get("camera"),
+        noise_from=origin,
+        target=said.get("target"),
+        illuminant=said.get("illuminant"),
+        band_m=said.get("band_m"),
+        electrons_per_unit=float(electrons) if electrons else None,
+        snr_db=said.get("snr_db"),
+        scene_shape=_whole(said.get("scene_shape")),
+        details=said,
+    )
+    grid = SuperpixelGrid(
+        shape=_whole(said.get("superpixel_shape")), count=_whole(said.get("lenslet_count"))
+    )
+    return {"noise": noise, "metadata": metadata, "grid": grid}
+
+
+def _whole(numbers: Any) -> tuple[int, ...] | None:
+    return None if numbers is None else tuple(int(n) for n in np.ravel(numbers))
+
+
+def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
+    with _sensible(path):
+        told = _told(path, source, found.details, found.gain)
+    return Capture(
+        mosaic=found.values,
+        cfa=found.cfa,
+        levels=Levels(black=found.black, white=found.white, gain=found.gain),
+        exposure_s=found.exposure_s,
+        **told,
+    )
+
+
+def _from_image(path: Path, kind: str, cfa: str) -> Capture:
     values, names, bits = read_stored(path, kind)
     keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
-    values, meta = values[..., keep], {"bits": bits, "verified": False}
+    values, details = values[..., keep], {"bits": bits, "verified": False}
     if values.dtype.kind not in "uf":
         raise InputError(f"holds {values.dtype} values", path, "give unsigned integers or float")
     if values.shape[-1] > 1:
         if (values == values[..., :1]).all():
-            meta["note"] = f"{values.shape[-1]} identical channels, one taken"
+            details["note"] = f"{values.shape[-1]} identical channels, one taken"
         else:
             raise InputError(
                 (
@@ -193,8 +210,96 @@ def _from_image(path, kind):
                 path,
                 "give the sensor's mosaic before demosaicing",
             )
-    return Mosaic(np.ascontiguousarray(values[..., 0]), white=_top(values, bits), meta=meta)
+    return Capture(
+        mosaic=np.ascontiguousarray(values[..., 0]),
+        cfa=cfa,
+        levels=Levels(white=float(2**bits - 1) if values.dtype.kind == "u" else np.inf),
+        metadata=CaptureMetadata(source="image", path=path, details=details),
+    )
 
 
-def _top(values, bits):
-    return float(2**bits - 1) if values.dtype.kind == "u" else np.inf
+# --- writing --------------------------------------------------------------------------------------
+
+
+def write_capture(
+    path: str | Path,
+    capture: Capture,
+    provenance: Provenance,
+    *,
+    scene: np.ndarray | None = None,
+    wavelengths: np.ndarray | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a simulated capture as .h5, .exr or .dng.
+
+    An EXR keeps float32, whole numbers up to 2^24 exactly; a DNG whole numbers below 65536.
+    path: its suffix says what is written.
+    capture: what the sensor reports.
+    provenance: where it came from.
+    scene: (band, scene_row, scene_column) the object as sampled, which an .h5 keeps.
+    wavelengths: (band,) of the scene, m.
+    overwrite: replace a file that is there.
+
+    Raises ValueError (a bug of the caller), UsageError, OutputError.
+    """
+    path = Path(path)
+    said = _attributes(capture)
+    if path.suffix == ".h5":
+        from plenocli.files.artefacts.container import Artefact, write_artefact
+
+        data = {
+            "mosaic": capture.mosaic,
+            "cfa": capture.cfa,
+            "lenslet_centre": capture.grid.centre if capture.grid else None,
+            "scene": scene,
+            "wavelength": wavelengths,
+        }
+        data = {f"capture/{name}": v for name, v in data.items() if v is not None}
+        artefact = Artefact("capture", data, {"capture": said}, provenance)
+        write_artefact(path, artefact, overwrite=overwrite)
+    elif path.suffix == ".exr":
+        # JSON knows no infinity
+        finite = {name: value for name, value in said.items() if value != float("inf")}
+        text = json.dumps(
+            finite | {"cfa": capture.cfa}, sort_keys=True, allow_nan=False, ensure_ascii=False
+        )
+        attrs = {CAPTURE: text, **provenance_texts(provenance)}
+        write_exr(path, {"Y": np.asarray(capture.mosaic)}, attrs, overwrite=overwrite)
+    else:
+        write_dng(
+            path,
+            capture.mosaic,
+            cfa=capture.cfa,
+            black=said["black"],
+            white=capture.levels.white,
+            exposure_s=capture.exposure_s,
+            xmp_json=said | {"provenance": asdict(provenance)},
+            overwrite=overwrite,
+        )
+
+
+def _attributes(capture: Capture) -> dict[str, Any]:
+    """The attributes of a capture artefact by their names; what is not known is left out."""
+    levels, metadata, grid = capture.levels, capture.metadata, capture.grid or SuperpixelGrid()
+    black = levels.black
+    said = {
+        "units": capture.units,
+        "black": float(black.flat[0]) if np.ptp(black) == 0 else black.tolist(),
+        "white": float(levels.white),
+        "snr_db": metadata.snr_db,
+        "noise_sigma": capture.white_noise.sigma if capture.white_noise else None,
+        "gain_e_per_dn": 1 / levels.gain if levels.gain else None,
+        "exposure_s": capture.exposure_s,
+        "electrons_per_unit": metadata.electrons_per_unit,
+        "lenslet_count": _listed(grid.count),
+        "superpixel_shape": _listed(grid.shape),
+        "scene_shape": _listed(metadata.scene_shape),
+        "target": metadata.target,
+        "illuminant": metadata.illuminant,
+        "band_m": metadata.band_m,
+    }
+    return {name: value for name, value in said.items() if value is not None}
+
+
+def _listed(numbers: tuple[int, ...] | None) -> list[int] | None:
+    return None if numbers is None else list(numbers)

@@ -4,12 +4,16 @@ LibRaw runs in a child process with limits (`raw_child`); what it returns must b
 anyone computes with it.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +38,30 @@ _REASONS = {
 }
 
 
-def read_raw(path, *, timeout_s=TIMEOUT_S):
-    """Read a RAW file as a dict: values (row, column) uint16 without masked borders, cfa ("mono" or
-    four letters), black (2, 2) DN by position, white DN, exposure_s or None, gain (DN/e) or None,
-    band_m or None, meta.
+@dataclass(frozen=True, kw_only=True)
+class RawFile:
+    """What a camera's RAW or a DNG holds.
+
+    values: (row, column) uint16 without masked borders, DN.
+    cfa: "mono" or four letters, row by row.
+    black: (2, 2) by position, DN.
+    white: DN.
+    exposure_s: s, None where unknown.
+    gain: DN per electron, None where unknown.
+    details: what else the file says, by its names.
+    """
+
+    values: np.ndarray
+    cfa: str
+    black: np.ndarray
+    white: float
+    exposure_s: float | None
+    gain: float | None
+    details: dict[str, Any]
+
+
+def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
+    """Read a RAW file or DNG; LibRaw may take `timeout_s`.
 
     Raises InputError, saying why, for a file that LibRaw cannot read, that holds no mosaic, or
     whose mosaic is implausible.
@@ -69,25 +93,24 @@ def read_raw(path, *, timeout_s=TIMEOUT_S):
         )
     else:
         _check_plausible(path, values, black, found["white"])
-    meta = {
+    details = {
         key: found[key]
         for key in ("full_shape", "camera_white", "iso", "f_number", "focal_length_m")
         if found.get(key)
     }
-    meta |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}
-    meta |= {key: value for key, value in notes.items() if key != "mosaic_sha256"} | {
+    details |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}
+    details |= {key: value for key, value in notes.items() if key != "mosaic_sha256"} | {
         "verified": bool(notes)
     }
-    return {
-        "values": values,
-        "cfa": cfa,
-        "black": black,
-        "white": float(found["white"]),
-        "exposure_s": notes.get("exposure_s") or _exposure(found),
-        "gain": 1 / notes["gain_e_per_dn"] if notes.get("gain_e_per_dn") else None,
-        "band_m": notes.get("band_m"),
-        "meta": meta,
-    }
+    return RawFile(
+        values=values,
+        cfa=cfa,
+        black=black,
+        white=float(found["white"]),
+        exposure_s=notes.get("exposure_s") or _exposure(found),
+        gain=1 / notes["gain_e_per_dn"] if notes.get("gain_e_per_dn") else None,
+        details=details,
+    )
 
 
 def _from_child(path, timeout_s):

@@ -1,6 +1,8 @@
-"""Captures as superpixels in the units of the system matrix: y = A x + noise with x the radiance
-relative to white.
+"""Captures as superpixels in the units of the system matrix, and along the grid of a
+calibration.
 """
+
+from __future__ import annotations
 
 from pathlib import Path
 
@@ -8,116 +10,91 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
+from plenocli.base.text import by
 from plenocli.base.tiling import to_blocks
-from plenocli.forward.sensor.frames import tiled
-from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.files.images.mosaic import read_capture
+from plenocli.forward.sensor.capture import Capture
+from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
 
-def read_superpixels(path, system, calibration=None):
-    """Superpixels of a capture: tiled as its file says, or cut out along the lenslet grid of a
-    calibration artefact.
+def read_superpixels(
+    path: str | Path,
+    system: LensletMatrix,
+    calibration: str | Path | None = None,
+) -> Superpixels:
+    """Superpixels of a capture.
 
-    system: LensletMatrix.
-    InputError where sizes disagree or the sensor is saturated beyond use.
+    path: of the capture.
+    system: the system matrix in whose units they are wanted.
+    calibration: artefact along whose lenslet grid they are cut out; without it the capture is
+        tiled as its file says.
+
+    Raises InputError where sizes disagree or the scale is not known.
     """
-    from plenocli.files.images.mosaic import read_mosaic
-
-    mosaic = read_mosaic(path)
-    if mosaic.cfa != "mono":
+    capture = read_capture(path)
+    if capture.cfa != "mono":
         raise InputError(
-            f"has the colour filter array {mosaic.cfa}; the system matrix knows none",
+            f"has the colour filter array {capture.cfa}; the system matrix knows none",
             path,
             "use --calibration with --method block-mean, or demux",
         )
     if calibration is not None:
-        signal, white = calibrated(path, mosaic, calibration)
-        if signal.shape[2] != system.own.shape[0]:
-            raise InputError(
-                (
-                    f"holds windows of {signal.shape[2]} pixels, the system matrix "
-                    f"{system.own.shape[0]}"
-                ),
-                calibration,
-                "simulate-pif with pixels_per_lenslet as measured",
-            )
-        lit = np.all(np.isfinite(signal), axis=2)
-        scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
-        return Superpixels(
-            y=np.where(lit[:, :, None], signal, 0) * scale[:, :, None], sigma=None, scene=None
-        )
-    light = mosaic.meta.get("illuminant")
+        return _along_the_grid(capture, system, calibration)
+    light = capture.metadata.illuminant
     if system.illuminant and light and light != system.illuminant:
         note(
             f"{Path(path).name} was lit by {light}, the system matrix has its bands for "
             f"{system.illuminant}: colours will be off"
         )
-    shape = tuple(int(n) for n in mosaic.meta.get("superpixel_shape", system.pixel_shape))
-    if shape != system.pixel_shape:
-        raise InputError(
-            (
-                f"has superpixels of {shape[0]} x {shape[1]} pixels, the system matrix "
-                f"{system.pixel_shape[0]} x {system.pixel_shape[1]}"
-            ),
-            path,
-            "use the pif of this camera",
-        )
-    rows, columns = mosaic.values.shape
-    if rows % shape[0] or columns % shape[1]:
-        raise InputError(
-            (
-                f"has {rows} x {columns} pixels, no whole number of superpixels of "
-                f"{shape[0]} x {shape[1]}"
-            ),
-            path,
-            "give --calibration to find the lenslets",
-        )
-    signal = mosaic.values - tiled(mosaic.black, (rows, columns), float)
-    unit = _unit(path, mosaic)
-    over = float(np.mean(mosaic.values >= mosaic.white)) if np.isfinite(mosaic.white) else 0.0
+    shape = _tiles(capture, system, path)
+    signal, unit = capture.signal(), _unit(capture, path)
+    white = capture.levels.white
+    over = float(np.mean(capture.mosaic >= white)) if np.isfinite(white) else 0.0
     if over > 0:
         note(
             f"{Path(path).name}: {over:.2%} of the pixels are saturated; the "
             "picture is too dark there"
         )
-    sigma = mosaic.meta.get("noise_sigma")
+    noise = capture.white_noise
     return Superpixels(
         y=to_blocks(signal, shape) / unit,
-        sigma=None if sigma is None else float(sigma) / unit,
-        scene=mosaic.meta.get("target"),
-        accuracy=mosaic.meta.get("accuracy"),
-        matrix=mosaic.meta.get("inputs", {}).get("pif", {}).get("sha256"),
+        sigma=None if noise is None else noise.sigma / unit,
+        scene=capture.metadata.target,
+        accuracy=capture.metadata.accuracy,
+        matrix=capture.metadata.matrix,
     )
 
 
-def calibrated(path, mosaic, calibration):
-    """(signal, white): a capture's and the white reference's windows (lenslet_row, lenslet_column,
-    pixel), dark subtracted.
+def calibrated(capture: Capture, calibration: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Windows of a capture and of the white reference along the grid of a calibration.
 
-    NaN where a superpixel is not wholly on the sensor. InputError where the two sensors differ.
+    calibration: path of the artefact.
+
+    Returns (signal, white), (lenslet_row, lenslet_column, pixel) each, dark subtracted; NaN where a
+    superpixel is not wholly on the sensor.
+    Raises InputError where the two sensors differ.
     """
     from plenocli.files.artefacts.container import read_artefact
-    from plenocli.forward.sensor.superpixel import extract
 
     found = read_artefact(calibration, "calibration")
     data = found.data
     for name in ("response/origin", "response/window", "response/white", "dark/mean"):
         if name not in data:
             raise InputError(f"lacks {name}", calibration, "run calibrate again")
-    if np.ndim(data["dark/mean"]) == 2 and data["dark/mean"].shape != mosaic.values.shape:
+    dark = data["dark/mean"]
+    if np.ndim(dark) == 2 and dark.shape != capture.shape:
         raise InputError(
-            (
-                f"is {mosaic.values.shape[0]} x {mosaic.values.shape[1]} px, the calibration "
-                f"{data['dark/mean'].shape[0]} x {data['dark/mean'].shape[1]}"
-            ),
-            path,
+            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
+            capture.metadata.path,
             "use captures of the calibrated camera",
         )
     reference = found.attrs.get("response", {}).get("exposure_s") or found.attrs.get(
         "white", {}
     ).get("exposure")
-    scale = reference / mosaic.exposure_s if reference and mosaic.exposure_s else 1.0
+    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
     signal = extract(
-        (mosaic.values - data["dark/mean"]) * scale,
+        (capture.mosaic - dark) * scale,
         data["response/origin"],
         tuple(int(n) for n in data["response/window"]),
     )
@@ -127,17 +104,52 @@ def calibrated(path, mosaic, calibration):
     return signal, white
 
 
-def _unit(path, mosaic):
+def _along_the_grid(
+    capture: Capture, system: LensletMatrix, calibration: str | Path
+) -> Superpixels:
+    """Lit superpixels in units of A x, by the light of a white object; dark ones are zero."""
+    signal, white = calibrated(capture, calibration)
+    if signal.shape[2] != system.own.shape[0]:
+        raise InputError(
+            (f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}"),
+            calibration,
+            "simulate-pif with pixels_per_lenslet as measured",
+        )
+    lit = np.all(np.isfinite(signal), axis=2)
+    scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
+    y = np.where(lit[:, :, None], signal, 0) * scale[:, :, None]
+    return Superpixels(y=y, sigma=None, scene=None)
+
+
+def _tiles(capture: Capture, system: LensletMatrix, path: str | Path) -> tuple[int, int]:
+    """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
+    system matrix.
+    """
+    shape = (capture.grid.shape if capture.grid else None) or system.pixel_shape
+    if shape != system.pixel_shape:
+        raise InputError(
+            (f"has superpixels of {by(shape)} pixels, the system matrix {by(system.pixel_shape)}"),
+            path,
+            "use the pif of this camera",
+        )
+    if capture.shape[0] % shape[0] or capture.shape[1] % shape[1]:
+        raise InputError(
+            f"has {by(capture.shape)} pixels, no whole number of superpixels of {by(shape)}",
+            path,
+            "give --calibration to find the lenslets",
+        )
+    return shape
+
+
+def _unit(capture: Capture, path: str | Path) -> float:
     """What one unit of A x is in the units of the mosaic."""
-    if mosaic.units == "relative":
+    if capture.units == "relative":
         return 1.0
-    electrons = mosaic.meta.get("electrons_per_unit") or mosaic.meta.get("notes", {}).get(
-        "electrons_per_unit"
-    )
+    electrons = capture.metadata.electrons_per_unit
     if not electrons:
         raise InputError(
             "does not say how many electrons white gives, so that the picture would have no scale",
             path,
             "give --calibration with a white reference",
         )
-    return float(electrons) * ((mosaic.gain or 1.0) if mosaic.units == "DN" else 1.0)
+    return electrons * ((capture.levels.gain or 1.0) if capture.units == "DN" else 1.0)

@@ -76,17 +76,17 @@ def read_chart_folder(folder, *, cfa, labels=None, spectra=None):
         )
     captures, white, shape = {}, None, None
     for path in shots:
-        mosaic, shape = _read(path, cfa, shape)
-        white = mosaic.white
+        capture, shape = _read(path, cfa, shape)
+        white = capture.levels.white
         captures.setdefault(int(_BAND.search(path.name)[1]) * 1e-9, []).append(
-            (_seconds(path), mosaic.values)
+            (_seconds(path), capture.mosaic)
         )
     kept, darks = [], []
     for path in dark_paths:
-        mosaic, _ = _read(path, cfa, None)
-        if mosaic.values.shape == shape:
+        capture, _ = _read(path, cfa, None)
+        if capture.shape == shape:
             kept.append(path)
-            darks.append((_seconds(path), mosaic.values))
+            darks.append((_seconds(path), capture.mosaic))
     label_path, label_map = _labels(labels, found, shape, folder)
     table_path, table = _spectra(spectra, found, folder)
     files = {"capture": shots, "dark": kept, "labels": label_path, "spectra": table_path}
@@ -99,19 +99,19 @@ def _seconds(path):
 
 
 def _read(path, cfa, shape):
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
-    mosaic = read_mosaic(path, cfa=cfa)
-    if shape is not None and mosaic.values.shape != shape:
+    capture = read_capture(path, cfa=cfa)
+    if shape is not None and capture.shape != shape:
         raise InputError(
             (
-                f"is {mosaic.values.shape[0]} x {mosaic.values.shape[1]} px, other captures "
+                f"is {capture.shape[0]} x {capture.shape[1]} px, other captures "
                 f"{shape[0]} x {shape[1]}"
             ),
             path,
             "give captures of one camera",
         )
-    return mosaic, mosaic.values.shape
+    return capture, capture.shape
 
 
 def _labels(path, found, shape, folder):
@@ -152,9 +152,9 @@ def _first(path, likely, read, what, folder, fix):
 def _label_map(path, shape):
     from scipy.ndimage import label
 
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
-    values = np.asarray(read_mosaic(path).values)
+    values = np.asarray(read_capture(path).mosaic)
     if values.shape != shape:
         raise InputError(
             f"is {values.shape[0]} x {values.shape[1]} px, the captures {shape[0]} x {shape[1]}",

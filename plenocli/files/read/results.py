@@ -311,9 +311,9 @@ def read_labels(source, grid):
     rows, cols = grid
     if str(source) == CHART:
         return chart_labels(rows, cols, whole_cells=True).astype(int)
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
-    values = np.asarray(read_mosaic(source).values)
+    values = np.asarray(read_capture(source).mosaic)
     if values.ndim != 2 or values.shape[0] % rows or values.shape[1] % cols:
         raise InputError(
             f"is {' x '.join(map(str, values.shape))}, the result has {rows} x {cols} lenslets",

@@ -5,8 +5,11 @@ A scene answers one question: its reflectance at a wavelength on a grid of objec
 image orientation.
 """
 
+from __future__ import annotations
+
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -19,16 +22,32 @@ between, constant outside.
 """
 
 
+class Scene(Protocol):
+    """What is in front of the camera.
+
+    uniform: whether it is the same everywhere, beyond the array's edge too.
+    spectral: whether its reflectance depends on the wavelength.
+    """
+
+    uniform: bool
+    spectral: bool
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m) on rows x columns object points."""
+        ...
+
+
 class Uniform:
     """The same reflectance everywhere, beyond the array's edge too."""
 
     uniform = True
     spectral = False
 
-    def __init__(self, level):
+    def __init__(self, level: float) -> None:
         self.level = level
 
-    def at(self, wavelength, rows, columns):
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column), the level everywhere."""
         return np.full((rows, columns), self.level, dtype=np.float32)
 
 
@@ -39,14 +58,12 @@ class Photograph:
 
     uniform = False
 
-    def __init__(self, values, sampling, spectral):
-        self.values, self.sampling, self.spectral = (
-            values,
-            sampling,
-            spectral and values.shape[2] >= 3,
-        )
+    def __init__(self, values: np.ndarray, sampling: str, spectral: bool) -> None:
+        self.values, self.sampling = values, sampling
+        self.spectral = spectral and values.shape[2] >= 3
 
-    def at(self, wavelength, rows, columns):
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m), of a grey picture its luminance."""
         from plenocli.forward.scene.sample import luminance, sample_picture
 
         if not self.spectral:
@@ -62,10 +79,11 @@ class Cube:
     uniform = False
     spectral = True
 
-    def __init__(self, wavelengths, values, sampling):
+    def __init__(self, wavelengths: np.ndarray, values: np.ndarray, sampling: str) -> None:
         self.wavelengths, self.values, self.sampling = np.asarray(wavelengths), values, sampling
 
-    def at(self, wavelength, rows, columns):
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m), linear between the bands."""
         from plenocli.forward.scene.sample import sample_picture
 
         position = np.interp(wavelength, self.wavelengths, np.arange(len(self.wavelengths)))
@@ -83,19 +101,25 @@ class Chart:
     uniform = False
     spectral = True
 
-    def at(self, wavelength, rows, columns):
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) of the chart at a wavelength (m)."""
         from plenocli.forward.scene.chart import chart_scene
 
         return chart_scene(rows, columns, np.array([wavelength]))[0][0]
 
 
-def read_scene(name, *, sampling="fit", spectral=False):
-    """The scene called `name`: "colorchecker", "skimage:astronaut", a photograph, a spectral EXR or
-    an image artefact.
+def read_scene(
+    name: str | Path, *, sampling: str = "fit", spectral: bool = False
+) -> Photograph | Cube | Chart:
+    """The scene called `name`.
 
-    spectral: whether the camera tells wavelengths apart; if not, a colour photograph
-        counts by its luminance.
-    InputError or UsageError where it cannot be had.
+    name: "colorchecker", "skimage:astronaut", or the path of a photograph, a spectral EXR or an
+        image artefact.
+    sampling: "fit" a photograph to the object points by area averages, or "crop" it.
+    spectral: whether the camera tells wavelengths apart; if not, a colour photograph counts by its
+        luminance.
+
+    Raises InputError or UsageError where it cannot be had.
     """
     if str(name) == "colorchecker":
         return Chart()
@@ -118,10 +142,10 @@ def read_scene(name, *, sampling="fit", spectral=False):
 
 
 @lru_cache(maxsize=16)
-def embedded_photograph(name):
+def embedded_photograph(name: str) -> np.ndarray:
     """A photograph that ships inside scikit-image, linear float32 (row, column, channel).
 
-    UsageError for unknown names.
+    Raises UsageError for unknown names.
     """
     from importlib.util import find_spec
 

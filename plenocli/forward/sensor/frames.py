@@ -14,7 +14,7 @@ SATURATION = 0.985
 SAME_EXPOSURE = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dark:
     """What the sensor reports without light.
 
@@ -69,7 +69,9 @@ def make_dark(frames, exposures, black, shape):
         frame is a robust spread over pixels, at least the rounding's.
     """
     if not frames:
-        return Dark(tiled(black, shape), np.asarray(black, float), None, None)
+        return Dark(
+            mean=tiled(black, shape), black=np.asarray(black, float), exposure=None, sigma=None
+        )
     longest = max((e for e in exposures if e is not None), default=None)
     chosen = [
         np.asarray(f, np.float32)
@@ -85,7 +87,13 @@ def make_dark(frames, exposures, black, shape):
         low, high = np.percentile((mean - tiled(black, shape))[::3, ::3], [15.87, 84.13])
         spread = float(high - low) / 2
     spread = max(spread, 1 / np.sqrt(12))
-    return Dark(mean, np.asarray(black, float), longest, spread, spread**2 / len(chosen))
+    return Dark(
+        mean=mean,
+        black=np.asarray(black, float),
+        exposure=longest,
+        sigma=spread,
+        variance=spread**2 / len(chosen),
+    )
 
 
 def saturated(values, black, white):

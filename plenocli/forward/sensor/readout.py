@@ -13,26 +13,26 @@ from plenocli.forward.sensor.frames import SATURATION, Dark
 from plenocli.forward.sensor.superpixel import inside
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Readout:
     """values (rows, columns) as the sensor reports them;
 
     dark: plenocli.forward.sensor.frames.Dark;
-    seconds: exposure (None: unknown);
+    exposure_s: s (None: unknown);
     black (2, 2) and white: levels beyond which pixels are saturated (white inf: none);
     scale: to the light of the calibration's exposure;
     offset: taken off after that;
-    ready: Levels that were cut before. `readout - number` is the capture with a larger offset.
+    ready: DarkWindows that were cut before. `readout - number` is the capture with a larger offset.
     """
 
     values: np.ndarray
     dark: Dark
-    seconds: float | None
+    exposure_s: float | None
     black: np.ndarray
     white: float
     scale: float = 1.0
     offset: float = 0.0
-    ready: "Levels | None" = None
+    ready: "DarkWindows | None" = None
 
     @property
     def shape(self):
@@ -71,7 +71,7 @@ class _Cutter:
         self.readout, self.origin, self.count = readout, origin, window[0] * window[1]
         dark = readout.dark
         self.raw = np.lib.stride_tricks.sliding_window_view(readout.values, window)
-        self.mean = None if dark.flat else Levels(dark, origin, window)
+        self.mean = None if dark.flat else DarkWindows(dark, origin, window)
         if readout.ready is not None and readout.ready.origin is origin:
             self.mean = readout.ready
         self.level = (
@@ -81,8 +81,8 @@ class _Cutter:
         )
         self.growth = (
             None
-            if dark.flat or not dark.grows(readout.seconds)
-            else np.float32(readout.seconds / dark.exposure)
+            if dark.flat or not dark.grows(readout.exposure_s)
+            else np.float32(readout.exposure_s / dark.exposure)
         )
         black = np.asarray(readout.black, float)
         top = black + SATURATION * (readout.white - black)
@@ -118,7 +118,7 @@ class _Cutter:
         return level if level.ndim == 0 else level[origin[:, 0] % 2, origin[:, 1] % 2]
 
 
-class Levels:
+class DarkWindows:
     """The dark image under windows; `keep` holds them all, for many captures."""
 
     def __init__(self, dark, origin, window):

@@ -2,17 +2,33 @@
 resampling, no demosaicing).
 """
 
+from __future__ import annotations
+
+from typing import Protocol
+
 import numpy as np
 
 
-def windows(centres, shape):
-    """First pixel (R, C, 2) int of windows of `shape` (rows, columns) px centred nearest to
-    `centres` (R, C, 2).
+class CutByWindow(Protocol):
+    """What gives its pixels by windows, such as plenocli.forward.sensor.readout.Readout."""
+
+    def cut(self, origin: np.ndarray, window: tuple[int, int]) -> np.ndarray:
+        """Pixels (lenslet, h*w) of windows (h, w) whose first pixels are `origin` (lenslet, 2)."""
+        ...
+
+
+def windows(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Windows of whole pixels centred nearest to given places.
 
     Pixel centres are at integers: an even window is centred half a pixel after its middle pixel's
     corner, so a centre at 25.5 with 52 rows starts at row 0. On a lattice of whole-pixel pitch all
     centres sit at the same place within a pixel; there all windows take the same rounding, lest
-    noise decide it for each. Sites without a centre (NaN) start at a large negative number.
+    noise decide it for each.
+    centres: (lenslet_row, lenslet_column, 2) px.
+    shape: (rows, columns) of a window, px.
+
+    Returns the first pixels (lenslet_row, lenslet_column, 2) int; sites without a centre (NaN)
+    start at a large negative number.
     """
     centres = np.asarray(centres, float)
     corner = centres - (np.asarray(shape) - 1) / 2
@@ -24,17 +40,22 @@ def windows(centres, shape):
     return np.where(np.isfinite(first), first, -(2**30)).astype(int)
 
 
-def inside(origin, window, shape):
-    """Which windows (R, C) lie wholly in a mosaic of `shape`."""
+def inside(origin: np.ndarray, window: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+    """Which windows (..) with first pixels `origin` (.., 2) lie wholly in a mosaic of `shape`."""
     return ((origin >= 0) & (origin + np.asarray(window) <= np.asarray(shape))).all(axis=-1)
 
 
-def extract(mosaic, origin, window):
-    """Pixels (R, C, h*w) of every window, row by row; NaN where a window is not
-    wholly in the mosaic.
+def extract(
+    mosaic: np.ndarray | CutByWindow, origin: np.ndarray, window: tuple[int, int]
+) -> np.ndarray:
+    """Pixels of every window, row by row.
 
-    mosaic (rows, columns), or a plenocli.forward.sensor.readout.Readout; origin (R, C, 2) int;
-    window (h, w). Float arrays keep their type, others become float64.
+    mosaic: (row, column).
+    origin: (lenslet_row, lenslet_column, 2) first pixels, int.
+    window: (rows, columns) px.
+
+    Returns (lenslet_row, lenslet_column, pixel), NaN where a window is not wholly in the mosaic;
+    float arrays keep their type, others become float64.
     """
     if hasattr(mosaic, "cut"):
         return mosaic.cut(origin.reshape(-1, 2), window).reshape(*origin.shape[:-1], -1)

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -32,20 +33,8 @@ Prior = tuple[np.ndarray, np.ndarray]
 """Mean (band,) and covariance (band, band) of radiances."""
 
 
-class SensorValues(Protocol):
-    """What a capture's file says (plenocli.files.read.mosaics.Exposure)."""
-
-    values: np.ndarray
-    black: np.ndarray
-    white: float
-    gain: float | None
-    seconds: float | None
-    units: str
-    sigma: float | None
-
-
 def readout(
-    exposure: SensorValues, c: LensletResponses, path: str | os.PathLike[str]
+    exposure: Capture, c: LensletResponses, path: str | os.PathLike[str]
 ) -> tuple[Readout, Noise | None]:
     """A capture as light at the calibration's exposure time, and the noise of it.
 
@@ -58,10 +47,10 @@ def readout(
     from plenocli.forward.sensor.readout import Readout
 
     sensor, shape = c.calibration.sensor, c.dark.mean.shape
-    if exposure.values.shape != shape:
+    if exposure.shape != shape:
         raise InputError(
             (
-                f"is {exposure.values.shape[0]} x {exposure.values.shape[1]} px, the calibration "
+                f"is {exposure.shape[0]} x {exposure.shape[1]} px, the calibration "
                 f"{shape[0]} x {shape[1]}"
             ),
             path,
@@ -73,29 +62,30 @@ def readout(
             path,
             "make all captures in the same way",
         )
-    if (exposure.seconds is None) != (sensor.exposure is None):
+    if (exposure.exposure_s is None) != (sensor.exposure is None):
         raise InputError(
             (
-                f"{'does not say' if exposure.seconds is None else 'says'} its exposure time, the "
-                f"calibration {'does not' if sensor.exposure is None else 'does'}"
+                f"{'does not say' if exposure.exposure_s is None else 'says'} its exposure time, "
+                f"the calibration {'does not' if sensor.exposure is None else 'does'}"
             ),
             path,
             "use files of one kind for all captures",
         )
-    scale = 1.0 if sensor.exposure is None else sensor.exposure / exposure.seconds
-    top = exposure.white if np.isfinite(exposure.white) else sensor.white_level
+    scale = 1.0 if sensor.exposure is None else sensor.exposure / exposure.exposure_s
+    top = exposure.levels.white if np.isfinite(exposure.levels.white) else sensor.white_level
     signal = Readout(
-        values=exposure.values,
+        values=exposure.mosaic,
         dark=c.dark,
-        seconds=exposure.seconds,
-        black=exposure.black,
+        exposure_s=exposure.exposure_s,
+        black=exposure.levels.black,
         white=top,
         scale=scale,
         ready=c.levels,
     )
-    if exposure.sigma is not None:
-        return signal, Noise.of_sigma(exposure.sigma).scaled(scale)
-    gain = sensor.gain if sensor.gain is not None else exposure.gain
+    known = exposure.white_noise
+    if known is not None and known.white:
+        return signal, known.scaled(scale)
+    gain = sensor.gain if sensor.gain is not None else exposure.levels.gain
     if gain is None:
         return signal, None
     return signal, Noise(gain=gain, read_variance=sensor.read_variance).scaled(scale)

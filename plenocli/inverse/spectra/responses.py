@@ -14,7 +14,7 @@ from plenocli.inverse.spectra.calibration import Calibration, MadeResponses
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.frames import Dark
-    from plenocli.forward.sensor.readout import Levels
+    from plenocli.forward.sensor.readout import DarkWindows
     from plenocli.inverse.registration.reference import Reference
     from plenocli.inverse.spectra.factored import Factored
 
@@ -103,16 +103,16 @@ class LensletResponses:
         return self.origin[self.sites]
 
     @cached_property
-    def levels(self) -> Levels | None:
+    def levels(self) -> DarkWindows | None:
         """Dark levels under the windows, None where they are black levels alone or some window
         is not on the sensor.
         """
-        from plenocli.forward.sensor.readout import Levels
+        from plenocli.forward.sensor.readout import DarkWindows
         from plenocli.forward.sensor.superpixel import inside
 
         if self.dark.flat or not inside(self.corners, self.window, self.dark.mean.shape).all():
             return None
-        return Levels(self.dark, self.corners, self.window).keep()
+        return DarkWindows(self.dark, self.corners, self.window).keep()
 
     @cached_property
     def factored(self) -> Factored:

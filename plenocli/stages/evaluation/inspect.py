@@ -107,34 +107,34 @@ def _picture(path, kind):
 
 
 def _raw(path):
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
-    mosaic = read_mosaic(path)
-    values, meta = mosaic.values, dict(mosaic.meta)
-    camera = " ".join(str(meta.pop(name)) for name in ("make", "model") if meta.get(name)) or None
+    capture = read_capture(path)
+    values, levels, meta = capture.mosaic, capture.levels, dict(capture.metadata.details)
+    meta = {name: v for name, v in meta.items() if name not in ("make", "model") or not v}
     positions = {
         f"{letter} ({i}, {j})": _statistics(values[i::2, j::2])
-        | {"black": float(mosaic.black[i, j])}
+        | {"black": float(levels.black[i, j])}
         for (i, j), letter in zip(
-            [(0, 0), (0, 1), (1, 0), (1, 1)], "mmmm" if mosaic.cfa == "mono" else mosaic.cfa
+            [(0, 0), (0, 1), (1, 0), (1, 1)], "mmmm" if capture.cfa == "mono" else capture.cfa
         )
     }
     return {
-        "type": "dng" if mosaic.source == "dng" else "raw",
+        "type": "dng" if capture.metadata.source == "dng" else "raw",
         "rows": values.shape[0],
         "columns": values.shape[1],
-        "cfa": mosaic.cfa,
-        "black": mosaic.black.tolist(),
-        "white": mosaic.white,
-        "exposure_s": mosaic.exposure_s,
+        "cfa": capture.cfa,
+        "black": levels.black.tolist(),
+        "white": levels.white,
+        "exposure_s": capture.exposure_s,
         "iso": meta.pop("iso", None),
         "f_number": meta.pop("f_number", None),
         "focal_length_m": meta.pop("focal_length_m", None),
-        "camera": camera,
+        "camera": capture.metadata.camera,
         "dtype": str(values.dtype),
         "verified": bool(meta.pop("verified", False)),
         "zeros": float(np.mean(values == 0)),
-        "saturated": float(np.mean(values >= mosaic.white)),
+        "saturated": float(np.mean(values >= levels.white)),
         "positions": positions,
         "meta": _json(meta),
     }

@@ -218,11 +218,11 @@ def _alone(page, files):
 
 def _capture(page, run, file):
     """One capture with its lenslet grid."""
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
     from plenocli.report.figures import capture_figures
 
     try:
-        mosaic = read_mosaic(file.path)
+        shot = read_capture(file.path)
     except InputError as error:
         page.warning(str(error))
         return
@@ -240,7 +240,7 @@ def _capture(page, run, file):
     )
     if centres is None and calibration is not None:
         centres = calibration.artefact().data["grid/centre"]
-    _add(page, capture_figures(mosaic, file.name, centres))
+    _add(page, capture_figures(shot, file.name, centres))
 
 
 def _refocused(page, run, scores):

@@ -134,7 +134,7 @@ def _inside(places, shape, option, what):
 
 
 def _capture(path, artefact, choice):
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
     from plenocli.report.figures import capture_figures
 
     centres = (
@@ -142,7 +142,7 @@ def _capture(path, artefact, choice):
         if choice.centres is not None or artefact is None
         else artefact.data.get("capture/lenslet_centre")
     )
-    return capture_figures(read_mosaic(path), path.name, centres)
+    return capture_figures(read_capture(path), path.name, centres)
 
 
 def _calibration(path, artefact, choice):

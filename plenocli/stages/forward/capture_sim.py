@@ -1,14 +1,23 @@
 """capture-sim: source -> optics -> detector, one exposure of a plenoptic camera."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
-from plenocli.files.read.scenes import Chart, Uniform, read_scene
+from plenocli.files.read.scenes import Chart, Scene, Uniform, read_scene
+from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.scene.light import Quadrature
 
 WHITE_LEVEL = 0.8
 """Share of full well that a perfect white reaches in [light] white_exposure, at
@@ -22,10 +31,23 @@ the last digits, are the same on all larger machines.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What the command line says beyond the files; lengths in m, exposure in s (None: the
-    camera's white exposure).
+    """What the command line says beyond the files.
+
+    target: "white", "dark", "mono:450nm" or "colorchecker", None where there is a scene.
+    sampling: "fit" or "crop", of a photograph.
+    refine: object points per side for each point of the camera description.
+    bandwidth: of the light, m.
+    spectral_step: m, None as the light needs.
+    superpixels: (rows, columns) that one lenslet's light may reach, or "auto".
+    coherent_ring: lenslets whose light interferes, or "auto".
+    accuracy: relative, None as the noise needs.
+    model: of the propagation, "auto" or a rung.
+    snr_db: of white noise instead of the sensor's own, dB.
+    noise: "sensor" or "none".
+    exposure: s, None for the camera's white exposure.
+    seed: of the noise.
     """
 
     target: str | None = None
@@ -43,25 +65,91 @@ class Settings:
     seed: int = 0
 
 
-def run_capture_sim(
-    camera_path,
-    output,
-    settings,
-    *,
-    scene=None,
-    pif=None,
-    scene_out=None,
-    overwrite=False,
-    command="",
-):
-    """Simulate one capture and write it as .h5, .exr or .dng; returns a summary dict.
+@dataclass(frozen=True, kw_only=True)
+class SensorLight:
+    """Relative light on a sensor tiled with superpixels, before detection.
 
-    Errors: ConfigError where the camera does not tile the sensor, UsageError for contradicting
-    options, InputError for files.
+    colours: letters of the colour filters.
+    superpixels: (colour, lenslet_row, lenslet_column, pixel) of the scene.
+    white: (colour, pixel) a superpixel of a uniform white object.
+    scene: (band, row, column) reflectance of the object as sampled.
     """
-    from plenocli.files.artefacts.provenance import describe_inputs
+
+    colours: tuple[str, ...]
+    superpixels: np.ndarray
+    white: np.ndarray
+    scene: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSummary:
+    """What capture-sim wrote.
+
+    output: the file.
+    rows, columns: of its mosaic.
+    wavelengths: how many the light was computed at.
+    units: of the mosaic.
+    peak: its largest value.
+    noise_sigma: standard deviation of the noise, None where the sensor's noise is simulated.
+    saturated: share of the pixels over full well, None in relative units.
+    exposure_s: s, None in relative units.
+    """
+
+    output: Path
+    rows: int
+    columns: int
+    wavelengths: int
+    units: str
+    peak: float | int
+    noise_sigma: float | None = None
+    saturated: float | None = None
+    exposure_s: float | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary for `--json`; what does not apply is left out."""
+        named = {
+            "units": self.units,
+            "noise_sigma": self.noise_sigma,
+            "peak": self.peak,
+            "saturated": self.saturated,
+            "exposure_s": self.exposure_s,
+            "output": str(self.output),
+            "rows": self.rows,
+            "columns": self.columns,
+            "wavelengths": self.wavelengths,
+        }
+        return {name: value for name, value in named.items() if value is not None}
+
+
+def run_capture_sim(
+    camera_path: str | Path,
+    output: str | Path,
+    settings: Settings,
+    *,
+    scene: str | Path | None = None,
+    pif: str | Path | None = None,
+    scene_out: str | Path | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> CaptureSummary:
+    """Simulate one capture and write it.
+
+    camera_path: description of the camera, .toml.
+    output: .h5, .exr or .dng.
+    scene: what read_scene takes; None where the settings have a target.
+    pif: artefact whose system matrix is used instead of a computed one.
+    scene_out: also write the object as sampled, .h5 or .exr.
+    overwrite: replace files that are there.
+    command: for the provenance.
+
+    Returns what was written.
+    Raises ConfigError where the camera does not tile the sensor, UsageError for contradicting
+    options, InputError for files, OutputError where one cannot be written.
+    """
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
     from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import camera_files, read_camera
 
     output = Path(output)
@@ -94,28 +182,44 @@ def run_capture_sim(
         if pif
         else (None, _accuracy(camera, settings, source.wavelengths))
     )
-    light, whites, truth = _carry(camera, source, what, settings, matrix)
-    capture, summary = _detect(camera, light, whites, settings, scene)
-    _describe(capture, camera, settings, truth, scene)
-    provenance = dict(
+    light = _carry(camera, source, what, settings, matrix)
+    capture, saturated = _detect(camera, light, settings, scene)
+    capture = _described(capture, camera, settings, light.scene, scene)
+    roles = camera_files(camera_path, camera) | {
+        "pif": pif,
+        "scene": scene if scene and Path(scene).is_file() else None,
+    }
+    provenance = Provenance(
         command=command,
-        inputs=describe_inputs(
-            camera_files(camera_path, camera)
-            | {"pif": pif, "scene": scene if scene and Path(scene).is_file() else None}
-        ),
+        inputs=describe_inputs(roles),
         seed=settings.seed,
         config=to_toml(camera),
         accuracy=accuracy,
     )
-    _write(output, capture, provenance, overwrite)
+    bands = np.array(camera.light.wavelengths[: len(light.scene)])
+    write_capture(
+        output, capture, provenance, scene=light.scene, wavelengths=bands, overwrite=overwrite
+    )
     if scene_out:
-        _write_scene(scene_out, truth, camera, provenance, overwrite)
-    return summary | {
-        "output": str(output),
-        "rows": capture["mosaic"].shape[0],
-        "columns": capture["mosaic"].shape[1],
-        "wavelengths": len(source.wavelengths),
-    }
+        _write_scene(scene_out, light.scene, bands, provenance, overwrite)
+    return _summary(output, capture, len(source.wavelengths), saturated)
+
+
+def _summary(
+    output: Path, capture: Capture, wavelengths: int, saturated: float | None
+) -> CaptureSummary:
+    peak, relative = capture.mosaic.max(), saturated is None
+    return CaptureSummary(
+        output=output,
+        rows=capture.shape[0],
+        columns=capture.shape[1],
+        wavelengths=wavelengths,
+        units=capture.units,
+        peak=float(peak) if relative else int(peak),
+        noise_sigma=capture.noise.sigma if relative else None,
+        saturated=saturated,
+        exposure_s=capture.exposure_s,
+    )
 
 
 def _check_tiling(camera, where):
@@ -214,7 +318,7 @@ def _source(camera, settings, scene):
     return white, scenes[target]
 
 
-class _Stored:
+class StoredMatrix:
     """The system matrix of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
 
     def __init__(self, artefact, band):
@@ -277,14 +381,18 @@ def _read_pif(path, camera, settings, wavelengths, camera_path):
                 path,
                 "run simulate-pif with the same --spectral-step, or leave --pif out",
             )
-        stored[wavelength] = _Stored(artefact, band)
+        stored[wavelength] = StoredMatrix(artefact, band)
     return stored, artefact.provenance.accuracy
 
 
-def _carry(camera, source, scene, settings, matrix):
-    """((letters, light on every superpixel by letter), the white superpixel by letter, the
-    object as sampled).
-    """
+def _carry(
+    camera: Camera,
+    source: Quadrature,
+    scene: Scene,
+    settings: Settings,
+    matrix: dict[float, StoredMatrix] | None,
+) -> SensorLight:
+    """Light of the scene on every superpixel, band by band through the system matrix."""
     from plenocli.base.budget import budget
     from plenocli.forward.sensor.cfa import sensitivity
     from plenocli.forward.sensor.irradiance import superpixel_light
@@ -311,7 +419,12 @@ def _carry(camera, source, scene, settings, matrix):
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2
         light = light + weight[:, :, None, None] * carried[None]
         whites = whites + weight * white[None]
-    return (letters, light), whites, _truth(camera, scene, grid, settings.refine)
+    return SensorLight(
+        colours=letters,
+        superpixels=light,
+        white=whites,
+        scene=_truth(camera, scene, grid, settings.refine),
+    )
 
 
 def _build(camera, wavelength, settings):
@@ -366,47 +479,75 @@ def _truth(camera, scene, grid, refine):
     )
 
 
-def _detect(camera, light, whites, settings, scene):
-    """From relative light to what the sensor reports: (capture dict, summary dict)."""
-    from plenocli.base.tiling import to_plane
-    from plenocli.forward.sensor.cfa import cfa_map
-    from plenocli.forward.sensor.noise import Noise, SensorModel, add_white_noise
-
-    letters, light = light
-    sensor, shape = camera.sensor, camera.sensor.pixels_per_lenslet
-    planes = {letter: to_plane(plane, shape) for letter, plane in zip(letters, light)}
-    mosaic = next(iter(planes.values()))
-    if sensor.cfa != "mono":
-        where = cfa_map(mosaic.shape, sensor.cfa)
-        mosaic = sum(np.where(where == letter, plane, 0.0) for letter, plane in planes.items())
-    peak = float(whites.max())
-    if not peak > 0:
+def _detect(
+    camera: Camera, light: SensorLight, settings: Settings, scene: str | Path | None
+) -> tuple[Capture, float | None]:
+    """What the sensor reports of relative light, and the share of pixels over full well (None in
+    relative units).
+    """
+    mosaic = _through_the_filters(camera, light)
+    if not float(light.white.max()) > 0:
         raise ConfigError(
             "no light of this source reaches the sensor",
             "camera",
             "check filters, wavelengths and illuminant",
         )
-    capture = {"cfa": sensor.cfa}
     rng = stream(settings.seed, "capture-sim")
     if settings.snr_db is not None or settings.noise == "none":
-        # relative units: with one wavelength and no colour the mosaic is A x itself
-        mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
-        noise = Noise()
-        if settings.snr_db is not None:
-            mosaic, noise = add_white_noise(mosaic, settings.snr_db, rng)
-        capture |= dict(
-            mosaic=mosaic.astype(np.float64),
-            units="relative",
-            black=0.0,
-            white=float("inf"),
-            snr_db=settings.snr_db,
-            noise_sigma=noise.sigma,
-        )
-        return capture, {
-            "units": "relative",
-            "noise_sigma": noise.sigma,
-            "peak": float(mosaic.max()),
-        }
+        return _relative(camera, mosaic, settings, rng), None
+    return _exposed(camera, mosaic, float(light.white.max()), settings, scene, rng)
+
+
+def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
+    """(row, column) light that the sensor's colour filters leave, relative."""
+    from plenocli.base.tiling import to_plane
+    from plenocli.forward.sensor.cfa import cfa_map
+
+    shape = camera.sensor.pixels_per_lenslet
+    planes = {c: to_plane(plane, shape) for c, plane in zip(light.colours, light.superpixels)}
+    mosaic = next(iter(planes.values()))
+    if camera.sensor.cfa == "mono":
+        return mosaic
+    where = cfa_map(mosaic.shape, camera.sensor.cfa)
+    return sum(np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
+
+
+def _relative(
+    camera: Camera, mosaic: np.ndarray, settings: Settings, rng: np.random.Generator
+) -> Capture:
+    """A capture in relative units, with white noise or none: with one wavelength and no colour
+    the mosaic is A x itself.
+    """
+    from plenocli.forward.sensor.noise import Noise, add_white_noise
+
+    sensor, noise = camera.sensor, Noise()
+    mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
+    if settings.snr_db is not None:
+        mosaic, noise = add_white_noise(mosaic, settings.snr_db, rng)
+    return Capture(
+        mosaic=mosaic.astype(np.float64),
+        units="relative",
+        cfa=sensor.cfa,
+        noise=noise,
+        metadata=CaptureMetadata(snr_db=settings.snr_db, noise_from="--snr and --noise"),
+    )
+
+
+def _exposed(
+    camera: Camera,
+    mosaic: np.ndarray,
+    peak: float,
+    settings: Settings,
+    scene: str | Path | None,
+    rng: np.random.Generator,
+) -> tuple[Capture, float]:
+    """A capture in digital numbers, and the share of its pixels over full well.
+
+    peak: relative light of the brightest pixel under a uniform white object.
+    """
+    from plenocli.forward.sensor.noise import SensorModel
+
+    sensor = camera.sensor
     exposure = settings.exposure or camera.light.white_exposure
     scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
     model = SensorModel.from_camera(camera)
@@ -417,103 +558,76 @@ def _detect(camera, light, whites, settings, scene):
             "clip it (reconstruct --clip), or use --noise none",
         )
     values = model.expose(mosaic * scale, rng)
-    capture |= dict(
-        mosaic=values,
-        units="DN",
-        black=float(sensor.black_level),
-        white=float(model.white_level),
-        gain_e_per_dn=1 / sensor.gain,
-        exposure_s=exposure,
-        electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),
-    )
     saturated = float(np.mean(mosaic * scale >= sensor.full_well))
     if saturated > 0.001:
         note(
             f"{saturated:.1%} of the pixels are over full well; a shorter "
             "--exposure would keep them"
         )
-    return capture, {
-        "units": "DN",
-        "peak": int(values.max()),
-        "saturated": saturated,
-        "exposure_s": exposure,
-    }
+    capture = Capture(
+        mosaic=values,
+        cfa=sensor.cfa,
+        levels=Levels(
+            black=np.full((2, 2), float(sensor.black_level)),
+            white=float(model.white_level),
+            gain=sensor.gain,
+        ),
+        exposure_s=exposure,
+        noise=model.noise,
+        metadata=CaptureMetadata(
+            noise_from="camera",
+            electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),
+        ),
+    )
+    return capture, saturated
 
 
-def _describe(capture, camera, settings, truth, scene):
-    """What later stages need to know beside the mosaic."""
+def _described(
+    capture: Capture,
+    camera: Camera,
+    settings: Settings,
+    truth: np.ndarray,
+    scene: str | Path | None,
+) -> Capture:
+    """The capture with what later stages need to know beside the mosaic."""
+    from plenocli.base.units import parse_length
+
     rows, columns = camera.sensor.pixels_per_lenslet
     count = camera.lenslet_array.count
     first = np.array([(rows - 1) / 2, (columns - 1) / 2])
     index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
-    capture.update(
-        scene=truth,
-        wavelength=np.array(camera.light.wavelengths[: len(truth)]),
-        lenslet_centre=first + index * np.array([rows, columns]),
-        lenslet_count=list(count),
-        superpixel_shape=[rows, columns],
-        scene_shape=list(truth.shape[1:]),
+    narrow = settings.target is not None and settings.target.startswith("mono:")
+    metadata = replace(
+        capture.metadata,
+        scene_shape=tuple(truth.shape[1:]),
         target=settings.target or str(Path(str(scene)).name),
         illuminant=camera.light.illuminant,
+        band_m=parse_length(settings.target.removeprefix("mono:")) if narrow else None,
     )
-    if settings.target and settings.target.startswith("mono:"):
-        from plenocli.base.units import parse_length
-
-        capture["band_m"] = parse_length(settings.target.removeprefix("mono:"))
-
-
-DATASETS = ("mosaic", "cfa", "scene", "wavelength", "lenslet_centre")
-"""Keys of a capture that are datasets; the others are attributes."""
+    grid = SuperpixelGrid(
+        shape=(rows, columns),
+        count=tuple(count),
+        centre=first + index * np.array([rows, columns]),
+    )
+    return replace(capture, grid=grid, metadata=metadata)
 
 
-def _write(output, capture, provenance, overwrite):
-    from plenocli.files.artefacts.container import Artefact, write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, provenance_texts
-    from plenocli.files.images.dng import write_dng
-    from plenocli.files.images.mosaic import write_capture_exr
-
-    attrs = {k: v for k, v in capture.items() if k not in DATASETS and v is not None}
-    if output.suffix == ".h5":
-        data = {f"capture/{k}": v for k, v in capture.items() if k in DATASETS}
-        write_artefact(
-            output,
-            Artefact("capture", data, {"capture": attrs}, Provenance(**provenance)),
-            overwrite=overwrite,
-        )
-        return
-    if output.suffix == ".exr":
-        words = {name: value for name, value in attrs.items() if value != float("inf")}
-        write_capture_exr(
-            output,
-            capture["mosaic"],
-            words | {"cfa": capture["cfa"]},
-            attrs=provenance_texts(Provenance(**provenance)),
-            overwrite=overwrite,
-        )
-    else:
-        write_dng(
-            output,
-            capture["mosaic"],
-            cfa=capture["cfa"],
-            black=capture["black"],
-            white=capture["white"],
-            exposure_s=capture["exposure_s"],
-            xmp_json=attrs | {"provenance": provenance},
-            overwrite=overwrite,
-        )
-
-
-def _write_scene(path, truth, camera, provenance, overwrite):
+def _write_scene(
+    path: str | Path,
+    truth: np.ndarray,
+    wavelengths: np.ndarray,
+    provenance: Provenance,
+    overwrite: bool,
+) -> None:
     """The object as sampled, an `image` artefact or EXR: one picture, or one a band of
     [light] wavelengths.
     """
     from plenocli.files.artefacts.container import Artefact, write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, provenance_texts
+    from plenocli.files.artefacts.provenance import provenance_texts
     from plenocli.files.images.exr import write_exr
     from plenocli.files.images.spectral_exr import write_spectral_exr
 
-    texts = provenance_texts(Provenance(**provenance))
-    path, wavelengths = Path(path), np.array(camera.light.wavelengths[: len(truth)])
+    texts, path = provenance_texts(provenance), Path(path)
     if path.suffix == ".exr" and len(truth) == 1:
         write_exr(path, {"Y": truth[0]}, texts, overwrite=overwrite)
     elif path.suffix == ".exr":
@@ -526,10 +640,5 @@ def _write_scene(path, truth, camera, provenance, overwrite):
             if len(truth) == 1
             else {"image/value": truth, "image/wavelength": wavelengths}
         )
-        write_artefact(
-            path,
-            Artefact(
-                "image", data, {"image": {"method": "object as sampled"}}, Provenance(**provenance)
-            ),
-            overwrite=overwrite,
-        )
+        attrs = {"image": {"method": "object as sampled"}}
+        write_artefact(path, Artefact("image", data, attrs, provenance), overwrite=overwrite)

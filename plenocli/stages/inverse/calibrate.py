@@ -11,12 +11,8 @@ import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError, UsageError
 from plenocli.base.progress import bar, note
-from plenocli.files.read.mosaics import (
-    Exposure,
-    check_exposure_times,
-    read_exposures,
-    true_centres,
-)
+from plenocli.files.read.series import check_exposure_times, read_series, true_centres
+from plenocli.forward.sensor.capture import Capture
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -214,31 +210,35 @@ def _calibrated(
     from plenocli.inverse.spectra.calibration import Calibration, Sensor, White, windows_on
     from plenocli.inverse.spectra.quality import mean_of_known
 
-    white = read_exposures(captures.whites, cfa=captures.cfa)
-    dark_frames = read_exposures(captures.darks, white[0], captures.cfa)
+    white = read_series(captures.whites, cfa=captures.cfa)
+    dark_frames = read_series(captures.darks, white[0], captures.cfa)
     check_exposure_times(white)
     first = white[0]
     dark = make_dark(
-        [e.values for e in dark_frames],
-        [e.seconds for e in dark_frames],
-        first.black,
-        first.values.shape,
+        [e.mosaic for e in dark_frames],
+        [e.exposure_s for e in dark_frames],
+        first.levels.black,
+        first.shape,
     )
     del dark_frames
     noise = _told_by(white, dark, _noise(white, dark, captures.camera))
     signal, _ = merge(
-        [e.values for e in white], [e.seconds for e in white], dark, first.white, first.seconds
+        [e.mosaic for e in white],
+        [e.exposure_s for e in white],
+        dark,
+        first.levels.white,
+        first.exposure_s,
     )
     if np.isnan(signal).mean() > SATURATED:
         raise InputError(
             f"{np.isnan(signal).mean():.0%} of the white image is saturated",
-            first.path,
+            first.metadata.path,
             "expose it for less time",
         )
     found = _grid(signal, first, lattice, near)
-    windows, valid = windows_on(found, first.values.shape)
+    windows, valid = windows_on(found, first.shape)
     step = 1 if first.cfa == "mono" else 2
-    bad = bad_pixels(signal, dark, first.white, step) | np.isnan(signal)
+    bad = bad_pixels(signal, dark, first.levels.white, step) | np.isnan(signal)
     reference = White.measured(np.where(bad, np.float32(np.nan), signal), windows, valid)
     valid = valid & (reference.level > 0)
     del signal
@@ -251,8 +251,8 @@ def _calibrated(
     sensor = Sensor(
         cfa=first.cfa,
         units=first.units,
-        white_level=first.white,
-        exposure=first.seconds,
+        white_level=first.levels.white,
+        exposure=first.exposure_s,
         gain_e_per_dn=1 / noise.gain if noise.gain else None,
         read_noise=float(np.sqrt(noise.read_variance)),
         notes=f"noise from: {noise.source}",
@@ -270,19 +270,20 @@ def _band_roles(bands: Sequence[tuple[float, Name]]) -> dict[str, list[Name]]:
     return roles
 
 
-def _noise(white: list[Exposure], dark: Dark, camera: Camera | None) -> KnownNoise:
+def _noise(white: list[Capture], dark: Dark, camera: Camera | None) -> KnownNoise:
     """Gain and read variance as far as the camera description or the files say them."""
     from plenocli.forward.sensor.noise import SensorModel
 
     if camera is not None and white[0].units == "DN":
         noise = SensorModel.from_camera(camera).noise
         return KnownNoise(noise.gain, noise.read_variance, "camera")
-    if white[0].sigma is not None:
-        return KnownNoise(0.0, white[0].sigma ** 2, "white noise of the simulation")
-    return KnownNoise(white[0].gain, None if dark.sigma is None else dark.sigma**2, "file")
+    known = white[0].white_noise
+    if known is not None and known.white:
+        return KnownNoise(0.0, known.white, "white noise of the simulation")
+    return KnownNoise(white[0].levels.gain, None if dark.sigma is None else dark.sigma**2, "file")
 
 
-def _told_by(group: list[Exposure], dark: Dark, noise: KnownNoise) -> KnownNoise:
+def _told_by(group: list[Capture], dark: Dark, noise: KnownNoise) -> KnownNoise:
     """The noise, what is not known of it from two frames of one scene among the
     exposures `group`.
     """
@@ -291,12 +292,13 @@ def _told_by(group: list[Exposure], dark: Dark, noise: KnownNoise) -> KnownNoise
     for a, b in zip(group[::2], group[1::2]):
         if (
             (noise.gain is None or noise.read_variance is None)
-            and a.seconds == b.seconds
-            and a.path != b.path
+            and a.exposure_s == b.exposure_s
+            and a.metadata.path != b.metadata.path
         ):
-            limit = 0.9 * (a.white - np.mean(a.black)) if np.isfinite(a.white) else np.inf
+            top, black = a.levels.white, a.levels.black
+            limit = 0.9 * (top - np.mean(black)) if np.isfinite(top) else np.inf
             found = photon_transfer(
-                a.values - dark.at(a.seconds), b.values - dark.at(b.seconds), limit
+                a.mosaic - dark.at(a.exposure_s), b.mosaic - dark.at(b.exposure_s), limit
             )
             if found:
                 return KnownNoise(
@@ -308,7 +310,7 @@ def _told_by(group: list[Exposure], dark: Dark, noise: KnownNoise) -> KnownNoise
 
 
 def _grid(
-    signal: np.ndarray, white: Exposure, lattice: str, near: tuple[float, float] | None
+    signal: np.ndarray, white: Capture, lattice: str, near: tuple[float, float] | None
 ) -> LensletGrid:
     from plenocli.inverse.grid.detect import find_grid
 
@@ -317,12 +319,12 @@ def _grid(
             np.where(np.isnan(signal), np.nanmax(signal), signal), white.cfa, None, lattice, near
         )
     except (NumericsError, InputError) as error:
-        raise error.at(white.path) from None
+        raise error.at(white.metadata.path) from None
 
 
 def _response(
     captures: Captures,
-    white: list[Exposure],
+    white: list[Capture],
     dark: Dark,
     bad: np.ndarray,
     noise: KnownNoise,
@@ -337,17 +339,22 @@ def _response(
     from plenocli.inverse.spectra.measured_response import GatheredResponses, measured_response
 
     wavelengths = list(dict.fromkeys(w for w, _ in captures.bands))
-    reference, cfa = white[0].seconds, white[0].cfa
+    reference, cfa = white[0].exposure_s, white[0].cfa
     gathered = GatheredResponses(windows, grid.valid, len(wavelengths))
     for k, wavelength in enumerate(bar(wavelengths, len(wavelengths), "bands")):
-        group = read_exposures([p for w, p in captures.bands if w == wavelength], white[0], cfa)
+        group = read_series([p for w, p in captures.bands if w == wavelength], white[0], cfa)
         check_exposure_times([white[0], *group])
         noise = _told_by(group, dark, noise)
         shares = [
-            1.0 if e.seconds is None or reference is None else e.seconds / reference for e in group
+            1.0 if e.exposure_s is None or reference is None else e.exposure_s / reference
+            for e in group
         ]
         signal, weight = merge(
-            [e.values for e in group], [e.seconds for e in group], dark, group[0].white, reference
+            [e.mosaic for e in group],
+            [e.exposure_s for e in group],
+            dark,
+            group[0].levels.white,
+            reference,
         )
         signal[bad] = np.nan
         energy = next(

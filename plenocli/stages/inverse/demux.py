@@ -17,13 +17,13 @@ from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import note
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
-from plenocli.files.read.mosaics import read_exposure
+from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch
-    from plenocli.files.read.mosaics import Exposure
+    from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.registration.alignment import Registration
@@ -287,10 +287,10 @@ class Demultiplexer:
         """
         from plenocli.files.artefacts.provenance import describe_inputs
 
-        exposure = read_exposure(path, cfa=self.responses.cfa)
+        exposure = read_capture(path, cfa=self.responses.cfa)
         return self.estimate(exposure, path, method), describe_inputs({"capture": path})
 
-    def estimate(self, exposure: Exposure, path: Name, method: str | None = None) -> Spectra:
+    def estimate(self, exposure: Capture, path: Name, method: str | None = None) -> Spectra:
         """Radiances of a capture that was read already."""
         from plenocli.inverse.registration.alignment import doubtful, warn_of_misfit
 

@@ -528,9 +528,9 @@ def _white_normalised(capture: Path, calibration: Path | None) -> np.ndarray:
 
     Pixels that the calibration masked (dead, or under dust) are left out of both sums.
     """
-    from plenocli.files.images.mosaic import read_mosaic
+    from plenocli.files.images.mosaic import read_capture
 
-    signal, white = calibrated(capture, read_mosaic(capture), calibration)
+    signal, white = calibrated(read_capture(capture), calibration)
     with np.errstate(divide="ignore", invalid="ignore"):
         usable = np.isfinite(signal) & np.isfinite(white)
         value = np.where(usable, signal, 0).sum(axis=2) / np.where(usable, white, 0).sum(axis=2)

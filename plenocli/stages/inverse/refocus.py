@@ -129,33 +129,32 @@ def _samples(capture, calibration, planes=1):
     """
     from plenocli.base.budget import budget
     from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.images.mosaic import read_mosaic
-    from plenocli.forward.sensor.frames import tiled
+    from plenocli.files.images.mosaic import read_capture
     from plenocli.inverse.lightfield.refocus import collect
 
-    mosaic = read_mosaic(capture)
+    shot = read_capture(capture)
     budget().require(
-        mosaic.values.size * (PIXEL_BYTES + PLANE_BYTES * planes),
+        shot.mosaic.size * (PIXEL_BYTES + PLANE_BYTES * planes),
         "refocusing",
         capture,
         "cut the capture",
     )
-    if mosaic.cfa != "mono":
+    if shot.cfa != "mono":
         raise InputError(
-            f"has the colour filter array {mosaic.cfa}; refocusing takes grey captures",
+            f"has the colour filter array {shot.cfa}; refocusing takes grey captures",
             capture,
             "demultiplex it first",
         )
     if calibration is not None:
         found = read_artefact(calibration, "calibration")
-        if "white/flat" not in found.data or found.data["white/flat"].shape != mosaic.values.shape:
+        if "white/flat" not in found.data or found.data["white/flat"].shape != shot.shape:
             raise InputError(
                 "holds no white image of this sensor",
                 calibration,
                 "calibrate with the white image of the camera that took the capture",
             )
         signal, white = (
-            mosaic.values - found.data["dark/mean"],
+            shot.mosaic - found.data["dark/mean"],
             np.nan_to_num(found.data["white/flat"]),
         )
         centres, valid = found.data["grid/centre"], found.data["grid/valid"].astype(bool)
@@ -165,16 +164,15 @@ def _samples(capture, calibration, planes=1):
         if level is not None:
             signal = signal / float(np.nanmedian(level))
     else:
-        size = mosaic.meta.get("superpixel_shape")
+        size = shot.grid.shape if shot.grid else None
         if size is None:
             raise InputError(
                 "does not say where its lenslets are",
                 capture,
                 "give --calibration (from calibrate) with the white image of this camera",
             )
-        size = [int(n) for n in size]
-        count = [mosaic.values.shape[axis] // size[axis] for axis in (0, 1)]
-        signal = np.asarray(mosaic.values - tiled(mosaic.black, mosaic.values.shape, float), float)
+        count = [shot.shape[axis] // size[axis] for axis in (0, 1)]
+        signal = shot.signal()
         # what all superpixels have in common stands for a white image
         mean = signal.reshape(count[0], size[0], count[1], size[1]).mean(axis=(0, 2))
         white = np.tile(mean / mean.max(), count)
@@ -194,4 +192,4 @@ def _samples(capture, calibration, planes=1):
             "check the white image and the calibration",
         )
     # pitches are measured
-    return samples, tuple(max(1, int(np.ceil(n / pitch - 0.1))) for n in mosaic.values.shape)
+    return samples, tuple(max(1, int(np.ceil(n / pitch - 0.1))) for n in shot.shape)

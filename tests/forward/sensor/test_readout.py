@@ -1,10 +1,12 @@
 """Superpixels cut from a mosaic as light: the same as the whole mosaic worked out first."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from plenocli.forward.sensor.frames import Dark, saturated, tiled
-from plenocli.forward.sensor.readout import Levels, Readout
+from plenocli.forward.sensor.readout import DarkWindows, Readout
 from plenocli.forward.sensor.superpixel import extract
 
 SHAPE, WINDOW, BLACK = (60, 70), (9, 8), np.array([[100.0, 102.0], [98.0, 101.0]])
@@ -18,7 +20,7 @@ def mosaic(seed=0):
 
 def whole(readout):
     light = (
-        np.asarray(readout.values, np.float32) - readout.dark.at(readout.seconds)
+        np.asarray(readout.values, np.float32) - readout.dark.at(readout.exposure_s)
     ) * np.float32(readout.scale) - np.float32(readout.offset)
     return np.where(saturated(readout.values, readout.black, readout.white), np.nan, light)
 
@@ -29,9 +31,14 @@ def whole(readout):
 def test_windows_hold_what_the_whole_mosaic_holds(seconds, flat, black):
     level = tiled(black, SHAPE)
     noise = 0 if flat else np.random.default_rng(1).normal(0, 2, SHAPE).astype(np.float32)
-    dark = Dark(level + noise, black, 0.1, 2.0)
+    dark = Dark(mean=level + noise, black=black, exposure=0.1, sigma=2.0)
     assert dark.flat == flat
-    readout = Readout(mosaic(), dark, seconds, black, 4095.0, 0.25) - 3.0
+    readout = (
+        Readout(
+            values=mosaic(), dark=dark, exposure_s=seconds, black=black, white=4095.0, scale=0.25
+        )
+        - 3.0
+    )
     np.testing.assert_allclose(
         readout.cut(ORIGIN, WINDOW), extract(whole(readout), ORIGIN, WINDOW), rtol=1e-6, atol=1e-4
     )
@@ -44,14 +51,14 @@ def test_windows_hold_what_the_whole_mosaic_holds(seconds, flat, black):
 
 def test_levels_cut_before_change_nothing():
     dark = Dark(
-        tiled(BLACK, SHAPE) + np.random.default_rng(1).normal(0, 2, SHAPE).astype(np.float32),
-        BLACK,
-        None,
-        2.0,
+        mean=tiled(BLACK, SHAPE) + np.random.default_rng(1).normal(0, 2, SHAPE).astype(np.float32),
+        black=BLACK,
+        exposure=None,
+        sigma=2.0,
     )
     origin = ORIGIN[:4]
-    plain = Readout(mosaic(), dark, None, BLACK, np.inf)
-    ready = Readout(mosaic(), dark, None, BLACK, np.inf, ready=Levels(dark, origin, WINDOW).keep())
+    plain = Readout(values=mosaic(), dark=dark, exposure_s=None, black=BLACK, white=np.inf)
+    ready = replace(plain, ready=DarkWindows(dark, origin, WINDOW).keep())
     np.testing.assert_array_equal(ready.cut(origin, WINDOW), plain.cut(origin, WINDOW))
     np.testing.assert_array_equal(ready.cut(origin + 1, WINDOW), plain.cut(origin + 1, WINDOW))
     np.testing.assert_array_equal(

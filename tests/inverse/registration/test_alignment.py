@@ -52,7 +52,7 @@ def calibration(cfa, shared):
     response = painted(np.zeros((ROWS, COLUMNS, 2)), ORIGIN, cfa).astype(np.float32)
     valid = np.ones((ROWS, COLUMNS), bool)
     valid[1, 2] = False
-    dark = Dark(np.zeros(SHAPE, np.float32), np.zeros((2, 2)), None, None)
+    dark = Dark(mean=np.zeros(SHAPE, np.float32), black=np.zeros((2, 2)), exposure=None, sigma=None)
     return lenslet_responses(
         response[0, 0] if shared else response,
         np.array([450e-9, 540e-9, 570e-9, 650e-9]),

@@ -1,0 +1,126 @@
+"""A capture: the mosaic of one exposure with all that is known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plenocli.forward.sensor.frames import tiled
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from plenocli.forward.sensor.noise import Noise
+
+
+@dataclass(frozen=True, kw_only=True)
+class Levels:
+    """What the numbers of a mosaic mean.
+
+    black: (2, 2) by position, level of no light, units of the mosaic.
+    white: level from which on pixels are saturated, units of the mosaic; inf where none is.
+    gain: units of the mosaic for one electron, None where unknown.
+    """
+
+    black: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
+    white: float = np.inf
+    gain: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuperpixelGrid:
+    """Where the superpixels are that a simulated capture was tiled with, as far as its file says.
+
+    shape: (rows, columns) of a superpixel, px.
+    count: lenslets (rows, columns).
+    centre: (lenslet_row, lenslet_column, 2) true centres, px.
+    """
+
+    shape: tuple[int, ...] | None = None
+    count: tuple[int, ...] | None = None
+    centre: np.ndarray | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureMetadata:
+    """Where a capture comes from and what was in front of the camera; None where not known.
+
+    source: kind of file: "raw", "dng", "image", "capture" or "exr"; "simulation" before it has one.
+    path: of the file.
+    camera: make and model.
+    noise_from: who says the noise.
+    target: what was in front of the camera.
+    illuminant: name of the light.
+    band_m: centre of the narrow band that lit the scene, m.
+    electrons_per_unit: electrons for one unit of A x, the light of a white object point.
+    snr_db: signal-to-noise ratio of the noise that was added, dB.
+    scene_shape: object points (rows, columns).
+    accuracy: record of a simulated capture's accuracy.
+    matrix: SHA-256 of the pif that a simulated capture was made with.
+    details: whatever else the file says, by its names.
+    """
+
+    source: str = "simulation"
+    path: Path | None = None
+    camera: str | None = None
+    noise_from: str | None = None
+    target: str | None = None
+    illuminant: str | None = None
+    band_m: float | None = None
+    electrons_per_unit: float | None = None
+    snr_db: float | None = None
+    scene_shape: tuple[int, ...] | None = None
+    accuracy: dict[str, Any] | None = None
+    matrix: str | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """One exposure of a plenoptic camera, measured or simulated, never demosaiced.
+
+    mosaic: (row, column) values as the sensor reports them.
+    units: of the values: "DN", "electron", or "relative": 1 is the light of a white object point
+        through the clear pupil.
+    cfa: colour filter array, "mono" or the four letters of the top left 2x2 pixels, row by row.
+    levels: black, white and gain.
+    exposure_s: exposure time, s, None where unknown.
+    noise: as far as it is known, in the units of the values; its gain alone where only that is.
+    mask: (row, column), True where a pixel counts for nothing; None where all count.
+    grid: where its superpixels are, where the capture itself says so.
+    metadata: where it comes from.
+    """
+
+    mosaic: np.ndarray
+    units: str = "DN"
+    cfa: str = "mono"
+    levels: Levels = field(default_factory=Levels)
+    exposure_s: float | None = None
+    noise: Noise | None = None
+    mask: np.ndarray | None = None
+    grid: SuperpixelGrid | None = None
+    metadata: CaptureMetadata = field(default_factory=CaptureMetadata)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, columns) of the sensor."""
+        return self.mosaic.shape
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return self.metadata.path.name if self.metadata.path else "capture"
+
+    @property
+    def white_noise(self) -> Noise | None:
+        """The noise where it is the same for every signal, else None."""
+        return self.noise if self.noise is not None and self.noise.is_white else None
+
+    def signal(self) -> np.ndarray:
+        """(row, column) float64 values above the black level; NaN where the mask says so."""
+        signal = self.mosaic - tiled(self.levels.black, self.shape, float)
+        if self.mask is not None:
+            signal[self.mask] = np.nan
+        return signal

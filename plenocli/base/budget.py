@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,7 +125,7 @@ def within(new: Budget | None = None) -> Iterator[None]:
         _current = before
 
 
-def one_thread():
+def one_thread() -> contextlib.AbstractContextManager:
     """A context in which products and decompositions of matrices stay on the thread that asks for
     them: idle threads that wait for the next product cost many times its processor time.
     """
@@ -134,15 +134,16 @@ def one_thread():
     return threadpool_limits(1, "blas")
 
 
-def spread(parts, work, workers):
-    """work(*part) for all parts on `workers` threads."""
+def spread(parts: Sequence[tuple], work: Callable[..., object]) -> None:
+    """work(*part) for all parts, on as many threads as the budget has."""
+    threads = budget().threads
     with one_thread():
-        if workers <= 1 or len(parts) < 2:
+        if threads <= 1 or len(parts) < 2:
             for part in parts:
                 work(*part)
             return
         from concurrent.futures import ThreadPoolExecutor
 
-        with ThreadPoolExecutor(workers) as pool:
+        with ThreadPoolExecutor(threads) as pool:
             for done in [pool.submit(work, *part) for part in parts]:
                 done.result()

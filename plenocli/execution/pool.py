@@ -20,6 +20,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
+from dataclasses import replace
 from pathlib import Path
 
 from plenocli import __version__
@@ -136,7 +137,7 @@ def _remotely(version, granted, function, task):
 
     # both for good: other tasks may run beside this one
     threadpool_limits(1, "blas")
-    set_budget(granted)
+    set_budget(replace(granted, threads=1))
     with heard() as said:
         return attempt(function, task), said
 

@@ -59,7 +59,7 @@ def layout(plan, where):
     )
 
 
-def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progress=None, workers=1):
+def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progress=None):
     """Compute a matrix piece by piece into `output`; returns (SystemMatrix without A, its
     Diagnosis).
 
@@ -73,9 +73,7 @@ def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progres
     with writing_pif(
         output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite
     ) as writer:
-        for builder, band, superpixel, slab in pif_pieces(
-            camera, plan, progress=progress, workers=workers
-        ):
+        for builder, band, superpixel, slab in pif_pieces(camera, plan, progress=progress):
             diagnosis = diagnosis or PiecewiseDiagnosis(
                 len(plan.bands),
                 builder.offsets,

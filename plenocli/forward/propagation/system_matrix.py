@@ -229,13 +229,11 @@ class PifBuilder:
         self,
         A: np.ndarray,
         *,
-        workers: int = 1,
         progress: Callable[[int], None] | None = None,
     ) -> None:
         """Write the whole matrix of this wavelength; the same bytes for any number of threads.
 
         A: (superpixel, pixel, point), filled;
-        workers: threads;
         progress: called with the number of columns x superpixels that are done.
 
         Raises as `columns`.
@@ -248,7 +246,7 @@ class PifBuilder:
             return
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, A[first])
-            spread(one.parts, one.compute, workers)
+            spread(one.parts, one.compute)
             one.complete()
             for index, how in members:
                 if index != first:
@@ -256,10 +254,8 @@ class PifBuilder:
                 if progress:
                     progress(self.points)
 
-    def pieces(self, *, workers: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+    def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """The matrix superpixel by superpixel, in the order of `orbits`.
-
-        workers: threads.
 
         Yields (superpixel, A of it (pixel, point)), a work array that the next one overwrites.
         Models that compute all superpixels of a point at once hold the whole matrix meanwhile.
@@ -273,7 +269,7 @@ class PifBuilder:
         slab, other = np.empty((2, self.shape[1], self.points), self.dtype)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, slab)
-            spread(one.parts, one.compute, workers)
+            spread(one.parts, one.compute)
             one.complete()
             for index, how in members:
                 if how == (False, False, False):
@@ -445,13 +441,11 @@ def build_pif(
     *,
     points: slice | None = None,
     progress: Progress | None = None,
-    workers: int = 1,
 ) -> SystemMatrix:
     """Compute a system matrix as planned (plenocli.forward.accuracy.dial.plan_pif).
 
     points: slice of flat point indices, as planned;
-    progress: called as progress(done, total) in columns;
-    workers: threads.
+    progress: called as progress(done, total) in columns.
 
     Raises NumericsError where a column holds more energy than entered the lenslets.
     """
@@ -462,7 +456,7 @@ def build_pif(
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=dtype)
         if points is None:
-            builder.fill(A[b], workers=workers, progress=count)
+            builder.fill(A[b], progress=count)
         else:
             for where, block in _chunks(builder, np.arange(builder.points)[points]):
                 A[b][:, :, where] = block
@@ -472,7 +466,7 @@ def build_pif(
 
 
 def pif_pieces(
-    camera: Camera, plan: PifPlan, *, progress: Progress | None = None, workers: int = 1
+    camera: Camera, plan: PifPlan, *, progress: Progress | None = None
 ) -> Iterator[tuple[PifBuilder, int, int, np.ndarray]]:
     """The system matrix in pieces, for one too large to hold; arguments as build_pif.
 
@@ -482,7 +476,7 @@ def pif_pieces(
     count = _ColumnCount(plan, progress)
     for b, band in enumerate(plan.bands):
         builder = PifBuilder(camera, band.wavelength, plan, dtype=plan.dtype)
-        for index, slab in builder.pieces(workers=workers):
+        for index, slab in builder.pieces():
             yield builder, b, index, slab
             count(builder.points)
 

@@ -168,7 +168,7 @@ def run_simulate_pif(
     Raises InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
-    from plenocli.base.budget import one_thread
+    from plenocli.base.budget import budget, one_thread, within
     from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
@@ -227,11 +227,10 @@ def run_simulate_pif(
     # the diagnosis too: its singular values must not depend on the cores of a machine
     with (
         one_thread(),
+        within(replace(budget(), threads=workers)),
         bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress,
     ):
-        options = dict(
-            progress=lambda done, total: progress.update(done - progress.n), workers=workers
-        )
+        options = dict(progress=lambda done, total: progress.update(done - progress.n))
         if chosen.streamed:
             matrix, found = pif_pieces.stream_pif(
                 camera, plan, output, chosen, finish, overwrite=overwrite, **options

@@ -5,11 +5,16 @@ import numpy as np
 INVISIBLE = 1e-6
 
 
-def column_coherence(effective, block=512):
-    """(largest, mean, visible): |cosine| over pairs of different columns of D `effective` (pixel,
-    atom), None without a pair.
+def column_coherence(
+    effective: np.ndarray, block: int = 512
+) -> tuple[float | None, float | None, np.ndarray]:
+    """|cosine| of pairs of different columns.
 
-    visible (atom,) bool: columns of at least INVISIBLE of the largest norm, which alone count.
+    effective: (pixel, atom) D, what the sensor sees of each atom.
+    block: columns whose products are held at a time.
+
+    Returns (largest, mean, visible): None and None without a pair; visible (atom,) bool, columns of
+    at least INVISIBLE of the largest norm, which alone count.
     """
     norm = np.linalg.norm(effective, axis=0)
     visible = norm > INVISIBLE * norm.max(initial=0)

@@ -8,19 +8,34 @@ docs/model.md, "Spatial reconstruction".
 import numpy as np
 
 
-def moments(patches, c):
-    """(C C^T / B, X C^T / B)."""
+def moments(patches: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the dictionary step needs of patches and their codes.
+
+    patches: (point, patch) X.
+    c: (atom, patch) C.
+
+    Returns (C C^T / B (atom, atom), X C^T / B (point, atom)) of B patches.
+    """
     return c @ c.T / patches.shape[1], patches @ c.T / patches.shape[1]
 
 
-def dictionary_step(energy, basis, gram, right, delta):
-    """(Phi, residual): the minimum of (1/B)|X - Phi C|^2 + delta |A Phi|^2, in closed form.
+def dictionary_step(
+    energy: np.ndarray, basis: np.ndarray, gram: np.ndarray, right: np.ndarray, delta: float
+) -> tuple[np.ndarray, float]:
+    """The minimum of (1/B)|X - Phi C|^2 + delta |A Phi|^2, in closed form.
 
     Its normal equations are the Sylvester equation delta Q Phi + Phi (G + e I) = R with Q = A^T A =
-    basis diag(energy) basis^T (energy (k,), basis (point, k): directions of no energy may be left
-    out), G = C C^T / B `gram`, R = X C^T / B `right`, and a ridge e = 1e-6 tr(G) / atoms that keeps
-    it solvable where atoms are not used. residual: |left - right|_F / |R|_F; above
-    1e-8 is NumericsError.
+    basis diag(energy) basis^T, and a ridge e = 1e-6 tr(G) / atoms that keeps it solvable where
+    atoms are not used.
+
+    energy: (k,) eigenvalues of Q.
+    basis: (point, k) its eigenvectors; directions of no energy may be left out.
+    gram: (atom, atom) G = C C^T / B.
+    right: (point, atom) R = X C^T / B.
+    delta: weight of what the sensor sees.
+
+    Returns (Phi (point, atom), |left - right|_F / |R|_F of the normal equations).
+    Raises NumericsError where that residual is above 1e-8.
     """
     from scipy.linalg import eigh  # five times faster at 1600 atoms than numpy's
 
@@ -43,13 +58,26 @@ def dictionary_step(energy, basis, gram, right, delta):
     return atoms, residual
 
 
-def gradient_step(energy, basis, gram, right, delta, atoms, steps):
-    """(Phi, residual): `steps` steps down the gradient 2 (Phi (G + e I) - R + delta Q Phi) from
-    `atoms`, as published.
+def gradient_step(
+    energy: np.ndarray,
+    basis: np.ndarray,
+    gram: np.ndarray,
+    right: np.ndarray,
+    delta: float,
+    atoms: np.ndarray,
+    steps: int,
+) -> tuple[np.ndarray, float]:
+    """The published dictionary step: down the gradient 2 (Phi (G + e I) - R + delta Q Phi).
 
-    Arguments as in `dictionary_step`. Step length 1 / (2 (largest eigenvalue of G + e + delta times
-    that of Q)), the largest that is safe; Nesterov's momentum. The residual says how far from
-    the minimum they end.
+    Step length 1 / (2 (largest eigenvalue of G + e + delta times that of Q)), the largest that is
+    safe; Nesterov's momentum.
+
+    energy, basis, gram, right, delta: as of `dictionary_step`.
+    atoms: (point, atom) to begin with.
+    steps: number of steps.
+
+    Returns (Phi (point, atom), relative residual, which says how far from the minimum they end).
+    Berkner et al. 2013, Fig. 4.
     """
     ridge = ridge_of(gram)
     length = 1 / (np.linalg.norm(gram, 2) + ridge + delta * energy.max())
@@ -62,12 +90,19 @@ def gradient_step(energy, basis, gram, right, delta, atoms, steps):
     return atoms, _normal_residual(energy, basis, gram, right, delta, atoms)
 
 
-def ridge_of(gram):
-    """e of the dictionary step: what keeps it solvable where atoms are not used."""
+def ridge_of(gram: np.ndarray) -> float:
+    """e of the dictionary step, of G (atom, atom): what keeps it solvable where atoms are unused."""
     return max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
 
 
-def _normal_residual(energy, basis, gram, right, delta, atoms):
+def _normal_residual(
+    energy: np.ndarray,
+    basis: np.ndarray,
+    gram: np.ndarray,
+    right: np.ndarray,
+    delta: float,
+    atoms: np.ndarray,
+) -> float:
     """|delta Q Phi + Phi (G + e I) - R|_F / |R|_F."""
     left = atoms @ gram + ridge_of(gram) * atoms
     if delta:

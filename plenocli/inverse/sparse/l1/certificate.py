@@ -3,15 +3,18 @@
 import numpy as np
 
 
-def duality_gap(d, y, c, threshold):
-    """(P, relative gap, q) of coefficients c (signal, atom): P and gap per signal, q = D^T (y - D
-    c) as (signal, atom).
+def duality_gap(
+    d: np.ndarray, y: np.ndarray, c: np.ndarray, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far coefficients are from the best ones, from the residual itself: y^T y - 2 b^T c + c^T
+    G c would cancel. The dual point is the residual scaled into |D_j^T u| <= threshold_j.
 
-    d: (M, atom).
+    d: (M, atom) D.
     y: (M, signal).
-    threshold: lambda w / 2 (atom,). The dual point is the residual scaled into |D_j^T u| <=
-        threshold_j. Everything comes from the residual itself: y^T y - 2 b^T c +
-        c^T G c would cancel.
+    c: (signal, atom).
+    threshold: (atom,) lambda w / 2.
+
+    Returns (P (signal,), relative gap (signal,), q = D^T (y - D c) (signal, atom)).
     """
     residual = y - d @ c.T
     q = residual.T @ d

@@ -7,7 +7,14 @@ Source: Boyd, Parikh, Chu, Peleato & Eckstein, Found. Trends Mach. Learn. 3 (201
 sections 3.4.3 and 6.4.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from plenocli.inverse.sparse.l1.solve import Problem
 
 ROUNDS = 14
 """Of alternating directions in the guess."""
@@ -40,12 +47,14 @@ more than it saves.
 """
 
 
-def guess(problem, threshold):
-    """Coefficients (signal, atom) to begin with, of a plenocli.inverse.sparse.l1.solve.Problem with
-    these thresholds (atom,).
+def guess(problem: Problem, threshold: np.ndarray) -> np.ndarray:
+    """Coefficients to begin with.
 
-    Zero where there are too few signals to pay for it, where the threshold is too small a part of
-    D^T y for single precision, and where nothing exceeds it.
+    problem: of plenocli.inverse.sparse.l1.solve.
+    threshold: (atom,) lambda w / 2.
+
+    Returns (signal, atom): zero where there are too few signals to pay for it, where the threshold
+    is too small a part of D^T y for single precision, and where nothing exceeds it.
     """
     count, atoms = problem.b.shape
     c, rows = np.zeros((count, atoms)), problem.d.shape[0]
@@ -88,7 +97,7 @@ def guess(problem, threshold):
     return c
 
 
-def _typical(energy, power, level):
+def _typical(energy: np.ndarray, power: np.ndarray, level: float) -> tuple[float, float]:
     """(penalty, atoms that the data determine), where thresholds are 1 / level: CONVERTED over the
     coefficients' size.
 
@@ -105,7 +114,7 @@ def _typical(energy, power, level):
     return CONVERTED / 3 * ridge, determined if np.isfinite(ridge) else 0
 
 
-def _alternate(right, half, share):
+def _alternate(right: np.ndarray, half: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Penalty times the sparse iterate after ROUNDS of ADMM for  min c^T G c / 2 - right c + |c|_1.
 
     right: (signal, atom) float32.

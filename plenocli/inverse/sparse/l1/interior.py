@@ -5,16 +5,38 @@ Clarabel (extra `bench`) solves the cone program min r^T r + lambda w^T t, D c +
 t, signal by signal.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from plenocli.inverse.sparse.l1.solve import SparseCode
 
 
-def interior_point(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6):
-    """Arguments and result (SparseCode; passes are Newton steps) as
-    in plenocli.inverse.sparse.l1.solve.sparse_code.
+def interior_point(
+    dictionary: ArrayLike,
+    signals: ArrayLike,
+    lam: float,
+    *,
+    weights: ArrayLike | None = None,
+    free: Sequence[int] = (),
+    tol: float = 1e-6,
+) -> SparseCode:
+    """Solve the l1 problem of plenocli.inverse.sparse.l1.solve.sparse_code by Clarabel.
 
-    Its coefficients are small where they should be zero, never exactly zero. Each signal is solved
-    twice: the solver's tolerances are absolute as well as relative, so the second time everything
-    is scaled by the first objective. InputError without Clarabel.
+    Each signal is solved twice: the solver's tolerances are absolute as well as relative, so the
+    second time everything is scaled by the first objective.
+
+    dictionary, signals, lam, weights, free: as of sparse_code.
+    tol: relative duality gap to reach.
+
+    Returns a code whose coefficients are small where they should be zero, never exactly zero;
+    passes are Newton steps.
+    Raises InputError without Clarabel, ValueError as `prepare`.
     """
     from plenocli.inverse.sparse.l1.certificate import duality_gap
     from plenocli.inverse.sparse.l1.solve import SparseCode, prepare
@@ -34,7 +56,9 @@ def interior_point(dictionary, signals, lam, *, weights=None, free=(), tol=1e-6)
     return SparseCode(problem.restore(c), objective, gap, steps)
 
 
-def _solve(d, y, threshold, tol):
+def _solve(
+    d: np.ndarray, y: np.ndarray, threshold: np.ndarray, tol: float
+) -> tuple[np.ndarray, int]:
     """(c, Newton steps) of one scaled signal."""
     from plenocli.base.errors import InputError
 

@@ -46,7 +46,7 @@ threshold sign, over active atoms.
 
 
 @_jit
-def _workspace(capacity):
+def _workspace(capacity: int) -> Work:
     return Work(
         np.empty((capacity, capacity)),
         np.empty((capacity, capacity)),
@@ -63,13 +63,13 @@ def _workspace(capacity):
 
 
 @_jit
-def _copy(values, n, target):
+def _copy(values: np.ndarray, n: int, target: np.ndarray) -> None:
     for i in range(n):
         target[i] = values[i]
 
 
 @_jit
-def _spread(values, index, target):
+def _spread(values: np.ndarray, index: np.ndarray, target: np.ndarray) -> None:
     """target[index] = values, zero elsewhere."""
     for i in range(target.shape[0]):
         target[i] = 0.0
@@ -78,7 +78,7 @@ def _spread(values, index, target):
 
 
 @_jit
-def _forward(factor, n, d):
+def _forward(factor: np.ndarray, n: int, d: np.ndarray) -> None:
     """d <- factor^-T d, four rows at a time."""
     k = 0
     while k + 4 <= n:
@@ -107,7 +107,7 @@ def _forward(factor, n, d):
 
 
 @_jit
-def _backward(factor, n, d):
+def _backward(factor: np.ndarray, n: int, d: np.ndarray) -> None:
     """d <- factor^-1 d, four rows at a time."""
     k = n
     while k >= 4:
@@ -147,7 +147,7 @@ def _backward(factor, n, d):
 
 
 @_jit
-def _append(factor, n, column, diagonal):
+def _append(factor: np.ndarray, n: int, column: np.ndarray, diagonal: float) -> None:
     """One more atom at the end: `column` (overwritten) is G between it and the n others,
     `diagonal` its own entry.
     """
@@ -160,7 +160,7 @@ def _append(factor, n, column, diagonal):
 
 
 @_jit
-def _remove(factor, n, place, v):
+def _remove(factor: np.ndarray, n: int, place: int, v: np.ndarray) -> None:
     """Atom `place` of n out: its column goes, and rotations work its row into those below (an
     update, so always stable).
     """
@@ -188,7 +188,7 @@ def _remove(factor, n, place, v):
 
 
 @_jit
-def _drop(w, n, place):
+def _drop(w: Work, n: int, place: int) -> None:
     """Forget active atom `place` of n."""
     w.active[w.local[place]] = False
     _remove(w.factor, n, place, w.v)
@@ -203,7 +203,7 @@ def _drop(w, n, place):
 
 
 @_jit
-def _subtract(q, x, n, gram, place):
+def _subtract(q: np.ndarray, x: np.ndarray, n: int, gram: np.ndarray, place: np.ndarray) -> None:
     """q -= sum_k x_k gram[place_k], four rows at a time."""
     k = 0
     while k + 4 <= n:
@@ -220,12 +220,26 @@ def _subtract(q, x, n, gram, place):
 
 
 @_jit
-def relative_gap(b, q, x, index, signal_energy, threshold):
-    """(P, gap / P) at c (values x at `index`), with the dual point that is the scaled residual.
+def relative_gap(
+    b: np.ndarray,
+    q: np.ndarray,
+    x: np.ndarray,
+    index: np.ndarray,
+    signal_energy: float,
+    threshold: np.ndarray,
+) -> tuple[float, float]:
+    """How far coefficients c of one signal are from the best ones.
 
-    b = D^T y, q = D^T (y - D c), signal_energy = y^T y, threshold = lambda w_j / 2 per atom. P =
-    |y - Dc|^2 + sum 2 threshold |c|; u = t (y - Dc) with |D_j^T u| <= threshold_j; dual = 2 t
-    r^T y - t^2 r^T r.
+    The dual point is u = t (y - Dc) with |D_j^T u| <= threshold_j; dual = 2 t r^T y - t^2 r^T r.
+
+    b: (atom,) D^T y.
+    q: (atom,) D^T (y - D c).
+    x: (n,) values of c that are not zero.
+    index: (n,) atoms that they belong to.
+    signal_energy: y^T y.
+    threshold: (atom,) lambda w_j / 2.
+
+    Returns (P = |y - Dc|^2 + sum 2 threshold |c|, gap / P).
     """
     fit = 0.0
     slope = 0.0
@@ -246,7 +260,7 @@ def relative_gap(b, q, x, index, signal_energy, threshold):
 
 
 @_jit
-def _step_length(w, n, threshold):
+def _step_length(w: Work, n: int, threshold: np.ndarray) -> tuple[float, int]:
     """(alpha, zero): the minimum of the piecewise quadratic along x + alpha d, 0 < alpha <= 1;
     `zero` is the value that lands on 0 there, or -1. h = G d, so that the slope at alpha with the
     first signs is 2 (alpha - 1) d^T h.
@@ -275,7 +289,7 @@ def _step_length(w, n, threshold):
 
 
 @_jit
-def _settle(w, n, threshold, limit):
+def _settle(w: Work, n: int, threshold: np.ndarray, limit: int) -> int:
     """Minimise over the n active atoms: Newton steps, exact line search, atoms at zero leave.
 
     Returns how many are left.
@@ -316,7 +330,7 @@ def _settle(w, n, threshold, limit):
 
 
 @_jit
-def _enter(w, n, q, threshold, newcomers):
+def _enter(w: Work, n: int, q: np.ndarray, threshold: np.ndarray, newcomers: np.ndarray) -> int:
     """Atoms `newcomers` of the working set become active at zero. Returns how many are."""
     for i in range(n):
         w.h[i] = q[w.local[i]] - threshold[w.local[i]] * w.sign[i]
@@ -331,7 +345,7 @@ def _enter(w, n, q, threshold, newcomers):
 
 
 @_jit
-def _kth_largest(values, k):
+def _kth_largest(values: np.ndarray, k: int) -> float:
     """The k-th largest of `values` (k from 1), by quickselect on a copy.
 
     (np.partition would take the compiler ten seconds.)
@@ -360,7 +374,9 @@ def _kth_largest(values, k):
 
 
 @_jit
-def _newcomers(w, size, q, threshold, most, tol):
+def _newcomers(
+    w: Work, size: int, q: np.ndarray, threshold: np.ndarray, most: int, tol: float
+) -> np.ndarray:
     """Up to `most` atoms outside the active set whose |q| exceeds the threshold most."""
     ratio = np.abs(q) / threshold
     for j in range(size):
@@ -374,7 +390,9 @@ def _newcomers(w, size, q, threshold, most, tol):
 
 
 @_jit
-def _solve_working_set(w, n, b, q, threshold, tol):
+def _solve_working_set(
+    w: Work, n: int, b: np.ndarray, q: np.ndarray, threshold: np.ndarray, tol: float
+) -> int:
     """Solve the problem of the working set (slices of b, q, threshold) from the n active atoms.
 
     Returns how many there are.
@@ -392,7 +410,7 @@ def _solve_working_set(w, n, b, q, threshold, tol):
 
 
 @_jit
-def _extend(w, size, gram, ratio, more):
+def _extend(w: Work, size: int, gram: np.ndarray, ratio: np.ndarray, more: int) -> int:
     """`more` atoms of the largest ratios join the `size` of the working set. Returns its size."""
     for j in w.working[:size]:
         ratio[j] = -1.0
@@ -412,7 +430,7 @@ def _extend(w, size, gram, ratio, more):
 
 
 @_jit
-def _resume(w, gram, index, value):
+def _resume(w: Work, gram: np.ndarray, index: np.ndarray, value: np.ndarray) -> None:
     """Working set, factor and values of the active set `index` from its coefficients."""
     for n in range(index.shape[0]):
         w.working[n] = index[n]
@@ -424,12 +442,29 @@ def _resume(w, gram, index, value):
 
 
 @_jit
-def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
-    """(finished, objective, relative gap, passes) for one signal, from the coefficients c (atom,),
-    which are overwritten.
+def solve_signal(
+    gram: np.ndarray,
+    b: np.ndarray,
+    signal_energy: float,
+    threshold: np.ndarray,
+    tol: float,
+    pass_limit: int,
+    c: np.ndarray,
+    w: Work,
+) -> tuple[bool, float, float, int]:
+    """Solve the problem of one signal.
 
-    Not finished: the workspace is too small for the working set; call again with a larger one. The
-    last pass allowed is not judged: objective and gap are those before it.
+    gram: (atom, atom) D^T D.
+    b: (atom,) D^T y.
+    signal_energy: y^T y.
+    threshold: (atom,) lambda w_j / 2.
+    tol: relative duality gap to reach.
+    pass_limit: passes allowed; the last one is not judged: objective and gap are those before it.
+    c: (atom,) to begin with; overwritten by the solution.
+    w: scratch of this thread.
+
+    Returns (finished, objective, relative gap, passes). Not finished: the workspace is too small
+    for the working set; call again with a larger one.
     """
     index = np.flatnonzero(c)
     n = size = index.shape[0]
@@ -475,9 +510,24 @@ def solve_signal(gram, b, signal_energy, threshold, tol, pass_limit, c, w):
 
 
 @numba.njit(cache=True, fastmath=_FLAGS, nogil=True)
-def solve_signals(gram, b, signal_energy, threshold, tol, pass_limit, c, objective, gap, passes):
-    """solve_signal for every row of b and c (signal, atom), into c, objective, gap and passes
-    (signal,); one thread, no lock held.
+def solve_signals(
+    gram: np.ndarray,
+    b: np.ndarray,
+    signal_energy: np.ndarray,
+    threshold: np.ndarray,
+    tol: float,
+    pass_limit: int,
+    c: np.ndarray,
+    objective: np.ndarray,
+    gap: np.ndarray,
+    passes: np.ndarray,
+) -> None:
+    """solve_signal for every signal, in one thread with no lock held.
+
+    gram, threshold, tol, pass_limit: as of solve_signal.
+    b, c: (signal, atom).
+    signal_energy: (signal,) y^T y.
+    objective, gap, passes: (signal,), filled.
     """
     w = _workspace(min(c.shape[1], CAPACITY))
     for i in range(b.shape[0]):

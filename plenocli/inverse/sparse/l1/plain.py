@@ -18,14 +18,29 @@ RIDGE = 1e-10
 """The same for the factored form, relative to the norm of each column."""
 
 
-def solve_signal(d, y, gram, threshold, tol, pass_limit, c):
-    """min |y - D c|^2 + sum_j 2 threshold_j |c_j| from the coefficients c (atom,), overwritten;
-    returns the outer passes done.
+def solve_signal(
+    d: np.ndarray,
+    y: np.ndarray,
+    gram: np.ndarray | None,
+    threshold: np.ndarray,
+    tol: float,
+    pass_limit: int,
+    c: np.ndarray,
+) -> int:
+    """min |y - D c|^2 + sum_j 2 threshold_j |c_j|.
 
-    d: (row, atom).
+    Stops at the gap wanted, after the passes allowed, or after three that no longer lower the
+    objective.
+
+    d: (row, atom) D.
     y: (row,).
-    gram: D^T D, or None for the factored form. Stops at relative duality gap `tol`, after
-        `pass_limit` passes, or after three that no longer lower the objective.
+    gram: (atom, atom) D^T D, or None for the factored form.
+    threshold: (atom,).
+    tol: relative duality gap to reach.
+    pass_limit: passes allowed.
+    c: (atom,) to begin with; overwritten by the solution.
+
+    Returns the outer passes done.
     """
     from plenocli.inverse.sparse.l1.certificate import duality_gap
 
@@ -52,7 +67,7 @@ def solve_signal(d, y, gram, threshold, tol, pass_limit, c):
     return passes
 
 
-def _newcomers(q, threshold, active, most):
+def _newcomers(q: np.ndarray, threshold: np.ndarray, active: np.ndarray, most: int) -> np.ndarray:
     """Up to `most` atoms outside `active` whose |q| exceeds the threshold most."""
     ratio = np.abs(q) / threshold
     ratio[active] = 0
@@ -60,7 +75,16 @@ def _newcomers(q, threshold, active, most):
     return candidate[np.argsort(-ratio[candidate], kind="stable")[:most]]
 
 
-def _settle(d, y, gram, threshold, index, x, sign, limit=1000):
+def _settle(
+    d: np.ndarray,
+    y: np.ndarray,
+    gram: np.ndarray | None,
+    threshold: np.ndarray,
+    index: np.ndarray,
+    x: np.ndarray,
+    sign: np.ndarray,
+    limit: int = 1000,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Minimise over the atoms `index` from x: Newton steps, exact line search, atoms at zero leave.
 
     Returns (index, x, sign).
@@ -88,7 +112,7 @@ def _settle(d, y, gram, threshold, index, x, sign, limit=1000):
     return index, x, sign
 
 
-def _from_gram(block, h):
+def _from_gram(block: np.ndarray, h: np.ndarray) -> np.ndarray:
     from scipy.linalg import cho_factor, cho_solve
 
     diagonal = np.diag(block).copy()
@@ -98,7 +122,7 @@ def _from_gram(block, h):
     )
 
 
-def _from_columns(columns, h):
+def _from_columns(columns: np.ndarray, h: np.ndarray) -> np.ndarray:
     """G^-1 h with G = columns^T columns, from the triangular factor of the columns; one
     correction by G itself.
     """
@@ -115,7 +139,9 @@ def _from_columns(columns, h):
     return step + solve(h - columns.T @ (columns @ step))
 
 
-def _step_length(x, step, h, threshold):
+def _step_length(
+    x: np.ndarray, step: np.ndarray, h: np.ndarray, threshold: np.ndarray
+) -> tuple[float, list[int]]:
     """(alpha, zero): the minimum of the piecewise quadratic along x + alpha step, 0 < alpha <= 1;
     `zero`, a list, is the value that lands on 0 there, if one does. h = G step, so that the slope
     at alpha with the first signs is 2 (alpha - 1) step^T h.

@@ -10,20 +10,26 @@ feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time
 the same certificate.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.inverse.sparse.l1.certificate import duality_gap
 
 
 @dataclass(frozen=True)
 class SparseCode:
-    """c: (atom, signal) float64.
-    objective: P per signal, of the part of y outside the free atoms' span.
-    gap: relative duality gap per signal, in [0, 1], from the residual itself.
-    passes: outer passes (active set) or iterations (FISTA) per signal.
-    factored: signals that needed the factored form.
+    """Coefficients of signals, and how good they are.
+
+    c: (atom, signal) float64.
+    objective: (signal,) P, of the part of y outside the free atoms' span.
+    gap: (signal,) relative duality gap in [0, 1], from the residual itself.
+    passes: (signal,) outer passes (active set) or iterations (FISTA).
+    factored: number of signals that needed the factored form.
     """
 
     c: np.ndarray
@@ -34,30 +40,33 @@ class SparseCode:
 
 
 def sparse_code(
-    dictionary,
-    signals,
-    lam,
+    dictionary: ArrayLike,
+    signals: ArrayLike,
+    lam: float,
     *,
-    weights=None,
-    free=(),
-    tol=1e-6,
-    passes=300,
-    start=None,
-    workers=None,
-):
+    weights: ArrayLike | None = None,
+    free: Sequence[int] = (),
+    tol: float = 1e-6,
+    passes: int = 300,
+    start: np.ndarray | None = None,
+    workers: int | None = None,
+) -> SparseCode:
     """Solve the l1 problem for every column of `signals` by the active-set Newton method.
 
-    dictionary: D = A Phi, (M, L).
-    signals: Y, (M, B).
-    lam > 0.
-    weights: w_j > 0, (L,), default 1.
+    dictionary: (M, L) D = A Phi.
+    signals: (M, B) Y.
+    lam: weight of |c|_1, above 0.
+    weights: (L,) w_j > 0, default 1.
     free: columns without penalty (they are projected out exactly, then solved for).
-    tol: relative duality gap to reach; what was reached is in the result. Zero columns get
-        a zero coefficient.
-    start: coefficients (L, B) to begin with (default: guessed by a ridge
-        regression where that pays).
-    workers: threads over signals (compiled code only; default all cores); the result
-        does not depend on it.
+    tol: relative duality gap to reach; what was reached is in the result.
+    passes: outer passes allowed a signal.
+    start: (L, B) coefficients to begin with (default: guessed by a ridge regression where that
+        pays).
+    workers: threads over signals (compiled code only; default all cores); the result does not
+        depend on it.
+
+    Returns the code; zero columns get a zero coefficient.
+    Raises ValueError as `prepare`.
     """
     problem = prepare(dictionary, signals, lam, weights, free)
     return _active_set(
@@ -66,10 +75,24 @@ def sparse_code(
 
 
 def lambda_path(
-    dictionary, signals, lams, *, weights=None, free=(), tol=1e-6, passes=300, workers=None
-):
-    """Yields (lambda, SparseCode) from the largest of `lams` down, each solved from the solution
-    before; D^T D is formed once.
+    dictionary: ArrayLike,
+    signals: ArrayLike,
+    lams: Iterable[float],
+    *,
+    weights: ArrayLike | None = None,
+    free: Sequence[int] = (),
+    tol: float = 1e-6,
+    passes: int = 300,
+    workers: int | None = None,
+) -> Iterator[tuple[float, SparseCode]]:
+    """Codes for several weights of |c|_1, each solved from the solution before; D^T D is formed
+    once.
+
+    lams: weights above 0.
+    dictionary, signals, weights, free, tol, passes, workers: as of sparse_code.
+
+    Returns (yields) (lambda, code) from the largest lambda down.
+    Raises ValueError as `prepare`.
     """
     problem = prepare(dictionary, signals, 1.0, weights, free)
     gram, code = problem.d.T @ problem.d, None
@@ -87,26 +110,45 @@ def lambda_path(
         yield lam, code
 
 
-def noise_lambda(dictionary, sigma, *, weights=None):
-    """2 sigma sqrt(2 ln L) max_j |D_j| / w_j: white noise of that standard deviation alone would,
-    for most signals, be coded as zero.
+def noise_lambda(dictionary: ArrayLike, sigma: float, *, weights: ArrayLike | None = None) -> float:
+    """The lambda with which white noise alone would, for most signals, be coded as zero.
 
-    The universal threshold (Chen, Donoho & Saunders 2001, section 5.2) in the scale without the
-    factor 1/2. An upper guide: the best reconstruction wants a smaller lambda, since bias costs
-    more than a few false atoms.
+    An upper guide: the best reconstruction wants a smaller lambda, since bias costs more than a few
+    false atoms.
+
+    dictionary: (M, L) D.
+    sigma: standard deviation of the noise.
+    weights: (L,) w_j > 0, default 1.
+
+    Returns 2 sigma sqrt(2 ln L) max_j |D_j| / w_j.
+    The universal threshold (Chen, Donoho & Saunders 2001, section 5.2), without the factor 1/2.
     """
     d = np.asarray(dictionary, float)
     norm = np.linalg.norm(d, axis=0) / (1 if weights is None else np.asarray(weights, float))
     return float(2 * sigma * np.sqrt(2 * np.log(max(d.shape[1], 2))) * norm.max())
 
 
-def fista(dictionary, signals, lam, *, weights=None, free=(), tol=1e-4, iterations=300):
-    """The same problem by accelerated proximal gradient with adaptive restart (Beck & Teboulle
-    2009; O'Donoghue & Candes 2015).
+def fista(
+    dictionary: ArrayLike,
+    signals: ArrayLike,
+    lam: float,
+    *,
+    weights: ArrayLike | None = None,
+    free: Sequence[int] = (),
+    tol: float = 1e-4,
+    iterations: int = 300,
+) -> SparseCode:
+    """The same problem by accelerated proximal gradient with adaptive restart.
 
-    Arguments and result as in `sparse_code`; stops when every signal's gap is <= tol or after
-    `iterations`. On a plenoptic system matrix the gap stays near 1 for thousands of
-    iterations, and says so.
+    On a plenoptic system matrix the gap stays near 1 for thousands of iterations, and says so.
+
+    dictionary, signals, lam, weights, free: as of sparse_code.
+    tol: relative duality gap of every signal at which it stops.
+    iterations: after which it stops at the latest.
+
+    Returns the code; passes are iterations.
+    Raises ValueError as `prepare`.
+    Beck & Teboulle 2009; O'Donoghue & Candes 2015.
     """
     problem = prepare(dictionary, signals, lam, weights, free)
     gram = problem.d.T @ problem.d
@@ -132,7 +174,15 @@ BLOCK = 1024
 """Signals certified together: bounds the memory of residuals and slopes."""
 
 
-def _active_set(problem, gram, threshold, tol, passes, start, workers):
+def _active_set(
+    problem: Problem,
+    gram: np.ndarray,
+    threshold: np.ndarray,
+    tol: float,
+    passes: int,
+    start: np.ndarray | None,
+    workers: int | None,
+) -> SparseCode:
     """SparseCode of a prepared problem: Gram form for all signals, then the factored form for
     those it could not certify.
     """
@@ -198,7 +248,14 @@ def _active_set(problem, gram, threshold, tol, passes, start, workers):
     return SparseCode(problem.restore(c), objective, gap, done, len(missed))
 
 
-def _certify(problem, threshold, which, c, objective, gap):
+def _certify(
+    problem: Problem,
+    threshold: np.ndarray,
+    which: slice | np.ndarray,
+    c: np.ndarray,
+    objective: np.ndarray,
+    gap: np.ndarray,
+) -> None:
     """Into objective and gap of the signals `which` (a slice, or indices), BLOCK at a time."""
     which = np.arange(len(c))[which]
     for first in range(0, len(which), BLOCK):
@@ -208,7 +265,7 @@ def _certify(problem, threshold, which, c, objective, gap):
         )
 
 
-def _span(index):
+def _span(index: np.ndarray) -> slice | np.ndarray:
     """Rising indices as a slice where they leave none out: a view instead of a copy."""
     return (
         slice(index[0], index[-1] + 1)
@@ -217,7 +274,18 @@ def _span(index):
     )
 
 
-def _compiled(solve_signals, gram, problem, threshold, tol, passes, which, c, done, workers):
+def _compiled(
+    solve_signals: Callable[..., None],
+    gram: np.ndarray,
+    problem: Problem,
+    threshold: np.ndarray,
+    tol: float,
+    passes: int,
+    which: slice | np.ndarray,
+    c: np.ndarray,
+    done: np.ndarray,
+    workers: int | None,
+) -> None:
     """Into c and done of the signals `which` (a slice, or indices), in threads; each signal is
     solved by itself, so the result does not depend on how they are dealt out.
     """
@@ -254,8 +322,16 @@ def _compiled(solve_signals, gram, problem, threshold, tol, passes, which, c, do
 
 @dataclass
 class Problem:
-    """The problem without its free atoms: d (M, penalised atom) and y (M, signal) outside their
-    span, b = y^T d, threshold = lambda w / 2.
+    """The problem without its free atoms.
+
+    d: (M, penalised atom) D outside the free atoms' span.
+    y: (M, signal) outside it.
+    b: (signal, penalised atom) y^T d.
+    threshold: (penalised atom,) lambda w / 2.
+    penalised, free: columns of D that are penalised, and that are not.
+    free_basis, free_factor: the free columns' QR factors.
+    free_part: (free atom, signal) of Y along the basis.
+    free_overlap: (free atom, penalised atom) of D along the basis.
     """
 
     d: np.ndarray
@@ -269,9 +345,12 @@ class Problem:
     free_part: np.ndarray
     free_overlap: np.ndarray
 
-    def restore(self, c):
-        """(signal, penalised atom) -> (atom, signal), with the free atoms'
-        coefficients filled in.
+    def restore(self, c: np.ndarray) -> np.ndarray:
+        """Coefficients of all atoms.
+
+        c: (signal, penalised atom).
+
+        Returns (atom, signal), with the free atoms' coefficients filled in.
         """
         full = np.empty((len(c), len(self.penalised) + len(self.free)))
         full[:, _span(self.penalised)] = c
@@ -282,13 +361,22 @@ class Problem:
         return full.T
 
 
-def _check_lambda(lam):
+def _check_lambda(lam: float) -> None:
     if not lam > 0 or not np.isfinite(lam):
         raise ValueError(f"lambda must be positive and finite, not {lam}")
 
 
-def prepare(dictionary, signals, lam, weights, free):
-    """Problem of `sparse_code`'s arguments, checked; ValueError says what is wrong with them."""
+def prepare(
+    dictionary: ArrayLike,
+    signals: ArrayLike,
+    lam: float,
+    weights: ArrayLike | None,
+    free: Sequence[int],
+) -> Problem:
+    """The problem with its free atoms projected out; arguments as of `sparse_code`.
+
+    Raises ValueError, which says what is wrong with the arguments.
+    """
     d, y = np.asarray(dictionary, float), np.asarray(signals, float)
     if d.ndim != 2 or y.ndim != 2 or d.shape[0] != y.shape[0]:
         raise ValueError(f"dictionary {d.shape} and signals {y.shape} must be (M, L) and (M, B)")

@@ -91,7 +91,7 @@ def gradient_step(
 
 
 def ridge_of(gram: np.ndarray) -> float:
-    """e of the dictionary step, of G (atom, atom): what keeps it solvable where atoms are unused."""
+    """e of the dictionary step of G (atom, atom): keeps it solvable where atoms are unused."""
     return max(1e-6 * np.trace(gram) / len(gram), np.finfo(float).tiny)
 
 

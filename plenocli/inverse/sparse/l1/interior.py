@@ -53,7 +53,7 @@ def interior_point(
                     duality_gap(problem.d, y[:, None], c[i : i + 1], problem.threshold)[0][0]
                 )
     objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
-    return SparseCode(problem.restore(c), objective, gap, steps)
+    return SparseCode(c=problem.restore(c), objective=objective, gap=gap, passes=steps)
 
 
 def _solve(

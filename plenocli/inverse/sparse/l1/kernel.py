@@ -274,14 +274,14 @@ def _step_length(w: Work, n: int, threshold: np.ndarray) -> tuple[float, int]:
             left += 1
     jumps = 0.0
     while left > 0:
-        i = np.argmin(w.crossing[:n])
-        alpha = w.crossing[i]
+        nearest = np.argmin(w.crossing[:n])
+        alpha = w.crossing[nearest]
         if (alpha - 1.0) * curvature + jumps >= 0.0:
             break
-        jumps += 2.0 * threshold[w.local[i]] * abs(w.d[i])
+        jumps += 2.0 * threshold[w.local[nearest]] * abs(w.d[nearest])
         if (alpha - 1.0) * curvature + jumps >= 0.0:
-            return alpha, i
-        w.crossing[i] = np.inf
+            return alpha, nearest
+        w.crossing[nearest] = np.inf
         left -= 1
     if curvature <= 0.0:
         return 1.0, -1

@@ -104,7 +104,7 @@ def _settle(
             x = x + alpha * step
             x[zero] = 0
             keep = x != 0
-            settled = alpha == 1 and np.all(np.sign(x[keep]) == sign[keep])
+            settled = alpha == 1 and bool(np.all(np.sign(x[keep]) == sign[keep]))
             sign = np.where(keep, np.sign(x), sign)
         index, x, sign = index[keep], x[keep], sign[keep]
         if settled:

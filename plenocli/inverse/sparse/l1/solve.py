@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from plenocli.inverse.sparse.l1.certificate import duality_gap
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SparseCode:
     """Coefficients of signals, and how good they are.
 
@@ -167,7 +167,9 @@ def fista(
         ahead, c, momentum = moved + pull[:, None] * (moved - c), moved, after
         if done % 10 == 0 or done == iterations:
             objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
-    return SparseCode(problem.restore(c), objective, gap, np.full(len(c), done))
+    return SparseCode(
+        c=problem.restore(c), objective=objective, gap=gap, passes=np.full(len(c), done)
+    )
 
 
 BLOCK = 1024
@@ -222,7 +224,7 @@ def _active_set(
             workers,
         )
         _certify(problem, threshold, everything, c, objective, gap)
-        again = np.flatnonzero(~(gap <= tol)) if first < passes else ()
+        again = np.flatnonzero(~(gap <= tol)) if first < passes else np.arange(0)
         if len(again):
             _compiled(
                 l1_kernel.solve_signals,
@@ -237,7 +239,7 @@ def _active_set(
                 workers,
             )
             _certify(problem, threshold, again, c, objective, gap)
-    missed = np.flatnonzero(~(gap <= tol)) if passes > 0 else []
+    missed = np.flatnonzero(~(gap <= tol)).tolist() if passes > 0 else []
     for i in missed:
         if objective[i] > problem.y[:, i] @ problem.y[:, i]:
             c[i] = 0
@@ -245,7 +247,9 @@ def _active_set(
             problem.d, problem.y[:, i], None, threshold, tol, passes, c[i]
         )
         _certify(problem, threshold, slice(i, i + 1), c, objective, gap)
-    return SparseCode(problem.restore(c), objective, gap, done, len(missed))
+    return SparseCode(
+        c=problem.restore(c), objective=objective, gap=gap, passes=done, factored=len(missed)
+    )
 
 
 def _certify(
@@ -320,7 +324,7 @@ def _compiled(
         c[which], done[which] = found, steps
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """The problem without its free atoms.
 
@@ -384,15 +388,24 @@ def prepare(
     if not (np.all(np.isfinite(d)) and np.all(np.isfinite(y))):
         raise ValueError("dictionary and signals must be finite")
     w = np.ones(d.shape[1]) if weights is None else np.asarray(weights, float)
-    free = np.unique(np.asarray(free, dtype=int))
-    penalised = np.setdiff1d(np.arange(d.shape[1]), free)
+    unpenalised = np.unique(np.asarray(free, dtype=int))
+    penalised = np.setdiff1d(np.arange(d.shape[1]), unpenalised)
     if np.any(w[penalised] <= 0):
         raise ValueError("weights must be positive; name the unpenalised atoms in `free`")
-    basis, factor = np.linalg.qr(d[:, free])
+    basis, factor = np.linalg.qr(d[:, unpenalised])
     rest = d[:, penalised]
     part, overlap = basis.T @ y, basis.T @ rest
     rest, y = rest - basis @ overlap, y - basis @ part
     b = np.ascontiguousarray(y.T @ rest)
     return Problem(
-        rest, y, b, lam * w[penalised] / 2, penalised, free, basis, factor, part, overlap
+        d=rest,
+        y=y,
+        b=b,
+        threshold=lam * w[penalised] / 2,
+        penalised=penalised,
+        free=unpenalised,
+        free_basis=basis,
+        free_factor=factor,
+        free_part=part,
+        free_overlap=overlap,
     )

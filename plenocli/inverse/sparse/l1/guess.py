@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from plenocli.inverse.sparse.l1.solve import Problem
+    from plenocli.inverse.sparse.l1.problem import Problem
 
 ROUNDS = 14
 """Of alternating directions in the guess."""
@@ -50,7 +50,7 @@ more than it saves.
 def guess(problem: Problem, threshold: np.ndarray) -> np.ndarray:
     """Coefficients to begin with.
 
-    problem: of plenocli.inverse.sparse.l1.solve.
+    problem: whose free atoms are projected out.
     threshold: (atom,) lambda w / 2.
 
     Returns (signal, atom): zero where there are too few signals to pay for it, where the threshold

@@ -8,13 +8,12 @@ t, signal by signal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from plenocli.inverse.sparse.l1.solve import SparseCode
+from plenocli.inverse.sparse.l1.certificate import duality_gap
+from plenocli.inverse.sparse.l1.problem import SparseCode, prepare
 
 
 def interior_point(
@@ -38,9 +37,6 @@ def interior_point(
     passes are Newton steps.
     Raises InputError without Clarabel, ValueError as `prepare`.
     """
-    from plenocli.inverse.sparse.l1.certificate import duality_gap
-    from plenocli.inverse.sparse.l1.solve import SparseCode, prepare
-
     problem = prepare(dictionary, signals, lam, weights, free)
     c, steps = np.zeros_like(problem.b), np.zeros(len(problem.b), int)
     for i, y in enumerate(problem.y.T):

@@ -280,7 +280,7 @@ def _step_length(w: Work, n: int, threshold: np.ndarray) -> tuple[float, int]:
             break
         jumps += 2.0 * threshold[w.local[nearest]] * abs(w.d[nearest])
         if (alpha - 1.0) * curvature + jumps >= 0.0:
-            return alpha, nearest
+            return alpha, int(nearest)
         w.crossing[nearest] = np.inf
         left -= 1
     if curvature <= 0.0:

@@ -129,10 +129,10 @@ def tikhonov(
     """Weight given, by the discrepancy principle, or with hindsight."""
     svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
     z = svd.compress(y)
-    if alpha is None and truth is None:
-        alpha, rule = least_squares.discrepancy_alpha(svd, z, sigma), "discrepancy"
-    elif alpha is None:
+    if alpha is None and truth is not None:
         alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
+    elif alpha is None:
+        alpha, rule = least_squares.discrepancy_alpha(svd, z, sigma), "discrepancy"
     return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
 
@@ -142,10 +142,10 @@ def tsvd(
     """Rank given, by the least estimated error, or with hindsight."""
     svd, rank, rule = estimators.svd, estimators.options.rank, "given"
     z = svd.compress(y)
-    if rank is None and truth is None:
-        rank, rule = least_squares.best_rank(svd, z, sigma), "least estimated error"
-    elif rank is None:
+    if rank is None and truth is not None:
         rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
+    elif rank is None:
+        rank, rule = least_squares.best_rank(svd, z, sigma), "least estimated error"
     rank = min(rank, svd.rank())
     return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
 

@@ -29,10 +29,10 @@ def by_loops(picture, sigma, pilot):
             near = [
                 (a, b)
                 for a in range(
-                    max(0, r - denoise.WINDOW), min(picture.shape[0] - p, r + denoise.WINDOW) + 1
+                    max(0, r - denoise.SEARCH), min(picture.shape[0] - p, r + denoise.SEARCH) + 1
                 )
                 for b in range(
-                    max(0, c - denoise.WINDOW), min(picture.shape[1] - p, c + denoise.WINDOW) + 1
+                    max(0, c - denoise.SEARCH), min(picture.shape[1] - p, c + denoise.SEARCH) + 1
                 )
             ]
             far = {

@@ -7,11 +7,13 @@ from the paper, in matrix products on strips of the picture, so that memory does
 grow with its height.
 """
 
+from __future__ import annotations
+
 from functools import lru_cache
 
 import numpy as np
 
-PATCH, STEP, WINDOW, STACK = 8, 4, 9, 16
+PATCH, STEP, SEARCH, STACK = 8, 4, 9, 16
 """Side of a patch, distance of reference patches, how far similar ones are searched, how many
 are stacked (a power of two).
 """
@@ -21,13 +23,19 @@ TOGETHER = 8192
 """Stacks that are filtered together."""
 
 
-def block_matching(picture, sigma, pilot=None):
-    """The picture (row, column) with its white noise of standard deviation `sigma` removed;
-    float64, same shape.
+def block_matching(
+    picture: np.ndarray, sigma: float, pilot: np.ndarray | None = None
+) -> np.ndarray:
+    """A picture with its white noise removed.
 
-    Without a pilot coefficients are cut at THRESHOLD sigma; with one (a picture like it with less
-    noise), patches are matched in the pilot and shrunk by the Wiener factor p^2 / (p^2 + sigma^2)
-    of the pilot's coefficients p.
+    picture: (row, column).
+    sigma: standard deviation of the noise.
+    pilot: a picture like it with less noise, or None. Without one coefficients are cut at THRESHOLD
+        sigma; with one patches are matched in it and shrunk by the Wiener factor p^2 / (p^2 +
+        sigma^2) of its coefficients p.
+
+    Returns (row, column) float64.
+    Dabov et al. 2007.
     """
     picture = np.asarray(picture, float)
     unit = np.abs(picture).max()  # squares of very large or small values leave single precision
@@ -40,15 +48,15 @@ def block_matching(picture, sigma, pilot=None):
     )
     patch = min(PATCH, *picture.shape)
     rows, columns = (_corners(n, patch) for n in picture.shape)
-    least = min(WINDOW + 1, picture.shape[0] - patch + 1) * min(
-        WINDOW + 1, picture.shape[1] - patch + 1
+    least = min(SEARCH + 1, picture.shape[0] - patch + 1) * min(
+        SEARCH + 1, picture.shape[1] - patch + 1
     )
     stack = min(STACK, 1 << (least.bit_length() - 1))
     guide = np.asarray(picture if pilot is None else pilot, np.float32)
     source = np.asarray(picture, np.float32)
     total, weight = np.zeros(picture.shape), np.zeros(picture.shape)
     for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // TOGETHER))):
-        span = slice(max(strip[0] - WINDOW, 0), min(strip[-1] + patch + WINDOW, picture.shape[0]))
+        span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, picture.shape[0]))
         stacks = _match(guide[span], strip - span.start, columns, patch, stack)
         one, two = _filter(
             source[span], None if pilot is None else guide[span], stacks, patch, sigma
@@ -58,13 +66,16 @@ def block_matching(picture, sigma, pilot=None):
     return unit * total / weight
 
 
-def _corners(length, patch):
+def _corners(length: int, patch: int) -> np.ndarray:
+    """First samples of the patches along a side, the last one included."""
     return np.unique(
         np.append(np.arange(0, length - patch + 1, max(1, min(STEP, patch // 2))), length - patch)
     )
 
 
-def _match(guide, rows, columns, patch, stack):
+def _match(
+    guide: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, stack: int
+) -> np.ndarray:
     """Flat corners (reference, stack) of the patches most like those with corners at rows x
     columns, these first.
     """
@@ -76,7 +87,7 @@ def _match(guide, rows, columns, patch, stack):
         for k, first in enumerate(at):
             sums[k, first : first + patch] = 1
     offsets = np.array(
-        [(r, c) for r in range(-WINDOW, WINDOW + 1) for c in range(-WINDOW, WINDOW + 1)]
+        [(r, c) for r in range(-SEARCH, SEARCH + 1) for c in range(-SEARCH, SEARCH + 1)]
     )
     distance = np.full((len(offsets), len(rows), len(columns)), np.inf, np.float32)
     for k, (down, right) in enumerate(offsets):
@@ -100,23 +111,25 @@ def _match(guide, rows, columns, patch, stack):
             sum_rows[at_r, r] @ np.square(change, out=change) @ sum_columns[at_c, c].T
         )
     distance[len(offsets) // 2] = -1
-    distance = distance.reshape(len(offsets), -1).T
-    best = np.argpartition(distance, stack - 1, axis=1)[:, :stack]
-    order = np.argsort(np.take_along_axis(distance, best, 1), axis=1, kind="stable")
+    by_patch = distance.reshape(len(offsets), -1).T
+    best = np.argpartition(by_patch, stack - 1, axis=1)[:, :stack]
+    order = np.argsort(np.take_along_axis(by_patch, best, 1), axis=1, kind="stable")
     best = np.take_along_axis(best, order, 1)
     return (rows[:, None] * width + columns).ravel()[:, None] + (offsets @ [width, 1])[best]
 
 
-def _filter(source, guide, stacks, patch, sigma):
+def _filter(
+    source: np.ndarray, guide: np.ndarray | None, stacks: np.ndarray, patch: int, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(weighted sum, weights), each like source, of the filtered patches.
 
     guide: None, or the pilot.
     """
     shape = source.shape
-    cosine, across, window = _transforms(patch, stacks.shape[1])
+    cosine, across, taper = _transforms(patch, stacks.shape[1])
     index = stacks[:, :, None] + (np.arange(patch)[:, None] * shape[1] + np.arange(patch)).ravel()
 
-    def forward(plane):
+    def forward(plane: np.ndarray) -> np.ndarray:
         return across @ (plane.ravel()[index].reshape(-1, patch * patch) @ cosine.T).reshape(
             index.shape
         )
@@ -133,17 +146,17 @@ def _filter(source, guide, stacks, patch, sigma):
         wiener[:, 0, 0] = 1
         spectrum *= wiener
         weight = 1 / np.maximum(np.square(wiener).sum(axis=(1, 2)), 1)
-    weight = weight[:, None, None] * window
+    weight = weight[:, None, None] * taper
     back = ((across @ spectrum).reshape(-1, patch * patch) @ cosine).reshape(index.shape) * weight
     index, size = index.ravel(), source.size
-    spread = np.broadcast_to(weight, back.shape)
+    weights = np.broadcast_to(weight, back.shape)
     return np.bincount(index, back.ravel(), size).reshape(shape), np.bincount(
-        index, spread.ravel(), size
+        index, weights.ravel(), size
     ).reshape(shape)
 
 
 @lru_cache(maxsize=8)
-def _transforms(patch, stack):
+def _transforms(patch: int, stack: int) -> tuple[np.ndarray, ...]:
     """(cosine transform of a patch, Walsh-Hadamard transform of a stack, Kaiser window),
     orthonormal, float32.
     """
@@ -151,12 +164,12 @@ def _transforms(patch, stack):
     from scipy.linalg import hadamard
 
     one = dct(np.eye(patch), axis=0, norm="ortho")
-    window = np.kaiser(patch, 2.0)
+    taper = np.kaiser(patch, 2.0)
     return tuple(
         m.astype(np.float32)
         for m in (
             np.kron(one, one),
             hadamard(stack) / np.sqrt(stack),
-            np.outer(window, window).ravel(),
+            np.outer(taper, taper).ravel(),
         )
     )

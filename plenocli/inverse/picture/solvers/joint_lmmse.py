@@ -10,26 +10,30 @@ superpixels from which the neighbours' light, as that estimate predicts it, is t
 3x3 matrix is formed.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from plenocli.inverse.picture.solvers.least_squares import Svd
 
 RING = 1
 MOST = 256
 """Singular vectors through which a superpixel is seen at most."""
 
 
-def by_lenslet(solve, y):
-    """`solve` (pixel, signal) -> (point, signal) on all superpixels y (lenslet_row,
-    lenslet_column, pixel) at once.
-    """
-    rows, columns = y.shape[:2]
-    return solve(y.reshape(rows * columns, -1).T).T.reshape(rows, columns, -1)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JointLmmse:
-    """LMMSE of a block from the superpixels within one ring, see `prepare_joint`."""
+    """LMMSE of a block from the superpixels within one ring, see `prepare_joint`.
+
+    mean: of the scene.
+    analysis, offset: (k, pixel) and (k,), a superpixel to its coordinates.
+    cross: (point, 9 k) covariance of the block with the coordinates of the ring.
+    data: (9 k, 9 k) covariance of these.
+    variance: (point,) of the block.
+    """
 
     mean: float
     analysis: np.ndarray
@@ -38,26 +42,29 @@ class JointLmmse:
     data: np.ndarray
     variance: np.ndarray
 
-    def apply(self, y):
-        """(lenslet_row, lenslet_column, pixel) -> (x, sigma), both (lenslet_row,
-        lenslet_column, point).
+    def apply(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The picture behind superpixels.
 
         Beyond the array's border there is nothing to look at: blocks there use the superpixels that
         exist. Light from outside the array is taken to have the scene's mean and covariance.
+
+        y: (lenslet_row, lenslet_column, pixel).
+
+        Returns (x, its standard deviation), both (lenslet_row, lenslet_column, point).
         """
         from scipy.linalg import cholesky, solve_triangular
 
         rows, columns = y.shape[:2]
         z = y @ self.analysis.T - self.offset
         x, sigma = np.empty((2, rows, columns, len(self.variance)))
-        ring = [(dr, dc) for dr in range(-RING, RING + 1) for dc in range(-RING, RING + 1)]
-        windows = {}
+        ring = _ring(RING)
+        alike: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
         for r in range(rows):
             for c in range(columns):
                 inside = tuple(0 <= r + dr < rows and 0 <= c + dc < columns for dr, dc in ring)
-                windows.setdefault(inside, []).append((r, c))
+                alike.setdefault(inside, []).append((r, c))
         used = self.analysis.shape[0]
-        for inside, lenslets in windows.items():
+        for inside, lenslets in alike.items():
             keep = np.flatnonzero(np.repeat(inside, used))
             cross = self.cross[:, keep]
             factor = cholesky(self.data[np.ix_(keep, keep)], lower=True)
@@ -77,22 +84,36 @@ class JointLmmse:
 
 
 def prepare_joint(
-    svd, blocks, offsets, object_shape, mean, autocovariance, sigma, bands=((1.0,),), *, most=MOST
-):
-    """Set up LMMSE from 3x3 superpixels for a scene with the stationary `autocovariance` (lags up
-    to `needed_reach`).
+    svd: Svd,
+    blocks: np.ndarray,
+    offsets: np.ndarray,
+    object_shape: tuple[int, int],
+    mean: float,
+    autocovariance: np.ndarray,
+    sigma: float,
+    bands: np.ndarray | Sequence[Sequence[float]] = ((1.0,),),
+    *,
+    most: int = MOST,
+) -> JointLmmse:
+    """Set up LMMSE from 3x3 superpixels for a stationary scene.
+
+    Superpixels are seen through left singular vectors of A_0, those whose signal can exceed a
+    hundredth of the noise: a linear reduction of the data, for which the estimate is exact,
+    neighbours' light included. Covariances are inner products of each vector's footprint on the
+    object with the footprints filtered by the autocovariance (FFT).
 
     svd: of the own block A_0.
-    blocks (offset, pixel, point), offsets (offset, 2): as in BlockToeplitz, points of several bands
-        one band after the other.
+    blocks, offsets: (offset, pixel, point) and (offset, 2) as in BlockToeplitz, points of several
+        bands one band after the other.
     object_shape: points (rows, columns) of a block in one band.
-    mean, autocovariance: of natural.autocovariance.
-    bands (band, band): covariance of the bands at a point, its diagonal about 1.
-    sigma > 0: noise of a pixel. Superpixels are seen through at most `most` left singular vectors
-        of A_0, those whose signal can exceed a hundredth of the noise: a linear reduction of the
-        data, for which the estimate is exact, neighbours' light included. Covariances are inner
-        products of each vector's footprint on the object with the footprints filtered by the
-        autocovariance (FFT).
+    mean, autocovariance: of plenocli.inverse.prior.natural_images.autocovariance, lags up to
+        `needed_reach`.
+    sigma: noise of a pixel, > 0.
+    bands: (band, band) covariance of the bands at a point, its diagonal about 1.
+    most: singular vectors at most.
+
+    Raises NumericsError where sigma is not positive.
+    docs/model.md, "Spatial reconstruction".
     """
     from plenocli.base.errors import NumericsError
 
@@ -101,21 +122,14 @@ def prepare_joint(
             f"LMMSE needs a positive noise level, not {sigma}",
             fix="give --noise-sigma, or use --method tikhonov",
         )
-    blocks, offsets = np.asarray(blocks, float), np.asarray(offsets, int)
-    rows, columns = object_shape
-    bands = np.asarray(bands, float)
-    count = len(bands)
+    offsets, bands = np.asarray(offsets, int), np.asarray(bands, float)
+    (rows, columns), count = object_shape, len(bands)
     brightest = np.linalg.eigvalsh(bands)[-1]
     strength = svd.s**2 * np.abs(autocovariance).max() * brightest * rows * columns
     used = max(1, min(int(np.count_nonzero(strength > 1e-4 * sigma**2)), most, svd.rank()))
     analysis = svd.u[:, :used].T
-    response = np.stack([analysis @ block for block in blocks])
-    reach = int(np.abs(offsets).max(initial=0))
-    side = 2 * reach + 1
-    footprint = np.zeros((used * count, side * rows, side * columns))
-    for block, (dr, dc) in zip(response, offsets):
-        r, c = (reach - dr) * rows, (reach - dc) * columns
-        footprint[:, r : r + rows, c : c + columns] += block.reshape(-1, rows, columns)
+    response = np.stack([analysis @ block for block in np.asarray(blocks, float)])
+    footprint = _footprints(response, offsets, object_shape, used * count)
     margin = 2 * RING * np.array([rows, columns])
     filtered = _filter(footprint, autocovariance, margin)
     if count > 1 or bands[0, 0] != 1:
@@ -123,22 +137,8 @@ def prepare_joint(
             "ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])
         ).reshape(filtered.shape)
 
-    def shifted(dr, dc):
-        """The filtered footprints as seen by a lenslet (dr, dc) from the one whose
-        footprints they are.
-        """
-        r, c = margin[0] + dr * rows, margin[1] + dc * columns
-        return filtered[:, r : r + footprint.shape[1], c : c + footprint.shape[2]]
-
-    flat = footprint.reshape(used, -1)
-    ring = [(dr, dc) for dr in range(-RING, RING + 1) for dc in range(-RING, RING + 1)]
-    pairs = {
-        (dr, dc): flat @ shifted(dr, dc).reshape(used, -1).T
-        for dr in range(-2 * RING, 2 * RING + 1)
-        for dc in range(-2 * RING, 2 * RING + 1)
-    }
-    data = np.block([[pairs[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
-    data = (data + data.T) / 2
+    flat, ring = footprint.reshape(used, -1), _ring(RING)
+    data, cross = _covariances(footprint, filtered, used, object_shape)
     # what rounding may have taken away, in proportion to each coordinate's light: almost without
     # noise data would be no covariance
     rounding = (
@@ -149,26 +149,77 @@ def prepare_joint(
         * np.einsum("ij,ij->i", flat, flat)
     )
     data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(ring))
-    own = np.s_[:, reach * rows : (reach + 1) * rows, reach * columns : (reach + 1) * columns]
-    cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
     middle = autocovariance.shape[0] // 2
     return JointLmmse(
-        mean,
-        analysis,
-        mean * response.sum(axis=(0, 2)),
-        cross,
-        data,
-        np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns),
+        mean=mean,
+        analysis=analysis,
+        offset=mean * response.sum(axis=(0, 2)),
+        cross=cross,
+        data=data,
+        variance=np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns),
     )
 
 
-def needed_reach(object_shape, offsets):
+def _covariances(
+    footprint: np.ndarray, filtered: np.ndarray, used: int, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(data, cross) of JointLmmse, without noise.
+
+    footprint: (coordinate times band, row, column).
+    filtered: the same, filtered by the scene's covariance and larger by 2 RING objects on each
+        side.
+    used: coordinates of a superpixel.
+    shape: (rows, columns) of an object in one band.
+    """
+    (rows, columns), flat, ring = shape, footprint.reshape(used, -1), _ring(RING)
+
+    def shifted(dr: int, dc: int) -> np.ndarray:
+        """The filtered footprints as seen by a lenslet (dr, dc) from the one whose
+        footprints they are.
+        """
+        r, c = (2 * RING + dr) * rows, (2 * RING + dc) * columns
+        return filtered[:, r : r + footprint.shape[1], c : c + footprint.shape[2]]
+
+    by_shift = {d: flat @ shifted(*d).reshape(used, -1).T for d in _ring(2 * RING)}
+    data = np.block([[by_shift[(a[0] - b[0], a[1] - b[1])] for b in ring] for a in ring])
+    r, c = (footprint.shape[1] - rows) // 2, (footprint.shape[2] - columns) // 2
+    own = np.s_[:, r : r + rows, c : c + columns]
+    cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
+    return (data + data.T) / 2, cross
+
+
+def _ring(reach: int) -> list[tuple[int, int]]:
+    """Lenslets (rows, columns) up to `reach` away, the middle one included."""
+    steps = range(-reach, reach + 1)
+    return [(dr, dc) for dr in steps for dc in steps]
+
+
+def _footprints(
+    response: np.ndarray, offsets: np.ndarray, shape: tuple[int, int], count: int
+) -> np.ndarray:
+    """(footprint, row, column) what each coordinate sees of the objects around.
+
+    response: (offset, coordinate, point).
+    shape: (rows, columns) of an object in one band.
+    count: coordinates times bands.
+    """
+    rows, columns = shape
+    reach = int(np.abs(offsets).max(initial=0))
+    side = 2 * reach + 1
+    footprint = np.zeros((count, side * rows, side * columns))
+    for block, (dr, dc) in zip(response, offsets):
+        r, c = (reach - dr) * rows, (reach - dc) * columns
+        footprint[:, r : r + rows, c : c + columns] += block.reshape(-1, rows, columns)
+    return footprint
+
+
+def needed_reach(object_shape: tuple[int, int], offsets: np.ndarray) -> int:
     """Largest lag (points) of the autocovariance that `prepare_joint` can use."""
     reach = int(np.abs(np.asarray(offsets)).max(initial=0))
     return (2 * RING + 2 * reach + 1) * max(object_shape) - 1
 
 
-def _filter(footprint, autocovariance, margin):
+def _filter(footprint: np.ndarray, autocovariance: np.ndarray, margin: np.ndarray) -> np.ndarray:
     """footprint convolved with the autocovariance, on its own grid enlarged by
     `margin` on each side.
     """

@@ -6,6 +6,8 @@ noise, and measures it. All estimates are linear: they may leave [0, 1], and
 nothing is clipped here.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,23 +15,25 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Svd:
-    """A = u diag(s)
+    """A = u diag(s) vt.
 
-    vt: u (pixel, k), s (k,) falling, vt (k, point), k = min(pixel, point).
+    u: (pixel, k), k = min(pixel, point).
+    s: (k,) falling.
+    vt: (k, point).
     """
 
     u: np.ndarray
     s: np.ndarray
     vt: np.ndarray
 
-    def compress(self, y):
+    def compress(self, y: np.ndarray) -> np.ndarray:
         """z = U^T y, (k, signal), from y (pixel, signal): no estimate that fits by least squares
         can tell z from y.
         """
         return self.u.T @ y
 
-    def rank(self, relative=None):
-        """Singular values above `relative` times the largest (default: machine precision
+    def rank(self, relative: float | None = None) -> int:
+        """Number of singular values above `relative` times the largest (default: machine precision
         times the larger side).
         """
         floor = (
@@ -40,10 +44,12 @@ class Svd:
         return int(np.count_nonzero(self.s > floor * self.s[0]))
 
 
-def decompose(matrix):
-    """Svd of A (pixel, point), in float64.
+def decompose(matrix: np.ndarray) -> Svd:
+    """Singular value decomposition in float64.
 
-    A zero or non-finite matrix is refused (NumericsError).
+    matrix: A (pixel, point).
+
+    Raises NumericsError where it is zero or not finite.
     """
     from plenocli.base.errors import NumericsError
 
@@ -60,14 +66,17 @@ def decompose(matrix):
     return Svd(u, s, vt)
 
 
-def estimate_noise(svd, y):
-    """Standard deviation of the noise in y (pixel, signal), from the part of y
-    that A cannot produce.
+def estimate_noise(svd: Svd, y: np.ndarray) -> float:
+    """Standard deviation of the noise, from the part of the signals that A cannot produce.
 
     Directions with s < 1e-6 s_0 count as such too. It is too large when the model is wrong
     (neighbours' light left out, for instance), since that also shows up outside the range of A: a
-    sound scale for the discrepancy rule, not a photometric figure. NumericsError where A
-    reaches every direction.
+    sound scale for the discrepancy rule, not a photometric figure.
+
+    svd: of A.
+    y: (pixel, signal).
+
+    Raises NumericsError where A reaches every direction.
     """
     from plenocli.base.errors import NumericsError
 
@@ -82,13 +91,16 @@ def estimate_noise(svd, y):
     return float(np.sqrt(np.sum(residual**2) / (left * y.shape[1])))
 
 
-def resolution(svd, sigma, contrast):
-    """Diagonal (point,) of A^T A (A^T A + (sigma/contrast)^2)^-1: 1 where noise sigma lets a point
-    be seen apart, 0 in the null space.
+def resolution(svd: Svd, sigma: float, contrast: float) -> np.ndarray:
+    """Diagonal of A^T A (A^T A + (sigma/contrast)^2)^-1: 1 where noise lets a point be seen apart,
+    0 in the null space. Its mean is the share of the object's directions that the sensor sees.
 
+    svd: of A.
+    sigma: noise of a pixel.
     contrast: standard deviation of a point about its surroundings; points are taken to be
-        independent, as the sensor cannot know better. The mean is the share of the object's
-        directions that the sensor sees.
+        independent, as the sensor cannot know better.
+
+    Returns (point,).
     """
     share = (
         svd.s**2 / (svd.s**2 + (sigma / contrast) ** 2)
@@ -98,29 +110,39 @@ def resolution(svd, sigma, contrast):
     return np.einsum("kj,k,kj->j", svd.vt, share, svd.vt)
 
 
-def tikhonov(svd, z, alpha):
-    """argmin |y - Ax|^2 + alpha |x|^2, (point, signal), from z = U^T y (k, signal);
-    alpha in units of s^2.
+def tikhonov(svd: Svd, z: np.ndarray, alpha: float) -> np.ndarray:
+    """argmin |y - Ax|^2 + alpha |x|^2.
+
+    svd: of A.
+    z: U^T y (k, signal).
+    alpha: in units of s^2.
+
+    Returns (point, signal).
     """
     return svd.vt.T @ ((svd.s / (svd.s**2 + alpha))[:, None] * z)
 
 
-def truncated(svd, z, rank):
-    """Least squares in the `rank` strongest directions, (point, signal)."""
+def truncated(svd: Svd, z: np.ndarray, rank: int) -> np.ndarray:
+    """Least squares in the `rank` strongest directions, (point, signal), from z = U^T y (k,
+    signal).
+    """
     return svd.vt[:rank].T @ (z[:rank] / svd.s[:rank, None])
 
 
-def discrepancy_alpha(svd, z, sigma):
-    """alpha for which the residual of all signals together is what noise of standard deviation
-    sigma leaves in z.
+def discrepancy_alpha(svd: Svd, z: np.ndarray, sigma: float) -> float:
+    """alpha for which the residual of all signals together is what noise leaves in z.
 
     Morozov's rule: sum |z - S V^T x|^2 = (number of entries of z) sigma^2; it rises with alpha, and
     is found by bisection in log alpha between 1e-18 and 1e6 times s_0^2 (an end is returned where
     the rule cannot be met).
+
+    svd: of A.
+    z: U^T y (k, signal).
+    sigma: standard deviation of the noise.
     """
     power, target = np.sum(z**2, axis=1), z.size * sigma**2
 
-    def residual(alpha):
+    def residual(alpha: float) -> float:
         return np.sum((alpha / (svd.s**2 + alpha)) ** 2 * power)
 
     low, high = 1e-18 * svd.s[0] ** 2, 1e6 * svd.s[0] ** 2
@@ -134,8 +156,9 @@ def discrepancy_alpha(svd, z, sigma):
     return float(np.sqrt(low * high))
 
 
-def best_rank(svd, z, sigma):
-    """The truncation with the least estimated mean square error of x, all signals together.
+def best_rank(svd: Svd, z: np.ndarray, sigma: float) -> int:
+    """The truncation with the least estimated mean square error of x, all signals together, from z
+    = U^T y (k, signal) with noise of standard deviation sigma.
 
     An unbiased estimate in the manner of Stein and Mallows: direction k costs 2 sigma^2 / s_k^2 of
     noise and saves z_k^2 / s_k^2 of picture, on average. (Morozov's rule keeps far too many
@@ -146,7 +169,7 @@ def best_rank(svd, z, sigma):
     return int(np.argmin(np.cumsum(change))) + 1
 
 
-def oracle_alpha(svd, z, truth):
+def oracle_alpha(svd: Svd, z: np.ndarray, truth: np.ndarray) -> float:
     """The alpha with the least mean square error against `truth` (point, signal).
 
     Needs the truth: a bound, not a method.
@@ -155,19 +178,19 @@ def oracle_alpha(svd, z, truth):
 
     coordinates = svd.vt @ truth
 
-    def error(log_alpha):
+    def error(log_alpha: float) -> float:
         alpha = 10.0**log_alpha * svd.s[0] ** 2
         return np.sum(((svd.s / (svd.s**2 + alpha))[:, None] * z - coordinates) ** 2)
 
-    grid = np.arange(-14.0, 2.01, 0.5)
-    best = grid[np.argmin([error(g) for g in grid])]
+    coarse = np.arange(-14.0, 2.01, 0.5)
+    best = coarse[np.argmin([error(a) for a in coarse])]
     found = minimize_scalar(
         error, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 1e-3}
     )
     return float(10.0**found.x * svd.s[0] ** 2)
 
 
-def oracle_rank(svd, z, truth):
+def oracle_rank(svd: Svd, z: np.ndarray, truth: np.ndarray) -> int:
     """The truncation with the least mean square error against `truth` (point, signal).
 
     Needs the truth.

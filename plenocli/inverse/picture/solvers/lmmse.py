@@ -7,9 +7,14 @@ nothing is assumed, and its own contrast, the square root of a scale that multip
 and is estimated from the lenslet's own data.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from plenocli.inverse.picture.solvers.least_squares import Svd
 
 SCALES = np.geomspace(1e-3, 30, 60)
 """Scales of the covariance that are tried."""
@@ -31,17 +36,18 @@ belongs to the field.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Lmmse:
-    """Everything that `prepare` works out once.
+    """Everything that `prepare` works out once. Points of several bands stand one band after the
+    other.
 
-    levels (level, pixel): y to brightnesses, one a band that can be told apart;
-    even (point, level): fields of brightness one;
-    mean (point,), variance (point,): of a field about its brightness;
-    analysis (k, pixel), offset (k,): y to uncorrelated coordinates;
-    power (k,): their variance at scale 1;
-    gain (point, k): back to the field;
-    sigma: of a pixel. Points of several bands stand one band after the other.
+    levels: (level, pixel) y to brightnesses, one a band that can be told apart.
+    even: (point, level) fields of brightness one.
+    mean, variance: (point,) of a field about its brightness.
+    offset, analysis: (k,) and (k, pixel), y to uncorrelated coordinates.
+    power: (k,) their variance at scale 1.
+    gain: (point, k) back to the field.
+    sigma: noise of a pixel.
     """
 
     levels: np.ndarray
@@ -54,7 +60,7 @@ class Lmmse:
     variance: np.ndarray
     sigma: float
 
-    def apply(self, y, scale=1.0):
+    def apply(self, y: np.ndarray, scale: float | np.ndarray = 1.0) -> np.ndarray:
         """(pixel, signal) -> (point, signal), with the covariance times `scale`, a
         number or one a signal.
         """
@@ -64,7 +70,7 @@ class Lmmse:
         )
         return self.even @ (self.levels @ y) + self.mean[:, None] + field
 
-    def adaptive(self, y):
+    def adaptive(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the
         estimates and their predicted standard deviations (point, signal), the scales (signal,).
         """
@@ -75,7 +81,7 @@ class Lmmse:
         level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]
         return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
 
-    def expected(self, scale=1.0):
+    def expected(self, scale: float = 1.0) -> float:
         """Root mean square error that it expects of fields whose covariance is `scale`
         times the given one.
         """
@@ -86,39 +92,39 @@ class Lmmse:
             np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1))))
         )
 
-    def brightness(self, y):
+    def brightness(self, y: np.ndarray) -> np.ndarray:
         """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
         return self.even.mean(axis=0) @ (self.levels @ y)
 
-    def seen(self):
+    def seen(self) -> np.ndarray:
         """Share of each point's variance about the brightness of its field that the superpixel
         determines at scale 1, (point,).
         """
         determined = self.gain**2 @ (1 / (self.power + self.sigma**2))
         return np.clip(determined / np.maximum(self.variance, np.finfo(float).tiny), 0, 1)
 
-    def common_scale(self, y):
+    def common_scale(self, y: np.ndarray) -> float:
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
         return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])
 
-    def implausible(self, y):
+    def implausible(self, y: np.ndarray) -> bool:
         """Whether the signals y (pixel, signal) together would need more contrast than a
         photograph has: a scale of IMPLAUSIBLE or more.
         """
         return len(self.power) > 0 and self.common_scale(y) >= IMPLAUSIBLE
 
-    def _likelihood(self, w):
+    def _likelihood(self, w: np.ndarray) -> np.ndarray:
         """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale,
         signal), but for a constant.
         """
         expected = np.outer(SCALES, self.power) + self.sigma**2
         return -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
 
-    def _coordinates(self, y):
+    def _coordinates(self, y: np.ndarray) -> np.ndarray:
         """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
         return self.analysis @ y - self.offset[:, None]
 
-    def scales(self, y):
+    def scales(self, y: np.ndarray) -> np.ndarray:
         """The scale of each signal of y (pixel, signal): the posterior mean of its logarithm.
 
         Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the
@@ -133,27 +139,37 @@ class Lmmse:
             posterior /= posterior.sum(axis=0)
             prior = posterior.mean(axis=1)
             middle = prior @ logs
-            spread = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
-            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * spread**2)), 1e-30)
+            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
+            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
         return np.exp(logs @ posterior)
 
 
-def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
-    """The LMMSE estimator for y = A x + n, n white with standard deviation `sigma`, x = level + t
-    with any level and t of the given statistics at an unknown scale.
+def prepare(
+    svd: Svd,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    sigma: float,
+    bands: np.ndarray | Sequence[Sequence[float]] = ((1.0,),),
+) -> Lmmse:
+    """The LMMSE estimator for y = A x + n, n white, x = level + t with any level and t of the given
+    statistics at an unknown scale.
+
+    Fields have the covariance kron(bands, covariance). Their brightness, one a band, is taken out
+    here, as the superpixel measures it: level(x) = F^+ A x, F = A times fields of ones. What is
+    left of y, (I - F F^+) y, depends on t alone, and t = m + C A^T (A C A^T + sigma^2/scale I)^-1
+    (y - A m) is worked out in the eigenvectors of the signal's covariance: of directions of A whose
+    signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept. Bands
+    that the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their own: there
+    it is part of t.
 
     svd: of A, whose points are those of one band after the other.
-    mean (point,), covariance (point, point): of fields of natural photographs;
-    bands (band, band): covariance of the bands at a point, its diagonal about 1, so that fields
-        have kron(bands, covariance). Their brightness, one a band, is taken out here, as the
-        superpixel measures it: level(x) = F^+ A x, F = A times fields of ones. What is left of y,
-        (I - F F^+) y, depends on t alone, and t = m + C A^T (A C A^T + sigma^2/scale I)^-1 (y - A
-        m) is worked out in the eigenvectors of the signal's covariance: of directions of A whose
-        signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept.
-        Bands that the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their
-        own: there it is part of t.
-    sigma > 0. Source: Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md,
-        "Spatial reconstruction".
+    mean, covariance: (point,) and (point, point) of fields of natural photographs.
+    sigma: noise of a pixel, > 0.
+    bands: (band, band) covariance of the bands at a point, its diagonal about 1.
+
+    Raises NumericsError where sigma is not positive.
+    Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md, "Spatial
+    reconstruction".
     """
     from plenocli.base.errors import NumericsError
 
@@ -163,34 +179,20 @@ def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
             fix="give --noise-sigma, or use --method tikhonov",
         )
     bands = np.asarray(bands, float)
-    levels, even = _levels(svd, bands, np.mean(np.diag(covariance)), sigma)
-    left, weight = (
-        levels / np.linalg.norm(levels, axis=1)[:, None],
-        (levels @ svd.u * svd.s) @ svd.vt,
-    )
+    levels, even = _levels(svd, bands, float(np.mean(np.diag(covariance))), sigma)
+    left = levels / np.linalg.norm(levels, axis=1)[:, None]
+    weight = (levels @ svd.u * svd.s) @ svd.vt
     mean = np.tile(mean, len(bands))
     mean = mean - even @ (weight @ mean)
     pulled = _times(bands, covariance, weight.T)
 
-    def spread(v):
+    def covary(v: np.ndarray) -> np.ndarray:
         """Covariance of t times v (point, n)."""
         v = v - weight.T @ (even.T @ v)
         return _times(bands, covariance, v) - even @ (pulled.T @ v)
 
-    used, cross = [], []
-    for first in range(0, len(svd.s), TOGETHER):
-        rows = svd.s[first : first + TOGETHER, None] * svd.vt[first : first + TOGETHER]
-        along = spread(rows.T)
-        loud = np.flatnonzero(np.einsum("ij,ji->i", rows, along) > 1e-5 * sigma**2)
-        if not len(loud):
-            break  # what follows is weaker still
-        used.append(first + loud)
-        cross.append(along[:, loud])
-    used = np.concatenate([*used, np.zeros(0, int)])
-    seen, cross = (
-        svd.s[used, None] * svd.vt[used],
-        np.concatenate([*cross, np.zeros((svd.vt.shape[1], 0))], axis=1),
-    )
+    used, cross = _audible(svd, covary, sigma)
+    seen = svd.s[used, None] * svd.vt[used]
     data = seen @ cross
     power, vectors = np.linalg.eigh((data + data.T) / 2)
     kept = power > 1e-4 * sigma**2
@@ -201,19 +203,42 @@ def prepare(svd, mean, covariance, sigma, bands=((1.0,),)):
         even * (2 * pulled - even @ (weight @ pulled)), axis=1
     )
     return Lmmse(
-        levels,
-        even,
-        mean,
-        vectors.T @ (seen @ mean),
-        analysis,
-        power,
-        cross @ vectors,
-        variance,
-        float(sigma),
+        levels=levels,
+        even=even,
+        mean=mean,
+        offset=vectors.T @ (seen @ mean),
+        analysis=analysis,
+        power=power,
+        gain=cross @ vectors,
+        variance=variance,
+        sigma=float(sigma),
     )
 
 
-def _levels(svd, bands, variance, sigma):
+def _audible(
+    svd: Svd, covary: Callable[[np.ndarray], np.ndarray], sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(directions of A whose signal stands above the noise, covariance (point, direction) of the
+    field with it).
+
+    covary: the field's covariance times v (point, n).
+    """
+    used, cross = [], []
+    for first in range(0, len(svd.s), TOGETHER):
+        rows = svd.s[first : first + TOGETHER, None] * svd.vt[first : first + TOGETHER]
+        along = covary(rows.T)
+        loud = np.flatnonzero(np.einsum("ij,ji->i", rows, along) > 1e-5 * sigma**2)
+        if not len(loud):
+            break  # what follows is weaker still
+        used.append(first + loud)
+        cross.append(along[:, loud])
+    nothing = np.zeros((svd.vt.shape[1], 0))
+    return np.concatenate([*used, np.zeros(0, int)]), np.concatenate([*cross, nothing], axis=1)
+
+
+def _levels(
+    svd: Svd, bands: np.ndarray, variance: float, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(levels (level, pixel), even (point, level)) of Lmmse: orthogonal rows that measure
     brightnesses, and the fields they stand for.
     """
@@ -227,7 +252,7 @@ def _levels(svd, bands, variance, sigma):
     return (svd.u @ u[:, kept] / s[kept]).T, ones @ vt[kept].T
 
 
-def _times(bands, covariance, v):
+def _times(bands: np.ndarray, covariance: np.ndarray, v: np.ndarray) -> np.ndarray:
     """kron(bands, covariance) v, v (point, n), points of one band after the other."""
     parts = v.reshape(len(bands), -1, v.shape[1])
     return np.tensordot(bands, np.stack([covariance @ part for part in parts]), 1).reshape(v.shape)

@@ -7,6 +7,8 @@ rule. A converged solution is checked against the optimality (KKT) conditions of
 early-stopped one is the accelerated projected gradient method.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +16,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class NonNegative:
-    """x (point, signal) >= 0.
+    """A solution x >= 0.
 
-    kkt (signal,): how far from optimal, see `kkt_violation`.
+    x: (point, signal).
+    kkt: (signal,) how far from optimal, see `kkt_violation`.
     iterations: of the gradient method, 0 for the active-set one.
     """
 
@@ -25,24 +28,32 @@ class NonNegative:
     iterations: int
 
 
-def kkt_violation(matrix, z, x):
+def kkt_violation(matrix: np.ndarray, z: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Largest violation of the optimality conditions per signal, relative to the gradient at x = 0.
 
     With g = A^T (A x - z): max_j of |g_j| where x_j > 0 and of max(-g_j, 0) where x_j = 0,
     over max_j |A^T z|_j.
+
+    matrix: A (row, point).
+    z: (row, signal).
+    x: (point, signal) >= 0.
+
+    Returns (signal,).
     """
     g = matrix.T @ (matrix @ x - z)
     wrong = np.where(x > 0, np.abs(g), np.maximum(-g, 0)).max(axis=0)
     return wrong / np.maximum(np.abs(matrix.T @ z).max(axis=0), np.finfo(float).tiny)
 
 
-def converged(matrix, z, *, tol=1e-10):
-    """The solution for each column of z (row, signal), by the active-set method of Lawson
-    and Hanson (1974).
+def converged(matrix: np.ndarray, z: np.ndarray, *, tol: float = 1e-10) -> NonNegative:
+    """The solution for each signal, about 2 s of CPU for one of 1600 points at 60 dB.
 
     matrix: (row, point); S V^T and U^T y serve as well as A and y, and are smaller.
-    NumericsError where the conditions are violated by more than `tol` (`kkt_violation`). About 2 s
-    of CPU for a signal of 1600 points at 60 dB.
+    z: (row, signal).
+    tol: how far the optimality conditions may be violated (`kkt_violation`).
+
+    Raises NumericsError where they are violated by more.
+    Lawson and Hanson 1974, the active-set method.
     """
     from scipy.optimize import nnls
 
@@ -62,12 +73,15 @@ def converged(matrix, z, *, tol=1e-10):
     return NonNegative(x, kkt, 0)
 
 
-def projected_gradient(matrix, z, iterations, norm=None):
-    """The iterate after `iterations` steps from x = 0 of the accelerated projected gradient method
-    (FISTA with x >= 0).
+def projected_gradient(
+    matrix: np.ndarray, z: np.ndarray, iterations: int, norm: float | None = None
+) -> NonNegative:
+    """The iterate of the accelerated projected gradient method (FISTA with x >= 0) from x = 0; step
+    1/|A|_2^2, momentum restarted per signal where it points uphill.
 
-    matrix (row, point), z (row, signal); step 1/|A|_2^2, momentum restarted per signal
-    where it points uphill.
+    matrix: A (row, point).
+    z: (row, signal).
+    iterations: steps.
     norm: |A|_2, if known.
     """
     matrix, z = np.asarray(matrix, float), np.asarray(z, float)

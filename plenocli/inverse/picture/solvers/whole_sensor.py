@@ -9,9 +9,14 @@ Total variation is the convex case, by the alternating direction method of multi
 (Boyd et al. 2011).
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
 import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.inverse.picture.solvers.least_squares import Svd
 
 FROM, TO, ROUNDS = 6.0, 0.1, 10
 """Plug and play: first and last tau over the error that is expected at the start, and rounds in
@@ -20,26 +25,42 @@ between; chosen on validation scenes (docs/model.md).
 TV_WEIGHT, TV_ROUNDS = 0.2, 20
 """Total variation: its weight times the error expected at the start, and rounds of ADMM."""
 
+Denoise = Callable[[np.ndarray, float], np.ndarray]
+"""(picture, standard deviation of its noise) -> picture."""
+
+Held = tuple[np.ndarray, np.ndarray]
+"""(mask (lenslet_row, lenslet_column), objects (lenslet_row, lenslet_column, point)) of lenslets
+whose light is not their own: their objects stay what they are.
+"""
+
 
 class DataTerm:
-    """|y - A x|^2/sigma^2 of a sensor, in the directions of the own block that can be seen.
+    """|y - A x|^2/sigma^2 of a sensor, in the directions of the own block that can be seen."""
 
-    svd: of the own block.
-    object_shape: points (rows, columns) of a block in one band.
-    y (lenslet_row, lenslet_column, pixel): own light, neighbours' taken away.
-    sigma > 0: noise of a pixel.
-    contrast: what a point may differ from what the prior expects; singular vectors whose signal is
-        then below 3 % of the noise are dropped.
-    held: (mask (lenslet_row, lenslet_column), x like y's lenslets (.., point)) of lenslets whose
-        light is not their own: their objects stay what they are.
-    """
+    def __init__(
+        self,
+        svd: Svd,
+        object_shape: tuple[int, int],
+        y: np.ndarray,
+        sigma: float,
+        contrast: float = 0.1,
+        held: Held | None = None,
+    ) -> None:
+        """For one capture.
 
-    def __init__(self, svd, object_shape, y, sigma, contrast=0.1, held=None):
-        self.shape, self.sigma, self.held = tuple(object_shape), float(sigma), held
+        svd: of the own block.
+        object_shape: points (rows, columns) of a block in one band.
+        y: (lenslet_row, lenslet_column, pixel) own light, neighbours' taken away.
+        sigma: noise of a pixel, > 0.
+        contrast: what a point may differ from what the prior expects; singular vectors whose signal
+            is then below 3 % of the noise are dropped.
+        held: lenslets that stay what they are.
+        """
+        self.shape, self.sigma, self.held = object_shape, float(sigma), held
         kept = max(1, int(np.count_nonzero((svd.s * contrast) ** 2 > 1e-3 * sigma**2)))
         self.s, self.vt, self.z = svd.s[:kept], svd.vt[:kept], y @ svd.u[:, :kept]
 
-    def proximal(self, picture, tau):
+    def proximal(self, picture: np.ndarray, tau: float) -> np.ndarray:
         """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column)
         or (band, row, column).
         """
@@ -52,21 +73,21 @@ class DataTerm:
         return to_plane(x, self.shape)
 
 
-def schedule(error):
+def schedule(error: float) -> np.ndarray:
     """Falling tau for `plug_and_play` from a picture whose root mean square error is
     expected to be `error`.
     """
     return np.geomspace(FROM * error, TO * error, ROUNDS)
 
 
-def denoiser(bands):
+def denoiser(bands: np.ndarray) -> Denoise:
     """Block matching for pictures (row, column), or (band, row, column) whose bands have the
     covariance `bands` (band, band): these are turned into uncorrelated ones, most of them nearly
     flat, which leaves white noise white.
     """
     from plenocli.inverse.picture.solvers.block_matching import block_matching
 
-    def denoise(picture, tau):
+    def denoise(picture: np.ndarray, tau: float) -> np.ndarray:
         if picture.ndim == 2:
             return block_matching(picture, tau)
         turn = np.linalg.eigh(bands)[1].T
@@ -79,9 +100,13 @@ def denoiser(bands):
     return denoise
 
 
-def plug_and_play(term, start, denoise, taus):
-    """The picture (row, column) after a round of v = denoise(x, tau), x = proximal(v, tau) for
-    each tau, from x = start.
+def plug_and_play(
+    term: DataTerm, start: np.ndarray, denoise: Denoise, taus: Iterable[float]
+) -> np.ndarray:
+    """The picture after a round of v = denoise(x, tau), x = term.proximal(v, tau) for each tau.
+
+    start: the first x, (row, column) or (band, row, column).
+    taus: falling, see `schedule`.
     """
     x = start
     for tau in taus:
@@ -89,15 +114,18 @@ def plug_and_play(term, start, denoise, taus):
     return x
 
 
-def total_variation(term, start, error, rounds=range(TV_ROUNDS)):
-    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by a round of ADMM for
-    each of `rounds` from x = start.
+def total_variation(
+    term: DataTerm, start: np.ndarray, error: float, rounds: Iterable[int] = range(TV_ROUNDS)
+) -> np.ndarray:
+    """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by ADMM.
 
-    error: root mean square error expected of `start`; it also scales the penalty, tau = error.
+    start: the first x, (row, column) or (band, row, column).
+    error: root mean square error expected of it; it also scales the penalty, tau = error.
+    rounds: one a round.
     """
     from skimage.restoration import denoise_tv_chambolle
 
-    def flatter(picture):
+    def flatter(picture: np.ndarray) -> np.ndarray:
         return denoise_tv_chambolle(picture, weight=TV_WEIGHT * error, eps=1e-5, max_num_iter=60)
 
     x = start

@@ -48,10 +48,11 @@ from plenocli.forward.propagation.costs import Features, Law, priced
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact.term_counts import TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
+from plenocli.forward.propagation.fresnel.spread_terms import SpreadLaw
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
-EXACT = "exact, low rank"
+EXACT, SPREAD = "exact, low rank", "spread function"
 FEATURES = {
     "rays": ("ray", rays.features),
     "fresnel, low rank": ("fresnel", square_cost.features),
@@ -83,7 +84,8 @@ class Measured:
     seconds: processor time;
     bytes: resident memory beyond the result;
     rate: of matrix products at its precision, real operations a second;
-    terms, products: most that any superpixel had, of the exact model, else 0.
+    terms: of the spread function, of an exact case the most that any superpixel had;
+    products: pairs of terms, most that any superpixel had, 0 of paraxial cases.
     """
 
     seconds: float
@@ -91,6 +93,11 @@ class Measured:
     rate: float
     terms: float
     products: float
+
+    @property
+    def counts(self) -> tuple[float, ...]:
+        """What the laws of terms expect."""
+        return (self.terms, self.products) if self.products else (self.terms,)
 
 
 # measuring
@@ -132,10 +139,13 @@ def features_of(case: Case, **numbers: TermLaw) -> Features:
     return count(camera, view, plan.bands[0], plan.shape, plan.double, **numbers)
 
 
-def expected(case: Case, counts: Mapping[str, float]) -> tuple[float, float]:
-    """Terms and pairs of terms that an exact case is expected to have by `counts`."""
+def expected(case: Case, counts: Mapping[str, float]) -> tuple[float, ...]:
+    """Terms, of an exact case also pairs of terms, that it is expected to have by `counts`."""
     plan, camera = plan_of(case), camera_named(case.camera)
     view = geometry(camera, plan.bands[0].wavelength, plan.pixel_shift)
+    if case.model != EXACT:
+        phase = view.k * view.D1 / 2 * plan.bands[0].half / view.z2
+        return (SpreadLaw(**counts).terms(phase, plan.tolerance),)
     return cost_law.expected_counts(camera, view, plan.bands[0], plan.shape, TermLaw(**counts))
 
 
@@ -151,13 +161,13 @@ def measure(case: Case) -> Measured | None:
     except NumericsError:
         return None
     seconds = time.process_time() - start
-    exact = case.model == EXACT
+    notes = builder.notes
     return Measured(
         seconds=seconds,
         bytes=_resident() - before - plan.bytes,
         rate=rate,
-        terms=float(builder.notes.separable_terms) if exact else 0.0,
-        products=float(builder.notes.products) if exact else 0.0,
+        terms=float(notes.separable_terms),
+        products=float(notes.products) if case.model == EXACT else 0.0,
     )
 
 
@@ -220,7 +230,7 @@ def fitted_counts(law: Law, cases: Mapping[Case, Measured], prior: float) -> dic
         numbers = dict(law.counts) | dict(zip(names, start * np.exp(logs)))
         found = [math.sqrt(prior) * logs]
         for case, took in counting(cases).items():
-            found.append(np.log(np.divide(expected(case, numbers), (took.terms, took.products))))
+            found.append(np.log(np.divide(expected(case, numbers), took.counts)))
         return np.concatenate(found)
 
     logs = least_squares(missed, np.zeros(len(names)), loss="soft_l1", f_scale=0.2).x
@@ -228,8 +238,14 @@ def fitted_counts(law: Law, cases: Mapping[Case, Measured], prior: float) -> dic
 
 
 def counting(cases: Mapping[Case, Measured]) -> dict[Case, Measured]:
-    """Cases without filters in the pupil, whose cells have fewer terms than the laws expect."""
-    return {c: t for c, t in cases.items() if camera_named(c.camera).filter_array is None}
+    """Cases with a round pupil without filters: the laws do not know of others."""
+    return {
+        c: t
+        for c, t in cases.items()
+        if t.terms > 0
+        and camera_named(c.camera).filter_array is None
+        and camera_named(c.camera).main_lens.aperture_shape == "circle"
+    }
 
 
 HELD = {"coarsest_cut", "separable_pupil", "lenslets_coarse", "lenslets_a_decade", "nodes_beside"}
@@ -254,8 +270,10 @@ def _rounded(value: float) -> float:
 def refitted(model: str, law: Law, cases: Mapping[Case, Measured], prior: float) -> Law:
     """The Law of a model by these cases."""
     counts = dict(law.counts)
-    if model == EXACT:
+    if model in (EXACT, SPREAD):
         counts = fitted_counts(law, cases, prior)
+    if model == SPREAD:
+        return Law(counts=counts, fit=described(cases))
     times, memory = [], []
     for case, took in cases.items():
         found = counted(model, case, counts)
@@ -316,8 +334,9 @@ class Residuals:
 
     def as_toml(self) -> dict[str, object]:
         """What the file says of them."""
-        found: dict[str, object] = {"time_within_factor_2": within(self.times)}
+        found: dict[str, object] = {}
         if len(self.times):
+            found["time_within_factor_2"] = within(self.times)
             found["estimated_over_measured"] = [
                 round(float(self.times.min()), 3),
                 round(float(self.times.max()), 3),
@@ -332,13 +351,13 @@ class Residuals:
 def residuals(model: str, law: Law, cases: Mapping[Case, Measured]) -> Residuals:
     """How a Law fares on these cases."""
     times, memory, counts = [], [], []
-    for case, took in cases.items():
+    for case, took in cases.items() if model in FEATURES else ():
         cost = law.cost(counted(model, case, law.counts))
         times.append((cost.operations / took.rate + cost.seconds) / took.seconds)
         if max(took.bytes, cost.bytes) > LEAST_BYTES:
             memory.append(cost.bytes / max(took.bytes, LEAST_BYTES))
-    for case, took in counting(cases).items() if model == EXACT else ():
-        counts += list(np.divide(expected(case, law.counts), (took.terms, took.products)))
+    for case, took in counting(cases).items() if model in (EXACT, SPREAD) else ():
+        counts += list(np.divide(expected(case, law.counts), took.counts))
     return Residuals(times=np.array(times), memory=np.array(memory), counts=np.array(counts))
 
 
@@ -413,7 +432,8 @@ def main() -> None:
     cases, laws = measured_cases(options), costs.read(costs.FITTED)
     print(f"{'':38s} cases within 2  least  median    most (estimated over measured)")
     for model, law in list(laws.items()):
-        own = {case: took for case, took in cases.items() if case.model == model}
+        models = ("fresnel, low rank", "fresnel, triple product") if model == SPREAD else (model,)
+        own = {case: took for case, took in cases.items() if case.model in models}
         if not own:
             continue
         print(*table(model, "present", residuals(model, law, own)), sep="\n")

@@ -52,9 +52,9 @@ class Law:
     fit: how these were found, for people.
     """
 
-    seconds: Mapping[str, float]
-    bytes: Mapping[str, float]
     operations: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    bytes: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
     fit: Mapping[str, object] = field(default_factory=dict)
 
@@ -82,11 +82,11 @@ def summed(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 
 def read(path: Path) -> dict[str, Law]:
-    """The Law of every model by the model's name, from a file such as costs.toml."""
+    """The Law of every model, and of the spread function, by name from a file as costs.toml."""
     return {name: Law(**parts) for name, parts in tomllib.loads(path.read_text()).items()}
 
 
 @cache
 def law(model: str) -> Law:
-    """The Law of the model of this name that plans are made with."""
+    """The Law of this name that plans are made with."""
     return read(FITTED)[model]

@@ -15,6 +15,7 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.pupil import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
+from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
 from plenocli.forward.propagation.plan import BandPlan
 
 if TYPE_CHECKING:
@@ -171,21 +172,6 @@ def size_band(geometry, superpixels, ring, accuracy, tolerance, dim=False):
         sampling=math.hypot(*errors),
         pixel_rule=rule,
         beside=beside,
-    )
-
-
-def expected_terms(phase, tolerance):
-    """Separable terms of the spread function of a round pupil whose rim runs through `phase` rad
-    from the middle to the end of the interval, cut at `tolerance`: within 2 terms or 10 % of those
-    found for phases from 18 to 960 and cuts from 4e-9 to 5e-2.
-    """
-    digits = math.log10(1 / tolerance)
-    if digits < 2.7:  # the rings of its tail go one by one
-        return max(
-            1, round((0.183 * phase + 4) * math.exp(-(0.17 + 4.8e-4 * phase) * (2.7 - digits) ** 2))
-        )
-    return max(
-        1, round(0.183 * phase + 4 + (digits - 2.7) * max(0.0, 0.9 * math.log(max(phase, 1.0)) - 2))
     )
 
 

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.costs import law
 from plenocli.forward.propagation.exact.low_rank_product import FILL, MAX_SKETCH
+from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
 from plenocli.forward.propagation.plan import BandPlan
-from plenocli.forward.propagation.sampling import (
-    expected_terms,
-)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry

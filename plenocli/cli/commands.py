@@ -2,6 +2,8 @@
 
 import importlib
 
+import click
+
 COMMANDS = {
     "init": "forward",
     "simulate-pif": "forward",
@@ -25,7 +27,7 @@ COMMANDS = {
 """Name of a command -> folder of its file. The order is that of the pipeline, and of the help."""
 
 
-def load_command(name):
+def load_command(name: str) -> click.Command:
     """The click command `name`, imported when it is asked for."""
     return importlib.import_module(
         f"plenocli.cli.{COMMANDS[name]}.{name.replace('-', '_')}"

@@ -23,15 +23,20 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 class Pipeline(click.Group):
     """A group whose commands are imported when they are asked for."""
 
-    def list_commands(self, ctx):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Their names, in the order of the pipeline."""
         return list(COMMANDS)
 
-    def get_command(self, ctx, name):
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """The command, imported; None where there is none of that name."""
         if name not in COMMANDS:
             return None
         return load_command(name)
 
-    def resolve_command(self, ctx, args):
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does; a misspelt name is answered with the nearest one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], COMMANDS, 1)
             hint = f"Did you mean {near[0]}?" if near else f"Choose one of {', '.join(COMMANDS)}."
@@ -57,7 +62,7 @@ class Pipeline(click.Group):
     "-v", "--verbose", is_flag=True, help="Also say what a command cost: time and memory."
 )
 @click.pass_context
-def cli(ctx, quiet, verbose):
+def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     """Model a plenoptic camera end to end: from its description and a scene to captures,
     spectra and images.
 
@@ -80,7 +85,7 @@ def cli(ctx, quiet, verbose):
         click.echo(f"{ctx.get_help()}\n\nNext: {next_step('.')}")
 
 
-def _cost(start):
+def _cost(start: float) -> None:
     import resource
 
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -97,14 +102,14 @@ def _cost(start):
     )
 
 
-def main(argv=None):
+def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit; every expected failure is one message on stderr
     and its exit code.
     """
     sys.exit(run(argv))
 
 
-def run(argv=None):
+def run(argv: list[str] | None = None) -> int:
     """Run the command line with `argv` (default: the process's own) and return the exit code."""
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
     try:
@@ -152,6 +157,6 @@ def run(argv=None):
         )
 
 
-def _fail(message, code):
+def _fail(message: str, code: int) -> int:
     click.echo(f"plenocli: error: {message}", err=True)
     return code

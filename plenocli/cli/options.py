@@ -2,9 +2,13 @@
 types that read units.
 """
 
+from __future__ import annotations
+
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -27,23 +31,24 @@ class _Quantity(click.ParamType):
 
     def __init__(
         self,
-        name,
-        parse,
-        minimum=None,
-        exclusive=False,
-        show=lambda value: format(value, ".12g"),
-        limits=(-math.inf, math.inf),
-    ):
-        self.name, self._parse, self._minimum, self._exclusive, self.show, self._limits = (
-            name,
+        name: str,
+        parse: Callable[[str], float],
+        minimum: float | None = None,
+        exclusive: bool = False,
+        show: Callable[[float], str] = lambda value: format(value, ".12g"),
+        limits: tuple[float, float] = (-math.inf, math.inf),
+    ) -> None:
+        self.name, self.show = name, show
+        self._parse, self._minimum, self._exclusive, self._limits = (
             parse,
             minimum,
             exclusive,
-            show,
             limits,
         )
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         """Text in the units that the command line takes; a default that is a
         number stays as it is.
         """
@@ -101,7 +106,7 @@ POSITIVE = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30,
 NON_NEGATIVE = _Quantity("number", parse_number, 0.0, limits=(1e-30, 1e12))
 
 
-def positive(text):
+def positive(text: str) -> float:
     """A number within the limits of POSITIVE; click's BadParameter otherwise."""
     return POSITIVE.convert(text, None, None)
 
@@ -114,13 +119,13 @@ class Whole(click.IntRange):
 
     name = "integer"
 
-    def convert(self, value, param, ctx):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """An int; other text is refused with an example."""
         try:
             int(value)
         except ValueError:
             self.fail(
-                f"{value!r} is no whole number; write for example {max(1, self.min)}", param, ctx
+                f"{value!r} is no whole number; write for example {max(1, int(self.min or 0))}", param, ctx
             )
         return super().convert(value, param, ctx)
 
@@ -130,10 +135,12 @@ class Grid(click.ParamType):
 
     name = "ROWSxCOLUMNS"
 
-    def __init__(self, *words):
+    def __init__(self, *words: str) -> None:
         self._words = words
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int] | str:
         """(rows, columns), or the word itself."""
         if not isinstance(value, str) or value in self._words:
             return value
@@ -152,7 +159,9 @@ class Place(click.ParamType):
 
     name = "ROW,COLUMN"
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
         """(row, column)."""
         parts = value.split(",") if isinstance(value, str) else value
         if len(parts) == 2 and all(str(p).strip().isdigit() and int(p) < 100000 for p in parts):
@@ -166,10 +175,12 @@ PLACE = Place()
 class Pair(click.ParamType):
     """KEY=VALUE with a length as the key, such as 450nm=capture.h5 or 450nm=0.8."""
 
-    def __init__(self, value_name, convert_value):
+    def __init__(self, value_name: str, convert_value: Callable[[str], Any]) -> None:
         self.name, self._convert = f"WAVELENGTH={value_name}", convert_value
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, Any]:
         """(length in m, converted value)."""
         if not isinstance(value, str):
             return value
@@ -194,7 +205,9 @@ class Ring(click.ParamType):
 
     name = "auto|0|1|2..."
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | str:
         """ "auto", or the number."""
         if value == "auto" or isinstance(value, int):
             return value
@@ -210,7 +223,7 @@ class _File(click.Path):
     the current folder.
     """
 
-    def convert(self, value, param, ctx):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the file name is empty", param, ctx)
         return super().convert(value, param, ctx)
@@ -219,7 +232,7 @@ class _File(click.Path):
 FILE = _File(path_type=Path)
 
 
-def input_path(name, **settings):
+def input_path(name: str, **settings: Any) -> Callable:
     """A positional input file; its existence is checked by the reader, so that the exit code is
     3 and the message says what is wrong.
     """
@@ -275,7 +288,7 @@ scheduler = click.option(
 )
 
 
-def _grant(ctx, param, value):
+def _grant(ctx: click.Context, param: click.Parameter, value: int | None) -> None:
     """What --mem-limit says holds for this process from now on."""
     from dataclasses import replace
 
@@ -308,7 +321,7 @@ coherent_ring = click.option(
 )
 
 
-def superpixels(meaning):
+def superpixels(meaning: str) -> Callable:
     """--superpixels with its meaning for one command."""
     return click.option(
         "--superpixels",
@@ -319,7 +332,7 @@ def superpixels(meaning):
     )
 
 
-def file_type(first, second):
+def file_type(first: str, second: str) -> Callable:
     """--format, the suffix of each result where OUT is a folder; the first is the default."""
     return click.option(
         "--format",
@@ -331,13 +344,13 @@ def file_type(first, second):
     )
 
 
-def command_line(ctx):
+def command_line(ctx: click.Context) -> str:
     """The command as typed, without folders and without options left at their default: it goes
     into the artefact.
     """
     words = [f"plenocli {ctx.info_name}"]
     for parameter in ctx.command.params:
-        value = ctx.params.get(parameter.name)
+        value: Any = ctx.params.get(parameter.name or "")
         source = ctx.get_parameter_source(parameter.name)
         if source is None or source.name == "DEFAULT" or parameter.name in _UNRECORDED:
             continue
@@ -365,7 +378,7 @@ whatever these say.
 """
 
 
-def _word(value, kind):
+def _word(value: Any, kind: click.ParamType | None) -> str:
     if isinstance(value, Path) or (isinstance(value, str) and "/" in value):
         return Path(value).name
     if isinstance(kind, Grid) and isinstance(value, tuple):
@@ -377,8 +390,8 @@ def _word(value, kind):
     return format(value, ".12g") if isinstance(value, float) else str(value)
 
 
-def summary(report, as_json, line):
-    """Print what a command did: `report` (a dict) as JSON on request, else the one `line`."""
+def summary(report: dict[str, Any], as_json: bool, line: str) -> None:
+    """Print what a command did: `report` as JSON on request, else the one `line`."""
     if as_json:
         click.echo(json.dumps(plain(report), allow_nan=False, sort_keys=True))
     else:

@@ -3,6 +3,7 @@ is --method lmmse.
 """
 
 import difflib
+from typing import Any
 
 import click
 
@@ -40,12 +41,15 @@ _OURS = {
 """What a chain of stages gives its stages by itself."""
 
 
-def read_options(stage, values):
-    """Parameter name -> value for the options of command `stage`, checked and converted as on its
-    command line; UsageError.
+def read_options(stage: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command, checked and converted as on its command line.
 
+    stage: the command.
     values: option without dashes -> text, number, true or false, or a list for an option
         that may be repeated.
+
+    Returns parameter name -> value.
+    Raises UsageError for what the command line would refuse.
     """
     command = load_command(stage)
     known = {
@@ -68,7 +72,7 @@ def read_options(stage, values):
     return found
 
 
-def _converted(option, value, where):
+def _converted(option: click.Option, value: Any, where: str) -> Any:
     if option.is_flag:
         if not isinstance(value, bool):
             raise UsageError(

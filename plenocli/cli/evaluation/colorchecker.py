@@ -2,6 +2,8 @@
 spectrometer, and as a scene.
 """
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -49,7 +51,20 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, folder, output, measures, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    folder: Path,
+    *,
+    output: Path,
+    measures: Path | None,
+    cfa: str,
+    flatten: str,
+    grid: tuple[int, int],
+    labels: Path | None,
+    spectra: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Merge the exposures in FOLDER, measure the reflectances of the 24 patches against the white
     one and compare them with the spectrometer's; write the chart, upright, as a spectral
     scene for capture-sim.
@@ -68,7 +83,7 @@ def command(ctx, folder, output, measures, overwrite, as_json, **settings):
     document = run_colorchecker(
         folder,
         output,
-        Settings(**settings),
+        Settings(cfa=cfa, flatten=flatten, grid=grid, labels=labels, spectra=spectra),
         measures=measures,
         overwrite=overwrite,
         command=options.command_line(ctx),

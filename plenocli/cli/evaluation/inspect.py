@@ -1,5 +1,7 @@
 """`plenocli inspect`: what a file holds."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -9,7 +11,11 @@ from plenocli.cli import options
 @options.input_path("file", metavar="FILE")
 @options.mem_limit
 @options.as_json
-def command(file, as_json):
+def command(
+    file: Path,
+    *,
+    as_json: bool,
+) -> None:
     """Verify FILE as a stage would and show what it holds: any artefact (.h5), EXR, camera RAW or
     DNG, PNG, TIFF or JPEG.
 

@@ -1,5 +1,7 @@
 """`plenocli report`: one page about a run folder."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -14,7 +16,14 @@ from plenocli.cli import options
 @options.mem_limit
 @options.overwrite
 @options.as_json
-def command(run_folder, output, title, overwrite, as_json):
+def command(
+    run_folder: Path,
+    *,
+    output: Path,
+    title: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Draw what lies in RUN_FOLDER and below (.h5, .exr, .dng, score*.json) on one
     self-contained HTML page.
 

@@ -1,5 +1,7 @@
 """`plenocli score`: results against the truth."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -90,7 +92,25 @@ METRICS = (
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, results, output, as_json, **settings):
+def command(
+    ctx: click.Context,
+    results: tuple[Path, ...],
+    *,
+    truth: str | None,
+    output: Path,
+    report: Path | None,
+    metrics: tuple[str, ...],
+    whites: tuple[Path, ...],
+    patches: str | None,
+    pif: Path | None,
+    capture: Path | None,
+    block: tuple[int, int] | None,
+    sampling: str,
+    light: str,
+    camera: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr)
     with the truth, side by side in one table.
 
@@ -113,5 +133,21 @@ def command(ctx, results, output, as_json, **settings):
     """
     from plenocli.stages.evaluation.score import run_score, table
 
-    document = run_score(results, output, command=options.command_line(ctx), **settings)
+    document = run_score(
+        results,
+        output,
+        command=options.command_line(ctx),
+        truth=truth,
+        report=report,
+        metrics=metrics,
+        whites=whites,
+        patches=patches,
+        pif=pif,
+        capture=capture,
+        block=block,
+        sampling=sampling,
+        light=light,
+        camera=camera,
+        overwrite=overwrite,
+    )
     options.summary(document, as_json, table(document))

@@ -1,5 +1,7 @@
 """`plenocli show`: pictures of files."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -44,7 +46,17 @@ from plenocli.cli import options
 @options.mem_limit
 @options.overwrite
 @options.as_json
-def command(files, as_json, **settings):
+def command(
+    files: tuple[Path, ...],
+    *,
+    output: Path | None,
+    truth: str | None,
+    calibration: Path | None,
+    points: tuple[tuple[int, int], ...],
+    lenslets: tuple[tuple[int, int], ...],
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Draw FILEs into one picture: system matrix, capture (with its lenslet grid), calibration,
     spectra, dictionary, image, as artefact, EXR or RAW.
 
@@ -60,5 +72,13 @@ def command(files, as_json, **settings):
     """
     from plenocli.stages.evaluation.show import run_show
 
-    made = run_show(files, **settings)
+    made = run_show(
+        files,
+        output=output,
+        truth=truth,
+        calibration=calibration,
+        points=points,
+        lenslets=lenslets,
+        overwrite=overwrite,
+    )
     options.summary(made, as_json, f"{made['output']}: {', '.join(dict.fromkeys(made['kinds']))}")

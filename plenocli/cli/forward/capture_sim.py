@@ -1,5 +1,7 @@
 """`plenocli capture-sim`: what a camera records of a scene."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -108,7 +110,30 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    camera: Path,
+    *,
+    scene: str | None,
+    target: str | None,
+    output: Path,
+    pif: Path | None,
+    snr_db: float | None,
+    noise: str,
+    exposure: float | None,
+    sampling: str,
+    refine: int,
+    bandwidth: float | None,
+    spectral_step: float | None,
+    superpixels: tuple[int, int] | str,
+    coherent_ring: int | str,
+    accuracy: float | None,
+    model: str,
+    scene_out: Path | None,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Simulate what CAMERA (a .toml file) records of a scene: light, filters, lenses, diffraction,
     colour filters, noise.
 
@@ -125,11 +150,24 @@ def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **se
     """
     from plenocli.stages.forward.capture_sim import Settings, run_capture_sim
 
-    settings["bandwidth"] = settings["bandwidth"] or 0.0
     report = run_capture_sim(
         camera,
         output,
-        Settings(**settings),
+        Settings(
+            target=target,
+            snr_db=snr_db,
+            noise=noise,
+            exposure=exposure,
+            sampling=sampling,
+            refine=refine,
+            bandwidth=bandwidth or 0.0,
+            spectral_step=spectral_step,
+            superpixels=superpixels,
+            coherent_ring=coherent_ring,
+            accuracy=accuracy,
+            model=model,
+            seed=seed,
+        ),
         scene=scene,
         pif=pif,
         scene_out=scene_out,
@@ -137,8 +175,8 @@ def command(ctx, camera, scene, output, pif, scene_out, overwrite, as_json, **se
         command=options.command_line(ctx),
     )
     noise = (
-        f"SNR {settings['snr_db']:g} dB, sigma {report.noise_sigma:.3g}"
-        if settings["snr_db"] is not None
+        f"SNR {snr_db:g} dB, sigma {report.noise_sigma:.3g}"
+        if snr_db is not None
         else f"peak {report.peak:.4g} {report.units}"
     )
     options.summary(

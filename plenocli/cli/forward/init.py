@@ -13,7 +13,12 @@ from plenocli.cli import options
 @options.mem_limit
 @click.option("--overwrite", is_flag=True, help="Replace files that exist (refused by default).")
 @options.as_json
-def command(folder: Path, overwrite: bool, as_json: bool) -> None:
+def command(
+    folder: Path,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Write the sample configurations (cameras, a lens, a scene, sweeps) into FOLDER, with a
     Makefile that runs the chain.
 

@@ -1,6 +1,8 @@
 """`plenocli lens`: real lenses, imported and described."""
 
 import math
+from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,7 +12,9 @@ from plenocli.cli import options
 class _Angle(click.ParamType):
     name = "angle"
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         """Radians from text such as 5deg or 0.1rad, from 0 to below 90 degrees."""
         if not isinstance(value, str):
             return value
@@ -29,7 +33,7 @@ class _Angle(click.ParamType):
 
 
 @click.group("lens", short_help="Import a lens prescription; show what a lens does.")
-def command():
+def command() -> None:
     """Real lenses for main_lens.prescription: surfaces, glasses and stop in a TOML
     file, traced exactly.
 
@@ -53,7 +57,14 @@ def command():
 @options.mem_limit
 @options.overwrite
 @options.as_json
-def import_command(prescription, output, focal_length, overwrite, as_json):
+def import_command(
+    prescription: Path,
+    *,
+    output: Path,
+    focal_length: float | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Convert FILE, a Zemax .zmx, CODE V .seq or optiland .json prescription, into a lens file OUT
     (.toml) with the dispersion of every glass written out. Needs optiland: the extra [lens].
 
@@ -98,7 +109,14 @@ def import_command(prescription, output, focal_length, overwrite, as_json):
 )
 @options.mem_limit
 @options.as_json
-def show_command(lens, wavelengths, fields, object_distance, as_json):
+def show_command(
+    lens: Path,
+    *,
+    wavelengths: tuple[float, ...],
+    fields: tuple[float, ...],
+    object_distance: float | None,
+    as_json: bool,
+) -> None:
     """Trace the lens of LENS (a .toml file) and print focal length, back focus, pupils and focal
     shift per wavelength, and per field the wavefront error, lateral colour, distortion and the
     share of the stop that is lit. --json adds Zernike terms.

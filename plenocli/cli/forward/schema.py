@@ -10,7 +10,9 @@ from plenocli.cli import options
 @click.command("schema", short_help="Print the JSON Schema of a camera, scene or lens description.")
 @click.argument("kind", type=click.Choice(["camera", "scene", "lens"]))
 @options.mem_limit
-def command(kind):
+def command(
+    kind: str,
+) -> None:
     """Print the JSON Schema of a configuration file, for editors and for checking without plenocli.
 
     \b

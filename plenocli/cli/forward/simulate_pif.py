@@ -1,5 +1,8 @@
 """`plenocli simulate-pif`: the system matrix of a camera."""
 
+from pathlib import Path
+from typing import Any
+
 import click
 
 from plenocli.cli import options
@@ -8,7 +11,9 @@ from plenocli.cli import options
 class _Step(click.ParamType):
     name = "auto|LENGTH"
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
         return value if value == "auto" else options.LENGTH.convert(value, param, ctx)
 
 
@@ -91,7 +96,25 @@ class _Step(click.ParamType):
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, camera, output, explain, workers, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    camera: Path,
+    *,
+    output: Path | None,
+    wavelengths: tuple[float, ...],
+    spectral_step: float | str | None,
+    superpixels: tuple[int, int] | str,
+    coherent_ring: int | str,
+    lenslet: tuple[int, int] | None,
+    model: str,
+    accuracy: float | None,
+    scene: Path | None,
+    dtype: str,
+    explain: bool,
+    workers: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Compute the system matrix A of CAMERA (a .toml file): for every object point over one
     lenslet's field the share of its light that lands on each pixel, by the cheapest model that
     meets --accuracy. Reports rank, condition, energy and symmetry.
@@ -110,7 +133,17 @@ def command(ctx, camera, output, explain, workers, overwrite, as_json, **setting
     report = run_simulate_pif(
         camera,
         output,
-        Settings(**settings),
+        Settings(
+            wavelengths=wavelengths,
+            spectral_step=spectral_step,
+            superpixels=superpixels,
+            coherent_ring=coherent_ring,
+            lenslet=lenslet,
+            model=model,
+            accuracy=accuracy,
+            scene=scene,
+            dtype=dtype,
+        ),
         explain=explain,
         overwrite=overwrite,
         workers=workers,

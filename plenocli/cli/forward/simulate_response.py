@@ -1,5 +1,7 @@
 """`plenocli simulate-response`: the response matrix F that a camera will have."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -78,7 +80,24 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, camera, output, grid, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    camera: Path,
+    *,
+    output: Path,
+    wavelengths: tuple[float, ...],
+    bandwidth: float | None,
+    model: str,
+    own_field: bool,
+    grid: Path | None,
+    exposure: float | None,
+    spectral_step: float | None,
+    superpixels: tuple[int, int] | str,
+    coherent_ring: int | str,
+    accuracy: float | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Predict the response matrix F of CAMERA (a .toml file): pixel by band behind every lenslet,
     from filters, glasses, diffraction, colour filters and quantum efficiency. OUT is a calibration
     as calibrate measures it.
@@ -92,11 +111,20 @@ def command(ctx, camera, output, grid, overwrite, as_json, **settings):
     """
     from plenocli.stages.forward.simulate_response import Settings, run_simulate_response
 
-    settings["bandwidth"] = settings["bandwidth"] or 0.0
     summary = run_simulate_response(
         camera,
         output,
-        Settings(**settings),
+        Settings(
+            wavelengths=wavelengths,
+            bandwidth=bandwidth or 0.0,
+            model=model,
+            own_field=own_field,
+            exposure=exposure,
+            spectral_step=spectral_step,
+            superpixels=superpixels,
+            coherent_ring=coherent_ring,
+            accuracy=accuracy,
+        ),
         grid=grid,
         overwrite=overwrite,
         command=options.command_line(ctx),

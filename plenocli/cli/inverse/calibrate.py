@@ -93,7 +93,22 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, output, as_json, radiances, **settings):
+def command(
+    ctx: click.Context,
+    *,
+    whites: tuple[Path, ...],
+    darks: tuple[Path, ...],
+    bands: tuple[tuple[float, Path], ...],
+    radiances: tuple[tuple[float, float], ...],
+    camera: Path | None,
+    response: str,
+    lattice: str,
+    near: tuple[float, float] | None,
+    cfa: str | None,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Calibrate a plenoptic camera: lenslet grid, white and dark levels, and the response F
     of every superpixel.
 
@@ -114,7 +129,18 @@ def command(ctx, output, as_json, radiances, **settings):
     from plenocli.stages.inverse.calibrate import run_calibrate
 
     summary = run_calibrate(
-        output, radiances=radiances, command=options.command_line(ctx), **settings
+        output,
+        radiances=radiances,
+        command=options.command_line(ctx),
+        whites=whites,
+        darks=darks,
+        bands=bands,
+        camera=camera,
+        response=response,
+        lattice=lattice,
+        near=near,
+        cfa=cfa,
+        overwrite=overwrite,
     )
     down, right = summary.pitch_px
     line = (
@@ -122,11 +148,11 @@ def command(ctx, output, as_json, radiances, **settings):
         f"{summary.angle_deg:.3f} deg, {summary.lenslets} lenslets, residual "
         f"{summary.rms_px:.3f} px rms ({summary.model})"
     )
-    if response := summary.response:
+    if measured := summary.response:
         line += (
-            f"; F: {len(response.bands_nm)} bands, condition {response.condition:.3g}, "
-            f"{response.columns}"
+            f"; F: {len(measured.bands_nm)} bands, condition {measured.condition:.3g}, "
+            f"{measured.columns}"
         )
-        if response.bias:
-            line += f", bias by its noise up to {max(map(abs, response.bias)):.1g}"
+        if measured.bias:
+            line += f", bias by its noise up to {max(map(abs, measured.bias)):.1g}"
     options.summary(summary.as_json(), as_json, line)

@@ -1,5 +1,7 @@
 """`plenocli demux`: spectra behind the lenslets of captures."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -54,8 +56,21 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 @options.as_json
 @click.pass_context
 def command(
-    ctx, captures, output, calibration, suffix, workers, scheduler, overwrite, as_json, **settings
-):
+    ctx: click.Context,
+    captures: tuple[Path, ...],
+    *,
+    calibration: Path,
+    method: str,
+    reference: Path | None,
+    reference_reflectance: float,
+    register: str,
+    suffix: str,
+    output: Path,
+    workers: int,
+    scheduler: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Demultiplex CAPTURE...: x = F b + noise is solved for the band radiances b of every lenslet,
     with standard deviations.
 
@@ -76,7 +91,12 @@ def command(
         captures,
         output,
         calibration=calibration,
-        settings=Settings(**settings),
+        settings=Settings(
+            method=method,
+            reference=reference,
+            reference_reflectance=reference_reflectance,
+            register=register,
+        ),
         suffix=f".{suffix}",
         workers=workers,
         scheduler=scheduler,
@@ -90,7 +110,7 @@ def command(
             f"{one.lenslets} lenslets, {one.method} ({one.reason})"
         )
         registration = one.registration
-        if registration and registration.corrected:
+        if registration and registration.motion and registration.corrected:
             line += (
                 f"; corrected: {', '.join(registration.corrected)} (lenslets moved by up "
                 f"to {registration.motion.reach:.3g} px)"

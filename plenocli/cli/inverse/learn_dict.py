@@ -1,5 +1,8 @@
 """`plenocli learn-dict`: a sparse dictionary that knows the system matrix."""
 
+from pathlib import Path
+from typing import Any
+
 import click
 
 from plenocli.cli import options
@@ -10,7 +13,9 @@ class Lambda(click.ParamType):
 
     name = "NUMBER|noise"
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
         """float, or the word."""
         return value if value == "noise" else options.POSITIVE.convert(value, param, ctx)
 
@@ -103,7 +108,28 @@ class Lambda(click.ParamType):
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    images: tuple[str, ...],
+    *,
+    pif: Path,
+    output: Path,
+    atoms: int | None,
+    batch: int | None,
+    iterations: int,
+    snr_db: float,
+    lam: float | str | None,
+    delta: float,
+    initial: str,
+    gradient_steps: int,
+    synthesis: bool,
+    resume: Path | None,
+    checkpoint: Path | None,
+    seed: int,
+    workers: int | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Learn from IMAGEs (photographs, folders of them, or skimage:NAME; default those that ship
     with scikit-image, without the astronaut).
 
@@ -123,7 +149,19 @@ def command(ctx, images, pif, output, resume, checkpoint, overwrite, as_json, **
     summary = run_learn_dict(
         images,
         output,
-        Settings(**settings),
+        Settings(
+            atoms=atoms,
+            batch=batch,
+            iterations=iterations,
+            snr_db=snr_db,
+            lam=lam,
+            delta=delta,
+            initial=initial,
+            gradient_steps=gradient_steps,
+            synthesis=synthesis,
+            seed=seed,
+            workers=workers,
+        ),
         pif=pif,
         resume=resume,
         checkpoint=checkpoint,

@@ -1,5 +1,7 @@
 """`plenocli reconstruct`: pictures from captures."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -94,18 +96,30 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
 @options.as_json
 @click.pass_context
 def command(
-    ctx,
-    captures,
-    output,
-    pif,
-    calibration,
-    suffix,
-    overlap,
-    scheduler,
-    overwrite,
-    as_json,
-    **settings,
-):
+    ctx: click.Context,
+    captures: tuple[Path, ...],
+    *,
+    pif: Path | None,
+    calibration: Path | None,
+    method: str,
+    dictionary: Path | None,
+    overlap: str | None,
+    training: tuple[str, ...],
+    truth: Path | None,
+    noise_sigma: float | None,
+    alpha: float | None,
+    rank: int | None,
+    lam: float | None,
+    nnls_iterations: int | None,
+    clip: bool,
+    suffix: str,
+    output: Path,
+    seed: int,
+    workers: int,
+    scheduler: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Reconstruct the object from CAPTURE...: y = A x + noise is solved for x in every lenslet,
     relative to white.
 
@@ -137,7 +151,21 @@ def command(
     summary = run_reconstruct(
         captures,
         output,
-        Settings(overlap=overlap and int(overlap), **settings),
+        Settings(
+            overlap=int(overlap) if overlap else None,
+            method=method,
+            dictionary=dictionary,
+            training=training,
+            truth=truth,
+            noise_sigma=noise_sigma,
+            alpha=alpha,
+            rank=rank,
+            lam=lam,
+            nnls_iterations=nnls_iterations,
+            clip=clip,
+            seed=seed,
+            workers=workers,
+        ),
         pif=pif,
         calibration=calibration,
         suffix=f".{suffix}",
@@ -146,7 +174,7 @@ def command(
         command=options.command_line(ctx),
     )
     if len(captures) == 1 and len(summary.captures) == 1:
-        line = summary.captures[0].line(with_reason=settings["method"] == "auto")
+        line = summary.captures[0].line(with_reason=method == "auto")
     else:
         done, skipped = len(summary.captures), summary.skipped
         line = f"{output}: {done} reconstructed, {skipped} were finished before"

@@ -1,5 +1,8 @@
 """`plenocli refocus`: pictures focused elsewhere, and depth, from one capture."""
 
+from pathlib import Path
+from typing import Any
+
 import click
 
 from plenocli.cli import options
@@ -10,7 +13,9 @@ class _Slope(click.ParamType):
 
     name = "number"
 
-    def convert(self, value, param, ctx):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         """The number."""
         try:
             number = float(value)
@@ -72,7 +77,20 @@ class _Slope(click.ParamType):
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, capture, output, overwrite, as_json, **settings):
+def command(
+    ctx: click.Context,
+    capture: Path,
+    *,
+    calibration: Path | None,
+    camera: Path | None,
+    distances: tuple[float, ...],
+    slopes: tuple[float, ...],
+    planes: int,
+    views: int,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Refocus CAPTURE: every pixel's ray is followed to the planes asked for. With three planes or
     more OUT (.h5) holds a map of depth with its confidence.
 
@@ -86,7 +104,16 @@ def command(ctx, capture, output, overwrite, as_json, **settings):
     from plenocli.stages.inverse.refocus import run_refocus
 
     report = run_refocus(
-        capture, output, overwrite=overwrite, command=options.command_line(ctx), **settings
+        capture,
+        output,
+        overwrite=overwrite,
+        command=options.command_line(ctx),
+        calibration=calibration,
+        camera=camera,
+        distances=distances,
+        slopes=slopes,
+        planes=planes,
+        views=views,
     )
     where = (
         ""

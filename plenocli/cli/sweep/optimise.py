@@ -1,5 +1,7 @@
 """`plenocli optimise`: a search through a design space."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -33,7 +35,20 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, description, output, as_json, **settings):
+def command(
+    ctx: click.Context,
+    description: Path,
+    *,
+    output: Path,
+    trials: int,
+    batch: int,
+    plot: Path | None,
+    seed: int,
+    workers: int,
+    scheduler: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Search the design space of SWEEP.toml (as for sweep) for what its [front] calls better, with
     the sampler of Optuna: points are proposed where earlier ones were good. Needs
     the extra [optimise].
@@ -57,6 +72,12 @@ def command(ctx, description, output, as_json, **settings):
         output,
         read_options=read_options,
         command=options.command_line(ctx),
-        **settings,
+        trials=trials,
+        batch=batch,
+        plot=plot,
+        seed=seed,
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
     )
     options.summary(report, as_json, lines(report))

@@ -1,5 +1,7 @@
 """`plenocli sweep`: many cameras through the stages."""
 
+from pathlib import Path
+
 import click
 
 from plenocli.cli import options
@@ -21,7 +23,18 @@ from plenocli.cli import options
 @options.overwrite
 @options.as_json
 @click.pass_context
-def command(ctx, description, output, as_json, **settings):
+def command(
+    ctx: click.Context,
+    description: Path,
+    *,
+    output: Path,
+    plot: Path | None,
+    seed: int,
+    workers: int,
+    scheduler: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Carry every point of a design space through simulate-pif, capture-sim, reconstruct (or
     simulate-response or calibrate, and demux) and score. SWEEP.toml names a camera, the keys of it
     and of the stages' options that vary (a grid, a Latin hypercube or a list), and
@@ -47,6 +60,10 @@ def command(ctx, description, output, as_json, **settings):
         output,
         read_options=read_options,
         command=options.command_line(ctx),
-        **settings,
+        plot=plot,
+        seed=seed,
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
     )
     options.summary(report, as_json, lines(report))

@@ -44,7 +44,7 @@ class Settings:
     coherent_ring: int | str = "auto"
     accuracy: float | None = None
     model: str = "auto"
-    scene: str | None = None
+    scene: Path | str | None = None
     lenslet: tuple[int, int] | None = None
     dtype: str = "auto"
 

@@ -124,9 +124,8 @@ class Whole(click.IntRange):
         try:
             int(value)
         except ValueError:
-            self.fail(
-                f"{value!r} is no whole number; write for example {max(1, int(self.min or 0))}", param, ctx
-            )
+            example = max(1, int(self.min or 0))
+            self.fail(f"{value!r} is no whole number; write for example {example}", param, ctx)
         return super().convert(value, param, ctx)
 
 

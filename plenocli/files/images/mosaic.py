@@ -94,7 +94,9 @@ def _from_artefact(path: Path) -> Capture:
         accuracy=origin.accuracy,
         matrix=origin.inputs.get("pif", {}).get("sha256"),
     )
-    grid = replace(found.grid, centre=artefact.data.get("capture/lenslet_centre"))
+    grid = replace(
+        found.grid or SuperpixelGrid(), centre=artefact.data.get("capture/lenslet_centre")
+    )
     return replace(found, metadata=metadata, grid=grid)
 
 

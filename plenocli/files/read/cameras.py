@@ -1,9 +1,18 @@
 """A camera with everything that its description names by file."""
 
+from __future__ import annotations
+
+import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from plenocli.base.errors import ConfigError, InputError
 
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.forward.camera.model import Camera
+
+Name = str | os.PathLike[str]
 _READERS = {
     "aperture_image": "read_transmittance",
     "wavefront": "read_wavefront",
@@ -11,12 +20,12 @@ _READERS = {
 }
 
 
-def read_camera(path):
-    """The Camera described at `path`, with its aperture image, wavefront and lens file read and
+def read_camera(path: Name) -> Camera:
+    """The camera described at `path`, with its aperture image, wavefront and lens file read and
     attached; names are relative to `path`'s folder.
 
-    InputError for a file that cannot be read or whose values cannot be, ConfigError
-    for the description.
+    Raises InputError for a file that cannot be read or whose values cannot be, ConfigError for the
+    description.
     """
     from plenocli.files.config import lens_file as lens
     from plenocli.files.config.camera_file import load_camera
@@ -34,14 +43,14 @@ def read_camera(path):
     return camera
 
 
-def camera_files(path, camera):
+def camera_files(path: Name, camera: Camera) -> dict[str, Name]:
     """Role -> path of the description and of every file that it names, for describe_inputs."""
     return {"camera": path} | {
         key.replace("_", " "): file for key, file in _named(path, camera).items()
     }
 
 
-def require_same_files(camera_path, camera, artefact, where):
+def require_same_files(camera_path: Name, camera: Camera, artefact: Artefact, where: Name) -> None:
     """InputError unless the files that `camera` names are, byte for byte, those that
     `artefact` was made with.
     """
@@ -57,7 +66,7 @@ def require_same_files(camera_path, camera, artefact, where):
             )
 
 
-def _named(path, camera):
+def _named(path: Name, camera: Camera) -> dict[str, Path]:
     lens = camera.main_lens
     return {
         key: Path(path).parent / getattr(lens, key)

@@ -1,38 +1,46 @@
 """What a scene file requires of the camera model, as the accuracy dial takes it."""
 
+from __future__ import annotations
+
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.files.read.scenes import Cube, read_scene
 from plenocli.forward.accuracy.needs import Needs
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+
 DARK = 1e-6
 """Lenslets whose part of the picture is below this share of its peak see no light."""
 
 
-def read_needs(name, camera):
-    """Needs of the scene called `name`: a scene .toml, or whatever read_scene takes, whose bands
-    and extent then count.
+def read_needs(name: str | Path, camera: Camera) -> Needs:
+    """What a scene requires of the camera model.
 
-    InputError, ConfigError or UsageError where it cannot be read.
+    name: of a scene .toml, or whatever read_scene takes, whose bands and extent then count.
+
+    Raises InputError, ConfigError or UsageError where it cannot be read.
     """
     if Path(name).suffix.lower() != ".toml":
-        return Needs(source=Path(name).name, **_from_picture(name, camera))
+        return replace(_from_picture(name, camera), source=Path(name).name)
     from plenocli.files.config.scene_file import load_scene
 
     scene = load_scene(name)
-    found = _from_picture(Path(name).parent / scene.picture, camera) if scene.picture else {}
-    found |= {
-        key: value
-        for key in ("depth", "spectrum", "lenslets")
-        if (value := getattr(scene, key)) is not None
-    }
-    noise = None if scene.snr is None else 10 ** (-scene.snr / 20)
-    return Needs(noise=noise, source=Path(name).name, **found)
+    found = _from_picture(Path(name).parent / scene.picture, camera) if scene.picture else Needs()
+    return Needs(
+        depth=scene.depth,
+        spectrum=found.spectrum if scene.spectrum is None else scene.spectrum,
+        lenslets=found.lenslets if scene.lenslets is None else scene.lenslets,
+        noise=None if scene.snr is None else 10 ** (-scene.snr / 20),
+        source=Path(name).name,
+    )
 
 
-def _from_picture(name, camera):
+def _from_picture(name: str | Path, camera: Camera) -> Needs:
     """Extent in lenslets and, of a spectral picture, the wavelengths between which it has light."""
     scene = read_scene(str(name), spectral=True)
     count = camera.lenslet_array.count
@@ -48,12 +56,13 @@ def _from_picture(name, camera):
     )
     peak = planes.max()
     if peak <= 0:
-        return {"lenslets": (1, 1)}
+        return Needs(lenslets=(1, 1))
     lit = (planes > DARK * peak).any(axis=0)
     rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
-    found = {"lenslets": (int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1))}
+    found = Needs(lenslets=(int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1)))
     if isinstance(scene, Cube):
         with_light = np.asarray(wavelengths)[planes.max(axis=(1, 2)) > DARK * peak]
         step = np.diff(wavelengths).max() / 2 if len(wavelengths) > 1 else 0.0
-        found["spectrum"] = (float(with_light[0] - step), float(with_light[-1] + step))
+        ends = (float(with_light[0] - step), float(with_light[-1] + step))
+        found = replace(found, spectrum=ends)
     return found

@@ -25,11 +25,9 @@ between, constant outside.
 class Scene(Protocol):
     """What is in front of the camera.
 
-    uniform: whether it is the same everywhere, beyond the array's edge too.
     spectral: whether its reflectance depends on the wavelength.
     """
 
-    uniform: bool
     spectral: bool
 
     def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
@@ -40,7 +38,6 @@ class Scene(Protocol):
 class Uniform:
     """The same reflectance everywhere, beyond the array's edge too."""
 
-    uniform = True
     spectral = False
 
     def __init__(self, level: float) -> None:
@@ -55,8 +52,6 @@ class Photograph:
     """A linear picture (row, column, channel); in colour its reflectance is interpolated
     between B, G and R.
     """
-
-    uniform = False
 
     def __init__(self, values: np.ndarray, sampling: str, spectral: bool) -> None:
         self.values, self.sampling = values, sampling
@@ -76,7 +71,6 @@ class Photograph:
 class Cube:
     """A spectral picture (band, row, column); linear between its bands, constant outside them."""
 
-    uniform = False
     spectral = True
 
     def __init__(self, wavelengths: np.ndarray, values: np.ndarray, sampling: str) -> None:
@@ -98,7 +92,6 @@ class Cube:
 class Chart:
     """The ColorChecker over the whole array."""
 
-    uniform = False
     spectral = True
 
     def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:

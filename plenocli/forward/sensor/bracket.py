@@ -2,6 +2,10 @@
 one picture of rates.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
 
 # DN: black is clipped below, so that the least values are not in proportion to the light
@@ -10,16 +14,29 @@ CEILING = 0.98  # of the white level: pixels that were averaged after clipping r
 HALF = 0.5  # DN: a converter that cuts off instead of rounding reads this much too little
 
 
-def merge_bracket(frames, seconds, darks, white, floor=FLOOR, ceiling=CEILING, truncated=True):
-    """Rate (rows, columns) DN/s: sum of signals over the sum of their times, of the exposures that
-    are good at a pixel.
+def merge_bracket(
+    frames: Sequence[np.ndarray],
+    seconds: Sequence[float],
+    darks: Sequence[np.ndarray | float],
+    white: float,
+    floor: float = FLOOR,
+    ceiling: float = CEILING,
+    truncated: bool = True,
+) -> np.ndarray:
+    """Rate of light: sum of signals over the sum of their times, of the exposures that are good at
+    a pixel.
 
-    frames: (rows, columns) each, DN;
-    seconds each;
-    darks: dark image or number of each. A value counts from `floor` DN to below `ceiling` of
-        `white` DN. A pixel below the floor in every exposure takes its longest one. NaN
-        where all saturate.
+    A value counts from `floor` to below `ceiling` of `white`. A pixel below the floor in every
+    exposure takes its longest one.
+    frames: (row, column) each, DN.
+    seconds: exposure time of each, s.
+    darks: dark image or number of each, DN.
+    white: saturation level, DN.
+    floor: least value that counts, DN.
+    ceiling: share of the white level from which on values are saturated.
     truncated: whether the converter cuts off its last digit.
+
+    Returns (row, column) DN/s, NaN where all exposures saturate.
     """
     total = time = 0.0
     for frame, exposure, dark in zip(frames, seconds, darks, strict=True):
@@ -34,13 +51,23 @@ def merge_bracket(frames, seconds, darks, white, floor=FLOOR, ceiling=CEILING, t
     return np.divide(total, time, out=np.full(longest.shape, np.nan), where=time > 0)
 
 
-def linearity(frames, seconds, darks, labels, white, least=20.0, ceiling=CEILING):
-    """Ratios of the rates of successive exposures, 1 for a linear sensor: list of (label, shorter
-    s, longer s, ratio).
+def linearity(
+    frames: Sequence[np.ndarray],
+    seconds: Sequence[float],
+    darks: Sequence[np.ndarray | float],
+    labels: np.ndarray,
+    white: float,
+    least: float = 20.0,
+    ceiling: float = CEILING,
+) -> list[tuple[int, float, float, float]]:
+    """Ratios of the rates of successive exposures, 1 for a linear sensor.
 
-    labels (rows, columns): regions 1.., 0 elsewhere. Regions with a saturated pixel or a mean of
-        the shorter exposure below `least` DN are left out. No offset is added: the test is of the
-        values as they are.
+    No offset is added: the test is of the values as they are.
+    frames, seconds, darks, white, ceiling: as of merge_bracket.
+    labels: (row, column) regions 1.., 0 elsewhere; one with a saturated pixel is left out.
+    least: mean of the shorter exposure below which a region is left out, DN.
+
+    Returns (label, shorter s, longer s, ratio) of each region and pair of exposures.
     """
     order = np.argsort(seconds)
     found = []
@@ -67,5 +94,5 @@ def linearity(frames, seconds, darks, labels, white, least=20.0, ceiling=CEILING
     return found
 
 
-def _signal(frame, dark, truncated):
+def _signal(frame: np.ndarray, dark: np.ndarray | float, truncated: bool) -> np.ndarray:
     return np.asarray(frame, float) - dark + (HALF if truncated else 0.0)

@@ -1,18 +1,29 @@
 """Colour filter array: which colour a pixel has, and what it makes of light."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
 
 MONO = "Y"
 
 
-def cfa_map(shape, cfa, origin=(0, 0)):
-    """Colour letter of every pixel, (rows, columns) of one-letter strings; "Y"
-    everywhere for "mono".
+def cfa_map(shape: tuple[int, int], cfa: str, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Colour letter of every pixel.
 
+    shape: (rows, columns).
     cfa: "mono" or the four letters of the top left 2x2 pixels, row by row.
     origin: sensor position (row, column) of the first pixel, for windows cut out of a sensor.
+
+    Returns (row, column) of one-letter strings, MONO everywhere for "mono".
+    Raises ConfigError where `cfa` is neither.
     """
     if cfa == "mono":
         return np.full(shape, MONO)
@@ -23,12 +34,15 @@ def cfa_map(shape, cfa, origin=(0, 0)):
     return tile[np.ix_(rows, columns)]
 
 
-def sensitivity(camera, wavelengths):
-    """Quantum efficiency by colour: (letters, (colour, wavelength)) for `wavelengths` in m.
+def sensitivity(camera: Camera, wavelengths: ArrayLike) -> tuple[tuple[str, ...], np.ndarray]:
+    """Quantum efficiency by colour.
 
-    A mono sensor has one colour "Y" with [sensor] quantum_efficiency at every wavelength; another
-    one has the measured relative sensitivities of [sensor] camera (peak 1)
-    times quantum_efficiency.
+    A mono sensor has one colour MONO with [sensor] quantum_efficiency at every wavelength; another
+    one has the measured relative sensitivities of [sensor] camera (peak 1) times
+    quantum_efficiency.
+    wavelengths: (wavelength,) m.
+
+    Returns the colours' letters and (colour, wavelength).
     """
     wavelengths = np.atleast_1d(np.asarray(wavelengths, float))
     efficiency = camera.sensor.quantum_efficiency

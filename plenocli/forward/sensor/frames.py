@@ -2,10 +2,14 @@
 masked, noise measured.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from plenocli.forward.sensor.noise import Noise
 
@@ -18,9 +22,10 @@ SAME_EXPOSURE = 0.01
 class Dark:
     """What the sensor reports without light.
 
-    mean (rows, columns) DN at `exposure` s (None: unknown);
-    black (2, 2) DN;
-    sigma: temporal noise of one frame, DN (None: no dark frame was given).
+    mean: (row, column) DN at `exposure`.
+    black: (2, 2) by position, DN.
+    exposure: s, None where unknown.
+    sigma: temporal noise of one frame, DN; None where no dark frame was given.
     variance: of the mean itself, DN^2.
     """
 
@@ -31,20 +36,20 @@ class Dark:
     variance: float = 0.0
 
     @cached_property
-    def flat(self):
+    def flat(self) -> bool:
         """Whether the dark image is the black level everywhere."""
         return bool((self.mean == tiled(self.black, self.mean.shape, self.mean.dtype)).all())
 
-    def grows(self, exposure):
-        """Whether the dark image at another exposure is another one."""
+    def grows(self, exposure: float | None) -> bool:
+        """Whether the dark image at another exposure (s) is another one."""
         return not (
             self.exposure is None
             or exposure is None
             or abs(exposure / self.exposure - 1) < SAME_EXPOSURE
         )
 
-    def at(self, exposure):
-        """Expected dark image at another exposure: the part above the black
+    def at(self, exposure: float | None) -> np.ndarray:
+        """Expected dark image (row, column), DN, at another exposure (s): the part above the black
         level grows with time.
         """
         if not self.grows(exposure):
@@ -53,20 +58,27 @@ class Dark:
         return level + (self.mean - level) * np.float32(exposure / self.exposure)
 
 
-def tiled(level, shape, dtype=np.float32):
+def tiled(level: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
     """A (2, 2) level by position, repeated over (rows, columns)."""
     rows, columns = shape
     return np.tile(np.asarray(level, dtype), ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
 
 
-def make_dark(frames, exposures, black, shape):
-    """Dark from dark frames (possibly none): the mean of those at the longest exposure,
-    noise from differences.
+def make_dark(
+    frames: Sequence[np.ndarray],
+    exposures: Sequence[float | None],
+    black: ArrayLike,
+    shape: tuple[int, ...],
+) -> Dark:
+    """Dark from dark frames (possibly none): the mean of those at the longest exposure, noise from
+    differences.
 
-    frames: list of (rows, columns) DN;
-    exposures: s or None each;
-    black (2, 2) DN. Without frames the black level stands for the dark image. The noise of a single
-        frame is a robust spread over pixels, at least the rounding's.
+    Without frames the black level stands for the dark image. The noise of a single frame is a
+    robust spread over pixels, at least the rounding's.
+    frames: (row, column) each, DN.
+    exposures: s or None each.
+    black: (2, 2) by position, DN.
+    shape: (rows, columns) of the sensor.
     """
     if not frames:
         return Dark(
@@ -96,9 +108,12 @@ def make_dark(frames, exposures, black, shape):
     )
 
 
-def saturated(values, black, white):
-    """Mask of pixels at or near the white level (DN); nothing is saturated where the white
-    level is unknown (inf).
+def saturated(values: np.ndarray, black: ArrayLike, white: float | None) -> np.ndarray:
+    """Mask of pixels at or near the white level.
+
+    values: (row, column) DN.
+    black: (2, 2) by position, DN.
+    white: DN; None or inf where unknown: then nothing is saturated.
     """
     if white is None or not np.isfinite(white):
         return np.zeros(values.shape, bool)
@@ -106,15 +121,25 @@ def saturated(values, black, white):
     return values >= top
 
 
-def merge(frames, exposures, dark, white, reference):
-    """Mean signal, DN at exposure `reference` (s), of several frames: (signal float32 NaN where
-    never good, weight).
+def merge(
+    frames: Sequence[np.ndarray],
+    exposures: Sequence[float | None],
+    dark: Dark,
+    white: float | None,
+    reference: float | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean signal of several frames, at one exposure time.
 
     sum of (frame - dark) over sum of exposures, saturated pixels left out: the least-noise average
     of shot-limited frames.
-    exposures: s each, or all None (taken as equal). weight (rows, columns): good exposure time in
-        units of `reference`: the variance of the signal is (gain signal + read variance) / weight
-        for frames near that exposure.
+    frames: (row, column) each, DN.
+    exposures: s each, or all None (taken as equal).
+    white: saturation level, DN.
+    reference: exposure time of the signal, s, None where unknown.
+
+    Returns signal (row, column) float32 DN, NaN where never good, and weight (row, column), good
+    exposure time in units of the reference: the variance of the signal is that of one frame
+    (Noise.variance) over the weight, for frames near that exposure.
     """
     total, time = 0.0, 0.0
     for frame, exposure in zip(frames, exposures):
@@ -164,13 +189,12 @@ def photon_transfer(
     return Noise(gain=float(slope), read_variance=float(max(offset, 0.0))) if slope > 0 else None
 
 
-def bad_pixels(white, dark, top, step):
+def bad_pixels(white: np.ndarray, dark: Dark, top: float | None, step: int) -> np.ndarray:
     """Mask of pixels that do not follow the light: dead in the white image, or hot in the dark one.
 
-    white: signal (rows, columns), NaN where saturated;
-    dark: Dark;
-    top: white level, DN;
-    step: 1 mono, 2 mosaic.
+    white: (row, column) signal, NaN where saturated, DN.
+    top: white level, DN.
+    step: px from a pixel to the next of its colour: 1 mono, 2 mosaic.
     """
     bad = dead_pixels(np.nan_to_num(white), step)
     if dark.sigma is not None:
@@ -181,9 +205,9 @@ def bad_pixels(white, dark, top, step):
     return bad
 
 
-def dead_pixels(image, step=1):
-    """Mask of pixels far outside the range of their four neighbours `step` px
-    away: dead, or hot.
+def dead_pixels(image: np.ndarray, step: int = 1) -> np.ndarray:
+    """Mask of pixels far outside the range of their four neighbours `step` px away: dead, or
+    hot.
     """
     neighbours = shifted_neighbours(image, step)
     high, low = np.maximum.reduce(neighbours), np.minimum.reduce(neighbours)
@@ -192,7 +216,8 @@ def dead_pixels(image, step=1):
     return (image > 3 * np.abs(high) + 6 * noise) | (image < low / 3 - 3 * noise)
 
 
-def shifted_neighbours(image, step):
+def shifted_neighbours(image: np.ndarray, step: int) -> list[np.ndarray]:
+    """The image moved by `step` px in the four directions, mirrored at its edges."""
     padded = np.pad(image, step, mode="reflect")
     rows, columns = image.shape
     return [

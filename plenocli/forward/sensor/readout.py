@@ -5,6 +5,9 @@ A whole mosaic in single precision would pass through memory several times; wind
 stay in the cache.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,14 +18,16 @@ from plenocli.forward.sensor.superpixel import inside
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
-    """values (rows, columns) as the sensor reports them;
+    """A capture that gives its light by windows; `readout - number` has a larger offset.
 
-    dark: plenocli.forward.sensor.frames.Dark;
-    exposure_s: s (None: unknown);
-    black (2, 2) and white: levels beyond which pixels are saturated (white inf: none);
-    scale: to the light of the calibration's exposure;
-    offset: taken off after that;
-    ready: DarkWindows that were cut before. `readout - number` is the capture with a larger offset.
+    values: (row, column) as the sensor reports them.
+    dark: what it reports without light.
+    exposure_s: s, None where unknown.
+    black: (2, 2) by position.
+    white: level from which on, or nearly, pixels are saturated; inf where none is.
+    scale: to the light of the calibration's exposure.
+    offset: taken off after that.
+    ready: windows of the dark image that were cut before.
     """
 
     values: np.ndarray
@@ -32,31 +37,37 @@ class Readout:
     white: float
     scale: float = 1.0
     offset: float = 0.0
-    ready: "DarkWindows | None" = None
+    ready: DarkWindows | None = None
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, ...]:
         """(rows, columns)."""
         return self.values.shape
 
-    def __sub__(self, offset):
+    def __sub__(self, offset: float) -> Readout:
         return replace(self, offset=self.offset + float(offset))
 
-    def cut(self, origin, window):
-        """Light (lenslet, h*w) float32 of windows (h, w) whose first pixels are at `origin`
-        (lenslet, 2); NaN where a pixel is saturated, and everywhere in windows that are not
-        wholly on the sensor.
+    def cut(self, origin: np.ndarray, window: tuple[int, ...]) -> np.ndarray:
+        """Light of windows.
+
+        origin: (lenslet, 2) first pixels.
+        window: (rows, columns) px.
+
+        Returns (lenslet, pixel) float32; NaN where a pixel is saturated, and everywhere in windows
+        that are not wholly on the sensor.
         """
         return self.cutter(origin, window)(slice(None))
 
-    def cutter(self, origin, window):
+    def cutter(
+        self, origin: np.ndarray, window: tuple[int, ...]
+    ) -> Callable[[np.ndarray | slice], np.ndarray]:
         """Function of an index or slice into `origin` that cuts those windows."""
         whole = inside(origin, window, self.shape)
         if whole.all():
             return _Cutter(self, origin, window)
         inner = _Cutter(self, np.where(whole[:, None], origin, 0), window)
 
-        def cut(part):
+        def cut(part: np.ndarray | slice) -> np.ndarray:
             light = inner(part)
             light[~whole[part]] = np.nan
             return light
@@ -67,7 +78,7 @@ class Readout:
 class _Cutter:
     """Windows that are all on the sensor, and what is the same for any of them."""
 
-    def __init__(self, readout, origin, window):
+    def __init__(self, readout: Readout, origin: np.ndarray, window: tuple[int, ...]) -> None:
         self.readout, self.origin, self.count = readout, origin, window[0] * window[1]
         dark = readout.dark
         self.raw = np.lib.stride_tricks.sliding_window_view(readout.values, window)
@@ -93,7 +104,7 @@ class _Cutter:
             else _tiles(top, window)
         )
 
-    def __call__(self, part):
+    def __call__(self, part: np.ndarray | slice) -> np.ndarray:
         origin, readout = self.origin[part], self.readout
         at = origin[:, 0], origin[:, 1]
         raw = self.raw[at].reshape(-1, self.count)
@@ -113,7 +124,7 @@ class _Cutter:
             light[raw >= self._of(self.top, origin)] = np.nan
         return light
 
-    def _of(self, level, origin):
+    def _of(self, level: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """A level under windows: one number, or (lenslet, pixel)."""
         return level if level.ndim == 0 else level[origin[:, 0] % 2, origin[:, 1] % 2]
 
@@ -121,11 +132,11 @@ class _Cutter:
 class DarkWindows:
     """The dark image under windows; `keep` holds them all, for many captures."""
 
-    def __init__(self, dark, origin, window):
+    def __init__(self, dark: Dark, origin: np.ndarray, window: tuple[int, ...]) -> None:
         self.origin, self.count, self.kept = origin, window[0] * window[1], None
         self.view = np.lib.stride_tricks.sliding_window_view(dark.mean, window)
 
-    def keep(self):
+    def keep(self) -> DarkWindows:
         """Cut them all now; returns itself."""
         kept = np.empty((len(self.origin), self.count), np.float32)
         for first in range(0, len(kept), 64):
@@ -133,14 +144,14 @@ class DarkWindows:
         self.kept = kept
         return self
 
-    def __call__(self, part):
+    def __call__(self, part: np.ndarray | slice) -> np.ndarray:
         if self.kept is not None:
             return self.kept[part]
         origin = self.origin[part]
         return self.view[origin[:, 0], origin[:, 1]].reshape(-1, self.count)
 
 
-def _tiles(level, window):
+def _tiles(level: np.ndarray, window: tuple[int, ...]) -> np.ndarray:
     """A (2, 2) level by position under a window that starts at an even or odd row and column,
     (2, 2, h*w) float32.
     """

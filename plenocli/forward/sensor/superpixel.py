@@ -12,7 +12,7 @@ import numpy as np
 class CutByWindow(Protocol):
     """What gives its pixels by windows, such as plenocli.forward.sensor.readout.Readout."""
 
-    def cut(self, origin: np.ndarray, window: tuple[int, int]) -> np.ndarray:
+    def cut(self, origin: np.ndarray, window: tuple[int, ...]) -> np.ndarray:
         """Pixels (lenslet, h*w) of windows (h, w) whose first pixels are `origin` (lenslet, 2)."""
         ...
 
@@ -40,13 +40,13 @@ def windows(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return np.where(np.isfinite(first), first, -(2**30)).astype(int)
 
 
-def inside(origin: np.ndarray, window: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+def inside(origin: np.ndarray, window: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
     """Which windows (..) with first pixels `origin` (.., 2) lie wholly in a mosaic of `shape`."""
     return ((origin >= 0) & (origin + np.asarray(window) <= np.asarray(shape))).all(axis=-1)
 
 
 def extract(
-    mosaic: np.ndarray | CutByWindow, origin: np.ndarray, window: tuple[int, int]
+    mosaic: np.ndarray | CutByWindow, origin: np.ndarray, window: tuple[int, ...]
 ) -> np.ndarray:
     """Pixels of every window, row by row.
 

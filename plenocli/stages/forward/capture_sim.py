@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -12,17 +13,13 @@ from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
 from plenocli.files.read.scenes import Chart, Scene, Uniform, read_scene
+from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE, WHITE_LEVEL
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.scene.light import Quadrature
-
-WHITE_LEVEL = 0.8
-"""Share of full well that a perfect white reaches in [light] white_exposure, at
-the brightest pixel.
-"""
 
 
 _MOST = 8 << 30
@@ -55,8 +52,8 @@ class Settings:
     refine: int = 1
     bandwidth: float = 0.0
     spectral_step: float | None = None
-    superpixels: object = "auto"
-    coherent_ring: object = "auto"
+    superpixels: str | tuple[int, int] = "auto"
+    coherent_ring: str | int = "auto"
     accuracy: float | None = None
     model: str = "auto"
     snr_db: float | None = None
@@ -216,13 +213,14 @@ def _summary(
         wavelengths=wavelengths,
         units=capture.units,
         peak=float(peak) if relative else int(peak),
-        noise_sigma=capture.noise.sigma if relative else None,
+        noise_sigma=capture.noise.sigma if capture.noise is not None and relative else None,
         saturated=saturated,
         exposure_s=capture.exposure_s,
     )
 
 
-def _check_tiling(camera, where):
+def _check_tiling(camera: Camera, where: str | Path) -> None:
+    """ConfigError unless superpixels of whole pixels tile the sensor."""
     if camera.lenslet_array.lattice != "square":
         raise ConfigError(
             "capture-sim tiles a sensor with superpixels, which a hexagonal lattice does not allow",
@@ -246,7 +244,7 @@ def _check_tiling(camera, where):
         )
 
 
-def _check_memory(camera, settings, where):
+def _check_memory(camera: Camera, settings: Settings, where: str | Path) -> None:
     """Refuse, before any work, a sensor or an object larger than the memory granted: light,
     white and mosaic, float64, by colour.
     """
@@ -270,12 +268,13 @@ def _check_memory(camera, settings, where):
     )
 
 
-def _source(camera, settings, scene):
-    """(Quadrature of the light, scene) from --target and --scene."""
+def _source(
+    camera: Camera, settings: Settings, scene: str | Path | None
+) -> tuple[Quadrature, Scene]:
+    """The light, and what is in front of the camera, from --target and --scene."""
     from plenocli.base.units import UnitError, parse_wavelength
     from plenocli.forward.scene.light import broadband, broadened, has_colour, narrow_band
     from plenocli.forward.scene.tables import illuminant
-    from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 
     target = settings.target
     if (target is None) == (scene is None):
@@ -296,15 +295,17 @@ def _source(camera, settings, scene):
     )
     if not has_colour(camera) and settings.bandwidth:
         white = broadened(camera.light.wavelengths, settings.bandwidth)
-    if scene is not None:
-        return white, read_scene(scene, sampling=settings.sampling, spectral=has_colour(camera))
+    if scene is not None or target is None:
+        return white, read_scene(
+            str(scene), sampling=settings.sampling, spectral=has_colour(camera)
+        )
     if target.startswith("mono:"):
         try:
             centre = parse_wavelength(target.removeprefix("mono:"))
         except UnitError as error:
             raise UsageError(str(error), "--target", "write for example mono:450nm") from None
         return narrow_band(centre, settings.bandwidth), Uniform(REFERENCE_REFLECTANCE)
-    scenes = {
+    scenes: dict[str, Scene] = {
         "white": Uniform(REFERENCE_REFLECTANCE),
         "dark": Uniform(0.0),
         "colorchecker": Chart(),
@@ -318,20 +319,58 @@ def _source(camera, settings, scene):
     return white, scenes[target]
 
 
+class MatrixByPoints(Protocol):
+    """A system matrix at one wavelength that comes in blocks of object points."""
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """(lenslet offset, 2) lenslets, rows and columns."""
+        ...
+
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Pairs (object points, (lenslet offset, pixel, point)) of at most `size` points each."""
+        ...
+
+
+@dataclass(frozen=True)
 class StoredMatrix:
-    """The system matrix of a pif artefact at one of its wavelengths, as a PifBuilder gives it."""
+    """The system matrix of a pif artefact at one of its wavelengths, in one block.
 
-    def __init__(self, artefact, band):
-        self.matrix, self.offsets = (
-            artefact.data["pif/A"][band],
-            artefact.data["pif/lenslet_offset"],
-        )
+    matrix: (lenslet offset, pixel, point).
+    offsets: (lenslet offset, 2).
+    """
 
-    def blocks(self, size=None):
+    matrix: np.ndarray
+    offsets: np.ndarray
+
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """All points at once: they are in memory."""
         yield np.arange(self.matrix.shape[2]), self.matrix
 
 
-def _read_pif(path, camera, settings, wavelengths, camera_path):
+_OF_THE_DETECTOR = {
+    "lenslet_array": {"count"},
+    "sensor": {
+        "full_well",
+        "read_noise",
+        "gain",
+        "bits",
+        "black_level",
+        "quantum_efficiency",
+        "cfa",
+        "camera",
+    },
+}
+"""What may differ, by section, between a capture's camera and the one that a pif was made for."""
+
+
+def _read_pif(
+    path: str | Path,
+    camera: Camera,
+    settings: Settings,
+    wavelengths: np.ndarray,
+    camera_path: str | Path,
+) -> tuple[dict[float, StoredMatrix], dict[str, Any]]:
     """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it
     belongs to another camera or lacks a wavelength.
     """
@@ -347,22 +386,7 @@ def _read_pif(path, camera, settings, wavelengths, camera_path):
         )
     made_for = parse_camera(artefact.provenance.config, path)
     for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array"):
-        drop = (
-            {"count"}
-            if section == "lenslet_array"
-            else {
-                "full_well",
-                "read_noise",
-                "gain",
-                "bits",
-                "black_level",
-                "quantum_efficiency",
-                "cfa",
-                "camera",
-            }
-            if section == "sensor"
-            else set()
-        )
+        drop = _OF_THE_DETECTOR.get(section, set())
         ours, theirs = getattr(camera, section), getattr(made_for, section)
         if (ours and ours.model_dump(exclude=drop)) != (theirs and theirs.model_dump(exclude=drop)):
             raise InputError(
@@ -371,7 +395,9 @@ def _read_pif(path, camera, settings, wavelengths, camera_path):
                 "run simulate-pif on this camera",
             )
     require_same_files(camera_path, camera, artefact, path)
-    known = artefact.data["pif/wavelength"]
+    known, matrices, offsets = (
+        artefact.data[f"pif/{part}"] for part in ("wavelength", "A", "lenslet_offset")
+    )
     stored = {}
     for wavelength in wavelengths:
         band = int(np.argmin(np.abs(known - wavelength)))
@@ -381,7 +407,7 @@ def _read_pif(path, camera, settings, wavelengths, camera_path):
                 path,
                 "run simulate-pif with the same --spectral-step, or leave --pif out",
             )
-        stored[wavelength] = StoredMatrix(artefact, band)
+        stored[wavelength] = StoredMatrix(matrices[band], offsets)
     return stored, artefact.provenance.accuracy
 
 
@@ -390,7 +416,7 @@ def _carry(
     source: Quadrature,
     scene: Scene,
     settings: Settings,
-    matrix: dict[float, StoredMatrix] | None,
+    matrix: Mapping[float, MatrixByPoints] | None,
 ) -> SensorLight:
     """Light of the scene on every superpixel, band by band through the system matrix."""
     from plenocli.base.budget import budget
@@ -399,22 +425,22 @@ def _carry(
 
     letters, efficiency = sensitivity(camera, source.wavelengths)
     count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
-    fine = tuple(n * settings.refine for n in samples)
-    grid = tuple(n * k for n, k in zip(count, fine))
+    fine = (samples[0] * settings.refine, samples[1] * settings.refine)
+    grid = (count[0] * fine[0], count[1] * fine[1])
     finer = (
         camera.replace(**{"object.samples_per_lenslet": fine}) if settings.refine > 1 else camera
     )
     pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
-    light, whites, picture = 0.0, 0.0, None
+    light, whites, picture = np.zeros(()), np.zeros(()), None
     for index, wavelength in enumerate(
         bar(source.wavelengths, len(source.wavelengths), "wavelengths")
     ):
         system = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
-        if not scene.uniform and (picture is None or scene.spectral):
+        if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
             picture = scene.at(wavelength, *grid)
         size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
         carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
-        if scene.uniform:
+        if isinstance(scene, Uniform):
             carried = np.broadcast_to(scene.level * white, (*count, pixels))
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2
         light = light + weight[:, :, None, None] * carried[None]
@@ -427,13 +453,13 @@ def _carry(
     )
 
 
-def _build(camera, wavelength, settings):
+def _build(camera: Camera, wavelength: float, settings: Settings) -> MatrixByPoints:
     from plenocli.forward.accuracy.dial import pif_builder
 
     return pif_builder(camera, wavelength, **_request(settings))
 
 
-def _request(settings):
+def _request(settings: Settings) -> dict[str, Any]:
     """What the dial is asked: with --snr its noise stands in for the sensor's where no
     accuracy is named.
     """
@@ -453,7 +479,7 @@ def _request(settings):
     )
 
 
-def _accuracy(camera, settings, wavelengths):
+def _accuracy(camera: Camera, settings: Settings, wavelengths: np.ndarray) -> dict[str, Any]:
     """The accuracy record of a capture that computes its own system matrices: that of the middle
     wavelength's plan. Says how long all will take.
     """
@@ -467,7 +493,7 @@ def _accuracy(camera, settings, wavelengths):
     return plan.accuracy_record().as_json()
 
 
-def _truth(camera, scene, grid, refine):
+def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> np.ndarray:
     """The object (band, row, column) on the grid that reconstruction uses: area
     averages of the finer one.
     """
@@ -509,7 +535,8 @@ def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
     if camera.sensor.cfa == "mono":
         return mosaic
     where = cfa_map(mosaic.shape, camera.sensor.cfa)
-    return sum(np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
+    filtered = (np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
+    return sum(filtered, start=np.zeros(()))
 
 
 def _relative(
@@ -596,13 +623,13 @@ def _described(
     count = camera.lenslet_array.count
     first = np.array([(rows - 1) / 2, (columns - 1) / 2])
     index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
-    narrow = settings.target is not None and settings.target.startswith("mono:")
+    target = settings.target or ""
     metadata = replace(
         capture.metadata,
         scene_shape=tuple(truth.shape[1:]),
         target=settings.target or str(Path(str(scene)).name),
         illuminant=camera.light.illuminant,
-        band_m=parse_length(settings.target.removeprefix("mono:")) if narrow else None,
+        band_m=parse_length(target.removeprefix("mono:")) if target.startswith("mono:") else None,
     )
     grid = SuperpixelGrid(
         shape=(rows, columns),

@@ -22,7 +22,7 @@ import os
 import platform
 import random
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -46,14 +46,14 @@ from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation import costs, rays
 from plenocli.forward.propagation.costs import Features, Law, priced
 from plenocli.forward.propagation.exact import cost_law
-from plenocli.forward.propagation.exact.term_counts import TermLaw
+from plenocli.forward.propagation.exact.term_counts import ExactBand, TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.spread_terms import SpreadLaw
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
 EXACT, SPREAD = "exact, low rank", "spread function"
-FEATURES = {
+FEATURES: dict[str, tuple[str, Callable[..., Features]]] = {
     "rays": ("ray", rays.features),
     "fresnel, low rank": ("fresnel", square_cost.features),
     "fresnel, triple product": ("fresnel", shaped.features),
@@ -146,6 +146,7 @@ def expected(case: Case, counts: Mapping[str, float]) -> tuple[float, ...]:
     if case.model != EXACT:
         phase = view.k * view.D1 / 2 * plan.bands[0].half / view.z2
         return (SpreadLaw(**counts).terms(phase, plan.tolerance),)
+    assert isinstance(plan.bands[0], ExactBand)
     return cost_law.expected_counts(camera, view, plan.bands[0], plan.shape, TermLaw(**counts))
 
 

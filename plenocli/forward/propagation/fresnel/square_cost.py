@@ -68,7 +68,7 @@ def features(
         **field_features(camera, geometry, band),
     }
     if narrow:
-        seconds["narrowed"] = max(grid) * table / grid[0] * math.sqrt(terms)
+        seconds |= {"narrowed": max(grid) * table / grid[0] * math.sqrt(terms)}
     return Features(
         {"sensor_narrowed" if narrow else "sensor": 8.0 * nodes * terms},
         seconds,

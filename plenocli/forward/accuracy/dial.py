@@ -2,8 +2,12 @@
 cost (docs/model.md).
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,8 +27,17 @@ from plenocli.forward.propagation.sampling import (
 )
 from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
 
+if TYPE_CHECKING:
+    from plenocli.forward.accuracy.needs import Needs
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.models import Model
+    from plenocli.forward.propagation.system_matrix import Progress, SystemMatrix
+
 BEST_ACCURACY = 1e-8
 """Finest sampling on offer: double precision."""
+Superpixels = tuple[int, int] | str
+"""Odd (rows, columns), or "auto"."""
 KINDS = ("auto", "ray", "fresnel", "exact")
 """What --model takes."""
 MAX_RING = 8
@@ -54,18 +67,18 @@ the accuracy's whole.
 
 
 def plan_pif(
-    camera,
+    camera: Camera,
     *,
-    wavelengths=None,
-    superpixels="auto",
-    coherent_ring="auto",
-    accuracy=None,
-    model="auto",
-    dtype="auto",
-    points=None,
-    needs=None,
-    lenslet=None,
-):
+    wavelengths: Sequence[float] | None = None,
+    superpixels: Superpixels = "auto",
+    coherent_ring: int | str = "auto",
+    accuracy: float | None = None,
+    model: str = "auto",
+    dtype: np.typing.DTypeLike = "auto",
+    points: slice | None = None,
+    needs: Needs | None = None,
+    lenslet: tuple[int, int] | None = None,
+) -> PifPlan:
     """Choose how to compute the system matrix of `camera`; no optics is computed.
 
     wavelengths: metres (default: the camera's);
@@ -104,17 +117,17 @@ class _Request:
 
     def __init__(
         self,
-        camera,
-        wavelengths,
-        superpixels,
-        coherent_ring,
-        accuracy,
-        model,
-        dtype,
-        points,
-        needs,
-        lenslet,
-    ):
+        camera: Camera,
+        wavelengths: Sequence[float] | None,
+        superpixels: Superpixels,
+        coherent_ring: int | str,
+        accuracy: float | None,
+        model: str,
+        dtype: np.typing.DTypeLike,
+        points: slice | None,
+        needs: Needs | None,
+        lenslet: tuple[int, int] | None,
+    ) -> None:
         if model not in KINDS:
             raise UsageError(f"model {model!r} is not one of {', '.join(KINDS)}", "model")
         if coherent_ring != "auto" and not (
@@ -162,7 +175,7 @@ class _Request:
                     f"{total - lit} of {total} lenslets see no light of the scene: no error"
                 )
 
-    def _accuracy(self, asked):
+    def _accuracy(self, asked: float | None) -> tuple[float, str]:
         noise, who = (
             (sensor_noise(self.camera), "sensor noise")
             if self.needs is None or self.needs.noise is None
@@ -183,7 +196,7 @@ class _Request:
             return seen, who
         return asked, "request"
 
-    def _depths(self):
+    def _depths(self) -> list[Geometry]:
         """The geometries that size the neighbourhood: those of the camera, or at both ends of
         the scene's depth.
         """
@@ -196,7 +209,7 @@ class _Request:
         )
         return ends
 
-    def _rings(self, asked):
+    def _rings(self, asked: int | str) -> tuple[int, ...]:
         if asked != "auto":
             if asked == 0:
                 self.reasons.append("isolated lenslets as asked: light of neighbours is left out")
@@ -204,7 +217,7 @@ class _Request:
         return tuple(range(1, MAX_RING + 1))
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int, int, int]:
         """(band, lenslet, pixel, point) of the matrix."""
         count = int(np.prod(self.geometries[0].object_shape))
         count = count if self.points is None else len(range(*self.points.indices(count)))
@@ -216,7 +229,9 @@ class _Request:
         )
 
 
-def _place(camera, lenslet):
+def _place(
+    camera: Camera, lenslet: tuple[int, int] | None
+) -> tuple[tuple[float, float] | None, bool]:
     """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; (None,
     False) for the one on the axis.
     """
@@ -232,7 +247,7 @@ def _place(camera, lenslet):
     return lenslet_shift(camera, *lenslet)[2], any(2 * n != m - 1 for n, m in zip(lenslet, count))
 
 
-def _consider(request, model):
+def _consider(request: _Request, model: Model) -> Candidate:
     """The Candidate of one model: its error by source, and the rings, precision and node counts
     that it would take.
     """
@@ -274,7 +289,7 @@ def _consider(request, model):
     return next(c for c in tried if c.error <= 1.1 * least)
 
 
-def _rings_of(request, model):
+def _rings_of(request: _Request, model: Model) -> Sequence[int]:
     """The rings of coherent neighbours to choose from: of the least number only for rays, which
     end where the blur ends.
     """
@@ -295,7 +310,7 @@ def _rings_of(request, model):
     ]
 
 
-def _band_nodes(request, model, ring):
+def _band_nodes(request: _Request, model: Model, ring: int) -> tuple[int, float]:
     """(wavelengths that stand for the camera's band of light, error that leaves);
     (0, 0.0) for lines.
     """
@@ -310,7 +325,9 @@ def _band_nodes(request, model, ring):
     return count, spectral_error(geometry, request.band, count, window)
 
 
-def _sized(request, model, ring, split, nodes):
+def _sized(
+    request: _Request, model: Model, ring: int, split: dict[str, float], nodes: int
+) -> Candidate:
     """Node counts for the accuracy that the other errors leave to sampling."""
     rest = math.hypot(*split.values())
     room = math.sqrt(max(request.accuracy**2 - rest**2, 0))
@@ -353,7 +370,7 @@ def _sized(request, model, ring, split, nodes):
     )
 
 
-def _finest(request, nodes):
+def _finest(request: _Request, nodes: int) -> list[Geometry]:
     """The geometries that node counts must serve: of a band, that of its shortest wavelength."""
     if not nodes:
         return request.geometries
@@ -364,12 +381,14 @@ def _finest(request, nodes):
     ]
 
 
-def _cheapest(found):
+def _cheapest(found: list[Candidate]) -> Candidate | None:
     serving = [c for c in found if c.why is None]
     return min(serving, key=Candidate.seconds) if serving else None
 
 
-def _fall_back(request, found):
+def _fall_back(
+    request: _Request, found: list[Candidate]
+) -> tuple[_Request, list[Candidate], Candidate]:
     """Where nothing serves: the best there is for a default accuracy, unless that is beyond
     COARSEST; exit 5 for one that was asked for.
     """
@@ -422,7 +441,7 @@ def _fall_back(request, found):
     return request, again, best
 
 
-def _reasons(found):
+def _reasons(found: list[Candidate]) -> str:
     """Why each model does not serve, models with the same reason together."""
     reasons = dict.fromkeys(c.why for c in found)
     return "; ".join(
@@ -430,7 +449,9 @@ def _reasons(found):
     )
 
 
-def _finest_served(request, found, limit):
+def _finest_served(
+    request: _Request, found: list[Candidate], limit: float
+) -> tuple[float, list[Candidate], Candidate | None]:
     """(accuracy, candidates, the chosen one) of about the finest accuracy that something serves
     between the request's, which nothing does, and `limit`; the chosen one is None where
     nothing serves any.
@@ -454,19 +475,19 @@ def _finest_served(request, found, limit):
     return served
 
 
-def _served(request, accuracy):
+def _served(request: _Request, accuracy: float) -> tuple[float, list[Candidate], Candidate | None]:
     request.accuracy = accuracy
     found = [_consider(request, each) for each in MODELS if request.model in ("auto", each.kind)]
     return accuracy, found, _cheapest(found)
 
 
-def _rounded_up(value):
+def _rounded_up(value: float) -> float:
     """To two digits, so that what is said can be asked for."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.ceil(value / unit - 1e-9) * unit
 
 
-def _plan(request, found, best):
+def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan:
     """The PifPlan of the chosen Candidate, with what was considered and left out."""
     table = tuple(
         replace(
@@ -515,17 +536,19 @@ def _plan(request, found, best):
     )
 
 
-def _model_error(request, best):
+def _model_error(request: _Request, best: Candidate) -> float:
     model = next(m for m in MODELS if m.name == best.name)
     return max(model.error_bound(request.camera, v) for v in request.geometries)
 
 
-def seconds_here(candidate):
+def seconds_here(candidate: Candidate) -> float:
     """Seconds of one core of this machine that a Candidate will take."""
     return candidate.seconds(product_rate)
 
 
-def _superpixels(asked, geometries, accuracy, reasons):
+def _superpixels(
+    asked: Superpixels, geometries: Sequence[Geometry], accuracy: float, reasons: list[str]
+) -> tuple[int, int]:
     if asked != "auto":
         rows, columns = (int(n) for n in asked)
         if rows < 1 or columns < 1 or rows % 2 == 0 or columns % 2 == 0:
@@ -555,7 +578,7 @@ def _superpixels(asked, geometries, accuracy, reasons):
     return 2 * ring + 1, 2 * ring + 1
 
 
-def _warnings(request, best):
+def _warnings(request: _Request, best: Candidate) -> list[str]:
     geometry, superpixels, found = request.geometries[0], request.superpixels, []
     for axis, name in ((0, "rows"), (1, "columns")):
         size = geometry.pixel_shape[axis] * geometry.pixel_pitch
@@ -581,14 +604,16 @@ def _warnings(request, best):
     return found
 
 
-def system_matrix(camera, *, progress=None, **request):
+def system_matrix(
+    camera: Camera, *, progress: Progress | None = None, **request: Any
+) -> SystemMatrix:
     """Plan and compute the SystemMatrix of `camera`; `request` as for plan_pif."""
     return build_pif(
         camera, plan_pif(camera, **request), points=request.get("points"), progress=progress
     )
 
 
-def pif_builder(camera, wavelength, **request):
+def pif_builder(camera: Camera, wavelength: float, **request: Any) -> PifBuilder:
     """A PifBuilder of `camera` at `wavelength` (m), planned by plan_pif with `request`."""
     return PifBuilder(
         camera,

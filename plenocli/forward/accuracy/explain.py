@@ -149,7 +149,7 @@ def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str
     )
 
 
-def _table(rows):
+def _table(rows: list[Considered]) -> list[str]:
     cells = [("rung", "error", "time", "memory", "")]
     for r in rows:
         known = r.error is not None
@@ -171,12 +171,12 @@ def _table(rows):
     ]
 
 
-def _duration(seconds):
+def _duration(seconds: float) -> str:
     """Seconds in a unit that a person would take."""
     units = (("s", 1, 100), ("min", 60, 100), ("h", 3600, 72), ("days", 86400, math.inf))
     unit, size, _ = next(known for known in units if seconds < (known[2] - 0.5) * known[1])
     return f"{seconds / size:.2g} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
 
 
-def _size(count):
+def _size(count: float) -> str:
     return f"{count / 2**30:.2f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"

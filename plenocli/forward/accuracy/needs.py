@@ -2,8 +2,15 @@
 noise lets anyone see.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
 
 HIDDEN = 0.3
 """A model error of this share of the noise, both relative to the signal, adds under 5 % to the
@@ -29,7 +36,7 @@ class Needs:
     source: str = "scene"
 
 
-def sensor_noise(camera):
+def sensor_noise(camera: Camera) -> float:
     """Relative noise of a pixel of `camera` at full well: shot and read noise over the
     signal (EMVA 1288).
     """
@@ -37,14 +44,16 @@ def sensor_noise(camera):
     return math.sqrt(sensor.full_well + sensor.read_noise**2) / sensor.full_well
 
 
-def visible_accuracy(noise):
+def visible_accuracy(noise: float) -> float:
     """The finest model error worth computing beside a relative `noise`, within
     what the dial offers.
     """
     return min(0.3, max(1e-8, HIDDEN * noise))
 
 
-def seen_wavelengths(wavelengths, needs):
+def seen_wavelengths(
+    wavelengths: Sequence[float], needs: Needs | None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """(those of `wavelengths` that the scene has light at, those left out); all of them where
     that would leave none.
     """

@@ -25,7 +25,7 @@ from plenocli.forward.propagation.lenslet_fields import LensletFields, PixelEner
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.model import Band, Camera
     from plenocli.forward.propagation.models import Model
     from plenocli.forward.propagation.plan import BandPlan, PifPlan
 
@@ -39,7 +39,7 @@ of it, times the lenslet's diffraction cells (measured, within a factor of 3).
 """
 
 
-def spectral_nodes(band, count):
+def spectral_nodes(band: Band, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths (m, ascending) and shares of the photons (sum 1) that stand for `band`
     (plenocli.forward.camera.model.Band): (count,) each.
     """
@@ -49,7 +49,7 @@ def spectral_nodes(band, count):
 
 
 @lru_cache(maxsize=256)
-def _rule(shape, count):
+def _rule(shape: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes in half widths (at half maximum) and weights of a band's spectral shape."""
     if shape == "box":
         return gauss(count)
@@ -69,7 +69,7 @@ def _rule(shape, count):
 
 
 @lru_cache(maxsize=64)
-def _transform(shape, phase):
+def _transform(shape: str, phase: float) -> tuple[np.ndarray, np.ndarray]:
     """(p, mean of cos(p x) over the band) for 65 phases p up to `phase`."""
     p = np.linspace(0, phase, 65)
     if shape == "box":
@@ -79,7 +79,7 @@ def _transform(shape, phase):
     return p, np.cos(np.outer(p, 2 * BAND_END * t)) @ w / w.sum()
 
 
-def rule_error(shape, count, phase):
+def rule_error(shape: str, count: int, phase: float) -> float:
     """Largest error of the rule for cos(p x), p up to `phase` (rad per half width), relative to
     the band's weight.
     """
@@ -88,7 +88,7 @@ def rule_error(shape, count, phase):
     return float(np.abs(np.cos(np.outer(p, x)) @ w / w.sum() - exact).max())
 
 
-def spectral_error(geometry, band, count, window=None):
+def spectral_error(geometry: Geometry, band: Band, count: int, window: int | None = None) -> float:
     """Estimated relative L2 error of the worst column when `count` wavelengths stand for `band`.
 
     geometry: at the centre;
@@ -109,7 +109,7 @@ def spectral_error(geometry, band, count, window=None):
     )
 
 
-def node_count(geometry, band, accuracy, window=None):
+def node_count(geometry: Geometry, band: Band, accuracy: float, window: int | None = None) -> int:
     """Fewest wavelengths whose spectral_error is at most `accuracy`;
     NumericsError beyond MAX_NODES.
     """

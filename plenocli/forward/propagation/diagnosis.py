@@ -108,13 +108,13 @@ class Spectrum:
         return np.sqrt(np.maximum(values, _RESOLUTION**2 * max(values[0], 0)))
 
 
-def _exchanged(gram, shape):
+def _exchanged(gram: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """The Gram matrix of points (rows, columns) as one of points (columns, rows)."""
     rows, columns = shape
     return gram.reshape(rows, columns, rows, columns).transpose(1, 0, 3, 2).reshape(gram.shape)
 
 
-def _parities(values, axis):
+def _parities(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Parts even and odd under reversal of an axis, in orthonormal coordinates."""
     low, high = np.array_split(values, [(values.shape[axis] + 1) // 2], axis)
     count = high.shape[axis]

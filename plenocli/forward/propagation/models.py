@@ -91,14 +91,14 @@ class Model(ABC):
         return self.lenslets(camera, geometry, plan, band)
 
 
-def _square_only(camera, geometry):
+def _square_only(camera: Camera, geometry: Geometry) -> str | None:
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
         return f"{array.aperture_shape} lenslets on a {array.lattice} lattice are not separable"
     return None
 
 
-def _paraxial_error(camera, geometry):
+def _paraxial_error(camera: Camera, geometry: Geometry) -> float:
     return exact.fresnel_model_error(geometry, camera.lenslet_array.profile == "parabolic")
 
 

@@ -18,6 +18,7 @@ their lower edges.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -39,15 +40,18 @@ from plenocli.forward.propagation.sampling import (
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.propagation.plan import PifPlan
 
+PupilMeasure = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(y, x) (m, broadcasting) -> share of the open aperture at smaller y and smaller x."""
 WORK_CORNERS = 1 << 17
 """Corners of rectangles in a work array: about what a second-level cache holds."""
 FOCUSED = 1e-9
 """An image of a whole pupil smaller than this share of a pixel or a lenslet is a point."""
 
 
-def valid_for(camera, geometry):
+def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """None, or one sentence why rays cannot serve this camera at this geometry."""
     lens = at_wavelength(camera, geometry.wavelength).main_lens
     if lens.wavefront is not None or any(term.noll > 4 for term in lens.aberrations or ()):
@@ -66,7 +70,9 @@ def valid_for(camera, geometry):
     return None
 
 
-def size_band(geometry, superpixels, ring, accuracy, tolerance):
+def size_band(
+    geometry: Geometry, superpixels: tuple[int, int], ring: int, accuracy: float, tolerance: float
+) -> BandPlan:
     """The BandPlan of this rung: no quadrature, every lenslet under the blur of every superpixel
     kept (ring 0: its own only).
     """
@@ -84,7 +90,7 @@ def size_band(geometry, superpixels, ring, accuracy, tolerance):
     )
 
 
-def error_bound(camera, geometry):
+def error_bound(camera: Camera, geometry: Geometry) -> float:
     """Estimated relative L2 error of the worst column against the Fresnel model.
 
     Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2
@@ -129,7 +135,7 @@ def features(
 class RayLenslets(LensletFields):
     """Pixel energies by rays."""
 
-    def __init__(self, camera, geometry, plan, band):
+    def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan) -> None:
         lens = at_wavelength(camera, geometry.wavelength).main_lens
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
         self.eps, *self._tilt = _affine(lens, geometry)
@@ -160,7 +166,9 @@ class RayLenslets(LensletFields):
         """As LensletFields.on_superpixel."""
         return partial(self._energies, self._places[sy, sx])
 
-    def _energies(self, place, rows, columns, out):
+    def _energies(
+        self, place: tuple[float, float], rows: np.ndarray, columns: np.ndarray, out: np.ndarray
+    ) -> None:
         """Pixel energies in the superpixel at `place` (pitches), as PixelEnergies."""
         g = self.geometry
         step = max(1, WORK_CORNERS // (4 * g.pixel_shape[0] * g.pixel_shape[1]))
@@ -180,7 +188,7 @@ class RayLenslets(LensletFields):
                                 rows[part], columns[part], m, n
                             )
 
-    def _edges(self, axis, points, place, m):
+    def _edges(self, axis: int, points: np.ndarray, place: float, m: float) -> np.ndarray:
         """Edges in the pupil of what the pixels of the superpixel at `place` see through the
         lenslet at m (both in pitches): (points, pixels + 1) where pixels touch, else pairs
         (points, 2 x pixels).
@@ -202,7 +210,7 @@ class RayLenslets(LensletFields):
         ]
         return np.clip(self._into_pupil(t, self.slope, FOCUSED * g.pixel_pitch), low, high)[where]
 
-    def _into_pupil(self, position, slope, small):
+    def _into_pupil(self, position: np.ndarray, slope: float, small: float) -> np.ndarray:
         """Pupil coordinates of positions = slope x; where the pupil's image is a point, +-inf
         for positions on either side of it.
         """
@@ -210,7 +218,9 @@ class RayLenslets(LensletFields):
             return position / slope
         return np.where(position <= 0, -np.inf, np.inf)
 
-    def _enters(self, rows, columns, m, n):
+    def _enters(
+        self, rows: np.ndarray, columns: np.ndarray, m: float, n: float
+    ) -> np.ndarray | int:
         """Whether points in focus lie in the opening of lenslet (m, n) where its shape is not
         square: (points, 1, 1).
         """
@@ -228,7 +238,7 @@ class RayLenslets(LensletFields):
         )
         return (far <= g.lenslet_width / 2)[:, None, None]
 
-    def _light(self, y, x):
+    def _light(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Light (points, pixel rows, pixel columns) through rectangles with edges y, x in
         pairs, filters included.
         """
@@ -237,7 +247,7 @@ class RayLenslets(LensletFields):
             total = total + transmittance * self._rectangles(np.clip(y, y0, y1), np.clip(x, x0, x1))
         return total
 
-    def _rectangles(self, y, x):
+    def _rectangles(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Share of the open pupil in the rectangles between edges y and x (points, edges),
         neighbours or pairs: (points, rows, columns).
         """
@@ -250,11 +260,11 @@ class RayLenslets(LensletFields):
         return np.maximum(areas[:, :, ::step], 0)
 
 
-def _lit(edges):
+def _lit(edges: np.ndarray) -> bool:
     return bool((edges != edges[:, :1]).any())
 
 
-def _affine(lens, geometry):
+def _affine(lens: MainLens, geometry: Geometry) -> tuple[float, float, float]:
     """Defocus (1/m) and tilt (rows, columns) of the rays: those of the geometry and of the
     wavefront's Noll terms 2 to 4.
     """
@@ -273,7 +283,7 @@ def _affine(lens, geometry):
 # the pupil as a measure: its share below and left of a corner
 
 
-def pupil_measure(lens):
+def pupil_measure(lens: MainLens) -> PupilMeasure:
     """A function (y, x) -> share of the open aperture at smaller y and smaller x
     (m), broadcasting.
     """
@@ -293,7 +303,7 @@ def pupil_measure(lens):
     )
 
 
-def disc_below(y, x):
+def disc_below(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Area of the part of the unit disc at smaller y and x than given, in closed form;
     y and x broadcast.
 
@@ -309,11 +319,11 @@ def disc_below(y, x):
     return at_x + math.pi / 4 + np.sign(y) * (side + middle)
 
 
-def _cap(x):
+def _cap(x: np.ndarray) -> np.ndarray:
     return (x * np.sqrt((1 - x) * (1 + x)) + np.arcsin(x)) / 2
 
 
-def _image_measure(image, half):
+def _image_measure(image: np.ndarray, half: float) -> PupilMeasure:
     """The measure of an aperture of constant cells: bilinear between the sums up to
     the cells' corners.
     """
@@ -321,7 +331,7 @@ def _image_measure(image, half):
     total = np.zeros((count + 1, count + 1))
     total[1:, 1:] = np.cumsum(np.cumsum(image, axis=0), axis=1) / image.sum()
 
-    def below(y, x):
+    def below(y: np.ndarray, x: np.ndarray) -> np.ndarray:
         y, x = ((np.clip(v / half, -1, 1) + 1) * count / 2 for v in (y, x))
         i, j = (np.minimum(v.astype(int), count - 1) for v in (y, x))
         y, x = y - i, x - j

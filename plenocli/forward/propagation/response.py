@@ -15,7 +15,11 @@ kappa u^2/2|^2 by waves. The fields of different lenslets are added in intensity
 many diffraction cells their interference averages out.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +28,13 @@ from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, aperture_picture, filter_cells, wavefront
 from plenocli.forward.camera.quadrature import cell_chords, gauss, nodes_for
 from plenocli.forward.propagation.rays import pupil_measure
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.propagation.system_matrix import PifBuilder
 
 TAIL = 6
 """Pitches beyond the pupil's image over which the diffraction of neighbouring
@@ -38,8 +49,11 @@ OPENING_STEPS = 8
 are summed over them.
 """
 
+FilterCells = Sequence[tuple[tuple[float, float, float, float], float]]
+"""((y0, y1, x0, x1) in m, transmittance) of the filters in the pupil."""
 
-def valid_for(camera, model):
+
+def valid_for(camera: Camera, model: str) -> str | None:
     """None, or one sentence why `model` ("ray" or "fresnel") has no closed form for this camera."""
     if model == "ray":
         return None
@@ -50,7 +64,9 @@ def valid_for(camera, model):
     return None
 
 
-def uniform_response(camera, wavelength, model, shifts=((0.0, 0.0),)):
+def uniform_response(
+    camera: Camera, wavelength: float, model: str, shifts: ArrayLike = ((0.0, 0.0),)
+) -> np.ndarray:
     """Response (lenslet, pixel) to an even object: mean over object points of what A, all
     superpixels together, gives a pixel.
 
@@ -97,7 +113,7 @@ def uniform_response(camera, wavelength, model, shifts=((0.0, 0.0),)):
     return out.reshape(len(shifts), -1) * scale
 
 
-def field_response(builder):
+def field_response(builder: PifBuilder) -> np.ndarray:
     """Response (superpixel, pixel) to the object points of one lenslet's field alone: mean
     over the columns of A.
 
@@ -111,7 +127,7 @@ def field_response(builder):
     return total / builder.points
 
 
-def own_light(camera, wavelength, count=256):
+def own_light(camera: Camera, wavelength: float, count: int = 256) -> float:
     """Share of a lenslet's light that comes from its own object field, by rays; the rest belongs
     to its neighbours'.
 
@@ -141,7 +157,7 @@ def own_light(camera, wavelength, count=256):
     return float((weight * stay).sum() / weight.sum())
 
 
-def _reach(geometry, model):
+def _reach(geometry: Geometry, model: str) -> int:
     """Lenslets, in pitches, whose light may meet the window of a superpixel."""
     image = geometry.z3 / geometry.z2 * geometry.D1 / 2 + abs(geometry.z3 * geometry.kappa) * max(
         geometry.lenslet_extent
@@ -161,14 +177,14 @@ class RaySpot:
     (odd and even part), in closed form.
     """
 
-    def __init__(self, geometry):
+    def __init__(self, geometry: Geometry) -> None:
         self.half = abs(geometry.z3 * geometry.kappa) * geometry.lenslet_width / 2
 
-    def first(self, s):
+    def first(self, s: np.ndarray) -> np.ndarray:
         """Light below s (m), less one half."""
         return np.clip(s / (2 * self.half), -0.5, 0.5) if self.half else np.sign(s) / 2
 
-    def second(self, s):
+    def second(self, s: np.ndarray) -> np.ndarray:
         """Integral of `first` from 0 to s, m; a constant does not matter."""
         far = np.abs(s)
         return np.where(far < self.half, s * s / (4 * self.half or 1.0), far / 2 - self.half / 4)
@@ -182,7 +198,7 @@ class WaveSpot:
     band, v = lambda z3 f, which Gauss-Legendre gives to rounding; it is tabulated.
     """
 
-    def __init__(self, geometry, reach):
+    def __init__(self, geometry: Geometry, reach: float) -> None:
         from scipy.interpolate import make_interp_spline
 
         width, cell = (
@@ -213,16 +229,16 @@ class WaveSpot:
         self._first = self._second.derivative()
         self.reach = s[-1]
 
-    def first(self, s):
+    def first(self, s: np.ndarray) -> np.ndarray:
         """As RaySpot.first."""
         return np.sign(s) * self._first(np.abs(s))
 
-    def second(self, s):
+    def second(self, s: np.ndarray) -> np.ndarray:
         """As RaySpot.second."""
         return self._second(np.abs(s))
 
 
-def _spot(geometry, model):
+def _spot(geometry: Geometry, model: str) -> RaySpot | WaveSpot:
     if model == "ray":
         return RaySpot(geometry)
     far = (
@@ -233,7 +249,7 @@ def _spot(geometry, model):
     return WaveSpot(geometry, far + (_reach(geometry, model) + 1) * geometry.superpixel_pitch)
 
 
-def _strips(geometry, lens, cells):
+def _strips(geometry: Geometry, lens: MainLens, cells: FilterCells) -> list[tuple]:
     """The pupil as [(weight, top, bottom, left, right)], arrays of m: rectangles, or chords at
     nodes (bottom None, weight times m).
     """
@@ -259,7 +275,14 @@ def _strips(geometry, lens, cells):
     return strips
 
 
-def _through_spot(geometry, spot, strips, edges, which, reach):
+def _through_spot(
+    geometry: Geometry,
+    spot: RaySpot | WaveSpot,
+    strips: list[tuple],
+    edges: list[list[np.ndarray]],
+    which: Sequence[np.ndarray],
+    reach: int,
+) -> np.ndarray:
     """Light (lenslet, pixel row, pixel column) of separable lenslets, times pupil
     area and cell area.
 
@@ -297,7 +320,9 @@ def _through_spot(geometry, spot, strips, edges, which, reach):
     return out * geometry.lenslet_width**2
 
 
-def _summed(integral, t, far, place):
+def _summed(
+    integral: Callable[[np.ndarray], np.ndarray], t: np.ndarray, far: np.ndarray, place: np.ndarray
+) -> np.ndarray:
     """integral(upper edge + place) - integral(lower edge + place), summed over lenslets `far`
     (m) away: (place, pixel) for edges t (2, pixel).
     """
@@ -305,7 +330,13 @@ def _summed(integral, t, far, place):
     return np.subtract(*integral(s[::-1])).sum(axis=1)
 
 
-def _through_opening(geometry, lens, cells, edges, reach):
+def _through_opening(
+    geometry: Geometry,
+    lens: MainLens,
+    cells: FilterCells,
+    edges: tuple[np.ndarray, np.ndarray],
+    reach: int,
+) -> np.ndarray:
     """The same by rays for any pupil and lenslet: exact areas of the pupil, summed over nodes in
     the lenslet's opening.
     """
@@ -341,7 +372,7 @@ def _through_opening(geometry, lens, cells, edges, reach):
     return total * aperture_area(lens)
 
 
-def _opening_nodes(geometry):
+def _opening_nodes(geometry: Geometry) -> list[tuple[float, float, float]]:
     """Nodes (y, x, area) over a lenslet's opening, enough for a spot z3 kappa times
     as large on pixels.
     """
@@ -359,7 +390,7 @@ def _opening_nodes(geometry):
     return [(y, x, weight * scale) for y, x, weight in nodes]
 
 
-def _opening_half(geometry, y):
+def _opening_half(geometry: Geometry, y: float) -> float:
     """Half the width (m) of the opening at height y."""
     half = geometry.lenslet_width / 2
     if geometry.lenslet_shape == "square":
@@ -369,6 +400,6 @@ def _opening_half(geometry, y):
     return min(half, 2 * half - math.sqrt(3) * abs(y))
 
 
-def _opening_area(geometry):
+def _opening_area(geometry: Geometry) -> float:
     side = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(3) / 2}
     return side[geometry.lenslet_shape] * geometry.lenslet_width**2

@@ -6,6 +6,7 @@ Chosen before any work (plenocli.forward.accuracy).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -57,7 +58,7 @@ over the spread function's cut.
 """
 
 
-def window_error(geometry, superpixels, ring):
+def window_error(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
     """Estimated relative error of a column because lenslets beyond the coherent window are left
     out; 0 if ring is 0 by choice.
 
@@ -84,14 +85,14 @@ def window_error(geometry, superpixels, ring):
     )
 
 
-def blur_ring(geometry):
+def blur_ring(geometry: Geometry) -> int:
     """Lenslets that the geometric blur of a point at the lenslet's edge reaches beyond
     its own, per side.
     """
     return math.ceil(geometry.blur / (2 * geometry.D2 * geometry.row_spacing) - 1e-9)
 
 
-def predicted_outside(geometry, ring):
+def predicted_outside(geometry: Geometry, ring: int) -> float:
     """Share of a corner point's light that falls outside a window of (2 ring + 1)^2 lenslets, from
     the asymptotic tail of an in-focus spread function beyond the geometric blur: 2/(pi v), v =
     pi r D1/(lambda z2).
@@ -102,7 +103,7 @@ def predicted_outside(geometry, ring):
     return min(1.0, 2 * geometry.wavelength * geometry.z2 / (math.pi**2 * distance * geometry.D1))
 
 
-def coherent_window(geometry, superpixels, ring):
+def coherent_window(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> int | None:
     """Lenslets |m| <= window (from the object's own) whose fields add, or None for isolated
     lenslets (ring 0).
 
@@ -116,7 +117,14 @@ def coherent_window(geometry, superpixels, ring):
     )
 
 
-def size_band(geometry, superpixels, ring, accuracy, tolerance, dim=False):
+def size_band(
+    geometry: Geometry,
+    superpixels: tuple[int, int],
+    ring: int,
+    accuracy: float,
+    tolerance: float,
+    dim: bool = False,
+) -> BandPlan:
     """Node counts at one wavelength; the phase across a lenslet counts the far edge of the
     outermost superpixel it lights.
 
@@ -175,7 +183,7 @@ def size_band(geometry, superpixels, ring, accuracy, tolerance, dim=False):
     )
 
 
-def is_symmetric(camera):
+def is_symmetric(camera: Camera) -> bool:
     """Whether pupil, filters and wavefront error are mirrored by both axes and the diagonals, as
     the dial counts on.
     """
@@ -197,13 +205,13 @@ def field_features(camera: Camera, geometry: Geometry, band: BandPlan) -> dict[s
     return {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
 
 
-def superpixels_of(count):
+def superpixels_of(count: int) -> tuple[int, int]:
     """(rows, columns) of so many superpixels: a square block, else one row."""
     side = math.isqrt(count)
     return (side, side) if side * side == count else (1, count)
 
 
-def distinct(camera, geometry, shape):
+def distinct(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> tuple[int, int]:
     """What symmetry leaves to compute of a matrix of `shape` (band, superpixel, pixel, point):
     (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
     """
@@ -219,7 +227,7 @@ def distinct(camera, geometry, shape):
         and superpixels[0] == superpixels[1]
     )
 
-    def lines(flip, points, superpixels):
+    def lines(flip: bool, points: int, superpixels: int) -> tuple[int, int]:
         """Of all superpixels of an axis and of the object's own: lines of points to compute."""
         own = (points + 1) // 2 if flip else points
         return own + (superpixels // 2 if flip else superpixels - 1) * points, own
@@ -234,7 +242,14 @@ def distinct(camera, geometry, shape):
 
 
 @lru_cache(maxsize=1024)
-def pixel_nodes(accuracy, own, joint, cells, blur, shares=WHOLE):
+def pixel_nodes(
+    accuracy: float,
+    own: float,
+    joint: float,
+    cells: float,
+    blur: float,
+    shares: tuple[float, float, float] = WHOLE,
+) -> tuple[int, int]:
     """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy` (half, for
     rules that err all over their band), and the step of quadrature.band_rule.
 
@@ -264,7 +279,15 @@ def pixel_nodes(accuracy, own, joint, cells, blur, shares=WHOLE):
 
 
 @lru_cache(maxsize=4096)
-def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
+def pixel_error(
+    count: int,
+    rule: int,
+    own: float,
+    joint: float,
+    cells: float,
+    blur: float,
+    shares: tuple[float, float, float] = WHOLE,
+) -> float:
     """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis,
     at the step `rule` of band_rule.
 
@@ -299,7 +322,7 @@ def pixel_error(count, rule, own, joint, cells, blur, shares=WHOLE):
     return worst
 
 
-def _fringe_errors(count, rule, own, lenslets):
+def _fringe_errors(count: int, rule: int, own: float, lenslets: int) -> Iterator[tuple[int, float]]:
     """(n, the rule's largest error for the fringes of lenslets n apart, weighted with how many
     there are of each frequency) for n from 1 to below `lenslets`, at most MANY of them.
     """
@@ -312,7 +335,7 @@ def _fringe_errors(count, rule, own, lenslets):
     return zip(some.tolist(), errors.tolist())
 
 
-def _patch_error(count, rule, own, cells, blur):
+def _patch_error(count: int, rule: int, own: float, cells: float, blur: float) -> float:
     """Relative error of a column from the evenly lit patch that one lenslet throws: the pupil's
     image, out of focus that part of it, down to one cycle. Its spectrum along an axis falls as
     1/(pi f width) and ends at `own`, in focus smoothly, out of it as the transfer function of a
@@ -333,7 +356,7 @@ def _patch_error(count, rule, own, cells, blur):
     )
 
 
-def rule_error(count, cycles, rule=0):
+def rule_error(count: int, cycles: np.ndarray, rule: int = 0) -> np.ndarray:
     """Error of the rule for cos(2 pi c t) on a unit pixel at each c of `cycles`."""
     t, w = band_rule(count, rule)
     return np.abs(np.cos(np.pi * np.outer(cycles, t)) @ w / 2 - np.sinc(cycles))

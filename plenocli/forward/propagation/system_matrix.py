@@ -282,7 +282,7 @@ class PifBuilder:
         """A of one superpixel (pixel, point) by rows and columns of both: a view."""
         return slab.reshape(*self.pixel_shape, *self.object_shape)
 
-    def _seeds(self):
+    def _seeds(self) -> np.ndarray:
         """One flat index of each set of points that the symmetry maps onto each
         other, columns together.
         """
@@ -299,7 +299,7 @@ class PifBuilder:
         flat, shared = (i * columns + j)[keep], self.lenslets.shared_axis
         return flat[np.argsort(flat % columns if shared else flat // columns, kind="stable")]
 
-    def _orbit(self, points, images):
+    def _orbit(self, points: np.ndarray, images: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """(points, images) and their mirror images under the symmetry;
 
         images: (point, sy, sx, py, px).
@@ -322,7 +322,7 @@ class PifBuilder:
             ]
         return found
 
-    def _images(self, points):
+    def _images(self, points: np.ndarray) -> np.ndarray:
         ry, rx = self.plan.superpixels
         out = np.empty((len(points), ry, rx, *self.pixel_shape), self.dtype)
         rows, columns = points // self.object_shape[1], points % self.object_shape[1]
@@ -330,10 +330,10 @@ class PifBuilder:
         self._guard(rows, columns, out)
         return out
 
-    def _flat(self, images):
+    def _flat(self, images: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(images).reshape(len(images), *self.shape)
 
-    def _guard(self, rows, columns, out):
+    def _guard(self, rows: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
         self.require_light(
             out.sum(axis=(1, 2, 3, 4), dtype=float),
             self.lenslets.incident(rows, columns),

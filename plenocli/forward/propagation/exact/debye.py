@@ -17,7 +17,10 @@ eps: that wave differs from the one towards the array by the path sqrt(z2^2 + r^
 sqrt(z2'^2 + r^2) + z2'.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,16 +30,22 @@ from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import hankel_series, is_radial, radial_field
 from plenocli.forward.propagation.fresnel.spread_function import mirrored
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera, MainLens
+
 APODISATION = {
     "uniform-pupil": lambda cos2: 1 / cos2,
     "aplanatic": lambda cos2: cos2**-0.25,
     "uniform-sine": np.ones_like,
 }
-SLAB = 1 << 21
+TRANSFORM_VALUES = 1 << 21
 """Numbers in a slab of pupil nodes x field points."""
 
 
-def spherical_field(camera, geometry, dy, dx):
+def spherical_field(
+    camera: Camera, geometry: Geometry, dy: np.ndarray, dx: np.ndarray
+) -> np.ndarray:
     """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: (len(dy),
     len(dx)), real where a radial pupil makes it so.
 
@@ -57,7 +66,7 @@ def spherical_field(camera, geometry, dy, dx):
     return total / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
 
 
-def spherical_profile(camera, geometry, reach):
+def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
     """As radial.profile: Chebyshev coefficients of h in 2 |d|^2/reach^2 - 1, |d| <= reach (m)."""
     g, lens = geometry, camera.main_lens
     outer = lens.aperture_diameter / 2
@@ -84,7 +93,7 @@ def spherical_profile(camera, geometry, reach):
     )
 
 
-def defocus_path(geometry, r2):
+def defocus_path(geometry: Geometry, r2: np.ndarray) -> np.ndarray:
     """Path (m) by which a wave towards the object's image is ahead of one towards the array at
     squared pupil radius r2 (m^2).
     """
@@ -94,7 +103,14 @@ def defocus_path(geometry, r2):
     )
 
 
-def _transform(y, x, weight, rate, dy, dx):
+def _transform(
+    y: np.ndarray,
+    x: np.ndarray,
+    weight: np.ndarray,
+    rate: np.ndarray,
+    dy: np.ndarray,
+    dx: np.ndarray,
+) -> np.ndarray:
     """sum of weight exp(-j rate (y dy + x dx)) over one panel of the pupil, by parts even
     and odd in dy and dx.
     """
@@ -108,7 +124,7 @@ def _transform(y, x, weight, rate, dy, dx):
         weight = weight.real
     rows, columns = len(dy) // 2, len(dx) // 2
     parts = np.zeros((2, 2, rows, columns), weight.dtype)
-    step = max(1, SLAB // (rows + columns))
+    step = max(1, TRANSFORM_VALUES // (rows + columns))
     for start in range(0, len(weight), step):
         some = slice(start, start + step)
         py, px = np.outer(dy[rows:], y[some]), np.outer(dx[columns:], x[some])
@@ -126,7 +142,7 @@ def _transform(y, x, weight, rate, dy, dx):
     return np.block(quadrants)
 
 
-def _folded(a, axis, weight):
+def _folded(a: np.ndarray, axis: int, weight: bool) -> np.ndarray:
     """The half of a mirror-symmetric array from its middle on; weights count twice but on
     the middle itself.
     """
@@ -139,7 +155,7 @@ def _folded(a, axis, weight):
     return half
 
 
-def _times_transposed(a, b):
+def _times_transposed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a b^T for a real a and a real or complex b."""
     if not np.iscomplexobj(b):
         return a @ b.T
@@ -148,7 +164,7 @@ def _times_transposed(a, b):
     return out
 
 
-def _aperture_norm(lens, geometry):
+def _aperture_norm(lens: MainLens, geometry: Geometry) -> float:
     """Integral of a(s)^2 d^2 s over the open aperture P1, filters not counted."""
     radius, shade = lens.aperture_diameter / 2, APODISATION[lens.apodisation]
     t, w = gauss(64)

@@ -10,8 +10,12 @@ on the superpixel is X (C (x) S) X'^T,
 Every pair of a lenslet and a superpixel has functions of its own, as many as its light needs.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,11 +24,16 @@ from plenocli.forward.propagation.exact.low_rank_product import thin
 from plenocli.forward.propagation.exact.residual import Residual, path, split
 from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
-SLAB = 256
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.propagation.exact.low_rank_product import Matrix
+    from plenocli.forward.propagation.fresnel.spread_function import SeparableField
+
+ROWS_AT_ONCE = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
 
 
-class Way:
+class SensorSide:
     """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m,
     from its centre) and the roots of their weights;
 
@@ -34,7 +43,15 @@ class Way:
     faint: root of the faintest point's light over the brightest's.
     """
 
-    def __init__(self, u, root, points, emphasis, modes=None, faint=1.0):
+    def __init__(
+        self,
+        u: np.ndarray,
+        root: np.ndarray,
+        points: np.ndarray,
+        emphasis: np.ndarray,
+        modes: np.ndarray | None = None,
+        faint: float = 1.0,
+    ) -> None:
         self.u, self.root, self.points, self.emphasis, self.modes, self.faint = (
             u,
             root,
@@ -45,11 +62,11 @@ class Way:
         )
 
     @property
-    def lines(self):
+    def lines(self) -> int:
         """How many numbers carry the field of one point."""
         return len(self.u if self.modes is None else self.modes)
 
-    def carry(self, wave):
+    def carry(self, wave: np.ndarray) -> np.ndarray:
         """A kernel (nodes, x), roots of weights folded in, as (lines, x)."""
         real = wave.real.dtype
         return (
@@ -69,8 +86,19 @@ class Interval:
     tolerance: root energy by which the field may miss.
     """
 
-    def __init__(self, geometry, field, axis, s, m, way, parabolic, tolerance, dtype):
-        self.geometry, self.way, self.parabolic, self.dtype = geometry, way, parabolic, dtype
+    def __init__(
+        self,
+        geometry: Geometry,
+        field: SeparableField,
+        axis: int,
+        s: int,
+        m: int,
+        side: SensorSide,
+        parabolic: bool,
+        tolerance: float,
+        dtype: np.dtype,
+    ) -> None:
+        self.geometry, self.side, self.parabolic, self.dtype = geometry, side, parabolic, dtype
         g = geometry
         half = g.lenslet_width / 2
         self.offset = s * g.superpixel_pitch - m * g.D2
@@ -85,51 +113,57 @@ class Interval:
             min(m * g.D2 + reach, field.half),
             tolerance,
         )
-        values = self.terms.evaluate(self.place[:, None] - way.points) * way.emphasis[:, None]
+        values = self.terms.evaluate(self.place[:, None] - side.points) * side.emphasis[:, None]
         self.values = values.astype(dtype if np.iscomplexobj(values) else dtype.type().real.dtype)
 
-    def _slope(self, middle, half):
+    def _slope(self, middle: float, half: float) -> float:
         """Largest slope (rad/m) of the integrand's phase: of the way to either end of the
         superpixel, the lens and the main lens's wave.
         """
         g, x = self.geometry, half * np.linspace(-1, 1, 17)
-        d = self.offset + np.array([[self.way.u.min()], [self.way.u.max()]]) - x
+        d = self.offset + np.array([[self.side.u.min()], [self.side.u.max()]]) - x
         bend = x / g.f2 if self.parabolic else x / np.hypot(x, g.f2)
         return g.k * (
             np.abs(d / np.hypot(d, g.z3) + bend - (middle + x) / g.z2).max() + g.D1 / (2 * g.z2)
         )
 
-    def wave(self, other):
+    def wave(self, other: float) -> np.ndarray:
         """W (u, x) towards superpixels displaced by `other` (m) along the other axis."""
-        g, u = self.geometry, self.way.u
+        g, u = self.geometry, self.side.u
         phase = (
             path(self.offset + u[:, None] - self.x, g.z3, self.offset, other)
             - path(u, g.z3)[:, None]
             + self.place**2 / (2 * g.z2)
         )
         phase = phase - (self.x**2 / (2 * g.f2) if self.parabolic else path(self.x, g.f2))
-        return (self.way.root[:, None] * self.w / math.sqrt(g.wavelength * g.z3)) * np.exp(
+        return (self.side.root[:, None] * self.w / math.sqrt(g.wavelength * g.z3)) * np.exp(
             1j * g.k * phase
         )
 
     @cached_property
-    def gram(self):
+    def gram(self) -> np.ndarray:
         """Overlaps, for a mean point, of what each term alone brings to the superpixel through
         the separable part: (term, term).
         """
         sheet = _times(
-            self.way.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)
+            self.side.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)
         ).reshape(-1, self.values.shape[2])
-        gram = (sheet.conj().T @ sheet).astype(complex) / len(self.way.points)
+        gram = (sheet.conj().T @ sheet).astype(complex) / len(self.side.points)
         return gram if np.iscomplexobj(self.values) else gram.real
 
     @cached_property
-    def weigh(self):
+    def weigh(self) -> np.ndarray:
         """R with R^H R = gram."""
         values, vectors = np.linalg.eigh(self.gram)
         return np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
 
-    def sheet(self, other, functions, mixing, kept):
+    def sheet(
+        self,
+        other: float,
+        functions: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        mixing: np.ndarray,
+        kept: tuple[np.ndarray, ...],
+    ) -> np.ndarray:
         """X for the pairs kept = (r, i) of `functions`(u, x) -> (r, u, x) and the columns i of
         `mixing`, terms of this interval: (lines of the sensor x points, kept).
         """
@@ -137,13 +171,13 @@ class Interval:
         values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(
             *self.values.shape[:2], -1
         )
-        out = np.empty((self.way.lines, len(self.way.points), len(kept_r)), self.dtype)
-        for r, term in enumerate(functions(self.way.u, self.x)):
+        out = np.empty((self.side.lines, len(self.side.points), len(kept_r)), self.dtype)
+        for r, term in enumerate(functions(self.side.u, self.x)):
             some = np.flatnonzero(kept_r == r)
             if len(some):
                 flat = values[:, :, kept_i[some]].reshape(len(self.x), -1)
                 out[:, :, some[0] : some[-1] + 1] = _times(
-                    self.way.carry((wave * term).astype(self.dtype)), flat
+                    self.side.carry((wave * term).astype(self.dtype)), flat
                 ).reshape(len(out), -1, len(some))
         return out.reshape(len(out) * out.shape[1], -1)
 
@@ -154,12 +188,12 @@ class Pair:
     weight: root energy of a mean point's field there, by the separable part alone.
     """
 
-    def __init__(self, row, column, symmetric):
+    def __init__(self, row: Interval, column: Interval, symmetric: bool) -> None:
         self.row, self.column, self.symmetric = row, column, symmetric
         self._field = row.terms.coefficients(0) @ column.terms.coefficients(1).T
         self.weight = float(np.linalg.norm(row.weigh @ self._field @ column.weigh.T))
 
-    def factors(self, reach, tolerance):
+    def factors(self, reach: float, tolerance: float) -> tuple[np.ndarray, np.ndarray, Matrix]:
         """(X, X', K) with the field X K X'^T up to about `tolerance` (root energy of a mean point);
         X' is X where symmetric.
 
@@ -196,18 +230,18 @@ class Pair:
         )
         # now that it is seen what each term brings: residuals send light where the
         # separable part does not
-        brings = [_energy(x) / len(self.row.way.points)]
-        brings += brings if self.symmetric else [_energy(y) / len(self.column.way.points)]
+        brings = [_energy(x) / len(self.row.side.points)]
+        brings += brings if self.symmetric else [_energy(y) / len(self.column.side.points)]
         (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 4)
         x, coupling = x[:, some], coupling[np.ix_(some, some)]
         return x, x if self.symmetric else y[:, some], coupling
 
-    def _terms(self, tolerance):
+    def _terms(self, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(A, K, B): A K B^T are the terms S of the main lens's field, but for what does not
         reach the superpixel.
         """
         if self.symmetric:
-            return split(self._field, tolerance * self.row.way.faint, symmetric=True)
+            return split(self._field, tolerance * self.row.side.faint, symmetric=True)
         rows, columns = self.row.weigh, self.column.weigh
         u, s, v = split(rows @ self._field @ columns.T, tolerance)
         s = np.maximum(np.diag(s), np.finfo(float).tiny)  # no light passes a shut filter
@@ -219,7 +253,7 @@ class Pair:
         )
 
 
-def _coupled(core, field, kept):
+def _coupled(core: Matrix, field: Matrix, kept: Sequence[tuple[np.ndarray, ...]]) -> Matrix:
     """core[r, s] field[i, j] for the pairs kept = ((r, i), (s, j)): an array, or
     sparse where both are.
     """
@@ -231,32 +265,36 @@ def _coupled(core, field, kept):
         return sparse.csr_array(whole)[r * field.shape[0] + i][:, s * field.shape[1] + j]
     core, field = (a.toarray() if sparse.issparse(a) else a for a in (core, field))
     out = core[r[:, None], s]
-    for start in range(0, len(out), SLAB):  # the largest array there is, no second one beside it
-        out[start : start + SLAB] *= field[i[start : start + SLAB, None], j]
+    for start in range(
+        0, len(out), ROWS_AT_ONCE
+    ):  # the largest array there is, no second one beside it
+        out[start : start + ROWS_AT_ONCE] *= field[i[start : start + ROWS_AT_ONCE, None], j]
     return out
 
 
-def _weighed(coupling, power):
+def _weighed(coupling: Matrix, power: np.ndarray) -> np.ndarray:
     """|coupling|^2 @ power, with no second array of that size."""
-    parts = range(0, coupling.shape[0], SLAB)
-    return np.concatenate([abs(coupling[start : start + SLAB]) ** 2 @ power for start in parts])
+    parts = range(0, coupling.shape[0], ROWS_AT_ONCE)
+    return np.concatenate(
+        [abs(coupling[start : start + ROWS_AT_ONCE]) ** 2 @ power for start in parts]
+    )
 
 
-def _norms(interval, mixing):
+def _norms(interval: Interval, mixing: np.ndarray) -> np.ndarray:
     """Energy, for a mean point, that each column of `mixing` brings to the superpixel."""
     return (np.abs(interval.weigh @ mixing) ** 2).sum(axis=0)
 
 
-def _energy(columns):
+def _energy(columns: np.ndarray) -> np.ndarray:
     """Sum of squares of each column of a complex matrix: (columns,)."""
     total = np.zeros(2 * columns.shape[1])
-    for start in range(0, len(columns), SLAB):
-        parts = columns[start : start + SLAB].view(columns.real.dtype)
+    for start in range(0, len(columns), ROWS_AT_ONCE):
+        parts = columns[start : start + ROWS_AT_ONCE].view(columns.real.dtype)
         total += np.einsum("ij,ij->j", parts, parts)
     return total.reshape(-1, 2).sum(axis=1)
 
 
-def _strong(power, tolerance):
+def _strong(power: np.ndarray, tolerance: float) -> tuple[np.ndarray, ...]:
     """Indices (r, i) of all entries of `power` but the weakest, which together are
     at most tolerance^2.
     """
@@ -272,7 +310,9 @@ class LocalTerms:
     `tolerance` of the whole field.
     """
 
-    def __init__(self, field, axis, low, high, tolerance):
+    def __init__(
+        self, field: SeparableField, axis: int, low: float, high: float, tolerance: float
+    ) -> None:
         self.middle, self.half = (low + high) / 2, (high - low) / 2
         count = max(
             8, int(len(field.rows) * (2 if field.even else 1) * self.half / field.half) + 24
@@ -289,17 +329,17 @@ class LocalTerms:
             basis / root
         )
 
-    def coefficients(self, axis):
+    def coefficients(self, axis: int) -> np.ndarray:
         """(i, term): the terms of h along `axis` in this basis."""
         return self._mixing[axis]
 
-    def evaluate(self, d):
+    def evaluate(self, d: np.ndarray) -> np.ndarray:
         """e_i at d (m): d.shape + (i,), the same for both axes."""
         t = (np.asarray(d, float).ravel() - self.middle) / self.half
         return (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
 
 
-def field_norms(field, axis):
+def field_norms(field: SeparableField, axis: int) -> np.ndarray:
     """Root energy of each term of h along one axis: (terms,)."""
     coefficients = field.columns if axis else field.rows
     degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
@@ -308,7 +348,7 @@ def field_norms(field, axis):
     )
 
 
-def _times(kernel, values):
+def _times(kernel: np.ndarray, values: np.ndarray) -> np.ndarray:
     """kernel @ values for a complex kernel and real or complex values of the same precision."""
     if np.iscomplexobj(values):
         return kernel @ values

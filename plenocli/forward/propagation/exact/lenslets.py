@@ -14,14 +14,18 @@ own rank (optics.product): what is left are factor tables as the paraxial rung h
 them (optics.factors).
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
-from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, Way
+from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, SensorSide
 from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
@@ -45,6 +49,11 @@ from plenocli.forward.propagation.lenslet_fields import (
 )
 from plenocli.forward.propagation.sampling import size_band
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import PifPlan
+
 CUT, CUT_EFFECT = 0.42, 1.3
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column
 over itself (measured: 0.5 to 2.3).
@@ -62,7 +71,9 @@ GAPS = 3.0
 """By how much finer fields are cut where lenslets leave gaps."""
 
 
-def exact_band(geometry, superpixels, ring, accuracy, tolerance):
+def exact_band(
+    geometry: Geometry, superpixels: tuple[int, int], ring: int, accuracy: float, tolerance: float
+) -> ExactBand:
     """The ExactBand of Geometry `view` for `grid` superpixels (rows, columns), coherent ring and
     accuracy as in size_band.
 
@@ -93,12 +104,12 @@ def exact_band(geometry, superpixels, ring, accuracy, tolerance):
     )
 
 
-def _extent(geometry, pixels):
+def _extent(geometry: Geometry, pixels: int) -> float:
     """Half width (m) of a superpixel of so many pixels, wherever the raster puts it."""
     return (pixels + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2
 
 
-def _bandwidth(geometry, superpixels):
+def _bandwidth(geometry: Geometry, superpixels: tuple[int, int]) -> float:
     """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that
     of its middle's path taken out, among `grid` superpixels: steeper rays come from no point of the
     lenslet. Up to 5 % are added for slopes that change on the way: without them, prolate functions
@@ -113,7 +124,7 @@ def _bandwidth(geometry, superpixels):
     return geometry.k * source * reach / geometry.z3 * (1 + min(0.05, bent))
 
 
-def valid_for(camera, geometry):
+def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """None, or one sentence why this rung cannot serve `camera` at the Geometry `view`."""
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
@@ -129,7 +140,7 @@ def valid_for(camera, geometry):
     return None
 
 
-def fresnel_model_error(geometry, parabolic):
+def fresnel_model_error(geometry: Geometry, parabolic: bool) -> float:
     """Estimated relative L2 error of the worst column of the paraxial model against the exact one.
 
     Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P =
@@ -159,7 +170,7 @@ def fresnel_model_error(geometry, parabolic):
 class ExactSquareLenslets(LensletFields):
     """Sensor fields behind square lenslets by the exact kernel; see the module."""
 
-    def __init__(self, camera, geometry, plan, band):
+    def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: ExactBand) -> None:
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
@@ -168,7 +179,7 @@ class ExactSquareLenslets(LensletFields):
             [_extent(geometry, n) for n in geometry.pixel_shape],
             _bandwidth(geometry, plan.superpixels),
         )
-        self._ways, self._intervals = {}, {}
+        self._sensor_sides, self._intervals = {}, {}
         self._tables, counts = {}, []
         for sy, sx in self._pairs():
             self._tables[sy, sx], products = self._compressed(sy, sx)
@@ -181,7 +192,7 @@ class ExactSquareLenslets(LensletFields):
             products=max(counts),
         )
 
-    def _illuminate(self, camera, tolerance):
+    def _illuminate(self, camera: Camera, tolerance: float) -> None:
         """The main lens's field, its symmetries, and the light of points that enters, down to
         that of the faintest point.
         """
@@ -208,38 +219,38 @@ class ExactSquareLenslets(LensletFields):
 
     # which lenslets light which superpixels
 
-    def _reach(self, axis):
+    def _reach(self, axis: int) -> int:
         return (self.superpixels[axis] - 1) // 2
 
-    def _lenslets(self, s, axis):
+    def _lenslets(self, s: int, axis: int) -> Sequence[int]:
         """Lenslets along one axis whose light is followed to superpixel s."""
         window = self.band.window
         return [s] if window is None else lit_lenslets(self._reach(axis), window)
 
-    def _pairs(self):
+    def _pairs(self) -> list[tuple[int, int]]:
         """Superpixels (rows, columns) whose tables are made; the others' follow by symmetry."""
         ry, rx = (self._reach(axis) for axis in (0, 1))
         return sorted(
             {self._canonical(sy, sx)[:2] for sy in range(-ry, ry + 1) for sx in range(-rx, rx + 1)}
         )
 
-    def _canonical(self, sy, sx):
+    def _canonical(self, sy: int, sx: int) -> tuple[int, int, bool]:
         sy, sx = abs(sy) if self.symmetry[0] else sy, abs(sx) if self.symmetry[1] else sx
         turned = self._turn and sy < sx
         return (sx, sy, True) if turned else (sy, sx, False)
 
     # one axis
 
-    def _points(self, s, axis):
+    def _points(self, s: int, axis: int) -> np.ndarray:
         """Object points (m, on the array) along one axis that are computed for superpixel s; the
         others mirror them.
         """
         points = self.geometry.points(axis)
         return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
 
-    def _way(self, s, axis):
-        """The Way to superpixel s."""
-        if (s, axis) not in self._ways:
+    def _sensor_side(self, s: int, axis: int) -> SensorSide:
+        """The SensorSide of superpixel s."""
+        if (s, axis) not in self._sensor_sides:
             g = self.geometry
             modes, count, phase = None, self.band.sensor_count, self._bandwidth
             if count:
@@ -257,10 +268,12 @@ class ExactSquareLenslets(LensletFields):
             if self._faint < 1:
                 light = self._entering.max(axis=1 - axis)[: len(points)] / self._entering.max()
                 emphasis = np.maximum(emphasis, 1 / np.sqrt(np.maximum(light, LEAST)))
-            self._ways[s, axis] = Way(u, np.sqrt(w), points, emphasis, modes, self._faint)
-        return self._ways[s, axis]
+            self._sensor_sides[s, axis] = SensorSide(
+                u, np.sqrt(w), points, emphasis, modes, self._faint
+            )
+        return self._sensor_sides[s, axis]
 
-    def _interval(self, s, m, axis):
+    def _interval(self, s: int, m: int, axis: int) -> Interval:
         axis = 0 if self._turn else axis
         if (s, m, axis) not in self._intervals:
             self._intervals[s, m, axis] = Interval(
@@ -269,14 +282,14 @@ class ExactSquareLenslets(LensletFields):
                 axis,
                 s,
                 m,
-                self._way(s, axis),
+                self._sensor_side(s, axis),
                 self._parabolic,
                 self.band.cut / 3 * self._faint,
                 self.dtype,
             )
         return self._intervals[s, m, axis]
 
-    def _light(self):
+    def _light(self) -> np.ndarray:
         """Share of the light of a point (row, column) that enters the lenslets of
         the neighbourhood.
         """
@@ -285,7 +298,7 @@ class ExactSquareLenslets(LensletFields):
         columns = rows * np.outer(signs, signs) if alike else self._gram(1)
         return (rows.reshape(len(rows), -1) @ columns.reshape(len(columns), -1).T).real
 
-    def _gram(self, axis):
+    def _gram(self, axis: int) -> np.ndarray:
         """(point, term, term): overlaps of the terms of h over the lenslets."""
         g, total, points = self.geometry, 0, self._points(0, axis)
         half = g.lenslet_width / 2
@@ -299,7 +312,7 @@ class ExactSquareLenslets(LensletFields):
 
     # products of two axes
 
-    def _compressed(self, sy, sx):
+    def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
         """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
         cut, symmetric = self.band.cut, self._turn and sy == sx
         pairs = {
@@ -349,26 +362,28 @@ class ExactSquareLenslets(LensletFields):
             self.band.pixel_nodes,
         ), products
 
-    def _expected_rank(self, sy, sx):
+    def _expected_rank(self, sy: int, sx: int) -> float:
         return field_rank(self.geometry, self.band, self._parabolic, (sy != 0) + (sx != 0))
 
-    def _to_pixels(self, factor, s, axis):
+    def _to_pixels(self, factor: np.ndarray, s: int, axis: int) -> np.ndarray:
         """(lines of the sensor x points, terms) to (points, pixel nodes, terms)."""
-        g, way = self.geometry, self._way(s, axis)
+        g, side = self.geometry, self._sensor_side(s, axis)
         real = factor.real.dtype
-        factor = factor.reshape(way.lines, len(way.points), -1) / way.emphasis.astype(real)[:, None]
+        factor = (
+            factor.reshape(side.lines, len(side.points), -1) / side.emphasis.astype(real)[:, None]
+        )
         factor = factor.view(real).transpose(1, 0, 2)
-        if way.modes is not None:
+        if side.modes is not None:
             v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
             matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(
-                v.ravel() / self._extent[axis], self._bandwidth, way.lines
+                v.ravel() / self._extent[axis], self._bandwidth, side.lines
             )
             factor = matrix.astype(real) @ factor
         return np.ascontiguousarray(factor).view(self.dtype)
 
     # what the builder asks for
 
-    def incident(self, rows, columns):
+    def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
         neighbourhood: (points,).
         """
@@ -379,7 +394,9 @@ class ExactSquareLenslets(LensletFields):
         """As LensletFields.on_superpixel."""
         return partial(self._energies, sy, sx)
 
-    def _energies(self, sy, sx, rows, columns, out):
+    def _energies(
+        self, sy: int, sx: int, rows: np.ndarray, columns: np.ndarray, out: np.ndarray
+    ) -> None:
         """As PixelEnergies; mirrored points and superpixels are computed as their mirror
         images.
         """

@@ -7,10 +7,20 @@ core, whose singular values say where to cut. Where factors have many more terms
 combinations of both rows and columns show first how many of them it takes, and which.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+    Matrix = np.ndarray | csr_array
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
@@ -32,13 +42,19 @@ class Product:
     symmetric: whether M^T = M, with the same factors on both sides.
     """
 
-    def __init__(self, left, right, couplings, symmetric):
+    def __init__(
+        self,
+        left: list[np.ndarray],
+        right: list[np.ndarray],
+        couplings: Mapping[tuple[int, int], Matrix],
+        symmetric: bool,
+    ) -> None:
         self.left, self.right = left, right
         self.couplings, self.symmetric = {key: thin(k) for key, k in couplings.items()}, symmetric
         self.limit = min(len(left[0]), len(right[0]))
         self.rng = np.random.default_rng(20130701)
 
-    def _through(self, side, blocks):
+    def _through(self, side: int, blocks: list[np.ndarray]) -> list[np.ndarray]:
         """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t)
         for this side's (0 left, 1 right).
         """
@@ -52,7 +68,7 @@ class Product:
             for b in range(len(self.right))
         ]
 
-    def _times(self, side, seen):
+    def _times(self, side: int, seen: list[np.ndarray]) -> np.ndarray:
         """M (side 0) or M^T (1) times combinations of its columns, given as what the other
         side's factors make of them: (rows, combinations).
         """
@@ -62,7 +78,7 @@ class Product:
             _add_product(out, x, y)
         return out
 
-    def _mixed(self, side, count):
+    def _mixed(self, side: int, count: int) -> list[np.ndarray]:
         """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of
         rows, every one of which goes into one of them.
         """
@@ -77,7 +93,7 @@ class Product:
         combine = sparse.csr_array((signs, (np.arange(rows) % count, order)), (count, rows))
         return [(combine @ x).T for x in factors]
 
-    def _through_basis(self, q):
+    def _through_basis(self, q: np.ndarray) -> list[np.ndarray]:
         """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is
         symmetric, else M^T q* alone.
         """
@@ -85,7 +101,9 @@ class Product:
         seen = [x.T @ turned for x in self.left]
         return seen if self.symmetric else [self._times(1, seen)]
 
-    def _extend(self, q, seen, count):
+    def _extend(
+        self, q: np.ndarray | None, seen: list[np.ndarray] | None, count: int
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
         is seen of M through it.
         """
@@ -102,14 +120,14 @@ class Product:
             np.hstack(pair) for pair in zip(seen, self._through_basis(new))
         ]
 
-    def _core(self, q, seen):
+    def _core(self, q: np.ndarray, seen: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
         if self.symmetric:
             return q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
         p, triangle = _triangle(seen[0])
         return p, triangle.T
 
-    def factors(self, cut, count):
+    def factors(self, cut: float, count: int) -> tuple[np.ndarray, np.ndarray]:
         """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of
         `count` columns or more.
 
@@ -136,7 +154,7 @@ class Product:
                 )
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
 
-    def narrowed(self, cut):
+    def narrowed(self, cut: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than
         M's factors have terms, X orthonormal and Y = X where M is symmetric; or None: M does not
         have so few terms, or its factors have few enough.
@@ -155,7 +173,7 @@ class Product:
         )
         return (x, y, core) if self._missed(x, core, y) <= 2 * cut else None
 
-    def _directions(self, cut, count):
+    def _directions(self, cut: float, count: int) -> tuple[list[np.ndarray], int]:
         """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each
         factor, and the terms that M has; no more than `count` of either. Found where M is small:
         through random combinations of its rows and of its columns, OVER times as many.
@@ -178,7 +196,7 @@ class Product:
         basis = basis @ vh[: int(terms / FILL) + 8].conj().T
         return [m @ basis for m in right], terms
 
-    def _missed(self, x, core, y):
+    def _missed(self, x: np.ndarray, core: np.ndarray, y: np.ndarray) -> float:
         """Root sum of squares of M - X K Y^T, estimated on random entries."""
         rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
         exact = sum(
@@ -189,7 +207,7 @@ class Product:
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
 
 
-def _add_product(out, x, y):
+def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
     """out += x @ y, all row by row in memory, without an array between."""
     from scipy.linalg.blas import get_blas_funcs
 
@@ -200,7 +218,7 @@ def _add_product(out, x, y):
         out[:] = done.T
 
 
-def thin(matrix):
+def thin(matrix: np.ndarray) -> Matrix:
     """The matrix with its entries below rounding left out, sparse where few are left: couplings
     of singular vectors are all but diagonal.
     """
@@ -217,12 +235,12 @@ def thin(matrix):
     )
 
 
-def orthonormal(columns):
+def orthonormal(columns: np.ndarray) -> np.ndarray:
     """An orthonormal basis of the columns."""
     return _triangle(columns)[0]
 
 
-def _triangle(columns):
+def _triangle(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(Q, R) with columns = Q R, Q orthonormal, R triangular."""
     from scipy.linalg import qr
 

@@ -8,6 +8,8 @@ coefficients are the eigenvectors of a tridiagonal matrix (Xiao, Rokhlin and Yar
 Problems 17, 2001).
 """
 
+from __future__ import annotations
+
 import math
 from functools import lru_cache
 
@@ -16,7 +18,7 @@ import numpy as np
 from plenocli.forward.propagation.fresnel.spread_function import legendre
 
 
-def prolate_count(c, error):
+def prolate_count(c: float, error: float) -> int:
     """How many prolate functions leave no more than about `error` (root mean square over t and over
     a) of exp(j a t), |a| <= c: the law of Landau and Widom (Journal of Mathematical Analysis and
     Applications 77, 1980), fitted from c = 0.01 to 1000.
@@ -26,7 +28,7 @@ def prolate_count(c, error):
     )
 
 
-def prolate(t, c, count):
+def prolate(t: np.ndarray, c: float, count: int) -> np.ndarray:
     """The first `count` prolate functions of bandwidth c at t in [-1, 1]: (len(t), count),
     orthonormal over [-1, 1].
     """
@@ -35,7 +37,7 @@ def prolate(t, c, count):
 
 
 @lru_cache(maxsize=2)
-def _series(c, count):
+def _series(c: float, count: int) -> np.ndarray:
     """Legendre coefficients (degrees, count) of the first `count` prolate functions."""
     from scipy.linalg import eigh_tridiagonal
 

@@ -15,13 +15,20 @@ profile leaves an ell(y, x) of the same form. Their product on all displacements
     kappa(dy, dx) ell(y, x) = sum_rs P_r(u_y, y) C_rs Q_s(u_x, x).
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
+AxisFunctions = Callable[[np.ndarray], np.ndarray]
+"""Values (place, term) at places (m, or shares of a half width) along one axis."""
 
-def path(d, z, own=0.0, other=0.0):
+
+def path(d: np.ndarray, z: float, own: float = 0.0, other: float = 0.0) -> np.ndarray:
     """One axis's part of R - z at displacements d (m) about the centre (own, other) of both axes,
     without cancellation.
 
@@ -34,7 +41,9 @@ def path(d, z, own=0.0, other=0.0):
     ) / (2 * (middle + z))
 
 
-def kappa(dy, dx, z, k, centre=(0.0, 0.0)):
+def kappa(
+    dy: np.ndarray, dx: np.ndarray, z: float, k: float, centre: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
     """The residual of the kernel at displacements dy, dx (m) over the distance z
     (m), about `centre`.
     """
@@ -48,7 +57,7 @@ def kappa(dy, dx, z, k, centre=(0.0, 0.0)):
     return np.exp(1j * k * psi) * (z / r) ** 2 * (1 + 1j / (k * r))
 
 
-def ell(y, x, f, k):
+def ell(y: np.ndarray, x: np.ndarray, f: float, k: float) -> np.ndarray:
     """The residual of a hyperbolic lens of focal length f (m) at (y, x) from its centre."""
     q = y * y + x * x
     r = np.sqrt(f * f + q) + f
@@ -69,7 +78,17 @@ class Residual:
     core: C.
     """
 
-    def __init__(self, centre, reach_u, reach_x, z, k, f, tolerance, symmetric=False):
+    def __init__(
+        self,
+        centre: tuple[float, float],
+        reach_u: float,
+        reach_x: float,
+        z: float,
+        k: float,
+        f: float | None,
+        tolerance: float,
+        symmetric: bool = False,
+    ) -> None:
         self.centre, self.reach_u, self.reach_x = centre, reach_u, reach_x
         reach = reach_u + reach_x
         slopes = [_slope(a, b, reach, z, k) for a, b in (centre, centre[::-1])]
@@ -116,7 +135,7 @@ class Residual:
                 )
             )
 
-    def functions(self, axis, u, x):
+    def functions(self, axis: int, u: np.ndarray, x: np.ndarray) -> np.ndarray:
         """P_r (axis 0) or Q_s (1) at sensor positions u and lenslet positions x (m, from their
         centres): (terms, len(u), len(x)).
         """
@@ -127,7 +146,9 @@ class Residual:
         return rows @ self._values[axis] @ columns.T
 
 
-def split(matrix, tolerance, symmetric=False):
+def split(
+    matrix: np.ndarray, tolerance: float, symmetric: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A, K, B) with orthonormal columns and matrix = A K B^T up to `tolerance` (root sum of
     squares); K is diagonal, or where the matrix is `symmetric` and A = B as nearly so as equal
     singular values allow.
@@ -140,7 +161,9 @@ def split(matrix, tolerance, symmetric=False):
     return u, np.diag(s[:terms]), vh[:terms].T
 
 
-def _lens_terms(reach_x, f, k, tolerance):
+def _lens_terms(
+    reach_x: float, f: float | None, k: float, tolerance: float
+) -> tuple[AxisFunctions, np.ndarray, AxisFunctions, float]:
     """The lens's functions of y and of x, their core, and the phase (rad) that they run
     through per half width.
     """
@@ -154,13 +177,13 @@ def _lens_terms(reach_x, f, k, tolerance):
     )
     series = _series(t) @ (basis * np.sqrt(len(t)))
 
-    def functions(grid):
+    def functions(grid: np.ndarray) -> np.ndarray:
         return legendre(grid, len(t), 1) @ series
 
     return functions, core, functions, slope
 
 
-def _slope(own, other, reach, z, k):
+def _slope(own: float, other: float, reach: float, z: float, k: float) -> float:
     """Largest phase (rad) of kappa per half span along the axis with the centre `own`."""
     d, e = own + reach * np.linspace(-1, 1, 9)[:, None], other + reach * np.array([-1.0, 1.0])
     return (
@@ -172,14 +195,14 @@ def _slope(own, other, reach, z, k):
     )
 
 
-def _nodes(slope):
+def _nodes(slope: float) -> int:
     """Gauss-Legendre nodes that carry a function whose phase changes by `slope`
     rad per half span.
     """
     return int(np.ceil(slope + 5 * np.cbrt(slope) + 12))
 
 
-def _series(t):
+def _series(t: np.ndarray) -> np.ndarray:
     """Legendre coefficients from values on the Gauss nodes t."""
     w = gauss(len(t))[1]
     degrees = np.arange(len(t))

@@ -12,12 +12,21 @@ the square is taken. Pixel energies are sums over `nodes` points per axis; sub-n
 that summing them is adding whole planes.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from plenocli.forward.camera.quadrature import band_rule
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
 
-def sensor_nodes(geometry, axis, count, place=0.0, rule=0):
+
+def sensor_nodes(
+    geometry: Geometry, axis: int, count: int, place: float = 0.0, rule: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel
     along `axis`: (count, pixels).
 
@@ -33,7 +42,14 @@ def sensor_nodes(geometry, axis, count, place=0.0, rule=0):
     ), np.broadcast_to(half * w[:, None], (count, geometry.pixel_shape[axis]))
 
 
-def lenslet_kernel(geometry, n, v, weight, x, dtype=complex):
+def lenslet_kernel(
+    geometry: Geometry,
+    n: float,
+    v: np.ndarray,
+    weight: np.ndarray,
+    x: np.ndarray,
+    dtype: np.typing.DTypeLike = complex,
+) -> np.ndarray:
     """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and
     lenslet nodes x: (v, x) of `dtype`.
     """
@@ -51,7 +67,7 @@ def lenslet_kernel(geometry, n, v, weight, x, dtype=complex):
     return kernel
 
 
-def lit_lenslets(reach, window):
+def lit_lenslets(reach: int, window: int | None) -> range:
     """Lenslets (along one axis) whose light is followed: |m| <= window, or each superpixel's own
     where window is None.
     """
@@ -59,7 +75,7 @@ def lit_lenslets(reach, window):
     return range(-far, far + 1)
 
 
-def pixel_energy(field):
+def pixel_energy(field: np.ndarray) -> np.ndarray:
     """Sum |field|^2 over the sub-nodes of each pixel: (points, p, rows, p, columns) complex,
     weights included, overwritten.
     """

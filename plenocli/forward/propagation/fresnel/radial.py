@@ -8,7 +8,11 @@ carries it from a few hundred radii to any number of points. Source: Born and Wo
 docs/model.md, "From a point to the lenslet array".
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,11 +25,15 @@ from plenocli.forward.camera.pupil import (
 )
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+
 SERIES_POINTS = 1 << 13
 """Points that go through the series together: three such arrays stay in the cache."""
 
 
-def is_radial(camera):
+def is_radial(camera: Camera) -> bool:
     """Whether the pupil, its filters and its wavefront error are the same in all directions."""
     lens = camera.main_lens
     plain = (
@@ -36,7 +44,7 @@ def is_radial(camera):
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 
 
-def profile(camera, geometry, reach):
+def profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
     """Chebyshev coefficients (terms,) of h (1/m) in 2 |d|^2/reach^2 - 1, |d| <= reach
     (m); real where h is.
     """
@@ -60,7 +68,7 @@ def profile(camera, geometry, reach):
     )
 
 
-def hankel_series(rates, weight, edge):
+def hankel_series(rates: np.ndarray, weight: np.ndarray, edge: float) -> np.ndarray:
     """Chebyshev coefficients in 2 t^2 - 1, 0 <= t <= 1, of the sum of weight J0(rates t); rates
     at most `edge`; real where it is.
     """
@@ -75,7 +83,13 @@ def hankel_series(rates, weight, edge):
     return series[:, 0] if real else series[:, 0] + 1j * series[:, 1]
 
 
-def radial_field(camera, geometry, dy, dx, profile=profile):
+def radial_field(
+    camera: Camera,
+    geometry: Geometry,
+    dy: np.ndarray,
+    dx: np.ndarray,
+    profile: Callable[..., np.ndarray] = profile,
+) -> np.ndarray:
     """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is.
 
     The pupil must be radial (is_radial).
@@ -104,7 +118,7 @@ def radial_field(camera, geometry, dy, dx, profile=profile):
     return field[back_y[:, None], back_x]
 
 
-def _chebyshev(series, t):
+def _chebyshev(series: np.ndarray, t: np.ndarray) -> np.ndarray:
     """sum_n series[n] T_n(t) for a flat array t, by Clenshaw's recurrence slab by slab."""
     out = np.empty_like(t)
     for start in range(0, len(t), SERIES_POINTS):

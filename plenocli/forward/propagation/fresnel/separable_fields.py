@@ -10,6 +10,8 @@ The product is made in pieces that stay in the caches, real and imaginary parts 
 squared and summed over the nodes of each pixel before it leaves it.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 WORK_BYTES = 1 << 22
@@ -31,7 +33,14 @@ class Factors:
     signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both.
     """
 
-    def __init__(self, high, wide, pixel_shape, pixel_nodes, signs=None):
+    def __init__(
+        self,
+        high: np.ndarray,
+        wide: np.ndarray,
+        pixel_shape: tuple[int, int],
+        pixel_nodes: int,
+        signs: np.ndarray | None = None,
+    ) -> None:
         if (
             high.shape[2] != pixel_nodes * pixel_shape[0]
             or wide.shape[2] != pixel_nodes * pixel_shape[1]
@@ -48,7 +57,9 @@ class Factors:
         self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
 
-    def superpixel(self, sy, sx, rows, columns, out):
+    def superpixel(
+        self, sy: int, sx: int, rows: np.ndarray, columns: np.ndarray, out: np.ndarray
+    ) -> None:
         """Pixel energies on one superpixel, as counted in the tables, of points (rows[i],
         columns[i]) into out (points, pixel rows, pixel columns).
         """
@@ -74,7 +85,7 @@ class Factors:
                 lines = np.einsum("nqk,nqk->nk", parts, parts)
                 out[part] = np.einsum("nyqx->nyx", lines.reshape(len(part), py, 2 * nodes, px))
 
-    def _right(self, factor):
+    def _right(self, factor: np.ndarray) -> np.ndarray:
         """(node, term) complex as the right-hand side of a real product: (term x (real,
         imaginary), (real, imaginary) x node).
         """

@@ -11,8 +11,9 @@ separable terms x sensor nodes, and sensor nodes x scan nodes x sensor nodes.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,7 +36,12 @@ from plenocli.forward.propagation.sampling import (
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import PifPlan
 
+Positions = Sequence[float] | np.ndarray
+"""Where lenslets stand along one axis, in pitches."""
+Products = Sequence[tuple[Positions, Positions]]
+"""Lenslets as products of rows and columns."""
 WORK_VALUES = 1 << 20
 """Complex numbers in the work arrays of a few points: about what the last-level cache holds."""
 KEPT_BYTES = 1 << 26
@@ -64,7 +70,7 @@ class Chords:
     pieces: tuple
 
 
-def chords(shape, width, slope, error=1e-10):
+def chords(shape: str, width: float, slope: float, error: float = 1e-10) -> Chords:
     """Chords of a "square", "circle" or "hexagon" of `width` (m, across flat sides) for phases of
     up to `slope` rad/m.
 
@@ -98,7 +104,9 @@ def chords(shape, width, slope, error=1e-10):
     )
 
 
-def _chords(axis, at, weight, ends, slope, error):
+def _chords(
+    axis: int, at: np.ndarray, weight: np.ndarray, ends: np.ndarray, slope: float, error: float
+) -> Chords:
     t, w = gauss(2 * ((nodes_for(slope * ends[0]) + 1) // 2))
     pieces = [(ends[0] * t[None], ends[0] * w[None])]
     # panels differ in width and so in nodes
@@ -119,7 +127,7 @@ class ShapedLenslets(LensletFields):
 
     by_superpixel = False
 
-    def __init__(self, camera, geometry, plan, band):
+    def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan) -> None:
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
         self.pixel_nodes, self.pixel_rule, self.dtype = (
             band.pixel_nodes,
@@ -148,7 +156,7 @@ class ShapedLenslets(LensletFields):
 
     # the two tables of one set of lenslets
 
-    def _rows(self, positions):
+    def _rows(self, positions: Positions) -> np.ndarray:
         """Terms at the scan nodes of lenslets at `positions`, sums and differences of mirror
         images: (point, chord, node, term).
         """
@@ -157,7 +165,7 @@ class ShapedLenslets(LensletFields):
         values = self.field.evaluate(at - g.points(axis)[:, None, None], axis)
         return np.ascontiguousarray(_folded(values, 2)).astype(self.dtype)
 
-    def _across(self, positions, place):
+    def _across(self, positions: Positions, place: float) -> list[np.ndarray]:
         """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by
         piece (chord, node, sensor node).
         """
@@ -181,7 +189,7 @@ class ShapedLenslets(LensletFields):
             )
         return parts
 
-    def _along(self, positions, index):
+    def _along(self, positions: Positions, index: int) -> list[np.ndarray]:
         """Terms at the chords' nodes of lenslets at `positions` for point `index` of the chord
         axis: by piece (chord, term, node).
         """
@@ -205,7 +213,7 @@ class ShapedLenslets(LensletFields):
             self._kept[key] = parts
         return self._kept[key]
 
-    def _kernel(self, products, place):
+    def _kernel(self, products: Products, place: float) -> np.ndarray:
         """Kernel from the scan nodes of all products to the superpixel at `place`: (sensor node,
         sums of all, differences of all).
         """
@@ -265,7 +273,7 @@ class ShapedLenslets(LensletFields):
                         energy = self._energy(kernel, lines, mirrored)
                         out[part, sy, sx] = energy.transpose(0, 2, 1) if self.cut.axis else energy
 
-    def _once(self, key, make):
+    def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Kernels made by `make`, kept for the next block of points while they are few."""
         if key not in self._hops:
             if sum(size for _, size in self._hops.values()) > KEPT_BYTES:
@@ -279,7 +287,7 @@ class ShapedLenslets(LensletFields):
             )
         return self._hops[key][0]
 
-    def _tasks(self):
+    def _tasks(self) -> list[tuple[Hashable, float, list]]:
         """Superpixels that share their place along the chords: (key of the products, place,
         [(index in out, scan place)]).
         """
@@ -291,7 +299,7 @@ class ShapedLenslets(LensletFields):
             )
         return [(key, place, sites) for (key, place), sites in tasks.items()]
 
-    def _mirrored(self, products, place):
+    def _mirrored(self, products: Products, place: float) -> bool:
         """Whether mirroring maps the scan nodes onto themselves as seen from the superpixel, so
         that sums and differences part.
         """
@@ -305,7 +313,9 @@ class ShapedLenslets(LensletFields):
         )
         return centred and self.geometry.window_shift(self.cut.axis, place) == 0
 
-    def _spread(self, product, across, index):
+    def _spread(
+        self, product: tuple[Positions, Positions], across: list[np.ndarray], index: int
+    ) -> np.ndarray:
         """Terms carried along every chord to the sensor, for one point of the chord axis:
         (chord, term, sensor node).
         """
@@ -316,7 +326,7 @@ class ShapedLenslets(LensletFields):
             start += len(kernel)
         return _accumulated(out)
 
-    def _lines(self, key, scan, spread):
+    def _lines(self, key: Hashable, scan: np.ndarray, spread: list[np.ndarray]) -> np.ndarray:
         """Fields of points `scan` at the scan nodes, before the hop along the scan axis: (point,
         sums then differences, sensor node).
         """
@@ -337,7 +347,7 @@ class ShapedLenslets(LensletFields):
             start = stop
         return out.reshape(len(scan), count, -1)
 
-    def _energy(self, kernel, lines, mirrored):
+    def _energy(self, kernel: np.ndarray, lines: np.ndarray, mirrored: bool) -> np.ndarray:
         p, shape = self.pixel_nodes, self.geometry.pixel_shape
         ps, pc = shape[self.cut.axis], shape[1 - self.cut.axis]
         field = _hop(kernel, lines) if mirrored else kernel @ lines
@@ -345,7 +355,7 @@ class ShapedLenslets(LensletFields):
 
     # the guard
 
-    def incident(self, rows, columns):
+    def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
         neighbourhood: (points,).
         """
@@ -370,7 +380,7 @@ class ShapedLenslets(LensletFields):
                     )
         return share
 
-    def _gram(self, product, index):
+    def _gram(self, product: tuple[Positions, Positions], index: int) -> np.ndarray:
         """Gram matrices of the terms over every chord, for one point of the chord axis:
         (chord, term, term).
         """
@@ -381,7 +391,7 @@ class ShapedLenslets(LensletFields):
         return _accumulated(np.concatenate(parts))
 
 
-def _accumulated(panels):
+def _accumulated(panels: np.ndarray) -> np.ndarray:
     """Running sums over the first axis, in place: plane by plane, which is many times
     faster than cumsum.
     """
@@ -390,14 +400,14 @@ def _accumulated(panels):
     return panels
 
 
-def _folded(values, axis):
+def _folded(values: np.ndarray, axis: int) -> np.ndarray:
     """Sums, then differences, of mirror images along `axis` (of even length)."""
     first, last = np.split(values, 2, axis=axis)
     last = np.flip(last, axis)
     return np.concatenate([first + last, first - last], axis=axis)
 
 
-def _hop(kernel, lines):
+def _hop(kernel: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """kernel @ lines for a kernel whose sums are even and whose differences are odd over the
     sensor nodes: half of the work.
     """
@@ -410,7 +420,7 @@ def _hop(kernel, lines):
     return out
 
 
-def _slope(camera, geometry, grid, window):
+def _slope(camera: Camera, geometry: Geometry, grid: tuple[int, int], window: int | None) -> float:
     """Largest gradient (rad/m) of the phase on a lenslet: of the hop to the farthest pixel, of
     the pupil's rim, of kappa.
     """
@@ -430,20 +440,22 @@ def _slope(camera, geometry, grid, window):
     return g.k * (reach / g.z3 + rim / g.z2 + abs(g.kappa) * corner)
 
 
-def valid_for(camera, geometry):
+def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """None: every lenslet shape and lattice of a camera description, and every pupil, can
     be cut into chords.
     """
     return
 
 
-def _chord_counts(shape, width, slope, error):
+def _chord_counts(
+    shape: str, width: float, slope: float, error: float
+) -> tuple[int, int, int, int]:
     """What `chords` will make: (axis, lines, nodes across the lines, nodes along all their
     pieces), without making them.
     """
     half = width / 2
 
-    def pieces(ends):
+    def pieces(ends: np.ndarray) -> int:
         total = 2 * ((nodes_for(slope * ends[0]) + 1) // 2)
         for part in (
             np.array_split(np.arange(1, len(ends)), min(PIECES, len(ends) - 1))

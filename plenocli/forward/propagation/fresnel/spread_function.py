@@ -11,8 +11,12 @@ a_j(dy) b_j(dx); the a_j, b_j are band-limited (the pupil is finite), so their L
 them to any other point.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +25,10 @@ from plenocli.forward.camera.pupil import aperture_area
 from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import Rows, gauss, nodes_for
 from plenocli.forward.propagation.fresnel.radial import is_radial, radial_field
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
 
 MAX_NODES = 4000
 """Beyond this many nodes per axis the wave model costs minutes a wavelength, and rays
@@ -52,11 +60,11 @@ class SeparableField:
     signs: np.ndarray | None = None
 
     @property
-    def terms(self):
+    def terms(self) -> int:
         """Number of separable terms."""
         return self.rows.shape[1]
 
-    def evaluate(self, d, axis):
+    def evaluate(self, d: np.ndarray, axis: int) -> np.ndarray:
         """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,),
         complex128, or float64 where h is real.
         """
@@ -72,7 +80,7 @@ class SeparableField:
         return out.view(coefficients.dtype).reshape(*d.shape, -1)
 
 
-def legendre(t, count, step):
+def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
     """Legendre polynomials of degrees 0, step, 2 step, ... at t: (len(t), count)."""
     out = np.empty((count, len(t)))
     previous, current, scaled = np.zeros_like(t), np.ones_like(t), np.empty_like(t)
@@ -87,7 +95,7 @@ def legendre(t, count, step):
     return out.T
 
 
-def psf_nodes(geometry, half):
+def psf_nodes(geometry: Geometry, half: float) -> int:
     """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number;
     NumericsError for more than MAX_NODES.
     """
@@ -103,7 +111,7 @@ def psf_nodes(geometry, half):
     return count + count % 2
 
 
-def sampled_field(camera, geometry, dy, dx):
+def sampled_field(camera: Camera, geometry: Geometry, dy: np.ndarray, dx: np.ndarray) -> np.ndarray:
     """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: (len(dy), len(dx)), real where
     a radial pupil makes it so.
 
@@ -128,7 +136,7 @@ def sampled_field(camera, geometry, dy, dx):
     return total / (geometry.wavelength * z2 * math.sqrt(aperture_area(camera.main_lens)))
 
 
-def mirrored(y, x, weight, axis):
+def mirrored(y: np.ndarray, x: np.ndarray, weight: np.ndarray, axis: int) -> bool:
     """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of
     its nodes (axis 1).
     """
@@ -141,7 +149,7 @@ def mirrored(y, x, weight, axis):
     )
 
 
-def _row_transforms(rows, frequency):
+def _row_transforms(rows: Rows, frequency: np.ndarray) -> np.ndarray:
     """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows
     and frequencies cost a quarter.
     """
@@ -171,7 +179,7 @@ def _row_transforms(rows, frequency):
     return np.concatenate([(c + 1j * s)[:, ::-1], here], axis=1) if paired else here
 
 
-def edge_emphasis(geometry, points):
+def edge_emphasis(geometry: Geometry, points: np.ndarray) -> np.ndarray:
     """Weights of `points` (m, on the array, along one axis) in what is left out: those at the
     lenslet's edge lose light and split it, so that the same error would be a larger
     share of their columns.
@@ -180,7 +188,13 @@ def edge_emphasis(geometry, points):
     return 1 + EDGE * np.exp((np.abs(points) - g.D2 / 2) * g.D1 / (g.wavelength * g.z2))
 
 
-def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
+def separable_field(
+    camera: Camera,
+    geometry: Geometry,
+    half: float,
+    tolerance: float,
+    sample: Callable[..., np.ndarray] = sampled_field,
+) -> SeparableField:
     """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of
     at most `tolerance`.
 
@@ -230,7 +244,7 @@ def separable_field(camera, geometry, half, tolerance, sample=sampled_field):
     )
 
 
-def terms_within(values, tolerance, rest=0.0):
+def terms_within(values: np.ndarray, tolerance: float | np.ndarray, rest: float = 0.0) -> int:
     """How many of the singular values `values`, the largest first, it takes to leave no more than
     `tolerance` (root sum of squares, with `rest` that is left in any case), one at the least. A
     tolerance for each number of terms may be given.
@@ -239,7 +253,9 @@ def terms_within(values, tolerance, rest=0.0):
     return max(1, int(np.count_nonzero(tails > tolerance)))
 
 
-def _factors(matrix, symmetric):
+def _factors(
+    matrix: np.ndarray, symmetric: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Singular value decomposition u, s, v of a square matrix; for a real symmetric one also the
     signs with v^T = u * signs.
     """

@@ -2,7 +2,10 @@
 of separable arrays.
 """
 
+from __future__ import annotations
+
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +29,12 @@ from plenocli.forward.propagation.lenslet_fields import (
 )
 from plenocli.forward.propagation.sampling import NARROWING_LOSS
 
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.fresnel.spread_function import SeparableField
+    from plenocli.forward.propagation.plan import BandPlan, PifPlan
+
 TERM_VALUES = 1 << 21
 """Values of the spread function's terms in memory at a time while tables are filled."""
 
@@ -39,7 +48,7 @@ class SquareLenslets(LensletFields):
     points that mirror each other share their tables.
     """
 
-    def __init__(self, camera, geometry, plan, band):
+    def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan) -> None:
         self.geometry, self.superpixels, self._band = geometry, plan.superpixels, band
         self.dtype, self._real = (
             np.dtype(t)
@@ -76,7 +85,7 @@ class SquareLenslets(LensletFields):
         )
         self._roots, self._least = {}, None
 
-    def _rules(self):
+    def _rules(self) -> list[tuple[bool, tuple[int, int]]]:
         """[(whether all superpixels or the object's own only, (nodes of a pixel per axis,
         rule))], all of them first.
         """
@@ -95,7 +104,7 @@ class SquareLenslets(LensletFields):
             return partial(self.factors.superpixel, sy, sx)
         return partial(self._narrowed(sy, sx).superpixel, 0, 0)
 
-    def _narrowed(self, sy, sx):
+    def _narrowed(self, sy: int, sx: int) -> Factors:
         """Factors of one superpixel, without the terms that its light does not need."""
         if self._least is None:
             self._least = self._least_term()
@@ -114,7 +123,7 @@ class SquareLenslets(LensletFields):
         )
         return Factors(high[None], wide[None], source.pixel_shape, source.pixel_nodes)
 
-    def _least_term(self):
+    def _least_term(self) -> float:
         """The terms up to which size (root energy of a mean point, points at the lenslet's edge
         weighing more) all superpixels together lose NARROWING_LOSS self._cut without.
         """
@@ -126,13 +135,13 @@ class SquareLenslets(LensletFields):
         lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROWING_LOSS * self._cut) ** 2))
         return sizes[lost - 1] if lost else 0.0
 
-    def _roots_of(self, sy, sx):
+    def _roots_of(self, sy: int, sx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(_root of superpixel row sy, of column sx with the signs of the terms, these signs)."""
         signs = self.factors.signs
         signs = np.ones(self.factors.high.shape[3]) if signs is None else signs
         return self._root(0, sy), self._root(1, sx) * signs, signs
 
-    def _root(self, axis, s):
+    def _root(self, axis: int, s: int) -> np.ndarray:
         """R with R^H R the overlaps of the terms on superpixel s for a mean point, on
         half of its nodes.
         """
@@ -152,13 +161,13 @@ class SquareLenslets(LensletFields):
             self._roots[axis, s] = np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
         return self._roots[axis, s]
 
-    def _axes_agree(self):
+    def _axes_agree(self) -> bool:
         g = self.geometry
         return self._centred and all(
             a[0] == a[1] for a in (g.pixel_shape, g.object_shape, self.superpixels)
         )
 
-    def _lenslet_nodes(self):
+    def _lenslet_nodes(self) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Nodes x and weights (m) on which the terms are sampled, and the kernel's own nodes with
         what carries it onto the former.
 
@@ -176,7 +185,7 @@ class SquareLenslets(LensletFields):
         carry = (legendre(tf, few, 1) * degrees) @ (legendre(t, few, 1).T * w)
         return half * t, half * w, (half * tf, (half * wf[:, None] * carry).astype(self._real))
 
-    def _kernel(self, axis, n, place, nodes, rule):
+    def _kernel(self, axis: int, n: int, place: int, nodes: int, rule: int) -> np.ndarray:
         """The kernel (sensor node, 2, term node), real and imaginary part, from a lenslet to the
         superpixel n before it, which stands at `place` (superpixel pitches; it matters on a
         sensor's own raster only).
@@ -194,7 +203,9 @@ class SquareLenslets(LensletFields):
             )
         return self._kernels[key]
 
-    def _tables(self, field, axis, rules):
+    def _tables(
+        self, field: SeparableField, axis: int, rules: list[tuple[bool, tuple[int, int]]]
+    ) -> tuple[list[np.ndarray], np.ndarray]:
         """The factor tables along one axis (as Factors takes them), one of each of `rules`, and the
         (point, term x term) Gram matrices over the lenslets.
         """
@@ -244,14 +255,14 @@ class SquareLenslets(LensletFields):
             entering[half:] = entering[: len(points) - half][::-1]
         return tables, entering
 
-    def incident(self, rows, columns):
+    def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
         neighbourhood: (points,).
         """
         return self._entering[rows, columns]
 
 
-def narrows(geometry, band, superpixels, double):
+def narrows(geometry: Geometry, band: BandPlan, superpixels: tuple[int, int], double: bool) -> bool:
     """Whether superpixels get factors of their own rank: where many columns with many nodes gain by
     it. In double precision the roots of sums of squares would not know what is that small.
     """
@@ -263,7 +274,7 @@ def narrows(geometry, band, superpixels, double):
     )
 
 
-def _product(kernel, values, out):
+def _product(kernel: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
     """The kernel (sensor node x (real, imaginary), term node), real, times values (term node,
     term) into complex `out`.
     """

@@ -5,7 +5,6 @@ python pipelines/paper.py SPATIAL_RUN SPECTRAL_RUN PAGE.html: from the folders t
 spectral.mk leave.
 """
 
-import json
 import sys
 from pathlib import Path
 
@@ -16,7 +15,10 @@ from plenocli.files.artefacts.shards import read_pif
 from plenocli.files.atomic import publish
 from plenocli.files.config.camera_file import parse_camera
 from plenocli.files.images.mosaic import read_capture
-from plenocli.files.read.results import block_of, read_result, read_truth
+from plenocli.files.results.matrices import matrix_of
+from plenocli.files.results.results import read_block, read_result
+from plenocli.files.results.scores import read_scores
+from plenocli.files.results.truths import read_truth
 from plenocli.report import figures, pictures, spectral_pictures
 from plenocli.report.drawing import drawing, show_picture
 from plenocli.report.page import Page
@@ -82,7 +84,7 @@ def _columns(run):
     artefact = read_pif(run / "pif.h5")
     rows, columns = (int(n) for n in artefact.data["pif/object_shape"])
     points = [(rows // 2, columns // 2), (rows // 2, columns - 2), (1, columns - 2)]
-    return figures.matrix_figures(artefact, points)[:1]
+    return figures.matrix_figures(matrix_of(artefact), points)[:1]
 
 
 def _prototype(run):
@@ -116,11 +118,11 @@ def _bands(run):
 def _errors(run):
     entries = []
     for exposure in ("long", "short"):
-        document = json.loads((run / f"score-measured-{exposure}.json").read_text())
+        document = read_scores(run / f"score-measured-{exposure}.json")
         entries += [
-            e
-            for e in document["results"]
-            if Path(e["name"]).stem.endswith(("pinv", "single-pixel"))
+            one
+            for one in document.results
+            if Path(one.name).stem.endswith(("pinv", "single-pixel"))
         ]
     return [
         (
@@ -148,12 +150,9 @@ def _photograph(run):
 
 
 def _learnt(run):
-    system = figures.own_matrix(read_pif(run / "pif.h5"))
-    artefact = read_artefact(run / "dictionary.h5")
-    atoms = figures.dictionary_figures(
-        read_result(run / "dictionary.h5"), "dictionary.h5", figures.learning(artefact), system
-    )
-    return [*figures.matrix_figures(read_pif(run / "pif.h5"))[1:], *atoms]
+    matrix = matrix_of(read_pif(run / "pif.h5"))
+    atoms = figures.dictionary_figures(read_result(run / "dictionary.h5"), "dictionary.h5", matrix)
+    return [*figures.matrix_figures(matrix)[1:], *atoms]
 
 
 def _reconstructed(run):
@@ -164,8 +163,8 @@ def _reconstructed(run):
         if (run / "paper" / f"{n}.h5").exists()
     ]
     scores = {
-        Path(e["name"]).stem: e["metrics"]["psnr_db"]
-        for e in json.loads((run / "score-paper.json").read_text())["results"]
+        Path(one.name).stem: one.number("psnr_db")
+        for one in read_scores(run / "score-paper.json").results
     }
     results = [read_result(run / "paper" / f"{n}.h5") for n in names]
     true = read_truth(truth, results[0])
@@ -176,7 +175,7 @@ def _reconstructed(run):
             "The astronaut in the doll's place; each result above its error.",
         ),
         (
-            pictures.close_ups(entries, true, block_of(results[0], truth)),
+            pictures.close_ups(entries, true, read_block(results[0], truth)),
             "Close-up of the middle lenslets.",
         ),
     ]

@@ -1,187 +1,207 @@
-"""Spectral results in score: errors, patches, classification, SNR, and each method
-against single pixel.
-"""
+"""Spectral results: errors, patches, classification, SNR, and each method against single pixel."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
-from plenocli.files.read.results import CHART, read_labels
+from plenocli.evaluation.metrics.classify import ClassificationScore, score_classification
+from plenocli.evaluation.metrics.quality import PictureScore, score_picture
+from plenocli.evaluation.metrics.snr import SnrScore, score_snr
+from plenocli.evaluation.metrics.spectral import (
+    CubeScore,
+    PatchesScore,
+    PatchStatistics,
+    patch_statistics,
+    score_cube,
+    score_patches,
+)
+from plenocli.evaluation.results import Result, WhiteTarget
+from plenocli.evaluation.scores import PatchScore
+from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
+from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 
-WHITE_LABEL = 19  # of the chart's patches row by row, the first of the last row
+WHITE_LABEL = 19
+"""Of the chart's patches row by row, the first of the last row."""
 SINGLE = "single-pixel"
 
 
-def score_spectra(path, result, truth, context):
-    """(metrics, patches) of a spectral cube."""
-    from plenocli.evaluation.metrics.quality import score_picture
-    from plenocli.evaluation.metrics.spectral import patch_statistics, score_cube, score_patches
-    from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
+@dataclass(frozen=True, kw_only=True)
+class SpectraScore:
+    """Figures of a spectral cube; None where what a group needs is not known.
 
-    values = _reflectance(path, result, context)
-    labels = None if context.patches is None else read_labels(context.patches, result.grid)
-    scores = score_cube(values, truth, result.wavelengths, context.light)
-    if not scores["lenslets"]:
+    picture: of an image with bands, whose rmse then stands for that of the cube.
+    """
+
+    cube: CubeScore
+    picture: PictureScore | None
+    patches: PatchesScore | None
+    classification: ClassificationScore | None
+    snr: SnrScore | None
+
+    @property
+    def rmse(self) -> float:
+        """The error that is reported by this name."""
+        return self.cube.rmse if self.picture is None else self.picture.rmse
+
+    @property
+    def six_patch_rmse(self) -> float | None:
+        """Over the paper's six patches, None where none is seen."""
+        return self.patches.six.six_patch_rmse if self.patches and self.patches.six else None
+
+
+@dataclass(frozen=True)
+class SinglePixelScore:
+    """Ratios to the result of single pixel extraction, and the gain in SNR over it, dB."""
+
+    rmse_over_single_pixel: float | None
+    six_patch_rmse_over_single_pixel: float | None
+    delta_e_over_single_pixel: float | None
+    snr_over_single_pixel_db: float | None
+
+
+def score_spectra(
+    result: Result,
+    truth: np.ndarray,
+    *,
+    labels: np.ndarray | None = None,
+    light: str = "D65",
+    whites: Mapping[str, WhiteTarget] | None = None,
+    needs_reflectance: bool = False,
+) -> tuple[SpectraScore, tuple[PatchScore, ...]]:
+    """Figures of a spectral cube, and what each patch shows.
+
+    truth: (band, row, column) like the result.
+    labels: (row, column) of the chart's patches, 0 for nothing.
+    light: name of the illuminant for colour differences.
+    whites: method -> spectra of a white target.
+    needs_reflectance: the truth is reflectance for sure; radiance without a white is refused.
+
+    Raises InputError where no lenslet has values, UsageError where no white target fits.
+    docs/model.md, "Measures".
+    """
+    white = _white_of(result, whites or {})
+    values = _reflectance(result, white, needs_reflectance)
+    cube = score_cube(values, truth, result.wavelengths, light)
+    if cube is None:
         raise InputError(
             "has no lenslet with values in all bands",
-            path,
+            result.path,
             "check the calibration it was made with",
         )
-    if result.kind == "image":
-        scores |= score_picture(values, truth)
-    listed = []
+    picture = score_picture(values, truth) if result.kind == "image" else None
+    patches, classification, listed = None, None, ()
     if labels is not None:
         six = tuple(patch_index(name) + 1 for name in SIX_PATCHES)
-        scores |= score_patches(values, truth, labels, six)
+        patches = score_patches(values, truth, labels, six)
         true = patch_statistics(truth, labels)
-        scores |= _classification(values, labels, true)
-        names = colorchecker()[0]
-        for label, found in patch_statistics(values, labels).items():
-            listed.append(
-                {
-                    "label": label,
-                    "name": names[label - 1],
-                    "lenslets": found["count"],
-                    "mean": found["mean"].tolist(),
-                    "std": found["std"].tolist(),
-                    "truth": true[label]["mean"].tolist() if label in true else None,
-                    "one_of_six": label in six,
-                }
-            )
-    scores |= _snr(result, labels, _whites(path, result, context))
-    return scores, listed
+        classification = score_classification(
+            values, labels, {label: one.mean for label, one in true.items()}
+        )
+        listed = _patches(patch_statistics(values, labels), true, six)
+    return SpectraScore(
+        cube=cube,
+        picture=picture,
+        patches=patches,
+        classification=classification,
+        snr=_snr(result, labels, white),
+    ), listed
 
 
-def _reflectance(path, result, context):
-    """The result's values as reflectance: as they are, or radiance divided by that
-    of the white target.
+def _patches(
+    found: dict[int, PatchStatistics], true: dict[int, PatchStatistics], six: tuple[int, ...]
+) -> tuple[PatchScore, ...]:
+    names = colorchecker()[0]
+    return tuple(
+        PatchScore(
+            label=label,
+            name=names[label - 1],
+            lenslets=patch.count,
+            mean=patch.mean.tolist(),
+            std=patch.std.tolist(),
+            truth=true[label].mean.tolist() if label in true else None,
+            one_of_six=label in six,
+        )
+        for label, patch in found.items()
+    )
+
+
+def _reflectance(result: Result, white: WhiteTarget | None, needs_reflectance: bool) -> np.ndarray:
+    """The result's values as reflectance: as they are, or radiance divided by that of the white
+    target.
     """
-    from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-
     if result.quantity != "radiance":
         return result.values
-    whites = _whites(path, result, context)
-    if whites is None:
-        if str(context.truth) == CHART:
+    if white is None:
+        if needs_reflectance:
             raise UsageError(
                 "holds radiance, the truth is reflectance",
-                path,
+                result.path,
                 "demux with --reference, or name the spectra of a white target with --white",
             )
         return result.values
-    white = whites[0].mean(axis=0)
-    if white.shape != result.values.shape:
+    level = white.frames.mean(axis=0)
+    if level.shape != result.values.shape:
         raise UsageError(
             (
                 f"has {by(result.values.shape)} values (band x row x column), the white "
-                f"target {by(white.shape)}"
+                f"target {by(level.shape)}"
             ),
-            path,
+            result.path,
             "demultiplex both with one calibration",
         )
     return (
-        np.divide(result.values, white, out=np.full_like(white, np.nan), where=white > 0)
+        np.divide(result.values, level, out=np.full_like(level, np.nan), where=level > 0)
         * REFERENCE_REFLECTANCE
     )
 
 
-def _snr(result, labels, whites):
-    """Capture and predicted SNR on the white target, or on the chart's white patch
-    where there is none.
-    """
-    from plenocli.evaluation.metrics.snr import snr_capture, snr_predicted
-
-    if whites is not None:
-        frames, sigma = whites
-        target = (
-            f"white target, {len(frames)} frames over time"
-            if len(frames) > 1
-            else "white target, one frame over its lenslets"
-        )
-    elif labels is not None and (labels == WHITE_LABEL).any():
-        here = labels == WHITE_LABEL
-        frames, sigma = (
-            result.values[None][:, :, here],
-            None if result.sigma is None else np.asarray(result.sigma)[:, here],
-        )
-        target = "white patch of the chart, over its lenslets"
-    else:
-        return {}
-    scores = {"snr_target": target, "snr_capture_db": snr_capture(frames)}
-    if sigma is not None:
-        scores["snr_predicted_db"] = snr_predicted(frames[0], sigma)
-    for name in ("snr_capture", "snr_predicted"):
-        if f"{name}_db" in scores:
-            bands = scores[f"{name}_db"]
-            scores[f"{name}_mean_db"] = float(bands.mean()) if np.isfinite(bands).all() else None
-            scores[f"{name}_db"] = bands.tolist()
-    return scores
-
-
-def _whites(path, result, context):
-    """(frames (frame, band, row, column), sigma or None) of the white target made by the method of
-    the result, else of all there are; None without any.
-    """
-    groups = context.whites
-    if not groups:
+def _snr(result: Result, labels: np.ndarray | None, white: WhiteTarget | None) -> SnrScore | None:
+    """SNR on the white target, or on the chart's white patch where there is none."""
+    if white is not None:
+        count = len(white.frames)
+        over = f"{count} frames over time" if count > 1 else "one frame over its lenslets"
+        return score_snr(f"white target, {over}", white.frames, white.sigma)
+    if labels is None or not (labels == WHITE_LABEL).any():
         return None
-    if result.method in groups:
-        return groups[result.method]
-    if len(groups) > 1:
+    patch = labels == WHITE_LABEL
+    return score_snr(
+        "white patch of the chart, over its lenslets",
+        result.values[None][:, :, patch],
+        None if result.sigma is None else np.asarray(result.sigma)[:, patch],
+    )
+
+
+def _white_of(result: Result, whites: Mapping[str, WhiteTarget]) -> WhiteTarget | None:
+    """The white target made by the method of the result, else the only one there is."""
+    if not whites:
+        return None
+    if result.method in whites:
+        return whites[result.method]
+    if len(whites) > 1:
         raise UsageError(
             (
                 f"was made by {result.method or 'an unknown method'}, the white targets by "
-                f"{', '.join(sorted(groups))}"
+                f"{', '.join(sorted(whites))}"
             ),
-            path,
+            result.path,
             "demultiplex a white target by the same method",
         )
-    return next(iter(groups.values()))
+    return next(iter(whites.values()))
 
 
-def _classification(values, labels, true):
-    """How often spectra tell their patch; the number that needs scikit-learn only
-    where it is installed.
-    """
-    from plenocli.evaluation.metrics.classify import cross_validated, nearest_known, samples
-
-    spectra, patches = samples(values, labels)
-    known = {label: one["mean"] for label, one in true.items()}
-    if len(known) < 2 or not len(patches) or not set(patches) <= set(known):
-        return {}
-    scores = {"nearest_patch_accuracy": nearest_known(spectra, patches, known)}
-    try:
-        scores["classification_accuracy"] = cross_validated(spectra, patches)
-    except ImportError:
-        pass
-    return scores
+def over_single_pixel(own: SpectraScore, single: SpectraScore) -> SinglePixelScore:
+    """What a method gains over single pixel extraction; None where one of the two is not known."""
+    pair = [score.snr.snr_capture_mean_db if score.snr else np.nan for score in (own, single)]
+    return SinglePixelScore(
+        _ratio(own.rmse, single.rmse),
+        _ratio(own.six_patch_rmse, single.six_patch_rmse),
+        _ratio(own.cube.delta_e_2000, single.cube.delta_e_2000),
+        pair[0] - pair[1] if np.isfinite(pair).all() else None,
+    )
 
 
-def against_single_pixel(scored):
-    """Add to every entry of spectra what it gains over the one of single pixel extraction, where
-    there is exactly one.
-    """
-    base = [
-        entry["metrics"]
-        for entry in scored
-        if entry.get("method") == SINGLE and "error" not in entry
-    ]
-    for entry in scored:
-        if (
-            len(base) != 1
-            or entry.get("method") == SINGLE
-            or entry.get("kind") != "spectra"
-            or "error" in entry
-        ):
-            continue
-        own = entry["metrics"]
-        for name, ratio in (
-            ("rmse", "rmse"),
-            ("six_patch_rmse", "six_patch_rmse"),
-            ("delta_e_2000", "delta_e"),
-        ):
-            if own.get(name) is not None and base[0].get(name):
-                own[f"{ratio}_over_single_pixel"] = own[name] / base[0][name]
-        pair = own.get("snr_capture_mean_db"), base[0].get("snr_capture_mean_db")
-        if None not in pair:
-            own["snr_over_single_pixel_db"] = pair[0] - pair[1]
+def _ratio(own: float | None, single: float | None) -> float | None:
+    return own / single if own is not None and single else None

@@ -3,15 +3,27 @@ back as PNG bytes.
 """
 
 import io
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import UsageError
 from plenocli.base.extras import how_to_install
 
-#: Okabe and Ito's palette, told apart with any colour vision, in the order of use.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+Figures = list[tuple[bytes, str]]
+"""Pictures (PNG) with their captions."""
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00", "#555555")
+"""Okabe and Ito's palette, told apart with any colour vision, in the order of use."""
 TRUTH = "#1a1a1a"
 LIGHT_MAP = "inferno"  # amounts of light, dark is none
 LEVEL_MAP = "viridis"  # other positive quantities
@@ -61,16 +73,20 @@ _STYLE = {
 class Drawing:
     """A figure under construction; `png` holds its bytes after the `with drawing(...)` block."""
 
-    def __init__(self, figure):
+    def __init__(self, figure: "Figure") -> None:
+        """Begin with an empty `figure`."""
         self.figure, self.png = figure, b""
 
 
 @contextmanager
-def drawing(width, height, layout="constrained"):
-    """A Drawing of width x height inches in the house style; rendered when the block ends.
+def drawing(width: float, height: float, layout: str | None = "constrained") -> Iterator[Drawing]:
+    """A Drawing in the house style; rendered when the block ends.
 
+    width, height: inches.
     layout: matplotlib's layout engine; None for figures of many panels, which it would take
         seconds to arrange.
+
+    Raises UsageError where matplotlib is not installed.
     """
     try:
         import matplotlib
@@ -89,9 +105,11 @@ def drawing(width, height, layout="constrained"):
         made.png = buffer.getvalue()
 
 
-def show_picture(axes, values, title="", **options):
-    """A picture without ticks; a 2-D one as linear light, white at 1, encoded for the
-    screen as sRGB is.
+def show_picture(axes: "Axes", values: ArrayLike, title: str = "", **options: Any) -> None:
+    """A picture without ticks, encoded for the screen as sRGB is.
+
+    values: (row, column) linear light, white at 1, or (row, column, 3).
+    options: of imshow.
     """
     from plenocli.forward.scene.colour import encode_srgb
 
@@ -102,15 +120,19 @@ def show_picture(axes, values, title="", **options):
     bare(axes, title)
 
 
-def show_map(axes, values, title="", bar="", **options):
-    """A map with a colour bar labelled `bar` (quantity and unit)."""
+def show_map(
+    axes: "Axes", values: np.ndarray, title: str = "", bar: str = "", **options: Any
+) -> "AxesImage":
+    """A map (row, column) with a colour bar labelled `bar` (quantity and unit); `options` of
+    imshow.
+    """
     image = axes.imshow(values, **options)
     bare(axes, title)
     colour_bar(axes, image, bar)
     return image
 
 
-def colour_bar(axes, image, label):
+def colour_bar(axes: "Axes", image: Any, label: str) -> "Colorbar":
     """A slim colour bar beside `axes`, as high as what they show."""
     made = axes.figure.colorbar(image, cax=axes.inset_axes((1.025, 0, 0.04, 1)))
     made.outline.set_linewidth(0.4)
@@ -118,7 +140,7 @@ def colour_bar(axes, image, label):
     return made
 
 
-def bare(axes, title=""):
+def bare(axes: "Axes", title: str = "") -> None:
     """No ticks, a hairline frame."""
     axes.set_xticks([])
     axes.set_yticks([])
@@ -128,9 +150,13 @@ def bare(axes, title=""):
         axes.set_title(title)
 
 
-def thumbnail(values, limit=1100):
-    """`values` (row, column) averaged over whole blocks so that neither side exceeds `limit`,
-    and the block size used.
+def thumbnail(values: np.ndarray, limit: int = 1100) -> tuple[np.ndarray, int]:
+    """A picture averaged over whole blocks.
+
+    values: (row, column).
+    limit: of either side.
+
+    Returns (picture, side of a block).
     """
     from plenocli.forward.scene.sample import block_mean
 
@@ -141,13 +167,47 @@ def thumbnail(values, limit=1100):
     return block_mean(values[:rows, :cols], (step, step)), step
 
 
-def nanometres(wavelength):
+def nanometres(wavelength: float) -> str:
     """A wavelength in m as text, "550 nm"."""
     return f"{wavelength * 1e9:.4g} nm"
 
 
-def swatch(rgb):
+def swatch(rgb: ArrayLike) -> tuple[float, ...]:
     """Display colour, a tuple for matplotlib, of linear sRGB (3,)."""
     from plenocli.forward.scene.colour import encode_srgb
 
     return tuple(float(v) for v in encode_srgb(np.asarray(rgb)))
+
+
+_LETTER, _LINE = 16, 24
+"""Height of a letter and of a line of a caption on a sheet of pictures, pixels."""
+
+
+def stacked(figures: Figures) -> bytes:
+    """One PNG of several, below each other on white, each under its caption."""
+    import textwrap
+
+    from matplotlib.font_manager import findfont
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.truetype(findfont("DejaVu Sans"), _LETTER)
+    images = [Image.open(io.BytesIO(png)).convert("RGB") for png, _ in figures]
+    width = max(image.width for image in images)
+    captions = [
+        textwrap.wrap(caption, max(20, int(width / (0.56 * _LETTER)))) for _, caption in figures
+    ]
+    heights = [len(lines) * _LINE + _LINE // 2 for lines in captions]
+    sheet = Image.new(
+        "RGB",
+        (width, sum(i.height for i in images) + sum(heights) + _LINE * (len(images) - 1)),
+        "white",
+    )
+    pen, top = ImageDraw.Draw(sheet), 0
+    for image, lines, height in zip(images, captions, heights):
+        for number, line in enumerate(lines):
+            pen.text((10, top + 6 + number * _LINE), line, fill="#5b6670", font=font)
+        sheet.paste(image, ((width - image.width) // 2, top + height))
+        top += height + image.height + _LINE
+    buffer = io.BytesIO()
+    sheet.save(buffer, "png")
+    return buffer.getvalue()

@@ -1,15 +1,28 @@
-"""The figures of one file of each kind: lists of (PNG bytes, caption), for the report's
-page and for `show`.
+"""The figures of one file of each kind: lists of (PNG bytes, caption), for the report's page and
+for `show`.
 """
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.evaluation.results import Result
+from plenocli.files.results.matrices import StoredMatrix
+from plenocli.report.drawing import Figures
 
-def capture_figures(capture, name, centres=None):
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
+    from plenocli.inverse.spectra.calibration import Calibration
+
+Place = tuple[int, int]
+
+
+def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = None) -> Figures:
     """A capture with its lenslet grid.
 
-    capture: plenocli.forward.sensor.capture.Capture;
-    centres (R, C, 2) px, else the superpixels it tells of.
+    name: for the caption.
+    centres: (lenslet_row, lenslet_column, 2) px, else the superpixels it tells of.
     """
     from plenocli.report.pictures import capture_picture
 
@@ -30,25 +43,22 @@ def capture_figures(capture, name, centres=None):
     return [(picture, ", ".join(str(w) for w in words if w) + ".")]
 
 
-def matrix_figures(artefact, points=None):
-    """Columns of A on the superpixels (of `points`, (row, column) each; else of an even choice),
-    A itself, singular values and energy.
+def matrix_figures(matrix: StoredMatrix, points: Sequence[Place] | None = None) -> Figures:
+    """Columns of A on the superpixels, A itself, singular values and energy.
+
+    points: (row, column) of the object points whose columns are shown, else an even choice.
     """
     from plenocli.report.pictures import matrix_picture, matrix_summary, pif_columns
 
-    data = artefact.data
-    pixels, objects = (
-        tuple(int(n) for n in data[f"pif/{name}_shape"]) for name in ("pixel", "object")
-    )
     columns = pif_columns(
-        data["pif/A"][0], pixels, objects, data["pif/lenslet_offset"], points=points
+        matrix.blocks[0], matrix.pixel_shape, matrix.object_shape, matrix.offsets, points=points
     )
     summary = matrix_summary(
-        data.get("pif/singular_values"),
-        data["pif/column_energy"],
-        data["pif/wavelength"],
-        objects,
-        artefact.attrs.get("pif", {}).get("rank"),
+        matrix.singular_values,
+        matrix.column_energy,
+        matrix.wavelengths,
+        matrix.object_shape,
+        matrix.rank,
     )
     return [
         (
@@ -59,7 +69,7 @@ def matrix_figures(artefact, points=None):
             ),
         ),
         (
-            matrix_picture(own_matrix(artefact)[0]),
+            matrix_picture(matrix.own),
             (
                 "The system matrix of the object's own superpixel, square-root scale: a column is "
                 "what the sensor sees of one object point."
@@ -75,109 +85,88 @@ def matrix_figures(artefact, points=None):
     ]
 
 
-def calibration_figures(artefact):
+def calibration_figures(calibration: "Calibration") -> Figures:
     """The lenslet grid on the white image, and the response of the lenslet in the middle."""
     from plenocli.report.spectral_pictures import calibration_picture, response_picture
 
-    data = artefact.data
-    figures = []
-    if "grid/centre" in data:
-        figures.append(
-            (
-                calibration_picture(
-                    data.get("white/flat"),
-                    data["grid/centre"],
-                    data["grid/valid"],
-                    data.get("grid/residual"),
-                    _predicted(artefact),
-                ),
-                _grid_caption(artefact),
-            )
+    grid, response, windows = calibration.grid, calibration.response, calibration.windows
+    described = grid.model == "description"
+    flat = None if calibration.white is None else calibration.white.flat
+    figures = [
+        (
+            calibration_picture(flat, grid.centres, grid.valid, grid.residual, described),
+            "The lenslet grid of the camera's description."
+            if described
+            else "The lenslet grid found on the white image.",
         )
-    if "response/F" not in data:
+    ]
+    matrix = None if response is None else _middle_response(calibration)
+    if response is None or windows is None or matrix is None:
         return figures
-    values, window, wavelengths = (
-        data["response/F"],
-        tuple(int(n) for n in data["response/window"]),
-        data["response/wavelength"],
-    )
-    if values.ndim == 4:
-        seen = np.argwhere(np.isfinite(values).all(axis=(2, 3)) & data["grid/valid"].astype(bool))
-        if not len(seen):
-            return figures
-        row, col = seen[np.argmin(((seen - np.array(values.shape[:2]) / 2) ** 2).sum(axis=1))]
-        values = values[row, col]
-    units = artefact.attrs.get("response", {}).get("units", "DN")
     return [
         *figures,
         (
-            response_picture(values, window, wavelengths),
+            response_picture(matrix, windows.shape, response.wavelengths),
             (
-                f"Response F of the lenslet in the middle [{units} for unit relative radiance]: "
-                "pixels that answer to each band."
+                f"Response F of the lenslet in the middle [{calibration.sensor.units} for unit "
+                "relative radiance]: pixels that answer to each band."
             ),
         ),
     ]
 
 
-def _predicted(artefact):
-    model = artefact.attrs.get("grid", {}).get("model")
-    return isinstance(model, dict) and model.get("kind") == "description"
+def _middle_response(calibration: "Calibration") -> np.ndarray | None:
+    """F (pixel, band) of the lenslet nearest to the middle that has one, or of all."""
+    matrix = calibration.response.matrix
+    if matrix.ndim != 4:
+        return matrix
+    seen = np.argwhere(np.isfinite(matrix).all(axis=(2, 3)) & calibration.grid.valid)
+    if not len(seen):
+        return None
+    row, col = seen[np.argmin(((seen - np.array(matrix.shape[:2]) / 2) ** 2).sum(axis=1))]
+    return matrix[row, col]
 
 
-def _grid_caption(artefact):
-    return (
-        "The lenslet grid of the camera's description."
-        if _predicted(artefact)
-        else "The lenslet grid found on the white image."
-    )
+def dictionary_figures(
+    result: Result,
+    name: str,
+    matrix: StoredMatrix | None = None,
+    history: bool = True,
+) -> Figures:
+    """The first atoms of a dictionary, and how learning went.
 
-
-def dictionary_figures(result, name, history=None, system=None):
-    """The first atoms, on the sensor too where `system` (A of the object's own superpixel, its
-    pixel shape) fits, and how learning went.
+    result: of a dictionary.
+    name: for the caption.
+    matrix: through which atoms are shown on the sensor too, where it fits them.
+    history: whether to show how learning went.
     """
     from plenocli.report.pictures import dictionary_atoms, learning_history
 
-    matrix, pixel_shape = (
-        system if system is not None and system[0].shape[1] == len(result.values) else (None, None)
-    )
-    shape = result.attrs.get("object_shape")
-    side = round(len(result.values) ** 0.5)
-    shape = tuple(int(n) for n in shape) if shape is not None and len(shape) == 2 else (side, side)
+    points = len(result.values)
+    fits = matrix is not None and matrix.own.shape[1] == points
+    side = round(points**0.5)
+    told = result.object_shape
+    shape = told if told is not None and len(told) == 2 else (side, side)
     figures = []
-    if shape[0] * shape[1] == len(result.values):
-        figures.append(
-            (
-                dictionary_atoms(result.values, shape, matrix, pixel_shape),
-                f"{name}: the first atoms of the dictionary.",
-            )
+    if shape[0] * shape[1] == points:
+        atoms = dictionary_atoms(
+            result.values,
+            shape,
+            matrix.own if matrix is not None and fits else None,
+            matrix.pixel_shape if matrix is not None and fits else None,
         )
-    if history:
-        figures.append((learning_history(history), "How learning went."))
+        figures.append((atoms, f"{name}: the first atoms of the dictionary."))
+    if history and result.history:
+        figures.append((learning_history(result.history), "How learning went."))
     return figures
 
 
-def own_matrix(pif):
-    """(A of the object's own superpixel in the first band, pixel shape) of a pif artefact."""
-    own = np.flatnonzero((np.asarray(pif.data["pif/lenslet_offset"]) == 0).all(axis=1))
-    return pif.data["pif/A"][0, own[0] if own.size else 0], tuple(
-        int(n) for n in pif.data["pif/pixel_shape"]
-    )
+def spectra_figures(result: Result, name: str, lenslets: Sequence[Place] | None = None) -> Figures:
+    """Bands as pictures, and spectra with error bars.
 
-
-def learning(artefact):
-    """History of a dictionary artefact: name -> values by iteration."""
-    return {
-        key.rsplit("/", 1)[1]: values
-        for key, values in artefact.data.items()
-        if key.startswith("dictionary/history/")
-    }
-
-
-def spectra_figures(result, name, lenslets=None):
-    """Bands as pictures, and spectra with error bars of `lenslets` ((row, column) each; else
-    of an even choice).
+    result: with bands.
+    name: for the caption.
+    lenslets: (row, column) whose spectra are shown, else an even choice.
     """
     from plenocli.report.spectral_pictures import band_pictures, lenslet_spectra
 
@@ -194,9 +183,11 @@ def spectra_figures(result, name, lenslets=None):
     ]
 
 
-def image_figures(result, name, seen=None):
-    """One picture without truth, and where it is known what of each lenslet's object the sensor
-    sees, (object_row, object_column).
+def image_figures(result: Result, name: str, seen: np.ndarray | None = None) -> Figures:
+    """One picture without truth.
+
+    seen: (object_row, object_column) share of each lenslet's object that the sensor sees, drawn
+        too where it is given.
     """
     from plenocli.report.pictures import picture, seen_map
 

@@ -2,10 +2,18 @@
 joined, a third one as colour.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.report.drawing import COLOURS, LEVEL_MAP, colour_bar, drawing
+from plenocli.evaluation.designs import DesignTable
+from plenocli.report.drawing import COLOURS, LEVEL_MAP, Figures, colour_bar, drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LABELS = {
     "psnr_db": "PSNR (dB)",
@@ -28,66 +36,79 @@ _LOG_SPAN = 30.0
 _PREFIXES = (("nm", 1e-9), ("µm", 1e-6), ("mm", 1e-3), ("m", 1.0))
 
 
-def front_picture(artefact):
-    """PNG of a sweep artefact: the first objective over each of the others (two at most), the best
-    points joined, or coloured by the objective that no axis shows. InputError where no
-    objective has values.
+@dataclass(frozen=True)
+class _Column:
+    """What stands on an axis: its label, and values (point,) in the unit that it names."""
+
+    label: str
+    values: np.ndarray
+
+
+def front_picture(table: DesignTable) -> bytes:
+    """The first objective over each of the others (two at most), the best points joined, or
+    coloured by the objective that no axis shows.
+
+    Returns PNG.
+    Raises InputError where no objective has values.
     """
-    attrs = artefact.attrs["sweep"]
-    columns = _columns(artefact)
-    objectives = dict(attrs["objectives"])
-    names = [name for name in objectives if name in columns and np.isfinite(columns[name][1]).any()]
+    columns = _columns(table)
+    names = [
+        name
+        for name in table.objectives
+        if name in columns and np.isfinite(columns[name].values).any()
+    ]
     if not names:
         raise InputError(
             "the sweep has no point with the figures of its front",
             fix="inspect says why its points were refused",
         )
-    ahead = artefact.data["sweep/front"].astype(bool)
     across = names[1:3] or [None]
     with drawing(4.0 * len(across) + 0.6, 3.6) as made:
         for axes, x in zip(np.atleast_1d(made.figure.subplots(1, len(across))), across):
             colour = next((name for name in names[1:] if name != x), None)
-            _panel(axes, columns, x, names[0], colour, ahead, objectives)
+            _panel(axes, columns, x, names[0], colour, table.ahead, table.objectives)
         handles = axes.get_legend_handles_labels()
         made.figure.legend(*handles, loc="outside upper left", ncols=2)
     return made.png
 
 
-def _columns(artefact):
-    """Name -> (label, (point,) values) of every figure and of every key that is a number;
-    lengths in a handy unit.
-    """
-    attrs = artefact.attrs["sweep"]
+def _columns(table: DesignTable) -> dict[str, _Column]:
+    """Every figure and every key that is a number, by name; lengths in a handy unit."""
     found = {
-        p["key"]: (
-            f"{p['key']} ({p['unit']})" if p["unit"] else p["key"],
-            artefact.data["sweep/parameter"][:, i],
-        )
-        for i, p in enumerate(attrs["parameters"])
-        if "choices" not in p
+        p.key: (f"{p.key} ({p.unit})" if p.unit else p.key, table.values[:, i])
+        for i, p in enumerate(table.parameters)
+        if p.choices is None
+    } | {
+        m.name: (LABELS.get(m.name, m.name), table.figures[:, i])
+        for i, m in enumerate(table.metrics)
     }
-    if "sweep/metric" in artefact.data:
-        found |= {
-            m["name"]: (LABELS.get(m["name"], m["name"]), artefact.data["sweep/metric"][:, i])
-            for i, m in enumerate(attrs["metrics"])
-        }
     return {name: _handy(*column) for name, column in found.items()}
 
 
-def _handy(label, values):
+def _handy(label: str, values: np.ndarray) -> _Column:
     known = values[np.isfinite(values)]
     if not label.endswith("(m)") or not known.size:
-        return label, values
+        return _Column(label, values)
     unit, scale = next((p for p in _PREFIXES if np.abs(known).max() < 999.5 * p[1]), _PREFIXES[-1])
-    return f"{label[:-3]}({unit})", values / scale
+    return _Column(f"{label[:-3]}({unit})", values / scale)
 
 
-def _panel(axes, columns, x, y, colour, ahead, objectives):
-    def label(name):
-        return f"{columns[name][0]}, {'more' if objectives[name] == 'max' else 'less'} is better"
+def _panel(
+    axes: "Axes",
+    columns: Mapping[str, _Column],
+    x: str | None,
+    y: str,
+    colour: str | None,
+    ahead: np.ndarray,
+    objectives: Mapping[str, str],
+) -> None:
+    """One pair of axes: the figure y over x (the number of the point where there is none)."""
 
-    values = columns[y][1]
-    across = np.arange(len(values), dtype=float) if x is None else columns[x][1]
+    def label(name: str) -> str:
+        return f"{columns[name].label}, {'more' if objectives[name] == 'max' else 'less'} is better"
+
+    values = columns[y].values
+    across = np.arange(len(values), dtype=float) if x is None else columns[x].values
     known = np.isfinite(across) & np.isfinite(values)
     order = np.flatnonzero(known & ahead)[np.argsort(across[known & ahead], kind="stable")]
     axes.scatter(
@@ -113,7 +134,7 @@ def _panel(axes, columns, x, y, colour, ahead, objectives):
             across[order],
             values[order],
             s=30,
-            c=columns[colour][1][order],
+            c=columns[colour].values[order],
             cmap=LEVEL_MAP,
             edgecolor="#222222",
             linewidth=0.6,
@@ -132,52 +153,46 @@ def _panel(axes, columns, x, y, colour, ahead, objectives):
     axes.grid(True)
 
 
-def front_rows(artefact):
-    """(header, rows) of the designs on the front: their number, what varies, the objectives; as
-    text, best first in the first objective.
+def front_rows(table: DesignTable) -> tuple[list[str], list[list[str]]]:
+    """The designs on the front as text, best first in the first objective.
+
+    Returns (header, rows): number, what varies, objectives.
     """
-    attrs = artefact.attrs["sweep"]
-    columns, data = _columns(artefact), artefact.data
+    columns = _columns(table)
     words = {
-        p["key"]: [
-            p["choices"][int(i)] if np.isfinite(i) else "" for i in data["sweep/parameter"][:, k]
-        ]
-        for k, p in enumerate(attrs["parameters"])
-        if "choices" in p
+        p.key: [p.choices[int(i)] if np.isfinite(i) else "" for i in table.values[:, k]]
+        for k, p in enumerate(table.parameters)
+        if p.choices is not None
     }
-    keys = [p["key"] for p in attrs["parameters"]]
-    aims = [(name, way) for name, way in attrs["objectives"] if name in columns]
+    keys = [p.key for p in table.parameters]
+    aims = [(name, aim) for name, aim in table.objectives.items() if name in columns]
     shown = [*keys, *(name for name, _ in aims if name not in keys)]
+    first, aim = columns[aims[0][0]].values, aims[0][1]
     order = sorted(
-        np.flatnonzero(data["sweep/front"]),
-        key=lambda i: (
-            -columns[aims[0][0]][1][i] if aims[0][1] == "max" else columns[aims[0][0]][1][i]
-        ),
+        np.flatnonzero(table.ahead), key=lambda i: -first[i] if aim == "max" else first[i]
     )
     rows = [
         [
             str(i),
             *(
-                str(words[name][i]) if name in words else f"{columns[name][1][i]:.6g}"
+                str(words[name][i]) if name in words else f"{columns[name].values[i]:.6g}"
                 for name in shown
             ),
         ]
         for i in order
     ]
-    return ["design", *(name if name in words else columns[name][0] for name in shown)], rows
+    return ["design", *(name if name in words else columns[name].label for name in shown)], rows
 
 
-def front_figures(artefact):
+def front_figures(table: DesignTable) -> Figures:
     """[(PNG, caption)] of a sweep, for `show` and the report."""
-    attrs = artefact.attrs["sweep"]
-    status = artefact.data["sweep/status"]
-    aims = " and ".join(f"{name} ({way})" for name, way in attrs["objectives"])
+    aims = " and ".join(f"{name} ({aim})" for name, aim in table.objectives.items())
     return [
         (
-            front_picture(artefact),
+            front_picture(table),
             (
-                f"{len(status)} designs, {int((status != 0).sum())} of them refused; "
-                f"{int(artefact.data['sweep/front'].sum())} that no other beats in {aims}."
+                f"{len(table.status)} designs, {int((table.status != 0).sum())} of them refused; "
+                f"{int(table.ahead.sum())} that no other beats in {aims}."
             ),
         )
     ]

@@ -2,36 +2,40 @@
 
 import base64
 import html
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 
 class Page:
     """Collects blocks in order; `render` gives the HTML. Texts are plain text, never markup."""
 
-    def __init__(self, title, lead=""):
-        self._title, self._lead, self._blocks, self._sections = title, lead, [], []
+    def __init__(self, title: str, lead: str = "") -> None:
+        """An empty page; `lead`: a paragraph below its title."""
+        self._title, self._lead = title, lead
+        self._blocks: list[str] = []
+        self._sections: list[str] = []
 
-    def section(self, title, text=""):
+    def section(self, title: str, text: str = "") -> None:
         """A numbered-by-order main section with an entry in the list at the top."""
         self._sections.append(title)
         self._blocks.append(f'<h2 id="s{len(self._sections)}">{html.escape(title)}</h2>')
         self.text(text)
 
-    def heading(self, title, text=""):
+    def heading(self, title: str, text: str = "") -> None:
         """A heading below a section."""
         self._blocks.append(f"<h3>{html.escape(title)}</h3>")
         self.text(text)
 
-    def text(self, text):
+    def text(self, text: str) -> None:
         """One paragraph; nothing for an empty text."""
         if text:
             self._blocks.append(f"<p>{html.escape(text)}</p>")
 
-    def warning(self, text):
+    def warning(self, text: str) -> None:
         """A paragraph that stands out."""
         self._blocks.append(f'<p class="warning">{html.escape(text)}</p>')
 
-    def cards(self, cards):
+    def cards(self, cards: Sequence[tuple[str, str]]) -> None:
         """Headline numbers: a sequence of (value, what it is)."""
         if cards:
             boxes = "".join(
@@ -43,7 +47,7 @@ class Page:
             )
             self._blocks.append(f'<div class="cards">{boxes}</div>')
 
-    def figure(self, png, caption=""):
+    def figure(self, png: bytes, caption: str = "") -> None:
         """A picture with its caption, which is also its description for those who cannot see it."""
         if png:
             data = base64.b64encode(png).decode("ascii")
@@ -54,7 +58,19 @@ class Page:
                 f"<figcaption>{html.escape(caption)}</figcaption></figure>"
             )
 
-    def table(self, header, rows, caption="", best=None, text=False):
+    def figures(self, figures: Sequence[tuple[bytes, str]]) -> None:
+        """Several pictures, (PNG, caption) each."""
+        for png, caption in figures:
+            self.figure(png, caption)
+
+    def table(
+        self,
+        header: Sequence[str],
+        rows: Sequence[Sequence[str]],
+        caption: str = "",
+        best: Mapping[int, Set[int]] | None = None,
+        text: bool = False,
+    ) -> None:
         """A table of text cells.
 
         best: row number -> set of columns set in bold.
@@ -81,7 +97,9 @@ class Page:
             "</tbody></table></div>"
         )
 
-    def definitions(self, entries, summary="What the numbers mean"):
+    def definitions(
+        self, entries: Mapping[str, str], summary: str = "What the numbers mean"
+    ) -> None:
         """Terms and what they mean, folded away: dict term -> text."""
         if entries:
             inner = "".join(
@@ -92,14 +110,14 @@ class Page:
                 f"<details><summary>{html.escape(summary)}</summary><dl>{inner}</dl></details>"
             )
 
-    def code(self, text, summary):
+    def code(self, text: str, summary: str) -> None:
         """Text in a fixed-width block, folded away."""
         self._blocks.append(
             f"<details><summary>{html.escape(summary)}</summary><pre>"
             f"{html.escape(text)}</pre></details>"
         )
 
-    def render(self):
+    def render(self) -> str:
         """The page as text. The same blocks give the same bytes."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         links = "".join(

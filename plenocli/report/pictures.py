@@ -3,8 +3,13 @@
 Every function returns PNG bytes.
 """
 
-import numpy as np
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plenocli.evaluation.scores import ResultScore
 from plenocli.report.drawing import (
     COLOURS,
     GRID_LINE,
@@ -20,7 +25,16 @@ from plenocli.report.drawing import (
     thumbnail,
 )
 
-ZOOMED = 3  # superpixels per side in the close-up
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import Rectangle
+
+Shape = tuple[int, ...]
+Entry = tuple[str, np.ndarray, str]
+"""Label, values (row, column) and caption of a result."""
+ZOOMED = 3
+"""Superpixels per side in the close-up."""
 HISTORY = {
     "validation_psnr": "PSNR on held-out patches [dB]",
     "change": "change of the atoms (norm)",
@@ -34,13 +48,23 @@ HISTORY = {
 """What learning records, in words."""
 
 
-def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
-    """A capture: the whole mosaic (row, column) with its lenslet grid, and the middle
-    superpixels close up.
+def capture_picture(
+    mosaic: ArrayLike,
+    units: str = "",
+    centres: np.ndarray | None = None,
+    pitch: tuple[float, ...] | None = None,
+    black: float = 0.0,
+) -> bytes:
+    """A capture: the whole mosaic with its lenslet grid, and the middle superpixels close up.
 
-    centres: superpixel centres (R, C, 2) in px or None;
+    mosaic: (row, column).
+    units: of its values.
+    centres: (lenslet_row, lenslet_column, 2) px, or None.
     pitch: (row, column) px or None, used where centres are missing, for superpixels that tile from
-        the corner. Levels are shown above `black` on one scale for both parts.
+        the corner.
+    black: level above which values are shown, on one scale for both parts.
+
+    Returns PNG.
     """
     mosaic = np.asarray(mosaic, dtype=np.float64) - black
     top = float(np.percentile(mosaic, 99.9)) or 1.0
@@ -88,13 +112,13 @@ def capture_picture(mosaic, units="", centres=None, pitch=None, black=0.0):
     return made.png
 
 
-def _tiling(shape, pitch):
+def _tiling(shape: Shape, pitch: tuple[float, ...]) -> np.ndarray:
     count = [max(int(n / p + 1e-6), 1) for n, p in zip(shape, pitch, strict=True)]
     row, col = ((np.arange(n) + 0.5) * p - 0.5 for n, p in zip(count, pitch, strict=True))
     return np.stack(np.meshgrid(row, col, indexing="ij"), axis=-1)
 
 
-def _middle(shape, centres):
+def _middle(shape: Shape, centres: np.ndarray | None) -> tuple[int, int, int, int]:
     """Row and column range of the middle ZOOMED x ZOOMED superpixels, or of the
     middle of the frame.
     """
@@ -114,7 +138,7 @@ def _middle(shape, centres):
     return low[0], high[0], low[1], high[1]
 
 
-def _spacing(centres, shape):
+def _spacing(centres: np.ndarray, shape: Shape) -> list[float]:
     """Median (row, column) spacing of lenslets in px; the frame's size along an
     axis with one lenslet.
     """
@@ -126,7 +150,7 @@ def _spacing(centres, shape):
     return found
 
 
-def _lattice(axes, centres, width):
+def _lattice(axes: "Axes", centres: np.ndarray, width: float) -> None:
     """Boundaries between neighbouring superpixels along rows and columns; follows
     rotated and bent grids.
     """
@@ -144,7 +168,7 @@ def _lattice(axes, centres, width):
     axes.set(xlim=limits[0], ylim=limits[1])
 
 
-def _outline(box):
+def _outline(box: tuple[int, int, int, int]) -> "Rectangle":
     from matplotlib.patches import Rectangle
 
     return Rectangle(
@@ -157,13 +181,26 @@ def _outline(box):
     )
 
 
-def pif_columns(matrix, pixel_shape, object_shape, offsets, per_side=3, points=None):
-    """What the sensor sees of single object points: columns of A laid out on the superpixels,
-    per_side x per_side points or the given `points`, (row, column) each.
+def pif_columns(
+    matrix: np.ndarray,
+    pixel_shape: Shape,
+    object_shape: Shape,
+    offsets: np.ndarray,
+    per_side: int = 3,
+    points: Sequence[tuple[int, int]] | None = None,
+) -> bytes:
+    """What the sensor sees of single object points: columns of A laid out on the superpixels.
 
-    matrix (lenslet, pixel, point), offsets (lenslet, 2) superpixel (row, column) from the point's
-    own. The panels stand as the points' images do on the lenslet. Square-root scale, because the
-    outer fringes are weak.
+    matrix: (lenslet, pixel, point).
+    pixel_shape, object_shape: (rows, columns) of a superpixel and of an object block.
+    offsets: (lenslet, 2) superpixel (row, column) from the point's own.
+    per_side: points along each side, where none are given.
+    points: (row, column) each.
+
+    The panels stand as the points' images do on the lenslet. Square-root scale, because the outer
+    fringes are weak.
+
+    Returns PNG.
     """
     if points is None:
         rows, columns = (
@@ -198,13 +235,13 @@ def pif_columns(matrix, pixel_shape, object_shape, offsets, per_side=3, points=N
     return made.png
 
 
-def _root_norm(top):
+def _root_norm(top: float) -> "Normalize":
     from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, vmin=0, vmax=top)
 
 
-def _on_superpixels(column, pixel_shape, offsets):
+def _on_superpixels(column: np.ndarray, pixel_shape: Shape, offsets: ArrayLike) -> np.ndarray:
     """One column (lenslet, pixel) as a picture of all superpixels, each at its offset."""
     offsets = np.asarray(offsets) - np.min(offsets, axis=0)
     height, width = pixel_shape
@@ -216,9 +253,9 @@ def _on_superpixels(column, pixel_shape, offsets):
     return picture
 
 
-def matrix_picture(matrix):
-    """A of one superpixel, (pixel, point): what each pixel has of each object point,
-    square-root scale.
+def matrix_picture(matrix: np.ndarray) -> bytes:
+    """A of one superpixel, (pixel, point): what each pixel has of each object point, square-root
+    scale, as PNG.
     """
     shown, step = thumbnail(np.asarray(matrix, dtype=np.float64), 700)
     with drawing(7.2, 4.6) as made:
@@ -240,12 +277,23 @@ def matrix_picture(matrix):
     return made.png
 
 
-def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ranks=None):
-    """Singular values of A relative to the largest, one line a band, and the share of light
-    kept by object point.
+def matrix_summary(
+    singular_values: np.ndarray | None,
+    column_energy: np.ndarray,
+    wavelengths: ArrayLike,
+    object_shape: Shape,
+    ranks: ArrayLike | None = None,
+) -> bytes:
+    """Singular values of A relative to the largest, one line a band, and the share of light kept by
+    object point.
 
-    singular_values (band, value) or (value,) or None; column_energy (band, point); ranks (band,) or
-    None. Of many bands six are drawn.
+    singular_values: (band, value) or (value,), or None.
+    column_energy: (band, point).
+    wavelengths: (band,) m; of many bands six are drawn.
+    object_shape: (rows, columns) of an object block.
+    ranks: (band,) or None.
+
+    Returns PNG.
     """
     values = None if singular_values is None else np.atleast_2d(singular_values)
     with drawing(9.4, 3.6) as made:
@@ -287,12 +335,16 @@ def matrix_summary(singular_values, column_energy, wavelengths, object_shape, ra
     return made.png
 
 
-def reconstructions(entries, truth, columns=4):
-    """Reconstructions beside the truth, each above its error; light encoded for the
-    screen, white = 1.
+def reconstructions(entries: Sequence[Entry], truth: ArrayLike, columns: int = 4) -> bytes:
+    """Reconstructions beside the truth, each above its error; light encoded for the screen,
+    white = 1.
 
-    entries: sequence of (label, values (row, column), caption). One error scale for all, that of
-        the typical result.
+    entries: (label, values (row, column), caption) each. One error scale for all, that of the
+        typical result.
+    truth: (row, column).
+    columns: at most.
+
+    Returns PNG.
     """
     truth = np.asarray(truth, dtype=np.float64)
     errors = [np.asarray(values) - truth for _, values, _ in entries]
@@ -337,9 +389,22 @@ def reconstructions(entries, truth, columns=4):
     return made.png
 
 
-def close_ups(entries, truth, block, lenslets=3, columns=4):
-    """The middle `lenslets` x `lenslets` lenslet fields of truth and results, enlarged, with the
-    lenslets' borders.
+def close_ups(
+    entries: Sequence[Entry],
+    truth: np.ndarray,
+    block: tuple[int, int],
+    lenslets: int = 3,
+    columns: int = 4,
+) -> bytes:
+    """The fields of the middle lenslets of truth and results, enlarged, with the lenslets' borders.
+
+    entries: as for reconstructions.
+    truth: (row, column).
+    block: (rows, columns) of samples under a lenslet.
+    lenslets: along each side.
+    columns: at most.
+
+    Returns PNG.
     """
     boxes = []
     for size, side in zip(truth.shape, block, strict=True):
@@ -365,8 +430,8 @@ def close_ups(entries, truth, block, lenslets=3, columns=4):
     return made.png
 
 
-def picture(values, title=""):
-    """One reconstructed picture (row, column), without truth."""
+def picture(values: ArrayLike, title: str = "") -> bytes:
+    """One reconstructed picture (row, column), without truth, as PNG."""
     values = np.asarray(values, dtype=np.float64)
     top = float(np.percentile(values, 99.8))
     height = 5.4 * values.shape[0] / values.shape[1]
@@ -375,8 +440,10 @@ def picture(values, title=""):
     return made.png
 
 
-def seen_map(share):
-    """What of a lenslet's object the sensor tells apart, 0 to 1, by object point (row, column)."""
+def seen_map(share: np.ndarray) -> bytes:
+    """What of a lenslet's object the sensor tells apart, 0 to 1, by object point (row, column), as
+    PNG.
+    """
     with drawing(4.6, 3.8) as made:
         axes = made.figure.subplots()
         show_map(
@@ -391,58 +458,46 @@ def seen_map(share):
     return made.png
 
 
-def method_bars(documents):
-    """PSNR of every method, one colour an experiment: documents is a sequence of (name, entries
-    of a score document).
+def method_bars(documents: Sequence[tuple[str, Sequence[ResultScore]]]) -> bytes:
+    """PSNR of every method, one colour an experiment.
+
+    documents: (name, results that have a PSNR) each.
+
+    Returns PNG.
     """
-    methods = list(dict.fromkeys(entry["label"] for _, entries in documents for entry in entries))
+    methods = list(dict.fromkeys(one.label for _, results in documents for one in results))
     with drawing(8.2, 0.95 + (0.24 * len(documents) + 0.16) * len(methods)) as made:
         axes = made.figure.subplots()
         thick = 0.8 / len(documents)
         low = high = None
-        for number, (name, entries) in enumerate(documents):
-            found = {entry["label"]: entry["metrics"] for entry in entries}
-            colour = COLOURS[number % len(COLOURS)]
+        for number, (name, results) in enumerate(documents):
+            levels = {
+                one.label: ratio for one in results if (ratio := one.number("psnr_db")) is not None
+            }
+            shift = (number - (len(documents) - 1) / 2) * thick
+            first = next((method for method in methods if method in levels), None)
             for position, method in enumerate(methods):
-                value = found.get(method, {}).get("psnr_db")
+                value = levels.get(method)
                 if value is None:
                     continue
                 low, high = min(value, low or value), max(value, high or value)
-                place = position + (number - (len(documents) - 1) / 2) * thick
                 axes.barh(
-                    place,
+                    position + shift,
                     value,
                     0.88 * thick,
-                    color=colour,
-                    label=name
-                    if method
-                    == next(m for m in methods if found.get(m, {}).get("psnr_db") is not None)
-                    else None,
+                    color=COLOURS[number % len(COLOURS)],
+                    label=name if method == first else None,
                 )
                 axes.annotate(
                     f"{value:.1f}",
-                    (max(value, 0), place),
+                    (max(value, 0), position + shift),
                     (3, 0),
                     textcoords="offset points",
                     va="center",
                     fontsize=7.5,
                 )
-            baseline = next(
-                (
-                    m["block_mean_psnr_db"]
-                    for m in found.values()
-                    if m.get("block_mean_psnr_db") is not None
-                ),
-                None,
-            )
-            if baseline is not None and number == 0:
-                axes.axvline(
-                    baseline,
-                    color="#777777",
-                    linewidth=0.9,
-                    linestyle=(0, (4, 3)),
-                    label="block mean of the truth",
-                )
+            if number == 0:
+                _baseline(axes, results)
         axes.set_yticks(range(len(methods)), methods)
         axes.invert_yaxis()
         axes.set(
@@ -455,11 +510,36 @@ def method_bars(documents):
     return made.png
 
 
-def dictionary_atoms(atoms, object_shape, matrix=None, pixel_shape=None, per_side=10):
-    """Atoms in object space and, where A (pixel, point) is given, what the sensor sees of each;
-    each on its own scale.
+def _baseline(axes: "Axes", results: Sequence[ResultScore]) -> None:
+    """A line at the PSNR of one value a lenslet, where it is known."""
+    known = {one.label: one.number("block_mean_psnr_db") for one in results}
+    baseline = next((value for value in known.values() if value is not None), None)
+    if baseline is not None:
+        axes.axvline(
+            baseline,
+            color="#777777",
+            linewidth=0.9,
+            linestyle=(0, (4, 3)),
+            label="block mean of the truth",
+        )
 
-    atoms (point, atom); the first per_side^2 by order of use are those in the file's order.
+
+def dictionary_atoms(
+    atoms: np.ndarray,
+    object_shape: Shape,
+    matrix: np.ndarray | None = None,
+    pixel_shape: Shape | None = None,
+    per_side: int = 10,
+) -> bytes:
+    """Atoms in object space and on the sensor, each on its own scale.
+
+    atoms: (point, atom); the first per_side^2 by order of use are those in the file's order.
+    object_shape: (rows, columns) of an atom.
+    matrix: A (pixel, point), through which the sensor sees them, or None.
+    pixel_shape: (rows, columns) of a superpixel, where A is given.
+    per_side: atoms along each side.
+
+    Returns PNG.
     """
     count = min(per_side * per_side, atoms.shape[1])
     chosen = atoms[:, :count]
@@ -481,7 +561,7 @@ def dictionary_atoms(atoms, object_shape, matrix=None, pixel_shape=None, per_sid
     return made.png
 
 
-def _mosaic_of(columns, shape, per_side):
+def _mosaic_of(columns: np.ndarray, shape: Shape, per_side: int) -> np.ndarray:
     """Columns (sample, n) as small pictures side by side, each scaled to its largest
     magnitude, on a white gap.
     """
@@ -498,10 +578,12 @@ def _mosaic_of(columns, shape, per_side):
     return canvas
 
 
-def learning_history(history):
-    """How learning went: one small panel for each recorded value;
+def learning_history(history: Mapping[str, ArrayLike]) -> bytes:
+    """How learning went: one small panel for each recorded value.
 
-    history: name -> (iteration,) array.
+    history: name -> (iteration,).
+
+    Returns PNG, nothing where nothing was recorded.
     """
     named = {
         name: np.asarray(v, dtype=float)

@@ -4,42 +4,39 @@ through the pupil.
 
 import numpy as np
 
-from plenocli.report.drawing import COLOURS, LEVEL_MAP, drawing, show_map, show_picture
+from plenocli.inverse.lightfield.planes import DepthMap, LightField
+from plenocli.report.drawing import COLOURS, LEVEL_MAP, Figures, drawing, show_map, show_picture
 
 MOST = 9
 """Planes drawn, evenly from all."""
 
 
-def lightfield_figures(artefact):
-    """[(PNG, caption)] of a light-field artefact."""
-    data = artefact.data
+def lightfield_figures(field: LightField) -> Figures:
+    """[(PNG, caption)] of what refocus made of a capture."""
     figures = [
-        (_planes(data), "Planes of the capture, nearest last."),
-        (_sharpness(data), "Sharpness of each plane."),
+        (_planes(field), "Planes of the capture, nearest last."),
+        (_sharpness(field), "Sharpness of each plane."),
     ]
-    if "depth/slope" in data:
-        figures.append((_depth(data), "Where the views agree best, and how clearly."))
-    if "views/value" in data:
-        figures.append((_views(data["views/value"]), "The scene through parts of the pupil."))
+    if field.depth is not None:
+        figures.append((_depth(field.depth), "Where the views agree best, and how clearly."))
+    if field.views is not None:
+        figures.append((_views(field.views), "The scene through parts of the pupil."))
     return figures
 
 
-def _label(data, plane):
-    distance = data.get("refocus/distance")
-    slope = f"slope {data['refocus/slope'][plane]:.3g}"
-    return (
-        slope
-        if distance is None or np.isnan(distance[plane])
-        else f"{distance[plane] * 1e3:.4g} mm, {slope}"
-    )
+def _label(field: LightField, plane: int) -> str:
+    slope = f"slope {field.slopes[plane]:.3g}"
+    if field.distances is None or np.isnan(field.distances[plane]):
+        return slope
+    return f"{field.distances[plane] * 1e3:.4g} mm, {slope}"
 
 
-def _top(values):
+def _top(values: np.ndarray) -> float:
     return max(float(np.nanpercentile(values, 99.5)), 1e-30)
 
 
-def _planes(data):
-    pictures = data["refocus/value"]
+def _planes(field: LightField) -> bytes:
+    pictures = field.pictures
     chosen = np.unique(
         np.linspace(0, len(pictures) - 1, min(len(pictures), MOST)).round().astype(int)
     )
@@ -51,18 +48,17 @@ def _planes(data):
         for axes in panels[len(chosen) :]:
             axes.set_visible(False)
         for axes, plane in zip(panels, chosen):
-            show_picture(axes, pictures[plane] / _top(pictures), _label(data, plane))
+            show_picture(axes, pictures[plane] / _top(pictures), _label(field, plane))
     return made.png
 
 
-def _sharpness(data):
+def _sharpness(field: LightField) -> bytes:
     with drawing(5.6, 2.4) as made:
         axes = made.figure.subplots()
-        distance = data.get("refocus/distance")
-        known = distance is not None and np.isfinite(distance).all()
+        known = field.distances is not None and np.isfinite(field.distances).all()
         axes.plot(
-            1e3 * distance if known else data["refocus/slope"],
-            data["refocus/sharpness"],
+            1e3 * field.distances if known else field.slopes,
+            field.sharpness,
             "o-",
             color=COLOURS[0],
         )
@@ -74,13 +70,11 @@ def _sharpness(data):
     return made.png
 
 
-def _depth(data):
-    distance = data.get("depth/distance")
-    known = distance is not None and np.isfinite(distance).any()
+def _depth(depth: DepthMap) -> bytes:
+    known = depth.distance is not None and np.isfinite(depth.distance).any()
     values, bar = (
-        (1e3 * distance, "distance [mm]") if known else (data["depth/slope"], "slope [px/px]")
+        (1e3 * depth.distance, "distance [mm]") if known else (depth.slope, "slope [px/px]")
     )
-    sure = data["depth/confidence"]
     with drawing(8.6, 3.4) as made:
         left, right = made.figure.subplots(1, 2)
         low, high = np.nanpercentile(values, [2, 98])
@@ -93,13 +87,13 @@ def _depth(data):
             cmap=LEVEL_MAP,
             vmin=low,
             vmax=high if high > low else low + 1e-9,
-            alpha=np.clip(2 * sure, 0.1, 1),
+            alpha=np.clip(2 * depth.confidence, 0.1, 1),
         )
-        show_map(right, sure, "confidence", "", cmap=LEVEL_MAP, vmin=0, vmax=1)
+        show_map(right, depth.confidence, "confidence", "", cmap=LEVEL_MAP, vmin=0, vmax=1)
     return made.png
 
 
-def _views(values):
+def _views(values: np.ndarray) -> bytes:
     rows, columns, height, width = values.shape
     with drawing(1.9 * columns, 1.9 * rows * height / width + 0.1) as made:
         for axes, picture in zip(

@@ -1,7 +1,14 @@
 """The parts of a page that show a score document, and the page of one score alone."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.evaluation.results import Result
+from plenocli.evaluation.scores import ResultScore, ScoreDocument
 from plenocli.report.page import Page
-from plenocli.report.tables import LABELS, metric_rows
+from plenocli.report.tables import label_of, metric_rows
 
 HIGHER = ("psnr_db", "psnr_inner_db", "psnr_clipped_db", "ssim", "gain_over_block_mean_db")
 LOWER = (
@@ -13,43 +20,59 @@ LOWER = (
     "spectral_angle_deg",
     "delta_e_2000",
 )
-_MOST = 11  # results drawn in one picture
+_MOST = 11
+"""Results drawn in one picture."""
 
 
-def score_page(document, pictures):
-    """A page (HTML text) for one score document; `pictures` as run_score collects
-    them, one a result.
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """What a page draws of a result.
+
+    truth: like its values, None for a dictionary.
+    block: (rows, columns) of samples under a lenslet, or None.
     """
-    page = Page("plenocli score", document.get("command", ""))
+
+    result: Result
+    truth: np.ndarray | None = None
+    block: tuple[int, int] | None = None
+
+
+Pair = tuple[ResultScore, Compared]
+
+
+def score_page(document: ScoreDocument, drawn: Sequence[Compared | None]) -> str:
+    """A page (HTML text) for one score document.
+
+    drawn: one a result, None where there is nothing to draw.
+    """
+    page = Page("plenocli score", document.command)
     page.section("Numbers")
     add_table(page, document)
     page.section("Pictures")
-    add_pictures(page, document, pictures)
+    add_pictures(page, document, drawn)
     page.section("Files")
     add_inputs(page, document)
     return page.render()
 
 
-def add_table(page, document, caption=""):
-    """The table of all results with the best of each row in bold, failed results,
-    and the definitions.
+def add_table(page: Page, document: ScoreDocument, caption: str = "") -> None:
+    """The table of all results with the best of each row in bold, failed results, and the
+    definitions.
     """
     header, rows = metric_rows(document)
     page.table(header, rows, caption, _best(document, rows))
-    for entry in document["results"]:
-        if "error" in entry:
-            page.warning(f"{entry['name']} could not be scored: {entry['error']}")
-    page.definitions(
-        {LABELS.get(name, (name,))[0]: text for name, text in document["definitions"].items()}
-    )
+    for one in document.results:
+        if one.error:
+            page.warning(f"{one.name} could not be scored: {one.error}")
+    page.definitions({label_of(name): text for name, text in document.definitions.items()})
 
 
-def _best(document, rows):
+def _best(document: ScoreDocument, rows: list[list[str]]) -> dict[int, set[int]]:
     """Row number -> columns that hold the best value of a metric where more or less is better."""
-    if len(document["results"]) < 2:
+    if len(document.results) < 2:
         return {}
     best = {}
-    labels = {LABELS[name][0]: min for name in LOWER} | {LABELS[name][0]: max for name in HIGHER}
+    labels = {label_of(name): min for name in LOWER} | {label_of(name): max for name in HIGHER}
     for number, row in enumerate(rows):
         choose = labels.get(row[0].split(" [")[0]) or labels.get(row[0].split(",")[0])
         numbers = {
@@ -62,7 +85,7 @@ def _best(document, rows):
     return best
 
 
-def _is_number(cell):
+def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
@@ -70,38 +93,38 @@ def _is_number(cell):
     return cell != "none"
 
 
-def add_pictures(page, document, pictures):
-    """Pictures of results beside their truth; entries and pictures go together,
-    pictures may hold None.
-    """
+def add_pictures(page: Page, document: ScoreDocument, drawn: Sequence[Compared | None]) -> None:
+    """Pictures of results beside their truth; results and what is drawn of them go together."""
     from plenocli.report.figures import dictionary_figures
 
     pairs = [
-        (entry, picture)
-        for entry, picture in zip(document["results"], pictures, strict=True)
-        if picture is not None
+        (one, compared)
+        for one, compared in zip(document.results, drawn, strict=True)
+        if compared is not None
     ]
-    flat = [(e, p) for e, p in pairs if "truth" in p and p["result"].wavelengths is None]
-    for shape in dict.fromkeys(p["truth"].shape for _, p in flat):
-        add_reconstructions(page, [(e, p) for e, p in flat if p["truth"].shape == shape])
-    add_spectra(page, document, [(e, p) for e, p in pairs if p["result"].wavelengths is not None])
-    for entry, picture in pairs:
-        if picture["result"].kind == "dictionary":
-            for drawn, caption in dictionary_figures(picture["result"], entry["label"]):
-                page.figure(drawn, caption)
+    add_reconstructions(page, [pair for pair in pairs if pair[1].result.wavelengths is None])
+    bands = [compared for _, compared in pairs if compared.result.wavelengths is not None]
+    labels = [one.label for one, compared in pairs if compared.result.wavelengths is not None]
+    add_spectra(page, document, list(zip(labels, [c.result for c in bands], strict=True)))
+    for one, compared in pairs:
+        if compared.result.kind == "dictionary":
+            for picture, caption in dictionary_figures(compared.result, one.label, history=False):
+                page.figure(picture, caption)
 
 
-def add_reconstructions(page, pairs):
-    """Truth, results and errors of pictures on one grid, and a close-up where the
-    lenslets' blocks are known.
-    """
+def add_reconstructions(page: Page, pairs: Sequence[Pair]) -> None:
+    """Truth, results and errors of pictures, those on one grid together."""
+    known = [(one, compared) for one, compared in pairs if compared.truth is not None]
+    for shape in dict.fromkeys(compared.truth.shape for _, compared in known):
+        _add_one_grid(page, [pair for pair in known if pair[1].truth.shape == shape][:_MOST])
+
+
+def _add_one_grid(page: Page, pairs: Sequence[Pair]) -> None:
+    """Pictures on one grid, and a close-up where the lenslets' blocks are known."""
     from plenocli.report.pictures import close_ups, reconstructions
 
-    pairs = pairs[:_MOST]
-    if not pairs:
-        return
-    truth = pairs[0][1]["truth"]
-    entries = [(e["label"], p["result"].values, _caption(e["metrics"])) for e, p in pairs]
+    truth = pairs[0][1].truth
+    entries = [(one.label, compared.result.values, _caption(one)) for one, compared in pairs]
     page.figure(
         reconstructions(entries, truth),
         (
@@ -109,7 +132,7 @@ def add_reconstructions(page, pairs):
             "error scale for all."
         ),
     )
-    block = next((p["block"] for _, p in pairs if p.get("block")), None)
+    block = next((compared.block for _, compared in pairs if compared.block), None)
     if block is not None and min(truth.shape[0] // block[0], truth.shape[1] // block[1]) >= 2:
         page.figure(
             close_ups(entries, truth, block),
@@ -120,17 +143,16 @@ def add_reconstructions(page, pairs):
         )
 
 
-def _caption(metrics):
-    parts = []
-    if metrics.get("psnr_db") is not None:
-        parts.append(f"{metrics['psnr_db']:.2f} dB")
-    if metrics.get("ssim") is not None:
-        parts.append(f"SSIM {metrics['ssim']:.3f}")
-    return ", ".join(parts)
+def _caption(one: ResultScore) -> str:
+    ratio, similarity = one.number("psnr_db"), one.number("ssim")
+    parts = [] if ratio is None else [f"{ratio:.2f} dB"]
+    return ", ".join(parts if similarity is None else [*parts, f"SSIM {similarity:.3f}"])
 
 
-def add_spectra(page, document, pairs):
-    """Bars per band, spectra of patches and the bands as pictures of spectral results."""
+def add_spectra(page: Page, document: ScoreDocument, results: Sequence[tuple[str, Result]]) -> None:
+    """Bars per band and spectra of patches of a document, and the bands of `results`, (label,
+    spectra) each, as pictures.
+    """
     from plenocli.report.spectral_pictures import (
         accuracy_bars,
         band_pictures,
@@ -139,19 +161,17 @@ def add_spectra(page, document, pairs):
     )
 
     entries = [
-        e
-        for e in document["results"]
-        if e.get("wavelengths_nm") and "rmse_per_band" in e["metrics"]
+        one for one in document.results if one.wavelengths_nm and "rmse_per_band" in one.figures
     ]
-    same = [e for e in entries if e["wavelengths_nm"] == entries[0]["wavelengths_nm"]]
+    same = [one for one in entries if one.wavelengths_nm == entries[0].wavelengths_nm]
     if same:
         page.figure(
             accuracy_bars(same),
             "Error and signal-to-noise ratio by band, as in the paper's Fig. 7.",
         )
-        chart = [(e["label"], e["patches"]) for e in same if e.get("patches")][:6]
+        chart = [(one.label, one.patches) for one in same if one.patches][:6]
         if chart:
-            bands = same[0]["wavelengths_nm"]
+            bands = same[0].wavelengths_nm
             page.figure(
                 patch_errors(chart, bands),
                 (
@@ -166,18 +186,14 @@ def add_spectra(page, document, pairs):
                     "Grey: the chart's full spectrum."
                 ),
             )
-    for entry, picture in pairs[:4]:
-        result = picture["result"]
+    for label, result in results[:4]:
         page.figure(
             band_pictures(result.values, result.wavelengths, result.quantity or "value"),
-            f"{entry['label']}: one value a lenslet and band, and the colour they make together.",
+            f"{label}: one value a lenslet and band, and the colour they make together.",
         )
 
 
-def add_inputs(page, document):
+def add_inputs(page: Page, document: ScoreDocument) -> None:
     """Files by role, name and digest."""
-    rows = [
-        [role, about["name"], about["sha256"][:16]]
-        for role, about in document.get("inputs", {}).items()
-    ]
+    rows = [[role, file.name, file.sha256[:16]] for role, file in document.inputs.items()]
     page.table(["role", "file", "SHA-256 begins"], rows, text=True)

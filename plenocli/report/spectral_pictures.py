@@ -2,8 +2,13 @@
 patches, error bars. PNG bytes.
 """
 
-import numpy as np
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plenocli.evaluation.scores import PatchScore, ResultScore
 from plenocli.report.drawing import (
     COLOURS,
     LEVEL_MAP,
@@ -19,14 +24,28 @@ from plenocli.report.drawing import (
     thumbnail,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def calibration_picture(flat, centres, valid, residual=None, predicted=False):
-    """The white image (row, column; peak 1 in each superpixel) with the lenslet centres
-    found, and a close-up.
+    from plenocli.forward.camera.model import Camera
 
-    centres (R, C, 2) px, valid (R, C) bool, residual (R, C) px or None.
-    flat None: the centres alone.
+
+def calibration_picture(
+    flat: np.ndarray | None,
+    centres: ArrayLike,
+    valid: ArrayLike,
+    residual: ArrayLike | None = None,
+    predicted: bool = False,
+) -> bytes:
+    """The white image with the lenslet centres found, and a close-up.
+
+    flat: (row, column), peak 1 in each superpixel; None: the centres alone.
+    centres: (lenslet_row, lenslet_column, 2) px.
+    valid: (lenslet_row, lenslet_column) bool.
+    residual: (lenslet_row, lenslet_column) px from the lattice, or None.
     predicted: nobody looked for them.
+
+    Returns PNG.
     """
     centres, valid = np.asarray(centres), np.asarray(valid, dtype=bool)
     found = centres[valid & np.isfinite(centres).all(axis=-1)]
@@ -95,9 +114,16 @@ def calibration_picture(flat, centres, valid, residual=None, predicted=False):
     return made.png
 
 
-def response_picture(response, window, wavelengths):
-    """F of one lenslet (pixel, band): which pixels of the superpixel answer to which band, each
-    band on its own scale.
+def response_picture(
+    response: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float]
+) -> bytes:
+    """Which pixels of the superpixel answer to which band, each band on its own scale.
+
+    response: F of one lenslet, (pixel, band).
+    window: (rows, columns) of pixels.
+    wavelengths: (band,) m.
+
+    Returns PNG.
     """
     count = len(wavelengths)
     with drawing(min(2.5 * count, 10.2), 2.7) as made:
@@ -110,9 +136,17 @@ def response_picture(response, window, wavelengths):
     return made.png
 
 
-def response_errors(error, peak, window, wavelengths):
-    """Differences of two responses (pixel, band) over the brightest pixel of each band (band,):
-    which pixels of the superpixel differ, on one scale.
+def response_errors(
+    error: ArrayLike, peak: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float]
+) -> bytes:
+    """Which pixels of the superpixel differ between two responses, on one scale.
+
+    error: (pixel, band) difference.
+    peak: (band,) brightest pixel.
+    window: (rows, columns) of pixels.
+    wavelengths: (band,) m.
+
+    Returns PNG.
     """
     count = len(wavelengths)
     shares = 100 * np.asarray(error) / np.asarray(peak)
@@ -132,9 +166,9 @@ def response_errors(error, peak, window, wavelengths):
     return made.png
 
 
-def filters_picture(camera):
-    """The filter array in the pupil of the main lens, and what filters and sensor let through,
-    by wavelength; b"" without filters.
+def filters_picture(camera: "Camera") -> bytes:
+    """The filter array in the pupil of the main lens, and what filters and sensor let through, by
+    wavelength, as PNG; nothing without filters.
     """
     from matplotlib.patches import Circle, Rectangle
 
@@ -199,9 +233,17 @@ def filters_picture(camera):
     return made.png
 
 
-def band_pictures(cube, wavelengths, quantity="value", light="D65"):
-    """Demultiplexed bands (band, row, column) on one scale, and the colour they make
-    together (white = 1).
+def band_pictures(
+    cube: ArrayLike, wavelengths: np.ndarray, quantity: str = "value", light: str = "D65"
+) -> bytes:
+    """Demultiplexed bands on one scale, and the colour they make together (white = 1).
+
+    cube: (band, row, column).
+    wavelengths: (band,) m.
+    quantity: of the values, "reflectance" or another word.
+    light: name of the illuminant.
+
+    Returns PNG.
     """
     from plenocli.forward.scene.colour import preview_rgb
 
@@ -238,12 +280,23 @@ def band_pictures(cube, wavelengths, quantity="value", light="D65"):
     return made.png
 
 
-def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
-    """Spectra of single lenslets with one standard deviation: cube and sigma (band, row, column),
-    sigma None where unknown.
+def lenslet_spectra(
+    cube: ArrayLike,
+    sigma: ArrayLike | None,
+    wavelengths: ArrayLike,
+    quantity: str = "value",
+    lenslets: Sequence[tuple[int, int]] | None = None,
+) -> bytes:
+    """Spectra of single lenslets with one standard deviation.
 
+    cube: (band, row, column).
+    sigma: like the cube, None where unknown.
+    wavelengths: (band,) m.
+    quantity: of the values, in words.
     lenslets: (row, column) each; by default those whose brightness is at five even ranks, which
         shows dark and bright ones.
+
+    Returns PNG.
     """
     cube = np.asarray(cube, dtype=np.float64)
     if lenslets is None:
@@ -263,11 +316,11 @@ def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
     with drawing(6.4, 3.4) as made:
         axes = made.figure.subplots()
         for number, (row, col) in enumerate(lenslets):
-            spread = None if sigma is None else np.asarray(sigma)[:, row, col]
+            std = None if sigma is None else np.asarray(sigma)[:, row, col]
             axes.errorbar(
                 np.asarray(wavelengths) * 1e9,
                 cube[:, row, col],
-                spread,
+                std,
                 marker="o",
                 markersize=3.5,
                 capsize=2.5,
@@ -282,20 +335,25 @@ def lenslet_spectra(cube, sigma, wavelengths, quantity="value", lenslets=None):
     return made.png
 
 
-def patch_spectra(entries, wavelengths_nm, only_six=False):
-    """Spectra of the chart's patches: truth as a line, each result as points with +- one
-    standard deviation.
+def patch_spectra(
+    entries: Sequence[tuple[str, Sequence[PatchScore]]],
+    wavelengths_nm: Sequence[float],
+    only_six: bool = False,
+) -> bytes:
+    """Spectra of the chart's patches: truth as a line, each result as points with +- one standard
+    deviation; a colour strip beneath each title shows the patch.
 
-    entries: sequence of (label, patches) as score lists them: dicts with label, name, mean, std,
-        truth. A colour strip beneath each title shows the patch.
+    entries: (label, patches) of each result.
+    wavelengths_nm: (band,).
+    only_six: leave out all but the paper's six patches.
+
+    Returns PNG.
     """
     from plenocli.forward.scene.colour import preview_rgb
     from plenocli.forward.scene.tables import colorchecker
 
-    wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
-    wanted = {
-        p["label"]: p for _, patches in entries for p in patches if p["one_of_six"] or not only_six
-    }
+    bands = np.asarray(wavelengths_nm, dtype=float)
+    wanted = {p.label: p for _, patches in entries for p in patches if p.one_of_six or not only_six}
     order = sorted(wanted)
     columns = 6 if len(order) > 6 else 3
     lines = -(-len(order) // columns)
@@ -320,7 +378,6 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
         )
         for axes in panels.flat[len(order) :]:
             axes.set_axis_off()
-        spread = 0.012 * np.ptp(wavelengths_nm) if len(entries) > 1 else 0.0
         for place, (axes, label) in enumerate(zip(panels.flat, order, strict=False)):
             axes.axhspan(1.06, 1.14, color=swatch(colours[label - 1]), linewidth=0)
             axes.plot(
@@ -330,76 +387,101 @@ def patch_spectra(entries, wavelengths_nm, only_six=False):
                 linewidth=1,
                 label="chart, full spectrum" if not place else None,
             )
-            if wanted[label]["truth"] is not None:
-                axes.plot(
-                    wavelengths_nm,
-                    wanted[label]["truth"],
-                    "_",
-                    color=TRUTH,
-                    markersize=9,
-                    markeredgewidth=1.4,
-                    label="truth" if not place else None,
-                )
-            for number, (name, patches) in enumerate(entries):
-                for patch in patches:
-                    if patch["label"] == label:
-                        shift = (number - (len(entries) - 1) / 2) * spread
-                        axes.errorbar(
-                            wavelengths_nm + shift,
-                            patch["mean"],
-                            patch["std"],
-                            fmt="o",
-                            markersize=3.2,
-                            capsize=1.8,
-                            linewidth=0.9,
-                            color=COLOURS[number % len(COLOURS)],
-                            label=name if not place else None,
-                        )
-            axes.set_title(wanted[label]["name"], fontsize=8)
-            axes.set_ylim(-0.05, 1.14)
-            if 400 <= wavelengths_nm.min() and wavelengths_nm.max() <= 700:
-                axes.set(xlim=(400, 700), xticks=(450, 550, 650))
-            axes.grid(True)
+            _patch_panel(axes, wanted[label], entries, bands, named=not place)
         made.figure.supxlabel("wavelength [nm]", fontsize=8.5, y=0.06 / height)
         made.figure.supylabel("reflectance", fontsize=8.5, x=0.004)
         made.figure.legend(loc="upper center", ncols=len(entries) + 2)
     return made.png
 
 
-def patch_errors(entries, wavelengths_nm):
-    """Error (mean - truth) of the six patches by band with +- one standard deviation of a
-    lenslet; entries as in patch_spectra.
+def _patch_panel(
+    axes: "Axes",
+    wanted: PatchScore,
+    entries: Sequence[tuple[str, Sequence[PatchScore]]],
+    bands: np.ndarray,
+    named: bool,
+) -> None:
+    """One patch: its truth and what each result found; `named`: with entries for the legend."""
+    if wanted.truth is not None:
+        axes.plot(
+            bands,
+            wanted.truth,
+            "_",
+            color=TRUTH,
+            markersize=9,
+            markeredgewidth=1.4,
+            label="truth" if named else None,
+        )
+    apart = 0.012 * np.ptp(bands) if len(entries) > 1 else 0.0
+    for number, (name, patches) in enumerate(entries):
+        for patch in patches:
+            if patch.label == wanted.label:
+                shift = (number - (len(entries) - 1) / 2) * apart
+                _points(axes, bands + shift, patch.mean, patch.std, number, name if named else None)
+    axes.set_title(wanted.name, fontsize=8)
+    axes.set_ylim(-0.05, 1.14)
+    if 400 <= bands.min() and bands.max() <= 700:
+        axes.set(xlim=(400, 700), xticks=(450, 550, 650))
+    axes.grid(True)
+
+
+def _points(
+    axes: "Axes",
+    bands: np.ndarray,
+    values: ArrayLike,
+    std: ArrayLike,
+    number: int,
+    label: str | None,
+) -> None:
+    """Points of the result `number` with one standard deviation."""
+    axes.errorbar(
+        bands,
+        values,
+        std,
+        fmt="o",
+        markersize=3.2,
+        capsize=1.8,
+        linewidth=0.9,
+        color=COLOURS[number % len(COLOURS)],
+        label=label,
+    )
+
+
+def patch_errors(
+    entries: Sequence[tuple[str, Sequence[PatchScore]]], wavelengths_nm: Sequence[float]
+) -> bytes:
+    """Error (mean - truth) of the six patches by band with +- one standard deviation of a lenslet.
+
+    entries: (label, patches) of each result.
+    wavelengths_nm: (band,).
+
+    Returns PNG, nothing where none of the six is known.
     """
-    wavelengths_nm = np.asarray(wavelengths_nm, dtype=float)
+    bands = np.asarray(wavelengths_nm, dtype=float)
     found = {
-        p["label"]: p["name"]
+        p.label: p.name
         for _, patches in entries
         for p in patches
-        if p["one_of_six"] and p["truth"] is not None
+        if p.one_of_six and p.truth is not None
     }
     if not found:
         return b""
-    spread = 0.02 * max(np.ptp(wavelengths_nm), 1.0)
+    apart = 0.02 * max(np.ptp(bands), 1.0)
     with drawing(10.2, 3.1) as made:
         panels = made.figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
         for place, (axes, label) in enumerate(zip(panels, sorted(found), strict=True)):
             axes.axhline(0, color=TRUTH, linewidth=0.9)
             for number, (name, patches) in enumerate(entries):
-                patch = next(
-                    (p for p in patches if p["label"] == label and p["truth"] is not None), None
-                )
-                if patch is not None:
-                    shift = (number - (len(entries) - 1) / 2) * spread
-                    axes.errorbar(
-                        wavelengths_nm + shift,
-                        np.subtract(patch["mean"], patch["truth"]),
-                        patch["std"],
-                        fmt="o",
-                        markersize=3.2,
-                        capsize=1.8,
-                        linewidth=0.9,
-                        color=COLOURS[number % len(COLOURS)],
-                        label=name if not place else None,
+                patch = next((p for p in patches if p.label == label and p.truth is not None), None)
+                if patch is not None and patch.truth is not None:
+                    shift = (number - (len(entries) - 1) / 2) * apart
+                    _points(
+                        axes,
+                        bands + shift,
+                        np.subtract(patch.mean, patch.truth),
+                        patch.std,
+                        number,
+                        name if not place else None,
                     )
             axes.set(title=found[label], xlabel="wavelength [nm]")
             axes.grid(True, axis="y")
@@ -408,60 +490,55 @@ def patch_errors(entries, wavelengths_nm):
     return made.png
 
 
-def accuracy_bars(entries):
-    """Error and SNR per band for each result, as the paper's Fig. 7: entries of a score
-    document with bands.
+def accuracy_bars(results: Sequence[ResultScore]) -> bytes:
+    """Error and SNR per band for each result, as the paper's Fig. 7.
+
+    results: those without bands are left out.
 
     Left: RMSE averaged over the six patches (over all lenslets where no patches are known). Right:
     capture SNR, with the predicted SNR as a tick.
+
+    Returns PNG.
     """
-    entries = [e for e in entries if e.get("wavelengths_nm") and "rmse_per_band" in e["metrics"]]
-    error_name = (
-        "six_patch_rmse_per_band"
-        if all("six_patch_rmse_per_band" in e["metrics"] for e in entries)
-        else "rmse_per_band"
-    )
-    with_snr = any(e["metrics"].get("snr_capture_db") for e in entries)
+    shown = [one for one in results if one.wavelengths_nm and "rmse_per_band" in one.figures]
+    six = all("six_patch_rmse_per_band" in one.figures for one in shown)
+    error_name = "six_patch_rmse_per_band" if six else "rmse_per_band"
+    with_snr = any(one.bands("snr_capture_db") for one in shown)
     with drawing(9.6 if with_snr else 5.4, 3.1) as made:
         panels = np.ravel(made.figure.subplots(1, 2 if with_snr else 1))
-        _bars(panels[0], entries, error_name)
+        _bars(panels[0], shown, error_name)
         panels[0].set(
             ylabel="RMSE in reflectance",
-            title="error, mean of the six patches"
-            if error_name.startswith("six")
-            else "error over all lenslets",
+            title="error, mean of the six patches" if six else "error over all lenslets",
         )
         if with_snr:
-            _bars(panels[1], entries, "snr_capture_db", "snr_predicted_db")
+            _bars(panels[1], shown, "snr_capture_db", "snr_predicted_db")
             panels[1].set(ylabel="SNR [dB]", title="capture SNR on white (tick: predicted)")
         made.figure.legend(
             *panels[0].get_legend_handles_labels(),
             loc="outside lower center",
-            ncols=min(len(entries), 4),
+            ncols=min(len(shown), 4),
         )
     return made.png
 
 
-def _bars(axes, entries, name, tick=None):
-    bands = entries[0]["wavelengths_nm"]
-    width = 0.8 / len(entries)
-    for number, entry in enumerate(entries):
-        place = np.arange(len(bands)) + (number - (len(entries) - 1) / 2) * width
-        values = [
-            np.nan if v is None else v for v in entry["metrics"].get(name) or [None] * len(bands)
-        ]
+def _bars(axes: "Axes", results: Sequence[ResultScore], name: str, tick: str = "") -> None:
+    """A figure by band of each result as bars; `tick`: another one marked on them."""
+    bands = results[0].wavelengths_nm
+    width = 0.8 / len(results)
+    for number, one in enumerate(results):
+        place = np.arange(len(bands)) + (number - (len(results) - 1) / 2) * width
         axes.bar(
             place,
-            values,
+            _known(one.bands(name) or [None] * len(bands)),
             0.9 * width,
             color=COLOURS[number % len(COLOURS)],
-            label=entry.get("label", entry["name"]),
+            label=one.label or one.name,
         )
-        predicted = entry["metrics"].get(tick) if tick else None
-        if predicted:
+        if one.bands(tick):
             axes.plot(
                 place,
-                [np.nan if v is None else v for v in predicted],
+                _known(one.bands(tick)),
                 "_",
                 color=TRUTH,
                 markersize=60 * width,
@@ -470,3 +547,8 @@ def _bars(axes, entries, name, tick=None):
     axes.set_xticks(range(len(bands)), [f"{w:g} nm" for w in bands])
     axes.tick_params(axis="x", length=0)
     axes.grid(True, axis="y")
+
+
+def _known(values: Sequence[float | None]) -> list[float]:
+    """Values with NaN where there is none."""
+    return [np.nan if value is None else value for value in values]

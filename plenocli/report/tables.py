@@ -1,5 +1,13 @@
 """Numbers of a score document as rows of text, for the terminal and the page alike."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from plenocli.evaluation.chart_score import ChartDocument
+from plenocli.evaluation.metrics.figures import Figure
+from plenocli.evaluation.scores import ResultScore, ScoreDocument
+
 LABELS = {
     "psnr_db": ("PSNR", "dB"),
     "psnr_inner_db": ("PSNR without border lenslets", "dB"),
@@ -60,54 +68,54 @@ LABELS = {
 """Metric -> (what people read, unit); the order is that of the table."""
 
 
-def metric_rows(document):
-    """(header, rows) of text for a score document: metric names first, then one column a result.
+def label_of(name: str) -> str:
+    """What people read for a metric."""
+    return LABELS.get(name, (name,))[0]
+
+
+def metric_rows(document: ScoreDocument) -> tuple[list[str], list[list[str]]]:
+    """The figures of a score document as text.
 
     Metrics with one value a band take one row a band, named by its wavelength where all results
     share their bands.
+
+    Returns (header, rows): metric names first, then one column a result.
     """
-    results = document["results"]
-    header = ["", *(entry.get("label", entry["name"]) for entry in results)]
-    found = {name for entry in results for name in entry["metrics"]}
+    results = document.results
+    header = ["", *(one.label or one.name for one in results)]
+    found = {name for one in results for name in one.figures}
     names = [name for name in LABELS if name in found] + sorted(found - set(LABELS))
     rows = []
     for name in names:
-        values = [entry["metrics"].get(name) for entry in results]
+        values = [one.figures.get(name) for one in results]
         label, unit = LABELS.get(name, (name.replace("_", " "), ""))
         unit = f" [{unit}]" if unit else ""
         bands = max((len(v) for v in values if isinstance(v, list)), default=0)
         if not bands:
-            rows.append(
-                [
-                    label + unit,
-                    *(
-                        _cell(name, name in e["metrics"], v)
-                        for e, v in zip(results, values, strict=True)
-                    ),
-                ]
-            )
+            cells = [
+                _cell(name, name in one.figures, value)
+                for one, value in zip(results, values, strict=True)
+            ]
+            rows.append([label + unit, *cells])
         for band in range(bands):
-            of_band = [v[band] if isinstance(v, list) and band < len(v) else None for v in values]
-            given = [isinstance(v, list) and band < len(v) for v in values]
-            rows.append(
-                [
-                    f"{label}, {_band_name(results, band)}{unit}",
-                    *(_cell(name, g, v) for g, v in zip(given, of_band, strict=True)),
-                ]
-            )
+            cells = [
+                _cell(name, True, value[band])
+                if isinstance(value, list) and band < len(value)
+                else ""
+                for value in values
+            ]
+            rows.append([f"{label}, {_band_name(results, band)}{unit}", *cells])
     return header, rows
 
 
-def _band_name(results, band):
+def _band_name(results: Sequence[ResultScore], band: int) -> str:
     names = {
-        f"{entry['wavelengths_nm'][band]:g} nm"
-        for entry in results
-        if band < len(entry.get("wavelengths_nm", ()))
+        f"{one.wavelengths_nm[band]:g} nm" for one in results if band < len(one.wavelengths_nm)
     }
     return names.pop() if len(names) == 1 else f"band {band + 1}"
 
 
-def _cell(name, given, value):
+def _cell(name: str, given: bool, value: Figure) -> str:
     if not given:
         return ""
     if value is None:
@@ -119,3 +127,70 @@ def _cell(name, given, value):
     if name in ("ssim",) or name.startswith("coherence_effective"):
         return f"{value:.4f}"
     return f"{value:.4g}"
+
+
+def text_table(document: ScoreDocument) -> str:
+    """The results side by side for a terminal: one row a metric, one column a result."""
+    header, rows = metric_rows(document)
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = [
+        "  ".join(
+            cell.ljust(w) if i == 0 else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in [header, *rows]
+    ]
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def cell_text(value: object) -> str:
+    """A value as a cell of a table: four digits, and the range of several."""
+    if isinstance(value, (list, tuple, np.ndarray)):
+        values = np.ravel(value)
+        return (
+            cell_text(values[0])
+            if values.size == 1
+            else f"{cell_text(values.min())} to {cell_text(values.max())}"
+        )
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def chart_table(document: ChartDocument) -> str:
+    """The measures of a chart for a terminal: errors by band and method, linearity, then every
+    patch by band.
+    """
+    measures = document.measures
+    bands = [f"{band:.0f}" for band in measures.bands_nm]
+    row = "{:<42}" + "{:>8}" * (len(bands) + 1)
+    lines = [row.format("RMSE of reflectance, nm", *bands, "mean")]
+    for method in measures.methods:
+        score = method.score
+        for what, by_band, mean in (
+            ("24 patches", score.rmse_24_per_band, score.rmse_24),
+            ("six patches", score.rmse_six_per_band, score.rmse_six),
+        ):
+            cells = (f"{v:.4f}" for v in by_band)
+            lines.append(row.format(f"{method.name}: {what}", *cells, f"{mean:.4f}"))
+    linear = (document.linearity.get(band) for band in bands)
+    cells = ("-" if one is None else f"{one.median:.4f}" for one in linear)
+    lines.append(row.format("linearity: median of rate ratios", *cells, ""))
+    for method in measures.methods:
+        score, nominal = method.score, method.nominal
+        lines.append(
+            f"{method.name}: spectral angle {score.spectral_angle_deg:.2f} deg, worst "
+            f"{score.spectral_angle_worst_deg:.2f}; largest error {score.worst_error:.3f}"
+            + (
+                ""
+                if nominal is None
+                else f"; 10 nm bands at the labels: 24 patches {nominal.rmse_24:.4f}, six "
+                f"{nominal.rmse_six:.4f}"
+            )
+        )
+    last = measures.methods[-1]
+    lines += ["", row.format(f"{last.name}, less spectrometer", *bands, "rms")]
+    for patch, found, true in zip(measures.patch_names, last.reflectance, measures.truth):
+        error = found - true
+        cells = (f"{v:+.3f}" for v in error)
+        lines.append(row.format(patch, *cells, f"{np.sqrt(np.mean(np.square(error))):.3f}"))
+    return "\n".join(line.rstrip() for line in lines)

@@ -34,12 +34,12 @@ def test_errors_by_band_are_those_of_the_patches():
     found = truth.copy()
     found[3, 0], found[5, 1] = 0.7, 0.4
     scores = compare_chart(found, truth, (3, 7), np.array([True, True, False]))
-    assert scores["rmse_24_per_band"] == pytest.approx([0.2 / np.sqrt(24), 0.1 / np.sqrt(24), 0])
-    assert scores["rmse_six_per_band"] == pytest.approx([0.2 / np.sqrt(2), 0, 0]) and scores[
-        "rmse_six"
-    ] == pytest.approx(0.1 / np.sqrt(2))
+    assert scores.rmse_24_per_band == pytest.approx([0.2 / np.sqrt(24), 0.1 / np.sqrt(24), 0])
+    assert scores.rmse_six_per_band == pytest.approx(
+        [0.2 / np.sqrt(2), 0, 0]
+    ) and scores.rmse_six == pytest.approx(0.1 / np.sqrt(2))
     angles = np.degrees([np.arctan(7 / 5) - np.pi / 4, np.pi / 4 - np.arctan(4 / 5)])
-    assert scores["spectral_angle_deg"] == pytest.approx(angles.sum() / 24) and scores[
-        "spectral_angle_worst_deg"
-    ] == pytest.approx(angles.max())
+    assert scores.spectral_angle_deg == pytest.approx(
+        angles.sum() / 24
+    ) and scores.spectral_angle_worst_deg == pytest.approx(angles.max())
     np.testing.assert_allclose(against_white(3 * found, truth, 0), found)

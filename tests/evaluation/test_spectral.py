@@ -41,9 +41,9 @@ def test_cube_scores_leave_invalid_lenslets_out():
     estimate = truth + np.array([0.01, 0.02, 0.03, 0.04])[:, None, None]
     estimate[2, 0, 0] = np.nan
     scores = spectral.score_cube(estimate, truth, WAVELENGTHS)
-    assert scores["lenslets"] == 47 and scores["rmse"] == pytest.approx(0.025)
-    np.testing.assert_allclose(scores["rmse_per_band"], [0.01, 0.02, 0.03, 0.04])
-    assert spectral.score_cube(np.full_like(truth, np.nan), truth, WAVELENGTHS) == {"lenslets": 0}
+    assert scores.lenslets == 47 and scores.rmse == pytest.approx(0.025)
+    np.testing.assert_allclose(scores.rmse_per_band, [0.01, 0.02, 0.03, 0.04])
+    assert spectral.score_cube(np.full_like(truth, np.nan), truth, WAVELENGTHS) is None
 
 
 def test_patch_scores_separate_bias_from_spread():
@@ -54,10 +54,10 @@ def test_patch_scores_separate_bias_from_spread():
     estimate[1, 2] = 0.2  # bias without spread
     estimate[:, 0] = 99
     scores = spectral.score_patches(estimate, truth, labels, six=(1, 2, 24))
-    assert scores["patches"] == 3 and scores["six_patches_seen"] == 2
-    np.testing.assert_allclose(scores["patch_rmse_per_band"], [0, np.sqrt(0.04 / 3)], atol=1e-15)
-    np.testing.assert_allclose(scores["six_patch_rmse_per_band"], [0.15, 0.1])
-    assert scores["six_patch_rmse"] == pytest.approx(0.125)
+    assert scores.patches == 3 and scores.six_patches_seen == 2
+    np.testing.assert_allclose(scores.patch_rmse_per_band, [0, np.sqrt(0.04 / 3)], atol=1e-15)
+    np.testing.assert_allclose(scores.six.six_patch_rmse_per_band, [0.15, 0.1])
+    assert scores.six.six_patch_rmse == pytest.approx(0.125)
 
 
 def test_patch_statistics():
@@ -65,6 +65,6 @@ def test_patch_statistics():
     cube = np.arange(12.0).reshape(2, 2, 3)
     cube[0, 1, 0] = np.nan
     found = spectral.patch_statistics(cube, labels)
-    assert set(found) == {1} and found[1]["count"] == 3
-    np.testing.assert_allclose(found[1]["mean"], [(1 + 2 + 4) / 3, (7 + 8 + 10) / 3])
-    np.testing.assert_allclose(found[1]["std"], np.std([1, 2, 4], ddof=1))
+    assert set(found) == {1} and found[1].count == 3
+    np.testing.assert_allclose(found[1].mean, [(1 + 2 + 4) / 3, (7 + 8 + 10) / 3])
+    np.testing.assert_allclose(found[1].std, np.std([1, 2, 4], ddof=1))

@@ -87,10 +87,10 @@ def description(path, data):
 
 
 def score(path, data):
-    from plenocli.files.read.run_folder import _score_document
+    from plenocli.files.results.scores import read_scores
 
     path.write_bytes(data)
-    _score_document(path)
+    read_scores(path)
 
 
 READERS = {
@@ -127,7 +127,7 @@ def work(name, arguments):
         import plenocli.files.images.dng
         import plenocli.files.images.exr
         import plenocli.files.images.pictures
-        import plenocli.files.read.run_folder  # noqa: F401
+        import plenocli.files.results.run_folder  # noqa: F401
     from plenocli.base.errors import PlenoError
 
     read, path = (

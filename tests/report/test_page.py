@@ -4,6 +4,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from plenocli.evaluation.scores import PatchScore, ResultScore
 from plenocli.report import pictures, spectral_pictures
 from plenocli.report.page import Page
 
@@ -79,30 +80,30 @@ def rng():
 
 def patches(shift):
     return [
-        {
-            "label": n,
-            "name": f"patch {n}",
-            "mean": [0.2 + shift] * 4,
-            "std": [0.01] * 4,
-            "truth": [0.2] * 4,
-            "one_of_six": n in (7, 13),
-        }
+        PatchScore(
+            label=n,
+            name=f"patch {n}",
+            mean=[0.2 + shift] * 4,
+            std=[0.01] * 4,
+            truth=[0.2] * 4,
+            one_of_six=n in (7, 13),
+        )
         for n in range(1, 25)
     ]
 
 
 def entry(label, psnr=None, snr=None):
-    return {
-        "name": label,
-        "label": label,
-        "wavelengths_nm": [450, 540, 570, 650],
-        "metrics": {
+    return ResultScore(
+        name=label,
+        label=label,
+        wavelengths_nm=(450, 540, 570, 650),
+        figures={
             "psnr_db": psnr,
             "rmse_per_band": [0.01, 0.02, 0.03, None],
             "snr_capture_db": snr,
             "block_mean_psnr_db": 14.0,
         },
-    }
+    )
 
 
 DRAWN = {

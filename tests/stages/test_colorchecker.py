@@ -26,18 +26,16 @@ def test_a_painted_chart_is_measured_to_what_its_digits_allow(folder, tmp_path):
     document = run_colorchecker(
         folder, tmp_path / "chart.h5", Settings(cfa="GBRG"), measures=tmp_path / "chart.json"
     )
-    plain, flat = document["methods"].values()
+    plain, flat = (method.score for method in document.measures.methods)
     assert (
-        plain["rmse_24"] > 0.05
-        and flat["rmse_24"] < 0.006
-        and flat["rmse_six"] < 0.005
-        and flat["spectral_angle_deg"] < 0.6
+        plain.rmse_24 > 0.05
+        and flat.rmse_24 < 0.006
+        and flat.rmse_six < 0.005
+        and flat.spectral_angle_deg < 0.6
     )
     # digits are cut off
-    assert all(
-        v["median"] == pytest.approx(1.01, abs=0.015) for v in document["linearity"].values()
-    )
-    assert json.loads((tmp_path / "chart.json").read_text()) == document
+    assert all(v.median == pytest.approx(1.01, abs=0.015) for v in document.linearity.values())
+    assert json.loads((tmp_path / "chart.json").read_text()) == document.as_json()
     text = table(document)
     assert all(name in text for name in colorchecker()[0]) and "450" in text
     cube = read_artefact(tmp_path / "chart.h5", "image")
@@ -120,17 +118,17 @@ def test_a_real_chart_is_measured_as_well_as_its_data_allow(shared_data, tmp_pat
     """
     folder = shared_data / "spectra" / "colorchecker_filtered"
     document = run_colorchecker(folder, tmp_path / "chart.h5", Settings(cfa="GBRG"))
-    white, flat = document["methods"].values()
+    white, flat = (method.score for method in document.measures.methods)
     inner = slice(1, 6)
-    assert white["rmse_six"] <= 0.020 and max(white["rmse_six_per_band"][inner]) <= 0.030
-    assert flat["rmse_six"] <= 0.018 and max(flat["rmse_six_per_band"][inner]) <= 0.028
+    assert white.rmse_six <= 0.020 and max(white.rmse_six_per_band[inner]) <= 0.030
+    assert flat.rmse_six <= 0.018 and max(flat.rmse_six_per_band[inner]) <= 0.028
     assert (
-        flat["rmse_24"] <= 0.028
-        and max(flat["rmse_24_per_band"][inner]) <= 0.040
-        and white["rmse_24"] >= 2.5 * flat["rmse_24"]
+        flat.rmse_24 <= 0.028
+        and max(flat.rmse_24_per_band[inner]) <= 0.040
+        and white.rmse_24 >= 2.5 * flat.rmse_24
     )
-    assert flat["spectral_angle_deg"] <= 2.5
+    assert flat.spectral_angle_deg <= 2.5
     assert (
-        all(abs(v["median"] - 1) <= 0.015 for v in document["linearity"].values())
-        and len(document["linearity"]) >= 6
+        all(abs(v.median - 1) <= 0.015 for v in document.linearity.values())
+        and len(document.linearity) >= 6
     )

@@ -10,7 +10,8 @@ import pytest
 
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import read_artefact
-from plenocli.inverse.lightfield import refocus as lightfield
+from plenocli.inverse.lightfield.planes import distance_of, slope_of
+from plenocli.inverse.lightfield.refocus import STEP, sharpness
 
 CAMERA = """
 [main_lens]
@@ -73,7 +74,7 @@ def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distanc
     )
     assert run(["refocus", str(capture), "--camera", str(camera), "-o", str(out)]) == 0
     data = read_artefact(out, "lightfield").data
-    true = lightfield.slope_of(float(name) * 1e-3, 0.05, 0.055, 352e-6)
+    true = slope_of(float(name) * 1e-3, 0.05, 0.055, 352e-6)
     sure = data["depth/confidence"][3:-3, 3:-3] > 0.4
     assert sure.sum() > 10
     assert np.median(data["depth/slope"][3:-3, 3:-3][sure]) == pytest.approx(true, abs=0.25)
@@ -94,7 +95,7 @@ def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distanc
         and told["depth_sure_share"] > 0.8
         and abs(told["sharpest_slope_error"]) < 0.05
     )
-    near = lightfield.distance_of(true + np.array([-0.5, 0.5]), 0.05, 0.055, 352e-6)
+    near = distance_of(true + np.array([-0.5, 0.5]), 0.05, 0.055, 352e-6)
     assert (
         told["depth_limit_m"] == pytest.approx(abs(near[1] - near[0]), rel=0.01)
         and told["depth_distance_error_m"] < 0.15 * told["depth_limit_m"]
@@ -140,11 +141,11 @@ def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
         == 0
     )
     data = read_artefact(out, "lightfield").data
-    step = lightfield.STEP
+    step = STEP
 
     def sharpest(columns):
         part = data["refocus/value"][:, 2 * step : 18 * step, columns[0] * step : columns[1] * step]
-        return data["refocus/slope"][np.argmax([lightfield.sharpness(p) for p in part])]
+        return data["refocus/slope"][np.argmax([sharpness(p) for p in part])]
 
     t, ab = sharpest((4, 7)), sharpest((9, 16))
     assert t < ab - 0.2 and abs(t) < 0.6 and 0.2 < ab < 1.2

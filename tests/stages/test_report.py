@@ -10,7 +10,7 @@ from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance, describe_inputs
 from plenocli.files.images.exr import write_exr
-from plenocli.files.read.run_folder import RunFolder
+from plenocli.files.results.run_folder import RunFolder
 from plenocli.forward.scene.chart import chart_scene
 from plenocli.stages.evaluation.report import run_report
 from plenocli.stages.evaluation.score import run_score
@@ -186,9 +186,9 @@ def test_the_page_shows_both_chains(folder, tmp_path):
     summary = run_report(folder, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert (
-        summary["sections"] == ["Spatial", "Spectral"]
-        and summary["unreadable"] == []
-        and summary["scores"] == 3
+        summary.sections == ["Spatial", "Spectral"]
+        and summary.unreadable == []
+        and summary.scores == 3
     )
     # bars, results, close-up, capture, PIF, A, matrix, atoms, history; bars, errors, patches, 2 x
     # bands, grid, response, capture
@@ -227,10 +227,10 @@ def test_a_torn_file_is_named_and_the_rest_is_shown(folder, tmp_path):
     (copy / "score-bad.json").write_text('{"results": [{"metrics": 3}]}')
     (copy / "broken.json").write_text('{"results": ')
     summary = run_report(copy, tmp_path / "r.html")
-    assert summary["unreadable"] == ["broken.json", "score-bad.json", "torn.h5"]
-    assert "torn.h5 could not be read" in (tmp_path / "r.html").read_text() and summary[
-        "sections"
-    ] == ["Spectral"]
+    assert summary.unreadable == ["broken.json", "score-bad.json", "torn.h5"]
+    assert "torn.h5 could not be read" in (
+        tmp_path / "r.html"
+    ).read_text() and summary.sections == ["Spectral"]
 
 
 def test_results_without_scores_are_shown_alone(tmp_path):
@@ -244,7 +244,7 @@ def test_results_without_scores_are_shown_alone(tmp_path):
     summary = run_report(tmp_path / "run", tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
     assert (
-        summary["sections"] == ["Spatial"]
+        summary.sections == ["Spatial"]
         and page.count("<figure>") == 2
         and "no truth to compare with" in page
     )

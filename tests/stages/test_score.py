@@ -58,9 +58,9 @@ def picture(tmp_path):
 def test_pictures_side_by_side(picture):
     folder, capture, good, poor, truth = picture
     document = run_score([good, poor], folder / "score.json", truth=capture, capture=capture)
-    assert json.loads((folder / "score.json").read_text()) == document
-    first, second = (entry["metrics"] for entry in document["results"])
-    assert document["metrics"] == first
+    assert json.loads((folder / "score.json").read_text()) == document.as_json()
+    first, second = (entry.figures for entry in document.results)
+    assert document.figures == first
     assert first["psnr_db"] == pytest.approx(40, abs=1e-4) and second["psnr_db"] == pytest.approx(
         20, abs=1e-4
     )
@@ -70,7 +70,7 @@ def test_pictures_side_by_side(picture):
         -10 * np.log10(blocks.var(axis=1).mean()), abs=1e-4
     )
     assert first["snr_sensor_db"] == pytest.approx(60, abs=1e-4)
-    assert set(first) <= set(document["definitions"])
+    assert set(first) <= set(document.definitions)
     lines = table(document).splitlines()
     assert lines[0].split() == ["good", "poor"] and "40.00" in lines[2] and "20.00" in lines[2]
 
@@ -80,14 +80,14 @@ def test_a_perfect_result_gives_null_and_not_infinity(picture):
     result = put(folder / "perfect.h5", "image", {"image/value": np.full((12, 12), 0.5, "f8")})
     same = put(folder / "same.h5", "image", {"image/value": np.full((12, 12), 0.5, "f8")})
     document = run_score([result], folder / "p.json", truth=same)
-    assert document["metrics"]["psnr_db"] is None and document["metrics"]["rmse"] == 0
+    assert document.figures["psnr_db"] is None and document.figures["rmse"] == 0
     assert "Infinity" not in (folder / "p.json").read_text()
 
 
 def test_only_the_metrics_asked_for(picture):
     folder, capture, good, *_ = picture
     document = run_score([good], folder / "s.json", truth=capture, metrics=("ssim",))
-    assert set(document["metrics"]) == {"ssim"} == set(document["definitions"])
+    assert set(document.figures) == {"ssim"} == set(document.definitions)
     with pytest.raises(UsageError, match="--white"):
         run_score([good], folder / "t.json", truth=capture, metrics=("snr",))
     assert not (folder / "t.json").exists()
@@ -155,7 +155,7 @@ def chart(tmp_path):
 def test_spectra_against_the_chart(chart):
     folder, result, whites, _ = chart
     document = run_score([result], folder / "s.json", truth="colorchecker", whites=whites)
-    scores = document["metrics"]
+    scores = document.figures
     np.testing.assert_allclose(scores["rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=1e-6)
     np.testing.assert_allclose(scores["six_patch_rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=1e-6)
     assert scores["patches"] == 24 and scores["six_patches_seen"] == 6
@@ -163,9 +163,9 @@ def test_spectra_against_the_chart(chart):
     np.testing.assert_allclose(scores["snr_predicted_db"], 40, atol=0.1)
     assert "over time" in scores["snr_target"]
     assert scores["delta_e_2000"] > 0 and scores["spectral_angle_deg"] > 0
-    white = document["results"][0]["patches"][18]
-    assert white["name"].startswith("white") and white["one_of_six"]
-    assert white["mean"][3] - white["truth"][3] == pytest.approx(0.03, abs=1e-6)
+    white = document.results[0].patches[18]
+    assert white.name.startswith("white") and white.one_of_six
+    assert white.mean[3] - white.truth[3] == pytest.approx(0.03, abs=1e-6)
     assert "RMSE over the six patches, 650 nm" in table(document)
 
 
@@ -176,7 +176,7 @@ def test_truth_as_spectral_cube_finer_in_space_and_wavelength(chart):
     scene = put(folder / "scene.h5", "image", {"image/value": cube, "image/wavelength": fine})
     document = run_score([result], folder / "s.json", truth=scene, patches="colorchecker")
     np.testing.assert_allclose(
-        document["metrics"]["six_patch_rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=2e-4
+        document.figures["six_patch_rmse_per_band"], [0, 0.01, 0.02, 0.03], atol=2e-4
     )
 
 
@@ -199,7 +199,7 @@ def test_radiance_is_divided_by_the_white_target(chart):
     with pytest.raises(UsageError, match="--white"):
         run_score([result], folder / "s.json", truth="colorchecker")
     document = run_score([result], folder / "s.json", truth="colorchecker", whites=[white])
-    assert max(document["metrics"]["rmse_per_band"]) < 1e-6
+    assert max(document.figures["rmse_per_band"]) < 1e-6
 
 
 def test_label_map_from_a_file(chart):
@@ -210,7 +210,7 @@ def test_label_map_from_a_file(chart):
     document = run_score(
         [result], folder / "s.json", truth="colorchecker", patches=folder / "map.png"
     )
-    assert document["metrics"]["patches"] == 24
+    assert document.figures["patches"] == 24
     Image.fromarray(chart_labels(25, 36)).save(folder / "bad.png")
     with pytest.raises(InputError, match="24 x 36"):
         run_score([result], folder / "t.json", truth="colorchecker", patches=folder / "bad.png")
@@ -236,10 +236,10 @@ def test_dictionary_needs_its_matrix(tmp_path):
         run_score([dictionary], tmp_path / "s.json")
     document = run_score([dictionary], tmp_path / "s.json", pif=pif)
     unit = system[0, 0] / np.linalg.norm(system[0, 0], axis=0)
-    assert document["metrics"]["coherence_effective"] == pytest.approx(
+    assert document.figures["coherence_effective"] == pytest.approx(
         np.abs(unit.T @ unit - np.eye(16)).max(), rel=1e-4
     )
-    assert document["metrics"]["coherence_raw"] == pytest.approx(system.max(), rel=1e-5)
+    assert document.figures["coherence_raw"] == pytest.approx(system.max(), rel=1e-5)
 
 
 def test_exr_results(picture):
@@ -248,7 +248,7 @@ def test_exr_results(picture):
     folder, capture, _, _, truth = picture
     write_exr(folder / "good.exr", {"Y": (truth + 0.01).astype("f4")}, {}, overwrite=False)
     document = run_score([folder / "good.exr"], folder / "s.json", truth=capture)
-    assert document["metrics"]["psnr_db"] == pytest.approx(40, abs=1e-4)
+    assert document.figures["psnr_db"] == pytest.approx(40, abs=1e-4)
 
 
 def test_spectral_exr_results(chart):
@@ -259,7 +259,7 @@ def test_spectral_exr_results(chart):
         folder / "c.exr", BANDS, (truth + 0.02).astype("f4"), "reflectance", overwrite=False
     )
     document = run_score([folder / "c.exr"], folder / "s.json", truth="colorchecker")
-    np.testing.assert_allclose(document["metrics"]["rmse_per_band"], 0.02, atol=1e-6)
+    np.testing.assert_allclose(document.figures["rmse_per_band"], 0.02, atol=1e-6)
 
 
 def test_command_line(picture, capsys):
@@ -299,7 +299,7 @@ def test_command_line(picture, capsys):
 
 def test_a_picture_is_no_white_target(tmp_path):
     from plenocli.files.images.exr import write_exr
-    from plenocli.files.read.results import read_result
+    from plenocli.files.results.results import read_result
 
     write_exr(tmp_path / "grey.exr", {"Y": np.ones((4, 4), np.float32)}, {})
     assert read_result(tmp_path / "grey.exr").kind == "image"

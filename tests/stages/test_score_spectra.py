@@ -48,7 +48,7 @@ def methods(tmp_path):
 def test_every_method_is_set_against_single_pixel_with_its_own_white(methods):
     folder, results, whites = methods
     document = run_score(results, folder / "s.json", truth="colorchecker", whites=whites)
-    own, single = (entry["metrics"] for entry in document["results"])
+    own, single = (entry.figures for entry in document.results)
     assert own["snr_over_single_pixel_db"] == pytest.approx(20 * np.log10(3), abs=0.01)
     assert own["rmse_over_single_pixel"] == pytest.approx(1 / 3, rel=1e-3) and own[
         "six_patch_rmse_over_single_pixel"
@@ -56,21 +56,21 @@ def test_every_method_is_set_against_single_pixel_with_its_own_white(methods):
     assert 0.2 < own["delta_e_over_single_pixel"] < 0.5
     assert not any("over_single" in name for name in single)
     assert {name for name in own if "single" in name or "accuracy" in name} <= set(
-        document["definitions"]
+        document.definitions
     )
     assert "capture SNR above single pixel's" in table(document)
     only = run_score(
         results, folder / "t.json", truth="colorchecker", whites=whites, metrics=("rmse",)
     )
-    assert set(only["metrics"]) == {"rmse", "rmse_per_band"}
+    assert set(only.figures) == {"rmse", "rmse_per_band"}
 
 
 def test_a_white_of_another_method_serves_only_where_it_is_the_only_one(methods):
     folder, results, whites = methods
     other = put(folder / "wls.h5", TRUTH, method="wls")
-    assert run_score([other], folder / "s.json", truth="colorchecker", whites=whites[:1])[
-        "metrics"
-    ]["snr_capture_mean_db"] == pytest.approx(40, abs=0.3)
+    assert run_score([other], folder / "s.json", truth="colorchecker", whites=whites[:1]).figures[
+        "snr_capture_mean_db"
+    ] == pytest.approx(40, abs=0.3)
     with pytest.raises(UsageError, match="made by wls"):
         run_score([other], folder / "t.json", truth="colorchecker", whites=whites)
 
@@ -85,10 +85,10 @@ def test_lenslets_tell_their_patch_the_better_the_less_noise(methods, monkeypatc
     document = run_score(
         [*results, noisy], folder / "s.json", truth="colorchecker", metrics=("classification",)
     )
-    nearest = [entry["metrics"]["nearest_patch_accuracy"] for entry in document["results"]]
+    nearest = [entry.figures["nearest_patch_accuracy"] for entry in document.results]
     assert nearest[0] > 0.97 and nearest[0] > nearest[1] > nearest[2] > 3 / 24
     monkeypatch.setitem(sys.modules, "sklearn.discriminant_analysis", None)
-    without = run_score([noisy], folder / "t.json", truth="colorchecker")["metrics"]
+    without = run_score([noisy], folder / "t.json", truth="colorchecker").figures
     assert (
         "classification_accuracy" not in without and without["nearest_patch_accuracy"] == nearest[2]
     )
@@ -98,7 +98,7 @@ def test_a_trained_classifier_agrees(methods):
     pytest.importorskip("sklearn")
     folder, results, _ = methods
     document = run_score(results, folder / "s.json", truth="colorchecker")
-    trained = [entry["metrics"]["classification_accuracy"] for entry in document["results"]]
+    trained = [entry.figures["classification_accuracy"] for entry in document.results]
     assert trained[0] > 0.95 and trained[0] > trained[1] > 0.5
 
 
@@ -115,10 +115,8 @@ def test_the_truth_through_filters_is_the_integral_over_light_and_filter(tmp_pat
         truth[:, labels == k] = expected[k - 1][:, None]
     result = put(tmp_path / "seen.h5", truth, method="pinv")
     assert camera.filter_array.filters[0].fwhm == pytest.approx(15e-9)
-    plain = run_score([result], tmp_path / "p.json", truth="colorchecker")["metrics"]
-    through = run_score([result], tmp_path / "t.json", truth="colorchecker", camera=CAMERA)[
-        "metrics"
-    ]
+    plain = run_score([result], tmp_path / "p.json", truth="colorchecker").figures
+    through = run_score([result], tmp_path / "t.json", truth="colorchecker", camera=CAMERA).figures
     # nodes are 7.5 nm apart, spectra 5
     assert plain["six_patch_rmse"] > 2e-3 > 3e-4 > through["six_patch_rmse"]
 

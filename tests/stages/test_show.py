@@ -11,9 +11,10 @@ from scipy.ndimage import label
 
 from plenocli.cli.main import run
 from plenocli.files.images.exr import write_exr
+from plenocli.report.drawing import stacked
 from plenocli.report.pictures import pif_columns
 from plenocli.report.spectral_pictures import lenslet_spectra
-from plenocli.stages.evaluation.show import run_show, stacked
+from plenocli.stages.evaluation.show import run_show
 from tests.stages.test_report import spatial, spectral
 
 
@@ -44,7 +45,7 @@ def size(path):
 )
 def test_every_kind_is_drawn(folder, tmp_path, names, kinds, figures):
     made = run_show([folder / n for n in names], tmp_path / "p.png")
-    assert made["kinds"] == kinds and len(made["captions"]) == figures
+    assert made.kinds == kinds and len(made.captions) == figures
     width, height = size(tmp_path / "p.png")
     assert width > 500 and height > 280 * figures
 
@@ -65,7 +66,7 @@ def test_results_beside_their_truth(folder, tmp_path):
     files = [folder / "a" / "same" / f"{n}.h5" for n in ("tikhonov", "lmmse")]
     made = run_show(files, tmp_path / "p.png", truth=folder / "a" / "same" / "capture.h5")
     # errors below, then the close-up
-    assert len(made["captions"]) == 2 and size(tmp_path / "p.png")[1] > 900
+    assert len(made.captions) == 2 and size(tmp_path / "p.png")[1] > 900
 
 
 def test_chosen_points_and_lenslets(folder, tmp_path):
@@ -86,9 +87,7 @@ def test_chosen_points_and_lenslets(folder, tmp_path):
         right - left,
     )
     np.testing.assert_allclose(bright, [1.5 / 4, 2.5 / 4], atol=0.03)
-    assert run_show([folder / "a" / "pif.h5"], tmp_path / "p.png", points=((0, 3), (3, 3)))[
-        "captions"
-    ]
+    assert run_show([folder / "a" / "pif.h5"], tmp_path / "p.png", points=((0, 3), (3, 3))).captions
     one, two = (
         lenslet_spectra(np.ones((2, 3, 3)), None, np.array([5e-7, 6e-7]), lenslets=chosen)
         for chosen in ([(0, 0)], [(2, 2)])

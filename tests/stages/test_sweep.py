@@ -496,12 +496,12 @@ def test_show_and_report_draw_the_front(whole, tmp_path):
     ahead = int(read_artefact(whole[1], "sweep").data["sweep/front"].sum())
     assert (
         f"8 designs, 0 of them refused; {ahead} that no other beats"
-        in run_show([whole[1]], tmp_path / "front.png")["captions"][0]
+        in run_show([whole[1]], tmp_path / "front.png").captions[0]
     )
     assert (tmp_path / "front.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "run").mkdir()
     shutil.copy(whole[1], tmp_path / "run" / "lenslets.h5")
-    assert run_report(tmp_path / "run", tmp_path / "r.html")["sections"] == ["Design space"]
+    assert run_report(tmp_path / "run", tmp_path / "r.html").sections == ["Design space"]
     page = (tmp_path / "r.html").read_text()
     with open(whole[1].with_suffix(".csv"), newline="") as file:
         best = [r for r in csv.DictReader(file) if r["front"] == "1"]

@@ -88,11 +88,7 @@ def command(
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
+    bands = ", ".join(f"{band:.0f}" for band in document.measures.bands_nm)
     options.summary(
-        document,
-        as_json,
-        (
-            f"{table(document)}\n"
-            f"{output}: the chart at {', '.join(f'{band:.0f}' for band in document['bands_nm'])} nm"
-        ),
+        document.as_json(), as_json, f"{table(document)}\n{output}: the chart at {bands} nm"
     )

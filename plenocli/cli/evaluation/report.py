@@ -38,9 +38,9 @@ def command(
     from plenocli.stages.evaluation.report import run_report
 
     made = run_report(run_folder, output, title=title, overwrite=overwrite)
-    missing = f", {len(made['unreadable'])} unreadable" if made["unreadable"] else ""
+    missing = f", {len(made.unreadable)} unreadable" if made.unreadable else ""
     options.summary(
-        made,
+        made.as_json(),
         as_json,
-        f"{output}: {', '.join(made['sections']) or 'no pictures'}; {made['files']} files{missing}",
+        f"{output}: {', '.join(made.sections) or 'no pictures'}; {made.files} files{missing}",
     )

@@ -150,4 +150,4 @@ def command(
         camera=camera,
         overwrite=overwrite,
     )
-    options.summary(document, as_json, table(document))
+    options.summary(document.as_json(), as_json, table(document))

@@ -81,4 +81,5 @@ def command(
         lenslets=lenslets,
         overwrite=overwrite,
     )
-    options.summary(made, as_json, f"{made['output']}: {', '.join(dict.fromkeys(made['kinds']))}")
+    kinds = ", ".join(dict.fromkeys(made.kinds))
+    options.summary(made.as_json(), as_json, f"{made.output}: {kinds}")

@@ -115,17 +115,14 @@ def command(
         planes=planes,
         views=views,
     )
-    where = (
-        ""
-        if report["sharpest_distance_m"] is None
-        else f", {report['sharpest_distance_m']:.4g} m away"
-    )
+    away = report.sharpest_distance_m
+    rows, columns = report.lenslets
     options.summary(
-        report,
+        report.as_json(),
         as_json,
         (
-            f"{report['output']}: {report['planes']} planes of {report['lenslets'][0]} x "
-            f"{report['lenslets'][1]} lenslets; sharpest at slope "
-            f"{report['sharpest_slope']:.3g}{where}"
+            f"{report.output}: {report.planes} planes of {rows} x {columns} lenslets; sharpest at "
+            f"slope {report.sharpest_slope:.3g}"
+            f"{'' if away is None else f', {away:.4g} m away'}"
         ),
     )

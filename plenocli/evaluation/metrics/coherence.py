@@ -6,6 +6,7 @@ sensor sees of each atom. See docs/model.md, "Spatial reconstruction".
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,13 +42,34 @@ DEFINITIONS = {
 }
 
 
-def coherence(system, atoms, block=512):
-    """Measures of DEFINITIONS for A `system` (pixel, point) and Phi `atoms` (point,
-    atom): dict of numbers.
+@dataclass(frozen=True, kw_only=True)
+class CoherenceScore:
+    """Measures of a dictionary with a matrix, NaN where two visible atoms are due and there are
+    none. See DEFINITIONS.
+    """
 
-    Beside the inputs and D (pixel, atom) only blocks of `block` columns of products are held.
-    Computed in the precision of the inputs. Measures that need two visible atoms are
-    None without them.
+    coherence_raw: float
+    coherence_candes_romberg: float
+    coherence_effective: float
+    coherence_effective_mean: float
+    welch_bound: float
+    exact_recovery_sparsity: float
+    dead_atoms: int
+    invisible_atoms: int
+    atoms: int
+    points: int
+    pixels: int
+
+
+def coherence(system: np.ndarray, atoms: np.ndarray, block: int = 512) -> CoherenceScore:
+    """Measures of DEFINITIONS, in the precision of the inputs.
+
+    system: A (pixel, point).
+    atoms: Phi (point, atom).
+    block: columns of products held at a time, beside the inputs and D (pixel, atom).
+
+    Raises ValueError where the points of the two differ.
+    docs/model.md, "Spatial reconstruction".
     """
     system, atoms = np.asarray(system), np.asarray(atoms)
     pixels, points = system.shape
@@ -68,28 +90,28 @@ def coherence(system, atoms, block=512):
         magnitude = magnitude / row_scale[:, None] / atom_scale[part]
         candes = max(candes, float(magnitude.max(initial=0)))
     largest, mean, visible = column_coherence(effective, block)
-    return {
-        "coherence_raw": raw,
-        "coherence_candes_romberg": math.sqrt(points) * candes,
-        "coherence_effective": largest,
-        "coherence_effective_mean": mean,
-        "welch_bound": welch_bound(count, pixels),
-        "exact_recovery_sparsity": None if largest is None else exact_recovery_sparsity(largest),
-        "dead_atoms": int((atom_norm == 0).sum()),
-        "invisible_atoms": int((~visible & (atom_norm > 0)).sum()),
-        "atoms": count,
-        "points": points,
-        "pixels": pixels,
-    }
+    return CoherenceScore(
+        coherence_raw=raw,
+        coherence_candes_romberg=math.sqrt(points) * candes,
+        coherence_effective=math.nan if largest is None else largest,
+        coherence_effective_mean=math.nan if mean is None else mean,
+        welch_bound=welch_bound(count, pixels),
+        exact_recovery_sparsity=math.nan if largest is None else exact_recovery_sparsity(largest),
+        dead_atoms=int((atom_norm == 0).sum()),
+        invisible_atoms=int((~visible & (atom_norm > 0)).sum()),
+        atoms=count,
+        points=points,
+        pixels=pixels,
+    )
 
 
-def welch_bound(atoms, pixels):
-    """Least possible mutual coherence of `atoms` unit vectors in `pixels`
-    dimensions (Welch 1974).
+def welch_bound(atoms: int, pixels: int) -> float:
+    """Least possible mutual coherence of `atoms` unit vectors in `pixels` dimensions (Welch
+    1974).
     """
     return math.sqrt((atoms - pixels) / (pixels * (atoms - 1))) if atoms > pixels else 0.0
 
 
-def exact_recovery_sparsity(mu):
-    """Largest whole k below (1 + 1/mu)/2; None for mu = 0, where no limit follows."""
-    return None if mu <= 0 else math.ceil((1 + 1 / mu) / 2 - 1e-12) - 1
+def exact_recovery_sparsity(mu: float) -> float:
+    """Largest whole k below (1 + 1/mu)/2; NaN for mu = 0, where no limit follows."""
+    return math.nan if mu <= 0 else math.ceil((1 + 1 / mu) / 2 - 1e-12) - 1

@@ -5,7 +5,10 @@ The limit: a plane is told from another by its parallax over the whole pupil, an
 less than a lenslet's width, a slope of one. See docs/model.md, "Refocusing and depth".
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 SURE = 0.4
 """Confidence from which on a lenslet counts."""
@@ -27,38 +30,77 @@ DEFINITIONS = {
 }
 
 
-def score_depth(slope, confidence, true_slope, planes, sharpness):
-    """Figures of a depth map, a dict of those of DEFINITIONS that need no distances.
+@dataclass(frozen=True, kw_only=True)
+class SlopeScore:
+    """Figures of a depth map that need no distances, slopes in units of the geometric limit; NaN
+    where no lenslet counts. See DEFINITIONS.
+    """
 
-    slope, confidence (row, column);
-    true_slope: of the plane;
-    planes, sharpness (plane,): slopes tried, and how sharp each picture is.
+    depth_slope: float
+    depth_slope_found: float
+    depth_slope_error: float
+    depth_slope_worst: float
+    depth_sure_share: float
+    sharpest_slope_error: float
+
+
+@dataclass(frozen=True)
+class DepthScore:
+    """Figures of a depth map against a plane at a known distance, m; see DEFINITIONS."""
+
+    slopes: SlopeScore
+    depth_distance_m: float
+    depth_distance_error_m: float
+    depth_limit_m: float
+
+
+def score_depth(
+    slope: np.ndarray,
+    confidence: np.ndarray,
+    true_slope: float,
+    planes: np.ndarray,
+    sharpness: np.ndarray,
+) -> SlopeScore:
+    """Figures of a depth map of one plane.
+
+    slope, confidence: (row, column).
+    true_slope: of the plane, px per px.
+    planes: (plane,) slopes tried.
+    sharpness: (plane,) of the pictures at these slopes.
+
+    docs/model.md, "Refocusing and depth".
     """
     found = np.asarray(slope)[counted(slope, confidence)]
     error = np.abs(found - true_slope)
     middle, far = np.percentile(error, [50, 95]) if found.size else (np.nan, np.nan)
-    return {
-        "depth_slope": round(float(true_slope), 9) + 0.0,
-        "depth_slope_found": float(np.median(found)) if found.size else np.nan,
-        "depth_slope_error": float(middle),
-        "depth_slope_worst": float(far),
-        "depth_sure_share": found.size / np.size(slope),
-        "sharpest_slope_error": float(sharpest(planes, sharpness) - true_slope),
-    }
+    return SlopeScore(
+        depth_slope=round(float(true_slope), 9) + 0.0,
+        depth_slope_found=float(np.median(found)) if found.size else np.nan,
+        depth_slope_error=float(middle),
+        depth_slope_worst=float(far),
+        depth_sure_share=found.size / np.size(slope),
+        sharpest_slope_error=float(sharpest(planes, sharpness) - true_slope),
+    )
 
 
-def counted(slope, confidence):
-    """Which lenslets count."""
+def counted(slope: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """Which lenslets count, bool like slope."""
     return np.isfinite(slope) & (np.asarray(confidence) >= SURE)
 
 
-def sharpest(planes, sharpness):
-    """Slope where the sharpness peaks: on a parabola through the sharpest plane and its
-    neighbours, or that plane at an end.
+def sharpest(planes: ArrayLike, sharpness: ArrayLike) -> float:
+    """Slope where the sharpness peaks.
+
+    planes: (plane,) rising slopes.
+    sharpness: (plane,).
+
+    Returns the top of the parabola through the sharpest plane and its neighbours, or that plane
+    where it is the first or last one.
     """
-    best = int(np.argmax(sharpness))
-    if not 0 < best < len(planes) - 1:
-        return float(planes[best])
+    slopes, heights = np.asarray(planes), np.asarray(sharpness)
+    best = int(np.argmax(heights))
+    if not 0 < best < len(slopes) - 1:
+        return float(slopes[best])
     near = slice(best - 1, best + 2)
-    a, b, _ = np.polyfit(np.asarray(planes)[near] - planes[best], sharpness[near], 2)
-    return float(planes[best] - b / (2 * a))
+    a, b, _ = np.polyfit(slopes[near] - slopes[best], heights[near], 2)
+    return float(slopes[best] - b / (2 * a))

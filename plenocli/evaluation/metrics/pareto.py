@@ -1,14 +1,19 @@
 """Which designs no other beats: the Pareto front of several figures of merit."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def front(values, signs):
-    """Whether each row of `values` (point, figure) is beaten by none, (point,) bool.
+def front(values: ArrayLike, signs: ArrayLike) -> np.ndarray:
+    """Which points are beaten by none.
 
-    signs: (figure,) +1 where more is better, -1 where less is. A point is beaten by one that is at
-        least as good in every figure and better in one; equals beat none of each other. Points with
-        NaN are not on the front, and beat nobody.
+    values: (point, figure); points with NaN are not on the front, and beat nobody.
+    signs: (figure,) +1 where more is better, -1 where less is.
+
+    A point is beaten by one that is at least as good in every figure and better in one; equals
+    beat none of each other.
+
+    Returns (point,) bool.
     """
     merit = np.asarray(values, dtype=np.float64) * np.asarray(signs, dtype=np.float64)
     if merit.ndim != 2 or merit.shape[1] == 0:

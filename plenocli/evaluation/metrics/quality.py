@@ -5,6 +5,8 @@ whatever the picture's own maximum. Nothing is clipped or rounded here. See
 docs/model.md, "Measures".
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from plenocli.forward.scene.sample import block_mean
@@ -45,30 +47,67 @@ DEFINITIONS = {
 }
 
 
-def _pair(estimate, truth):
+@dataclass(frozen=True)
+class LensletScore:
+    """What needs the lenslets' blocks; NaN where it does not apply.
+
+    psnr_inner_db, block_mean_psnr_db, gain_over_block_mean_db: dB, see DEFINITIONS.
+    """
+
+    psnr_inner_db: float
+    block_mean_psnr_db: float
+    gain_over_block_mean_db: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureScore:
+    """Measures of one picture; see DEFINITIONS.
+
+    psnr_db, psnr_clipped_db: dB, infinite for equal pictures.
+    rmse: in the unit of the picture.
+    ssim: -1 to 1, NaN where the picture is too small for it.
+    lenslets: None where their blocks are not known.
+    """
+
+    psnr_db: float
+    psnr_clipped_db: float
+    rmse: float
+    ssim: float
+    lenslets: LensletScore | None = None
+
+
+def _pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     estimate, truth = (np.asarray(values, dtype=np.float64) for values in (estimate, truth))
     if estimate.shape != truth.shape:
         raise ValueError(f"estimate is {estimate.shape}, truth is {truth.shape}")
     return estimate, truth
 
 
-def rmse(estimate, truth):
+def rmse(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Root mean squared error over all samples, in the unit of the samples."""
     estimate, truth = _pair(estimate, truth)
     return float(np.sqrt(np.mean((estimate - truth) ** 2)))
 
 
-def psnr(estimate, truth):
-    """Peak signal-to-noise ratio in dB with peak 1.0: -20 log10(rmse); infinite
-    for equal pictures.
+def psnr(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio with peak 1.0.
+
+    estimate, truth: (..., row, column), linear, white is 1.
+
+    Returns -20 log10(rmse), dB; infinite for equal pictures.
     """
     error = rmse(estimate, truth)
     return float("inf") if error == 0 else float(-20 * np.log10(error / PEAK))
 
 
-def inner(values, block, border=1):
-    """`values` (..., row, column) without `border` rings of lenslets of `block` (h, w) samples;
-    None if nothing is left.
+def inner(values: np.ndarray, block: tuple[int, int], border: int = 1) -> np.ndarray | None:
+    """A picture without its outer lenslets.
+
+    values: (..., row, column).
+    block: (rows, columns) of samples under a lenslet.
+    border: rings of lenslets that are left out.
+
+    Returns a view of (..., row, column), None if nothing is left.
     """
     (height, width), (rows, cols) = block, np.shape(values)[-2:]
     top, left = border * height, border * width
@@ -77,18 +116,19 @@ def inner(values, block, border=1):
     return np.asarray(values)[..., top : rows - top, left : cols - left]
 
 
-def ssim(estimate, truth):
-    """Mean structural similarity, -1..1, with data range 1.0; bands of a (band, row, column)
-    cube are averaged.
+def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Mean structural similarity with data range 1.0.
 
-    Window and constants of Wang et al., IEEE Trans. Image Processing 13 (2004) 600-612. None for
-    pictures smaller than the window of 11 x 11 samples.
+    estimate, truth: (row, column), or (band, row, column), whose bands are averaged.
+
+    Returns -1 to 1; NaN for pictures smaller than the window of 11 x 11 samples.
+    Wang et al., IEEE Trans. Image Processing 13 (2004) 600-612 (window and constants).
     """
     from skimage.metrics import structural_similarity
 
     estimate, truth = _pair(estimate, truth)
     if min(truth.shape[-2:]) < 11:
-        return None
+        return np.nan
     bands = zip(
         estimate.reshape(-1, *truth.shape[-2:]), truth.reshape(-1, *truth.shape[-2:]), strict=True
     )
@@ -109,34 +149,46 @@ def ssim(estimate, truth):
     )
 
 
-def block_mean_baseline(truth, block):
-    """The truth with each lenslet's block (h, w) replaced by its mean; same shape as `truth`
-    (..., row, column).
+def block_mean_baseline(truth: np.ndarray, block: tuple[int, int]) -> np.ndarray:
+    """The truth with each lenslet's block replaced by its mean.
+
+    truth: (..., row, column).
+    block: (rows, columns) of samples under a lenslet.
+
+    Returns an array like truth.
     """
     means = block_mean(truth, block)
     return np.repeat(np.repeat(means, block[0], axis=-2), block[1], axis=-1)
 
 
-def score_picture(estimate, truth, block=None):
-    """All measures of DEFINITIONS for one picture, a dict of floats (None where
-    one does not apply).
+def score_picture(
+    estimate: np.ndarray, truth: np.ndarray, block: tuple[int, int] | None = None
+) -> PictureScore:
+    """All measures of DEFINITIONS for one picture.
 
-    block: samples of the object grid under one lenslet (h, w); without it the lenslet-wise
-        measures are left out.
+    estimate, truth: (..., row, column), linear, white is 1.
+    block: (rows, columns) of samples under one lenslet; without it the lenslet-wise measures
+        are left out.
     """
     estimate, truth = _pair(estimate, truth)
-    scores = {
-        "psnr_db": psnr(estimate, truth),
-        "psnr_clipped_db": psnr(np.clip(estimate, 0, PEAK), truth),
-        "rmse": rmse(estimate, truth),
-        "ssim": ssim(estimate, truth),
-    }
-    if block is not None:
-        middle = inner(estimate, block)
-        scores["psnr_inner_db"] = None if middle is None else psnr(middle, inner(truth, block))
-        baseline = psnr(block_mean_baseline(truth, block), truth)
-        scores["block_mean_psnr_db"] = baseline
-        scores["gain_over_block_mean_db"] = (
-            scores["psnr_db"] - baseline if np.isfinite(baseline) else None
-        )
-    return scores
+    whole = psnr(estimate, truth)
+    return PictureScore(
+        psnr_db=whole,
+        psnr_clipped_db=psnr(np.clip(estimate, 0, PEAK), truth),
+        rmse=rmse(estimate, truth),
+        ssim=ssim(estimate, truth),
+        lenslets=None if block is None else _score_lenslets(estimate, truth, whole, block),
+    )
+
+
+def _score_lenslets(
+    estimate: np.ndarray, truth: np.ndarray, whole: float, block: tuple[int, int]
+) -> LensletScore:
+    """Measures that need the blocks; `whole`: PSNR of the whole picture, dB."""
+    middle, true_middle = inner(estimate, block), inner(truth, block)
+    baseline = psnr(block_mean_baseline(truth, block), truth)
+    return LensletScore(
+        np.nan if middle is None or true_middle is None else psnr(middle, true_middle),
+        baseline,
+        whole - baseline if np.isfinite(baseline) else np.nan,
+    )

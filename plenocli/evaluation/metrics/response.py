@@ -5,6 +5,8 @@ Responses are (lenslet, pixel, band); NaN pixels of either are left out. See doc
 response predicted".
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 DEFINITIONS = {
@@ -28,9 +30,23 @@ DEFINITIONS = {
 }
 
 
-def score_response(response, truth):
-    """Measures of `response` against `truth`, (lenslet, pixel, band) each with the same
-    lenslets; a dict of DEFINITIONS.
+@dataclass(frozen=True, kw_only=True)
+class ResponseScore:
+    """Measures of one response against another, lists by band; see DEFINITIONS."""
+
+    response_gain_per_band: list[float]
+    response_error_per_band: list[float]
+    response_error_lenslet_per_band: list[float]
+    response_pixel_per_band: list[float]
+    response_leak: float
+
+
+def score_response(response: np.ndarray, truth: np.ndarray) -> ResponseScore:
+    """Measures of a response against the true one.
+
+    response, truth: (lenslet, pixel, band) of the same lenslets, NaN where unknown.
+
+    docs/model.md, "The response predicted".
     """
     error, gain, mean = response_error(response, truth)
     with np.errstate(invalid="ignore"):
@@ -41,20 +57,24 @@ def score_response(response, truth):
     size = np.linalg.norm(mean[seen], axis=0)
     leak = np.linalg.pinv(error[seen] + mean[seen]) @ mean[seen]
     own = np.diag(leak)
-    return {
-        "response_gain_per_band": gain.tolist(),
-        "response_error_per_band": (np.linalg.norm(error[seen], axis=0) / size).tolist(),
-        "response_error_lenslet_per_band": np.median(single, axis=0).tolist(),
-        "response_pixel_per_band": (
-            np.abs(error[seen]).max(axis=0) / mean[seen].max(axis=0)
-        ).tolist(),
-        "response_leak": float(np.abs(leak - np.diag(own)).max() / own.min()),
-    }
+    return ResponseScore(
+        response_gain_per_band=gain.tolist(),
+        response_error_per_band=(np.linalg.norm(error[seen], axis=0) / size).tolist(),
+        response_error_lenslet_per_band=np.median(single, axis=0).tolist(),
+        response_pixel_per_band=(np.abs(error[seen]).max(axis=0) / mean[seen].max(axis=0)).tolist(),
+        response_leak=float(np.abs(leak - np.diag(own)).max() / own.min()),
+    )
 
 
-def response_error(response, truth):
-    """(gain x response - truth, averaged over lenslets, (pixel, band), NaN where never known;
-    gain (band,); mean truth (pixel, band)).
+def response_error(
+    response: np.ndarray, truth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far a response lies from the true one after a gain for each band.
+
+    response, truth: (lenslet, pixel, band) of the same lenslets, NaN where unknown.
+
+    Returns (gain x response - truth, averaged over lenslets, (pixel, band), NaN where never
+    known; gain (band,); mean truth (pixel, band)).
     """
     both = np.isfinite(response) & np.isfinite(truth)
     f, t = np.where(both, response, 0), np.where(both, truth, 0)

@@ -3,7 +3,10 @@
 All in dB (docs/model.md, "Measures").
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 DEFINITIONS = {
     "snr_capture_db": (
@@ -29,19 +32,58 @@ DEFINITIONS = {
 }
 
 
-def _decibel(ratio):
+@dataclass(frozen=True, kw_only=True)
+class SnrScore:
+    """SNR on a white target, dB, lists by band; a mean is NaN where a band is not finite, the
+    predicted ones are None where no deviation is known. See DEFINITIONS.
+
+    snr_target: what it was measured on, in words.
+    """
+
+    snr_target: str
+    snr_capture_db: list[float]
+    snr_predicted_db: list[float] | None
+    snr_capture_mean_db: float
+    snr_predicted_mean_db: float | None
+
+
+def score_snr(target: str, frames: np.ndarray, sigma: np.ndarray | None) -> SnrScore:
+    """Capture and predicted SNR on a white target.
+
+    target: what it is, in words.
+    frames: (frame, band, lenslet...).
+    sigma: (band, lenslet...) predicted standard deviation of the first frame, or None.
+    """
+    capture = snr_capture(frames)
+    predicted = None if sigma is None else snr_predicted(frames[0], sigma)
+    return SnrScore(
+        snr_target=target,
+        snr_capture_db=capture.tolist(),
+        snr_predicted_db=None if predicted is None else predicted.tolist(),
+        snr_capture_mean_db=_mean(capture),
+        snr_predicted_mean_db=None if predicted is None else _mean(predicted),
+    )
+
+
+def _mean(bands: np.ndarray) -> float:
+    return float(bands.mean()) if np.isfinite(bands).all() else np.nan
+
+
+def _decibel(ratio: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         return 20 * np.log10(ratio)
 
 
-def snr_capture(frames):
-    """Capture SNR (band,) of estimates of one uniform white target, frames (frame,
-    band, lenslet...).
+def snr_capture(frames: np.ndarray) -> np.ndarray:
+    """Capture SNR of estimates of one uniform white target.
+
+    frames: (frame, band, lenslet...); lenslets with NaN are left out.
 
     Two or more frames: standard deviation over time at each lenslet, with which frame-to-frame
     change of the mean level counts as noise; for two frames it equals std(f1 - f2)/sqrt 2 at equal
-    means. One frame: over its lenslets. Lenslets with NaN are left out. NaN where fewer than two
-    samples are left; infinite without noise.
+    means. One frame: over its lenslets.
+
+    Returns (band,) dB; NaN where fewer than two samples are left, infinite without noise.
     """
     frames = np.asarray(frames, dtype=np.float64)
     frames = frames.reshape(*frames.shape[:2], -1)
@@ -56,9 +98,12 @@ def snr_capture(frames):
     return _ratio(mean, np.sqrt(variance))
 
 
-def snr_predicted(value, sigma):
-    """Predicted SNR (band,) of estimates `value` (band, lenslet...) with predicted standard
-    deviations `sigma`.
+def snr_predicted(value: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Predicted SNR of estimates.
+
+    value, sigma: (band, lenslet...), estimates and their predicted standard deviations.
+
+    Returns (band,) dB; NaN where no lenslet has both.
     """
     value, sigma = (
         np.asarray(v, dtype=np.float64).reshape(np.shape(v)[0], -1) for v in (value, sigma)
@@ -69,18 +114,20 @@ def snr_predicted(value, sigma):
     return _ratio(value[:, valid].mean(1), np.sqrt((sigma[:, valid] ** 2).mean(1)))
 
 
-def snr_sensor(signal, sigma, noisy=False):
-    """Sensor-model SNR of a capture `signal` (any shape) with white noise of standard deviation
-    `sigma`: 10 log10(mean(y^2)/sigma^2).
+def snr_sensor(signal: ArrayLike, sigma: float, noisy: bool = False) -> float:
+    """Sensor-model SNR of a capture with white noise, 10 log10(mean(y^2) / sigma^2).
 
-    noisy: the signal carries the noise already, whose power is taken off; -inf
-        where nothing is left.
+    signal: any shape.
+    sigma: standard deviation of the noise, in the unit of the signal.
+    noisy: the signal carries the noise already, whose power is taken off.
+
+    Returns dB; -inf where nothing is left.
     """
     power = np.mean(np.asarray(signal, dtype=np.float64) ** 2) - (sigma**2 if noisy else 0.0)
     return float(_ratio(np.sqrt(max(power, 0.0)), float(sigma)))
 
 
-def _ratio(mean, deviation):
+def _ratio(mean: ArrayLike, deviation: ArrayLike) -> np.ndarray:
     mean, deviation = np.maximum(mean, 0.0), np.asarray(deviation)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(

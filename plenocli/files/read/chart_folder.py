@@ -9,49 +9,80 @@ filter such as "550 nm".
 
 import csv
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
+from plenocli.evaluation.chart_score import ChartCaptures, Shot
+
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
 
 PICTURES = (".tif", ".tiff", ".png")
 MOST_FILES = 10_000
-_BAND, _TIME = (
-    re.compile(r"(?<![\d.])(\d{3,4})nm(?![a-z])", re.I),
-    re.compile(r"(?<![\d.])(\d+(?:\.\d+)?)(us|ms|s)(?![a-z])", re.I),
-)
+_BAND = re.compile(r"(?<![\d.])(\d{3,4})nm(?![a-z])", re.I)
+_TIME = re.compile(r"(?<![\d.])(\d+(?:\.\d+)?)(us|ms|s)(?![a-z])", re.I)
 _UNIT = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 _FILTER = re.compile(r"\s*(\d{3,4})\s*nm\s*")
 
 
+@dataclass(frozen=True, kw_only=True)
+class ChartFiles:
+    """Every file used: captures, dark frames, the label map and the spectrometer's table."""
+
+    captures: Sequence[Path]
+    darks: Sequence[Path]
+    labels: Path
+    spectra: Path
+
+    def paths(self) -> list[Path]:
+        """All of them."""
+        return [*self.captures, *self.darks, self.labels, self.spectra]
+
+    def by_role(self) -> dict[str, Any]:
+        """As describe_inputs takes them."""
+        return {
+            "capture": list(self.captures),
+            "dark": list(self.darks),
+            "labels": self.labels,
+            "spectra": self.spectra,
+        }
+
+
 @dataclass(frozen=True)
 class ChartFolder:
-    """captures: band (m) -> list of (seconds, values (rows, columns));
-    darks: list of (seconds, values);
-    white: level, DN; cfa;
-    labels (rows, columns) int;
-    wavelengths (n,) m, patches (24, n) reflectance, filters: label (m) -> (n,) transmission;
-    files: every file used, by role.
-    """
+    """What a folder holds of a chart, and the files it came from."""
 
-    captures: dict
-    darks: list
-    white: float
-    cfa: str
-    labels: np.ndarray
+    data: ChartCaptures
+    files: ChartFiles
+
+
+@dataclass(frozen=True)
+class _Table:
+    """wavelengths (n,) m; patches (24, n) reflectance; filters: label (m) -> (n,) transmission."""
+
     wavelengths: np.ndarray
     patches: np.ndarray
-    filters: dict
-    files: dict
+    filters: dict[float, np.ndarray]
 
 
-def read_chart_folder(folder, *, cfa, labels=None, spectra=None):
-    """The ChartFolder in `folder`;
+def read_chart_folder(
+    folder: Path | str,
+    *,
+    cfa: str,
+    labels: Path | str | None = None,
+    spectra: Path | str | None = None,
+) -> ChartFolder:
+    """The captures of a chart in a folder, with what is known of it.
 
-    labels, spectra: files instead of the ones in it.
-    InputError, saying what is missing.
+    cfa: of the captures, "mono" or four letters.
+    labels, spectra: files instead of the ones in the folder.
+
+    Raises InputError, saying what is missing.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -74,31 +105,41 @@ def read_chart_folder(folder, *, cfa, labels=None, spectra=None):
             folder,
             "name the captures so",
         )
-    captures, white, shape = {}, None, None
+    captures: dict[float, list[Shot]] = {}
+    white, shape = None, None
     for path in shots:
         capture, shape = _read(path, cfa, shape)
         white = capture.levels.white
-        captures.setdefault(int(_BAND.search(path.name)[1]) * 1e-9, []).append(
-            (_seconds(path), capture.mosaic)
-        )
+        band = int(_BAND.search(path.name)[1]) * 1e-9
+        captures.setdefault(band, []).append(Shot(_seconds(path), capture.mosaic))
     kept, darks = [], []
     for path in dark_paths:
         capture, _ = _read(path, cfa, None)
         if capture.shape == shape:
             kept.append(path)
-            darks.append((_seconds(path), capture.mosaic))
+            darks.append(Shot(_seconds(path), capture.mosaic))
     label_path, label_map = _labels(labels, found, shape, folder)
     table_path, table = _spectra(spectra, found, folder)
-    files = {"capture": shots, "dark": kept, "labels": label_path, "spectra": table_path}
-    return ChartFolder(dict(sorted(captures.items())), darks, white, cfa, label_map, *table, files)
+    data = ChartCaptures(
+        captures=dict(sorted(captures.items())),
+        darks=darks,
+        white=white,
+        cfa=cfa,
+        labels=label_map,
+        wavelengths=table.wavelengths,
+        patches=table.patches,
+        filters=table.filters,
+    )
+    files = ChartFiles(captures=shots, darks=kept, labels=label_path, spectra=table_path)
+    return ChartFolder(data, files)
 
 
-def _seconds(path):
+def _seconds(path: Path) -> float:
     value, unit = _TIME.search(path.name).groups()
     return float(value) * _UNIT[unit.lower()]
 
 
-def _read(path, cfa, shape):
+def _read(path: Path, cfa: str, shape: tuple[int, ...] | None) -> tuple["Capture", tuple[int, ...]]:
     from plenocli.files.images.mosaic import read_capture
 
     capture = read_capture(path, cfa=cfa)
@@ -114,7 +155,9 @@ def _read(path, cfa, shape):
     return capture, capture.shape
 
 
-def _labels(path, found, shape, folder):
+def _labels(
+    path: Path | str | None, found: Sequence[Path], shape: tuple[int, ...], folder: Path
+) -> tuple[Path, np.ndarray]:
     """(path, map): the one asked for, or the map of this size whose patches are
     each in one piece.
     """
@@ -133,7 +176,14 @@ def _labels(path, found, shape, folder):
     )
 
 
-def _first(path, likely, read, what, folder, fix):
+def _first(
+    path: Path | str | None,
+    likely: Sequence[Path],
+    read: Callable[[Path], Any],
+    what: str,
+    folder: Path,
+    fix: str,
+) -> tuple[Path, Any]:
     """(path, read(path)) of the file asked for, or of the first of the `likely` ones that can be
     read; InputError where there is none.
     """
@@ -149,7 +199,7 @@ def _first(path, likely, read, what, folder, fix):
     raise InputError(f"holds no {what}{said}", folder, fix)
 
 
-def _label_map(path, shape):
+def _label_map(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     from scipy.ndimage import label
 
     from plenocli.files.images.mosaic import read_capture
@@ -175,8 +225,8 @@ def _label_map(path, shape):
     return labels
 
 
-def _spectra(path, found, folder):
-    """(path, (wavelengths m, patches (24, n), filters)) from the first table that has them all."""
+def _spectra(path: Path | str | None, found: Sequence[Path], folder: Path) -> tuple[Path, _Table]:
+    """(path, table) of the first table that has all patches."""
     likely = [p for p in found if p.suffix.lower() == ".csv"]
     return _first(
         path,
@@ -188,7 +238,7 @@ def _spectra(path, found, folder):
     )
 
 
-def _table(path):
+def _table(path: Path) -> _Table:
     from plenocli.forward.scene.tables import colorchecker
 
     try:
@@ -231,4 +281,4 @@ def _table(path):
         for name in header[1:]
         if _FILTER.fullmatch(name)
     }
-    return wavelengths, np.array([columns[name] for name in names]), filters
+    return _Table(wavelengths, np.array([columns[name] for name in names]), filters)

@@ -1,126 +1,126 @@
-"""score: results against the truth, side by side, as JSON, a table and (on
-request) the report page.
+"""score: results against the truth, side by side, as JSON, a table and (on request) the report
+page.
 """
 
+from __future__ import annotations
+
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.text import plain
-from plenocli.evaluation.depth_score import score_lightfield
-from plenocli.evaluation.response_score import score_calibration
-from plenocli.evaluation.spectra_score import against_single_pixel, score_spectra
+from plenocli.evaluation.chosen import definitions_of, keep_chosen
+from plenocli.evaluation.depth_score import check_depth, score_lightfield
+from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
+from plenocli.evaluation.metrics.figures import figures
+from plenocli.evaluation.metrics.quality import PictureScore, score_picture
+from plenocli.evaluation.metrics.response import score_response
+from plenocli.evaluation.metrics.snr import snr_sensor
+from plenocli.evaluation.response_score import ComparedResponse, paired_responses
+from plenocli.evaluation.results import Result, WhiteTarget
+from plenocli.evaluation.scores import InputFile, ResultScore, ScoreDocument
+from plenocli.evaluation.spectra_score import (
+    SINGLE,
+    SpectraScore,
+    over_single_pixel,
+    score_spectra,
+)
 from plenocli.execution.batch import failed_together
-from plenocli.files.read.results import CHART, block_of, read_result, read_truth, read_whites
+from plenocli.files.results.matrices import matrix_of
+from plenocli.files.results.results import (
+    read_block,
+    read_response,
+    read_scored,
+    read_whites,
+)
+from plenocli.files.results.truths import CHART, read_labels, read_truth
+from plenocli.inverse.lightfield.planes import LightField
 
-GROUPS = {
-    "psnr": ("psnr_db", "psnr_inner_db", "psnr_clipped_db"),
-    "ssim": ("ssim",),
-    "block-mean": ("block_mean_psnr_db", "gain_over_block_mean_db"),
-    "rmse": ("rmse", "rmse_per_band"),
-    "patches": (
-        "patches",
-        "patch_rmse_per_band",
-        "six_patch_rmse",
-        "six_patch_rmse_per_band",
-        "six_patches_seen",
-    ),
-    "spectral-angle": ("spectral_angle_deg",),
-    "delta-e": ("delta_e_2000",),
-    "classification": ("classification_accuracy", "nearest_patch_accuracy"),
-    "single-pixel": (
-        "rmse_over_single_pixel",
-        "six_patch_rmse_over_single_pixel",
-        "delta_e_over_single_pixel",
-        "snr_over_single_pixel_db",
-    ),
-    "response": (
-        "response_gain_per_band",
-        "response_error_per_band",
-        "response_error_lenslet_per_band",
-        "response_pixel_per_band",
-        "response_leak",
-    ),
-    "depth": (
-        "depth_slope",
-        "depth_slope_found",
-        "depth_slope_error",
-        "depth_slope_worst",
-        "depth_sure_share",
-        "sharpest_slope_error",
-        "depth_distance_m",
-        "depth_distance_error_m",
-        "depth_limit_m",
-    ),
-    "limits": (
-        "noise_relative",
-        "model_error_relative",
-        "limited_by",
-        "loss_at_most_db",
-        "seen_share",
-    ),
-    "snr": (
-        "snr_capture_db",
-        "snr_capture_mean_db",
-        "snr_predicted_db",
-        "snr_predicted_mean_db",
-        "snr_sensor_db",
-    ),
-    "coherence": (
-        "coherence_raw",
-        "coherence_candes_romberg",
-        "coherence_effective",
-        "coherence_effective_mean",
-        "welch_bound",
-        "exact_recovery_sparsity",
-        "dead_atoms",
-        "invisible_atoms",
-        "atoms",
-        "points",
-        "pixels",
-    ),
-}
-"""What --metric may ask for, and the numbers that each brings."""
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.report.score_page import Compared
+
+POINT_BYTES = 128
+"""Memory for each point of a picture that is compared (measured)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Comparison:
+    """What a result is compared with; files are read once.
+
+    truth: path or scene name, or None.
+    whites: method -> spectra of a white target.
+    patches: label map or "colorchecker", or None.
+    lenslet_matrix: A (pixel, point) of the object's own superpixel, or None.
+    block: (rows, columns) of object samples under a lenslet, where they are given.
+    object_shape: the same as the system matrix tells it.
+    sensor_snr: of the capture, dB, or None.
+    """
+
+    truth: Path | str | None
+    whites: Mapping[str, WhiteTarget]
+    patches: Path | str | None
+    lenslet_matrix: np.ndarray | None
+    block: tuple[int, int] | None
+    object_shape: tuple[int, int] | None
+    sampling: str
+    light: str
+    camera: Camera | None
+    sensor_snr: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scored:
+    """One result with what the page draws of it; spectra: typed, to be set against single pixel."""
+
+    score: ResultScore
+    drawn: Compared | None = None
+    spectra: SpectraScore | None = None
+    failed: PlenoError | None = None
 
 
 def run_score(
-    results,
-    output,
+    results: Sequence[Path | str],
+    output: Path | str,
     *,
-    truth=None,
-    report=None,
-    metrics=(),
-    whites=(),
-    patches=None,
-    pif=None,
-    capture=None,
-    block=None,
-    sampling="fit",
-    light="D65",
-    camera=None,
-    overwrite=False,
-    command="",
-):
-    """Score every result, write `output` (JSON) and perhaps `report` (HTML); returns the JSON
-    document as a dict.
+    truth: Path | str | None = None,
+    report: Path | str | None = None,
+    metrics: Sequence[str] = (),
+    whites: Sequence[Path | str] = (),
+    patches: Path | str | None = None,
+    pif: Path | str | None = None,
+    capture: Path | str | None = None,
+    block: tuple[int, int] | None = None,
+    sampling: str = "fit",
+    light: str = "D65",
+    camera: Path | str | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> ScoreDocument:
+    """Score every result, write `output` (JSON) and perhaps `report` (HTML).
 
     results: paths.
     truth: path or scene name, needed but for dictionaries.
+    metrics: names of figures' groups, all without any.
     whites: spectra of a white target, frames.
     patches: label map or "colorchecker".
     pif: system matrix (dictionaries need it).
     capture: for its sensor-model SNR.
-    block: object samples per lenslet (h, w), else from the files.
+    block: object samples per lenslet (rows, columns), else from the files.
+    sampling: how a photograph became the object, "fit" or "crop".
     light: for colour differences.
-    camera: TOML, through whose filters spectra see the truth. One bad result does not stop the
-        others: its message is printed and stands in its place; an error with the exit code of the
-        worst is raised at the end.
+    camera: TOML, through whose filters spectra see the truth.
+
+    One bad result does not stop the others: its message is printed and stands in its place.
+    Raises the error of the worst one at the end.
     """
     from plenocli.files.artefacts.provenance import describe_inputs
-    from plenocli.files.artefacts.shards import read_pif
     from plenocli.files.atomic import check_output, publish
 
     inputs = [*results, truth, *whites, patches, pif, capture, camera]
@@ -128,59 +128,37 @@ def run_score(
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
-    system = read_pif(pif) if pif else None
-    context = _Context(truth, whites, patches, system, capture, block, sampling, light, camera)
-    scored, pictures, errors = [], [], []
-    for path in results:
-        try:
-            entry, picture = _score_one(path, context)
-        except PlenoError as error:
-            if len(results) == 1:
-                raise
-            entry, picture = _failed(path, error, errors), None
-        scored.append(entry)
-        pictures.append(picture)
-    against_single_pixel(scored)
-    for i, path in enumerate(results):
-        try:
-            if "error" not in scored[i]:
-                _keep(scored[i]["metrics"], metrics)
-        except PlenoError as error:
-            if len(results) == 1:
-                raise
-            scored[i], pictures[i] = _failed(path, error, errors), None
+    comparison = _comparison(truth, whites, patches, pif, capture, block, sampling, light, camera)
+    scored = _score_all(results, comparison, tuple(metrics))
+    errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
         raise failed_together(
             errors, len(results), "results", None, "nothing is written; see the messages above"
         )
-    _name_apart(scored, results)
-    document = {
-        "metrics": next(entry["metrics"] for entry in scored if "error" not in entry),
-        "results": scored,
-        "definitions": _definitions(scored),
-        "command": command,
-        "inputs": describe_inputs(
-            {
-                "result": list(results),
-                "truth": truth if truth and Path(truth).is_file() else None,
-                "white": list(whites),
-                "camera": camera,
-                "patches": patches if patches and Path(patches).is_file() else None,
-                "pif": pif,
-                "capture": capture,
-            }
-        ),
+    labels = _labels(results)
+    named = [replace(one.score, label=label) for one, label in zip(scored, labels, strict=True)]
+    roles = {
+        "result": list(results),
+        "truth": truth if truth and Path(truth).is_file() else None,
+        "white": list(whites),
+        "camera": camera,
+        "patches": patches if patches and Path(patches).is_file() else None,
+        "pif": pif,
+        "capture": capture,
     }
-    document = plain(document)
-    publish(
-        output,
-        (json.dumps(document, indent=1, allow_nan=False) + "\n").encode(),
-        overwrite=overwrite,
+    document = ScoreDocument(
+        results=tuple(named),
+        definitions=definitions_of(named),
+        command=command,
+        inputs={role: InputFile(**about) for role, about in describe_inputs(roles).items()},
     )
+    text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
+    publish(output, text.encode(), overwrite=overwrite)
     if report is not None:
         from plenocli.report.score_page import score_page
 
-        publish(report, score_page(document, pictures).encode(), overwrite=overwrite)
+        page = score_page(document, [one.drawn for one in scored])
+        publish(report, page.encode(), overwrite=overwrite)
     if errors:
         raise failed_together(
             errors, len(results), "results", output, "the others are scored; see the messages above"
@@ -188,113 +166,245 @@ def run_score(
     return document
 
 
-def _failed(path, error, errors):
-    """The entry of a result that cannot be scored; its error is told and kept."""
+def _comparison(
+    truth: Path | str | None,
+    whites: Sequence[Path | str],
+    patches: Path | str | None,
+    pif: Path | str | None,
+    capture: Path | str | None,
+    block: tuple[int, int] | None,
+    sampling: str,
+    light: str,
+    camera: Path | str | None,
+) -> _Comparison:
+    from plenocli.files.artefacts.shards import read_pif
+    from plenocli.files.read.cameras import read_camera
+    from plenocli.forward.scene.tables import illuminant
+
+    system = read_pif(pif) if pif else None
+    illuminant(light, [560e-9])  # an unknown name is refused before any work
+    if patches is None and str(truth) == CHART:
+        patches = CHART
+    matrix = None if system is None else matrix_of(system)
+    return _Comparison(
+        truth=truth,
+        whites=read_whites(whites),
+        patches=patches,
+        lenslet_matrix=None if matrix is None else matrix.own,
+        block=block,
+        object_shape=None if matrix is None else matrix.object_shape,
+        sampling=sampling,
+        light=light,
+        camera=read_camera(camera) if camera else None,
+        sensor_snr=_sensor_snr(capture) if capture else None,
+    )
+
+
+def _score_all(
+    results: Sequence[Path | str], comparison: _Comparison, groups: tuple[str, ...]
+) -> list[_Scored]:
+    """Every result scored, set against single pixel and reduced to what was asked for; a single
+    one raises its error.
+    """
+    scored = [_attempt(path, comparison, len(results) == 1) for path in results]
+    singles = [one for one in scored if one.score.method == SINGLE and not one.score.error]
+    single = singles[0].spectra if len(singles) == 1 else None
+    if single is not None:
+        scored = [_beside_single_pixel(one, single) for one in scored]
+    for number, (path, one) in enumerate(zip(results, scored)):
+        if one.failed is not None:
+            continue
+        try:
+            chosen = keep_chosen(one.score.figures, groups)
+        except PlenoError as error:
+            if len(results) == 1:
+                raise
+            scored[number] = _failed(path, error)
+        else:
+            scored[number] = replace(one, score=replace(one.score, figures=chosen))
+    return scored
+
+
+def _attempt(path: Path | str, comparison: _Comparison, alone: bool) -> _Scored:
+    try:
+        return _score_one(path, comparison)
+    except PlenoError as error:
+        if alone:
+            raise
+        return _failed(path, error)
+
+
+def _failed(path: Path | str, error: PlenoError) -> _Scored:
+    """The place of a result that cannot be scored; its error is told."""
     note(f"error: {error}")
-    errors.append((path, error))
-    return {
-        "name": Path(path).name,
-        "error": str(error).replace(str(path), Path(path).name),
-        "metrics": {},
-    }
+    name = Path(path).name
+    return _Scored(
+        score=ResultScore(name=name, error=str(error).replace(str(path), name)), failed=error
+    )
 
 
-class _Context:
-    """Everything a result is scored with; files are read once."""
-
-    def __init__(self, truth, whites, patches, system, capture, block, sampling, light, camera):
-        from plenocli.files.read.cameras import read_camera
-        from plenocli.forward.scene.tables import illuminant
-
-        illuminant(light, [560e-9])  # an unknown name is refused before any work
-        if patches is None and str(truth) == CHART:
-            patches = CHART
-        self.truth, self.patches, self.system, self.block = truth, patches, system, block
-        self.sampling, self.light = sampling, light
-        self.whites = read_whites(whites)
-        self.camera = read_camera(camera) if camera else None
-        self.sensor_snr = _sensor_snr(capture) if capture else None
+def _beside_single_pixel(one: _Scored, single: SpectraScore) -> _Scored:
+    """Spectra of another method with what they gain over single pixel extraction."""
+    if one.spectra is None or one.score.kind != "spectra" or one.score.method == SINGLE:
+        return one
+    gains = figures(over_single_pixel(one.spectra, single))
+    return replace(one, score=replace(one.score, figures={**one.score.figures, **gains}))
 
 
-POINT_BYTES = 128
-"""Memory for each point of a picture that is compared (measured)."""
+def _score_one(path: Path | str, comparison: _Comparison) -> _Scored:
+    """One result, whatever its kind."""
+    found = read_scored(path)
+    if isinstance(found, ComparedResponse):
+        return _score_calibration(found, comparison)
+    if isinstance(found, LightField):
+        return _score_planes(path, found, comparison)
+    if found.kind == "dictionary":
+        return _score_dictionary(found, comparison)
+    return _score_image(found, comparison)
 
 
-def _score_one(path, context):
-    """(JSON-able entry, what the report draws) of one result."""
-    from plenocli.base.budget import budget
+def _score_calibration(response: ComparedResponse, comparison: _Comparison) -> _Scored:
+    if comparison.truth is None:
+        raise UsageError(
+            "the truth is missing",
+            response.path,
+            "name with --truth the calibration to compare with",
+        )
+    pair = paired_responses(response, read_response(comparison.truth))
+    return _Scored(
+        score=ResultScore(
+            name=response.path.name,
+            kind="calibration",
+            wavelengths_nm=_nanometres(pair.wavelengths),
+            figures=figures(score_response(pair.first, pair.second)),
+        )
+    )
 
-    result = read_result(path, ("image", "spectra", "dictionary", "calibration", "lightfield"))
-    entry = {"name": Path(path).name, "kind": result.kind}
-    if result.kind == "calibration":
-        wavelengths, entry["metrics"] = score_calibration(path, context.truth)
-        return entry | {"wavelengths_nm": [round(float(w) * 1e9, 6) for w in wavelengths]}, None
-    if result.kind == "lightfield":
-        entry["metrics"] = score_lightfield(path, context.truth)
-        return entry, None
-    if result.method:
-        entry["method"] = result.method
-    if result.kind == "dictionary":
-        entry["metrics"] = _score_dictionary(path, result, context.system)
-        return entry, {"result": result}
-    if context.truth is None:
+
+def _score_planes(path: Path | str, field: LightField, comparison: _Comparison) -> _Scored:
+    try:
+        check_depth(field)
+        distance = _distance(comparison.truth, path)
+        score = score_lightfield(field, distance)
+    except InputError as error:
+        raise error if error.where else error.at(path) from None
+    return _Scored(
+        score=ResultScore(name=Path(path).name, kind="lightfield", figures=figures(score))
+    )
+
+
+def _distance(truth: Path | str | None, path: Path | str) -> float:
+    """Of the plane that a refocused capture shows, m: as told, or as the simulated capture says."""
+    from plenocli.base.units import UnitError, parse_length
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.config.camera_file import parse_camera
+
+    if truth is None:
         raise UsageError(
             "the truth is missing",
             path,
+            "name the plane's distance, such as --truth 620mm, or the simulated capture",
+        )
+    if not Path(truth).suffix == ".h5":
+        try:
+            return parse_length(str(truth))
+        except UnitError as error:
+            raise UsageError(
+                f"a refocused capture is compared with the distance of a plane ({error})",
+                "--truth",
+                "write for example 620mm, or name the simulated capture",
+            ) from None
+    config = read_artefact(truth, "capture").provenance.config
+    if not config:
+        raise InputError(
+            "does not say from how far it was taken",
+            truth,
+            "write the distance, such as --truth 620mm",
+        )
+    return parse_camera(config, truth).object.distance
+
+
+def _score_image(result: Result, comparison: _Comparison) -> _Scored:
+    """A picture, or spectra, against the truth."""
+    from plenocli.report.score_page import Compared
+
+    if comparison.truth is None:
+        raise UsageError(
+            "the truth is missing",
+            result.path,
             (
                 "name it with --truth: a capture, photograph, spectral EXR, image, "
                 "spectra or colorchecker"
             ),
         )
-    truth = read_truth(context.truth, result, context.sampling, context.camera)
+    truth = read_truth(comparison.truth, result, comparison.sampling, comparison.camera)
     if not np.isfinite(truth).any():
-        raise InputError("holds no finite value", context.truth, "name a truth that has values")
-    picture = {"result": result, "truth": truth}
+        raise InputError("holds no finite value", comparison.truth, "name a truth that has values")
+    block, patches, bands, spectra = None, None, (), None
     if result.wavelengths is None:
-        budget().require(
-            POINT_BYTES * truth.size,
-            "the comparison",
-            path,
-            "score a part of it",
-        )
-        block = context.block or block_of(result, context.truth, context.system)
-        entry["metrics"] = _score_image(path, result, truth, block)
-        picture["block"] = block
+        block = _block(result, comparison)
+        own: PictureScore | SpectraScore = _score_picture(result, truth, block, comparison)
     else:
-        entry["wavelengths_nm"] = [round(float(w) * 1e9, 6) for w in result.wavelengths]
-        entry["metrics"], entry["patches"] = score_spectra(path, result, truth, context)
-        picture["patches"] = entry["patches"]
-    limits = (
-        result.attrs.get("parameters", {}).get("limits")
-        if isinstance(result.attrs.get("parameters"), dict)
-        else None
+        bands = _nanometres(result.wavelengths)
+        labels = comparison.patches
+        own, patches = score_spectra(
+            result,
+            truth,
+            labels=None if labels is None else read_labels(labels, result.grid),
+            light=comparison.light,
+            whites=comparison.whites,
+            needs_reflectance=str(comparison.truth) == CHART,
+        )
+        spectra = own
+    sensor = comparison.sensor_snr
+    return _Scored(
+        score=ResultScore(
+            name=result.path.name,
+            kind=result.kind,
+            method=result.method,
+            wavelengths_nm=bands,
+            figures={
+                **figures(own),
+                **figures(result.told),
+                **({} if sensor is None else {"snr_sensor_db": plain(sensor)}),
+            },
+            patches=patches,
+        ),
+        drawn=Compared(result=result, truth=truth, block=block),
+        spectra=spectra,
     )
-    if limits:
-        entry["metrics"] |= {
-            "noise_relative": limits["noise"],
-            "model_error_relative": limits["model_error"],
-            "limited_by": limits["limited_by"],
-        }
-        if limits.get("loss_at_most_db") is not None:
-            entry["metrics"]["loss_at_most_db"] = limits["loss_at_most_db"]
-    seen = (
-        result.attrs.get("parameters", {}).get("seen")
-        if isinstance(result.attrs.get("parameters"), dict)
-        else None
+
+
+def _nanometres(wavelengths: np.ndarray) -> tuple[float, ...]:
+    return tuple(round(float(w) * 1e9, 6) for w in wavelengths)
+
+
+def _block(result: Result, comparison: _Comparison) -> tuple[int, int] | None:
+    """Object samples under a lenslet: as given, else as result, matrix or truth say."""
+    return (
+        comparison.block
+        or result.block
+        or comparison.object_shape
+        or read_block(result, comparison.truth)
     )
-    if seen:
-        entry["metrics"]["seen_share"] = seen["share"]
-    if context.sensor_snr is not None:
-        entry["metrics"]["snr_sensor_db"] = context.sensor_snr
-    return entry, picture
 
 
-def _score_image(path, result, truth, block):
-    from plenocli.evaluation.metrics.quality import score_picture
+def _score_picture(
+    result: Result, truth: np.ndarray, block: tuple[int, int] | None, comparison: _Comparison
+) -> PictureScore:
+    from plenocli.base.budget import budget
 
+    budget().require(
+        POINT_BYTES * truth.size,
+        "the comparison",
+        result.path,
+        "score a part of it",
+    )
     if not (np.isfinite(result.values).all() and np.isfinite(truth).all()):
         raise InputError(
-            "holds values that are not finite", path, "reconstruct again; pictures have no gaps"
+            "holds values that are not finite",
+            result.path,
+            "reconstruct again; pictures have no gaps",
         )
     if block is not None and any(n % b for n, b in zip(result.grid, block, strict=True)):
         raise UsageError(
@@ -302,15 +412,14 @@ def _score_image(path, result, truth, block):
                 f"{result.grid[0]} x {result.grid[1]} points are no whole number of {block[0]} "
                 f"x {block[1]} blocks"
             ),
-            path,
+            result.path,
             "correct --block",
         )
     return score_picture(result.values, truth, block)
 
 
-def _sensor_snr(path):
-    """Sensor-model SNR of a capture from its mosaic and the noise it says it got."""
-    from plenocli.evaluation.metrics.snr import snr_sensor
+def _sensor_snr(path: Path | str) -> float:
+    """Sensor-model SNR of a capture from its mosaic and the noise it says it got, dB."""
     from plenocli.files.artefacts.container import read_artefact
 
     capture = read_artefact(path, "capture")
@@ -328,69 +437,40 @@ def _sensor_snr(path):
     return snr_sensor(signal, sigma, noisy=True)
 
 
-def _score_dictionary(path, result, system):
-    """Coherence of the atoms with the matrix of their own superpixel, scaled as the
-    dictionary was learnt with.
+def _score_dictionary(result: Result, comparison: _Comparison) -> _Scored:
+    """Coherence of the atoms with the matrix of their own superpixel, scaled as the dictionary was
+    learnt with.
     """
-    from plenocli.evaluation.metrics.coherence import coherence
+    from plenocli.report.score_page import Compared
 
-    if system is None:
+    matrix = comparison.lenslet_matrix
+    if matrix is None:
         raise UsageError(
             "the coherence of a dictionary depends on the system matrix",
-            path,
+            result.path,
             "name it with --pif pif.h5",
         )
-    offsets = np.asarray(system.data["pif/lenslet_offset"])
-    own = np.flatnonzero((offsets == 0).all(axis=1))
-    matrix = system.data["pif/A"][0, own[0] if own.size else 0]
     if matrix.shape[1] != len(result.values):
         raise InputError(
             f"has atoms of {len(result.values)} points, the matrix has {matrix.shape[1]}",
-            path,
+            result.path,
             "name the matrix it was learnt for",
         )
-    scale = float(result.attrs.get("scale") or 1.0)
-    return coherence(
-        matrix / matrix.dtype.type(scale), result.values.astype(matrix.dtype, copy=False)
+    found: CoherenceScore = coherence(
+        matrix / matrix.dtype.type(result.scale), result.values.astype(matrix.dtype, copy=False)
+    )
+    return _Scored(
+        score=ResultScore(
+            name=result.path.name,
+            kind=result.kind,
+            method=result.method,
+            figures=figures(found),
+        ),
+        drawn=Compared(result=result),
     )
 
 
-def _keep(scores, wanted):
-    """Leave only the metrics asked for; UsageError where one could not be computed."""
-    if not wanted:
-        return
-    for group in wanted:
-        if not any(name in scores for name in GROUPS[group]):
-            raise UsageError(
-                f"--metric {group} does not apply to this result with what was given",
-                fix=_NEEDS.get(group, "leave it out"),
-            )
-    names = {name for group in wanted for name in GROUPS[group]} | (
-        {"snr_target"} if "snr" in wanted else set()
-    )
-    for name in [name for name in scores if name not in names]:
-        del scores[name]
-
-
-_NEEDS = {
-    "snr": "name the spectra of a white target with --white, or a --capture simulated with --snr",
-    "patches": "give a label map with --patches",
-    "block-mean": "give the object samples per lenslet with --block 40x40",
-    "coherence": "give a dictionary and --pif",
-    "response": "give a calibration and name another one with --truth",
-    "spectral-angle": "give a spectral result",
-    "limits": "give a picture that reconstruct made with a --pif of known accuracy",
-    "delta-e": "give a spectral result",
-    "depth": "give planes of refocus --camera",
-    "classification": (
-        "give a spectral result and its --patches, two or more; one of the two numbers "
-        "needs scikit-learn"
-    ),
-    "single-pixel": "give spectra of demux --method single-pixel among the results",
-}
-
-
-def _name_apart(scored, paths):
+def _labels(paths: Sequence[Path | str]) -> list[str]:
     """Short labels for the table: file stems, with the folder's name where two stems are equal,
     else with a number.
     """
@@ -400,53 +480,14 @@ def _name_apart(scored, paths):
         if len(set(stems)) == len(stems)
         else [f"{Path(p).parent.name}/{stem}" for p, stem in zip(paths, stems, strict=True)]
     )
-    for number, (entry, label) in enumerate(zip(scored, labels, strict=True), start=1):
-        entry["label"] = label if labels.count(label) == 1 else f"{label} {number}"
-
-
-def _definitions(scored):
-    from plenocli.evaluation.metrics import (
-        classify,
-        coherence,
-        depth,
-        quality,
-        response,
-        snr,
-        spectral,
-    )
-
-    found = {}
-    for entry in scored:
-        home = {
-            "dictionary": [coherence],
-            "image": [quality],
-            "spectra": [spectral],
-            "lightfield": [depth],
-        }.get(entry.get("kind"), [])
-        if entry.get("kind") == "calibration":
-            home = [response]
-        elif "wavelengths_nm" in entry:
-            home = [spectral, quality]
-        for name in entry["metrics"]:
-            for module in (*home, snr, classify):
-                if name in module.DEFINITIONS:
-                    found[name] = module.DEFINITIONS[name]
-                    break
-    return found
-
-
-def table(document):
-    """The results side by side as text: one row a metric, one column a result."""
-    from plenocli.report.tables import metric_rows
-
-    header, rows = metric_rows(document)
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    lines = [
-        "  ".join(
-            cell.ljust(w) if i == 0 else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in [header, *rows]
+    return [
+        label if labels.count(label) == 1 else f"{label} {number}"
+        for number, label in enumerate(labels, start=1)
     ]
-    lines.insert(1, "  ".join("-" * w for w in widths))
-    return "\n".join(line.rstrip() for line in lines)
+
+
+def table(document: ScoreDocument) -> str:
+    """The results side by side as text: one row a metric, one column a result."""
+    from plenocli.report.tables import text_table
+
+    return text_table(document)

@@ -1,45 +1,93 @@
 """show: one picture of a file, or of several: artefacts, EXR, RAW and photographs."""
 
-import io
-import textwrap
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
 
-CAPTION, LINE = 16, 24
-"""Height of a letter and of a line of a caption, pixels."""
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.results.matrices import StoredMatrix
+    from plenocli.report.drawing import Figures
+
+Place = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowSummary:
+    """What was drawn: the picture, the files and what they are, and the captions in order."""
+
+    output: str
+    files: list[str]
+    kinds: list[str]
+    captions: list[str]
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary of --json."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    """A file to draw: its kind, and its artefact, verified, where it is one."""
+
+    path: Path
+    kind: str
+    artefact: Artefact | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Choice:
+    """What of the files is drawn.
+
+    centres: (lenslet_row, lenslet_column, 2) px, over captures.
+    points: (row, column) of object points, whose columns of A are shown.
+    lenslets: (row, column), whose spectra are shown.
+    matrix: whose sensor sees a dictionary.
+    """
+
+    centres: np.ndarray | None = None
+    points: Sequence[Place] | None = None
+    lenslets: Sequence[Place] | None = None
+    matrix: StoredMatrix | None = None
 
 
 def run_show(
-    files,
-    output=None,
+    files: Sequence[Path | str],
+    output: Path | str | None = None,
     *,
-    truth=None,
-    calibration=None,
-    points=(),
-    lenslets=(),
-    overwrite=False,
-):
-    """Draw `files` into one PNG and return {"output", "files", "kinds", "captions"}.
+    truth: Path | str | None = None,
+    calibration: Path | str | None = None,
+    points: Sequence[Place] = (),
+    lenslets: Sequence[Place] = (),
+    overwrite: bool = False,
+) -> ShowSummary:
+    """Draw files into one PNG.
 
     output: default the first file's name with .png, in the current folder.
     truth: what pictures are compared with, as in score.
     calibration: its lenslet grid is drawn over captures.
-    points: (row, column) object points whose columns of A are shown;
-    lenslets: whose spectra.
-    InputError for a file that no stage would read, UsageError where points lie outside.
+    points: (row, column) object points whose columns of A are shown.
+    lenslets: (row, column) whose spectra are shown.
+
+    Raises InputError for a file that no stage would read, UsageError where points lie outside.
     """
     from plenocli.files.atomic import check_output, publish
+    from plenocli.files.results.matrices import matrix_of
+    from plenocli.report.drawing import stacked
 
     output = Path(output) if output is not None else Path(f"{Path(files[0]).stem}.png")
     check_output(output, overwrite=overwrite, suffixes=(".png",))
     centres = None if calibration is None else _centres(calibration)
-    found = [opened(file) for file in files]
-    kinds = [kind for kind, _ in found]
+    found = [_open(Path(file)) for file in files]
+    kinds = [file.kind for file in found]
     if truth is not None:
         if set(kinds) != {"image"}:
             raise UsageError(
@@ -49,42 +97,25 @@ def run_show(
             )
         figures = _compared(files, truth)
     else:
+        matrix = next((file.artefact for file in found if file.kind == "pif"), None)
         choice = _Choice(
-            centres,
-            points or None,
-            lenslets or None,
-            next((a for kind, a in found if kind == "pif"), None),
+            centres=centres,
+            points=points or None,
+            lenslets=lenslets or None,
+            matrix=None if matrix is None else matrix_of(matrix),
         )
-        figures = [
-            figure
-            for file, (kind, artefact) in zip(files, found)
-            for figure in _FIGURES[kind](Path(file), artefact, choice)
-        ]
+        figures = [figure for file in found for figure in _FIGURES[file.kind](file, choice)]
     publish(output, stacked(figures), overwrite=overwrite)
-    return {
-        "output": str(output),
-        "files": [str(f) for f in files],
-        "kinds": kinds,
-        "captions": [caption for _, caption in figures],
-    }
+    return ShowSummary(
+        output=str(output),
+        files=[str(f) for f in files],
+        kinds=kinds,
+        captions=[caption for _, caption in figures],
+    )
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """What of a file is drawn: lenslet centres over captures, points of A, lenslets of spectra,
-    the pif whose sensor sees a dictionary.
-    """
-
-    centres: np.ndarray | None
-    points: tuple | None
-    lenslets: tuple | None
-    pif: object
-
-
-def opened(file):
-    """(kind, verified artefact or None) of a file: pif, capture, calibration, dictionary,
-    spectra or image; InputError where it is none.
-    """
+def _open(path: Path) -> _File:
+    """A file of any kind that can be drawn; InputError where it is none."""
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import require_file
     from plenocli.files.artefacts.shards import read_pif
@@ -93,39 +124,38 @@ def opened(file):
     from plenocli.files.images.pictures import file_type
     from plenocli.files.images.spectral_exr import is_spectral
 
-    path = Path(file)
     require_file(path)
     if is_hdf5(path):
         artefact = read_artefact(path)
-        return (
-            ("pif", read_pif(path)) if artefact.kind == "pif-index" else (artefact.kind, artefact)
-        )
-    if file_type(path) == "exr":
-        return "spectra" if is_spectral(path) else "capture" if CAPTURE in read_exr(path)[
-            1
-        ] else "image", None
-    return "capture", None
+        if artefact.kind == "pif-index":
+            return _File(path=path, kind="pif", artefact=read_pif(path))
+        return _File(path=path, kind=artefact.kind, artefact=artefact)
+    kind = "capture"
+    if file_type(path) == "exr" and is_spectral(path):
+        kind = "spectra"
+    elif file_type(path) == "exr" and CAPTURE not in read_exr(path)[1]:
+        kind = "image"
+    return _File(path=path, kind=kind, artefact=None)
 
 
-def _centres(path):
-    from plenocli.files.artefacts.container import read_artefact
+def _centres(path: Path | str) -> np.ndarray:
+    from plenocli.files.read.calibrations import read_calibration
 
-    return read_artefact(path, "calibration").data["grid/centre"]
+    return read_calibration(path, response=False).grid.centres
 
 
-def _pif(path, artefact, choice):
+def _pif(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.matrices import matrix_of
     from plenocli.report.figures import matrix_figures
 
-    _inside(
-        choice.points,
-        tuple(int(n) for n in artefact.data["pif/object_shape"]),
-        "--point",
-        "object points",
-    )
-    return matrix_figures(artefact, choice.points)
+    matrix = matrix_of(file.artefact)
+    _require_inside(choice.points, matrix.object_shape, "--point", "object points")
+    return matrix_figures(matrix, choice.points)
 
 
-def _inside(places, shape, option, what):
+def _require_inside(
+    places: Sequence[Place] | None, shape: tuple[int, int], option: str, what: str
+) -> None:
     for row, column in places or ():
         if not (row < shape[0] and column < shape[1]):
             raise UsageError(
@@ -133,63 +163,61 @@ def _inside(places, shape, option, what):
             )
 
 
-def _capture(path, artefact, choice):
+def _capture(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.images.mosaic import read_capture
     from plenocli.report.figures import capture_figures
 
-    centres = (
-        choice.centres
-        if choice.centres is not None or artefact is None
-        else artefact.data.get("capture/lenslet_centre")
-    )
-    return capture_figures(read_capture(path), path.name, centres)
+    centres = choice.centres
+    if centres is None and file.artefact is not None:
+        centres = file.artefact.data.get("capture/lenslet_centre")
+    return capture_figures(read_capture(file.path), file.path.name, centres)
 
 
-def _calibration(path, artefact, choice):
+def _calibration(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.read.calibrations import calibration_of
     from plenocli.report.figures import calibration_figures
 
-    return calibration_figures(artefact)
+    return calibration_figures(calibration_of(file.artefact))
 
 
-def _dictionary(path, artefact, choice):
-    from plenocli.files.read.results import read_result
-    from plenocli.report.figures import dictionary_figures, learning, own_matrix
+def _dictionary(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.results import result_of
+    from plenocli.report.figures import dictionary_figures
 
-    system = None if choice.pif is None else own_matrix(choice.pif)
-    return dictionary_figures(read_result(path), path.name, learning(artefact), system)
+    return dictionary_figures(result_of(file.artefact, file.path), file.path.name, choice.matrix)
 
 
-def _spectra(path, artefact, choice):
-    from plenocli.files.read.results import read_result
+def _spectra(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.results import read_result
     from plenocli.report.figures import spectra_figures
 
-    result = read_result(path)
-    _inside(choice.lenslets, result.grid, "--lenslet", "lenslets")
-    return spectra_figures(result, path.name, choice.lenslets)
+    result = read_result(file.path)
+    _require_inside(choice.lenslets, result.grid, "--lenslet", "lenslets")
+    return spectra_figures(result, file.path.name, choice.lenslets)
 
 
-def _image(path, artefact, choice):
-    from plenocli.files.read.results import read_result
+def _image(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.results import read_result
     from plenocli.report.figures import image_figures, spectra_figures
 
-    result = read_result(path)
+    result = read_result(file.path)
     if result.wavelengths is not None:
-        return spectra_figures(result, path.name)[:1]
-    return image_figures(
-        result, path.name, None if artefact is None else artefact.data.get("image/seen")
-    )
+        return spectra_figures(result, file.path.name)[:1]
+    return image_figures(result, file.path.name, result.seen)
 
 
-def _sweep(path, artefact, choice):
+def _sweep(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.design_tables import designs_of
     from plenocli.report.front import front_figures
 
-    return front_figures(artefact)
+    return front_figures(designs_of(file.artefact))
 
 
-def _lightfield(path, artefact, choice):
+def _lightfield(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.lightfields import lightfield_of
     from plenocli.report.planes import lightfield_figures
 
-    return lightfield_figures(artefact)
+    return lightfield_figures(lightfield_of(file.artefact))
 
 
 _FIGURES = {
@@ -204,9 +232,11 @@ _FIGURES = {
 }
 
 
-def _compared(files, truth):
+def _compared(files: Sequence[Path | str], truth: Path | str) -> Figures:
+    """Pictures beside their truth."""
     from plenocli.evaluation.metrics.quality import psnr
-    from plenocli.files.read.results import block_of, read_result, read_truth
+    from plenocli.files.results.results import read_block, read_result
+    from plenocli.files.results.truths import read_truth
     from plenocli.report.pictures import close_ups, reconstructions
 
     results = [read_result(file, ("image",)) for file in files]
@@ -227,35 +257,7 @@ def _compared(files, truth):
             )
     entries = [(r.method or r.name, r.values, f"{psnr(r.values, true):.2f} dB") for r in results]
     figures = [(reconstructions(entries, true), "Each result above its error.")]
-    block = block_of(results[0], truth)
+    block = read_block(results[0], truth)
     if block is not None and min(np.floor_divide(true.shape, block)) >= 2:
         figures.append((close_ups(entries, true, block), "Close-up of the middle lenslets."))
     return figures
-
-
-def stacked(figures):
-    """One PNG of several (PNG, caption), below each other on white, each under its caption."""
-    from matplotlib.font_manager import findfont
-    from PIL import Image, ImageDraw, ImageFont
-
-    font = ImageFont.truetype(findfont("DejaVu Sans"), CAPTION)
-    images = [Image.open(io.BytesIO(png)).convert("RGB") for png, _ in figures]
-    width = max(image.width for image in images)
-    captions = [
-        textwrap.wrap(caption, max(20, int(width / (0.56 * CAPTION)))) for _, caption in figures
-    ]
-    heights = [len(lines) * LINE + LINE // 2 for lines in captions]
-    sheet = Image.new(
-        "RGB",
-        (width, sum(i.height for i in images) + sum(heights) + LINE * (len(images) - 1)),
-        "white",
-    )
-    pen, top = ImageDraw.Draw(sheet), 0
-    for image, lines, height in zip(images, captions, heights):
-        for number, line in enumerate(lines):
-            pen.text((10, top + 6 + number * LINE), line, fill="#5b6670", font=font)
-        sheet.paste(image, ((width - image.width) // 2, top + height))
-        top += height + image.height + LINE
-    buffer = io.BytesIO()
-    sheet.save(buffer, "png")
-    return buffer.getvalue()

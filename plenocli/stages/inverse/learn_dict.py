@@ -367,6 +367,7 @@ def _judge(
     pictures, a contrast for every patch; coherence.
     """
     from plenocli.evaluation.metrics.coherence import coherence
+    from plenocli.evaluation.metrics.figures import figures
     from plenocli.inverse.picture.solvers.lmmse import prepare
     from plenocli.inverse.prior.natural_images import draw_patches, mean_covariance
     from plenocli.inverse.prior.scene_prior import PATCHES_A_POINT
@@ -409,7 +410,7 @@ def _judge(
         worst_gap=found.worst_gap,
         objective=found.objective,
         dead_share=state.history[-1].dead_share if state.history else None,
-        coherence=coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms),
+        coherence=figures(coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)),
         output=str(output),
     )
 

@@ -374,7 +374,7 @@ def _score(settings, folder, result, **truth):
     document = run_score([folder / result], folder / "score.json", **truth, **settings["score"])
     return {
         name: float(value)
-        for name, value in document["metrics"].items()
+        for name, value in document.figures.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     }
 

@@ -154,9 +154,10 @@ def finish(space, rows, objectives, store, computed, command):
     if store.plot is not None and not ahead.any():
         note("no point has all figures of the front: there is nothing to draw")
     elif store.plot is not None:
+        from plenocli.files.results.design_tables import designs_of
         from plenocli.report.front import front_picture
 
-        publish(store.plot, front_picture(artefact), overwrite=store.again)
+        publish(store.plot, front_picture(designs_of(artefact)), overwrite=store.again)
     write_artefact(store.output, artefact, overwrite=store.overwrite)
     shutil.rmtree(store.folder / "matrices", ignore_errors=True)
     if not (status == 0).any():

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from plenocli.inverse.lightfield import refocus as lightfield
+from plenocli.inverse.lightfield.depth import depth
+from plenocli.inverse.lightfield.planes import distance_of, slope_of
+from plenocli.inverse.lightfield.refocus import STEP, refocus, views
+from plenocli.inverse.lightfield.samples import collect
 
 FOCAL, IMAGE, GAP, PITCH_PX, COUNT = 0.05, 0.055, 0.5e-3, 11, 25
 PITCH = 55e-6  # of the lenslets, m
@@ -61,20 +64,16 @@ def samples(mosaic, noise=0.0):
     rows, columns = np.indices(mosaic.shape)
     inside = ((rows % PITCH_PX - 5) ** 2 + (columns % PITCH_PX - 5) ** 2 <= 25).astype(float)
     noisy = mosaic + noise * np.random.default_rng(0).normal(size=mosaic.shape)
-    return lightfield.collect(
-        noisy * inside, inside, centres, np.ones((COUNT, COUNT), bool), PITCH_PX
-    )
+    return collect(noisy * inside, inside, centres, np.ones((COUNT, COUNT), bool), PITCH_PX)
 
 
 def slope(distance):
-    return lightfield.slope_of(distance, FOCAL, IMAGE, GAP)
+    return slope_of(distance, FOCAL, IMAGE, GAP)
 
 
 @pytest.mark.parametrize("distance", [0.45, 0.52, 0.55, 0.58, 0.75, np.inf])
 def test_slopes_and_distances_are_each_others_inverse(distance):
-    assert lightfield.distance_of(slope(distance), FOCAL, IMAGE, GAP) == pytest.approx(
-        distance, rel=1e-9
-    )
+    assert distance_of(slope(distance), FOCAL, IMAGE, GAP) == pytest.approx(distance, rel=1e-9)
     assert (slope(distance) > 0) == (distance < 0.55 - 1e-9)
 
 
@@ -82,13 +81,13 @@ def test_slopes_and_distances_are_each_others_inverse(distance):
 def test_a_plane_is_sharpest_and_right_at_its_own_slope(distance):
     made = samples(capture(distance))
     own = slope(distance)
-    step, edge = lightfield.STEP, 5 * lightfield.STEP
+    step, edge = STEP, 5 * STEP
     at = ((np.arange(COUNT * step) / step * PITCH_PX) - (COUNT * PITCH_PX - 1) / 2) / PITCH_PX
     true = scene(*np.meshgrid(at, at, indexing="ij")[::-1])
     inner = (slice(edge, -edge), slice(edge, -edge))
     errors = {}
     for offset in (-1.6, -0.5, 0.0, 0.5, 1.6):
-        picture, spread = lightfield.refocus(made, own + offset, (COUNT, COUNT))
+        picture, spread = refocus(made, own + offset, (COUNT, COUNT))
         errors[offset] = (
             float(np.sqrt(np.mean((picture - true)[inner] ** 2))),
             float(np.mean(spread[inner])),
@@ -104,12 +103,16 @@ def test_a_plane_is_sharpest_and_right_at_its_own_slope(distance):
     )
 
 
+def _parts(found):
+    return found.slope, found.confidence
+
+
 @pytest.mark.parametrize("far, near", [(0.556, 0.541), (0.6, 0.5), (0.75, 0.6)])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(noise, far, near):
     """The limit: a lenslet of parallax across the pupil is a slope of one."""
     made = samples(capture(far, near), noise)
-    found, confidence = lightfield.depth(made, np.linspace(-3, 3, 25), (COUNT, COUNT))
+    found, confidence = _parts(depth(made, np.linspace(-3, 3, 25), (COUNT, COUNT)))
     inner = confidence[4:-4, 4:-4] > 0.5
     left, right = found[4:-4, 4:10], found[4:-4, 15:-4]
     sure_left, sure_right = inner[:, :6], inner[:, 11:]
@@ -118,25 +121,25 @@ def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(n
         abs(np.median(left[sure_left]) - slope(far)) < 0.1
         and abs(np.median(right[sure_right]) - slope(near)) < 0.1
     )
-    distances = lightfield.distance_of(right[sure_right], FOCAL, IMAGE, GAP)
+    distances = distance_of(right[sure_right], FOCAL, IMAGE, GAP)
     limit = abs(
-        lightfield.distance_of(slope(near) + 0.5, FOCAL, IMAGE, GAP)
-        - lightfield.distance_of(slope(near) - 0.5, FOCAL, IMAGE, GAP)
+        distance_of(slope(near) + 0.5, FOCAL, IMAGE, GAP)
+        - distance_of(slope(near) - 0.5, FOCAL, IMAGE, GAP)
     )
     assert abs(np.median(distances) - near) < 0.2 * limit
 
 
 def test_a_scene_without_texture_has_no_depth_and_no_confidence():
     made = samples(np.full((COUNT * PITCH_PX,) * 2, 0.4))
-    found, confidence = lightfield.depth(made, np.linspace(-2, 2, 9), (COUNT, COUNT))
+    found, confidence = _parts(depth(made, np.linspace(-2, 2, 9), (COUNT, COUNT)))
     assert confidence.max() < 1e-6 and np.isfinite(found[3:-3, 3:-3]).all()
-    picture, spread = lightfield.refocus(made, 1.3, (COUNT, COUNT))
+    picture, spread = refocus(made, 1.3, (COUNT, COUNT))
     assert np.nanmax(np.abs(picture - 0.4)) < 1e-9 and np.nanmax(spread) < 1e-12
 
 
 def test_views_see_the_parallax_of_their_part_of_the_pupil():
     near = samples(capture(0.541))
-    seen = lightfield.views(near, 3, (COUNT, COUNT))
+    seen = views(near, 3, (COUNT, COUNT))
     inner = slice(6, -6)
     left, right = seen[1, 0][inner, inner], seen[1, 2][inner, inner]
     from scipy.ndimage import shift
@@ -156,5 +159,5 @@ def test_holes_dead_pixels_and_lenslets_off_the_sensor_are_left_out():
     mosaic[20:25, 30:33] = np.nan
     made = samples(np.nan_to_num(mosaic, nan=np.nan))
     assert np.isfinite(made.value).all()
-    picture, _ = lightfield.refocus(made, 0.0, (COUNT + 3, COUNT))
+    picture, _ = refocus(made, 0.0, (COUNT + 3, COUNT))
     assert np.isnan(picture[-4:]).all() and np.isfinite(picture[8:-20, 8:-8]).all()

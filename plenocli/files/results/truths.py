@@ -1,132 +1,32 @@
-"""What score compares: results, truths and label maps from their files, brought to one grid."""
+"""Truths and label maps from their files, brought to the grid and the bands of a result."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.base.text import by
+from plenocli.evaluation.results import Result
+from plenocli.forward.camera.model import Camera
 
 CHART = "colorchecker"
-# chart samples per lenslet and side when the truth of a mixed lenslet is averaged
 _CHART_OVERSAMPLING = 20
+"""Chart samples per lenslet and side when the truth of a mixed lenslet is averaged."""
 
 
-@dataclass
-class Result:
-    """values: (row, column) or (band, row, column) float64;
-    wavelengths (band,) m or None;
-    quantity "" for pictures.
+def read_truth(
+    truth: Path | str, result: Result, sampling: str = "fit", camera: Camera | None = None
+) -> np.ndarray:
+    """The truth on the grid and at the wavelengths of a result.
 
-    kind: "image", "spectra", "dictionary" (values are then the atoms), "calibration" (the response
-        as stored) or "lightfield" (planes).
-    sigma: like values, or None.
-    """
+    truth: a path, or a name that read_scene knows. A capture brings the object that it was
+        simulated from; a finer grid is averaged over areas; other wavelengths are interpolated.
+    sampling: how a photograph became the object, "fit" or "crop".
+    camera: through whose filters a scene is seen (width, leak, light and all), instead of at
+        their centres.
 
-    name: str
-    kind: str
-    values: np.ndarray
-    wavelengths: np.ndarray | None = None
-    sigma: np.ndarray | None = None
-    quantity: str = ""
-    attrs: dict = field(default_factory=dict)
-
-    @property
-    def method(self):
-        return str(self.attrs.get("method", ""))
-
-    @property
-    def grid(self):
-        return self.values.shape[-2:]
-
-
-def read_result(path, kinds=("image", "spectra", "dictionary")):
-    """A result from an artefact .h5 or an EXR picture (spectral or not).
-
-    InputError for anything else.
-    """
-    path = Path(path)
-    if path.suffix == ".h5":
-        return _from_artefact(path, kinds)
-    if path.suffix.lower() != ".exr":
-        raise InputError(
-            f"is {path.suffix or 'a file without a suffix'}, not a result",
-            path,
-            "give an image, spectra or dictionary as .h5, or an .exr",
-        )
-    found = _from_exr(path)
-    if found.kind not in kinds:
-        raise InputError(
-            f"is a picture without wavelengths where {' or '.join(kinds)} are due",
-            path,
-            "give a spectral EXR or an .h5 (from demux)",
-        )
-    return found
-
-
-def _from_artefact(path, kinds):
-    from plenocli.files.artefacts.container import read_artefact
-
-    artefact = read_artefact(path, kinds)
-    attrs = artefact.attrs.get(artefact.kind, {})
-    if artefact.kind == "dictionary":
-        return Result(path.stem, "dictionary", artefact.data["dictionary/atoms"], attrs=attrs)
-    if artefact.kind == "calibration":
-        return Result(path.stem, "calibration", artefact.data.get("response/F"), attrs=attrs)
-    if artefact.kind == "lightfield":
-        return Result(path.stem, "lightfield", artefact.data["refocus/value"], attrs=attrs)
-    kind = artefact.kind
-    data = {part: artefact.data.get(f"{kind}/{part}") for part in ("value", "sigma", "wavelength")}
-    values = np.asarray(data["value"], dtype=np.float64)
-    if kind == "image" and values.ndim == 3 and len(values) == 1:
-        values = values[0]
-    return Result(
-        path.stem,
-        kind,
-        values,
-        data["wavelength"] if values.ndim == 3 else None,
-        data["sigma"],
-        str(attrs.get("quantity", "")),
-        attrs,
-    )
-
-
-def _from_exr(path):
-    from plenocli.files.images.exr import read_exr
-    from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
-
-    if is_spectral(path):
-        spectral = read_spectral_exr(path)
-        values = np.asarray(spectral.values, dtype=np.float64)
-        return Result(
-            path.stem,
-            "spectra",
-            values,
-            np.asarray(spectral.wavelengths),
-            spectral.sigma,
-            spectral.quantity,
-            dict(spectral.attrs),
-        )
-    channels, attrs = read_exr(path)
-    if "Y" not in channels and len(channels) != 1:
-        raise InputError(
-            f"has the channels {', '.join(channels)} and no wavelengths",
-            path,
-            "give a picture with channel Y, or a spectral EXR",
-        )
-    values = channels.get("Y", next(iter(channels.values())))
-    return Result(path.stem, "image", np.asarray(values, dtype=np.float64), attrs=dict(attrs))
-
-
-def read_truth(truth, result, sampling="fit", camera=None):
-    """The truth on the grid and at the wavelengths of `result`: an array like result.values.
-
-    truth: a path or a name that stages.scenes.read_scene knows. A capture brings the object that it
-        was simulated from; a finer grid is averaged over areas; other wavelengths are interpolated.
-    camera: a Camera through whose filters a scene is seen (width, leak, light and all), instead
-        of at their centres.
-    InputError where no comparison is possible.
+    Returns an array like the values of the result.
+    Raises InputError where no comparison is possible.
     """
     rows, cols = result.grid
     spectral = result.wavelengths is not None
@@ -142,21 +42,7 @@ def read_truth(truth, result, sampling="fit", camera=None):
             "name the scene itself: an image with wavelengths, a spectral EXR or colorchecker",
         )
     if known is None:
-        from plenocli.files.read.scenes import Chart, read_scene
-
-        scene = read_scene(truth, sampling=sampling, spectral=spectral)
-        if not spectral and getattr(scene, "spectral", False):
-            raise InputError(
-                "is spectral, the result is a single picture",
-                truth,
-                "compare with a photograph or with the capture's own scene",
-            )
-        fine = _CHART_OVERSAMPLING if isinstance(scene, Chart) else 1
-        plane = lambda w: _coarser(scene.at(w, rows * fine, cols * fine), rows, cols)
-        if spectral and camera is not None:
-            return _through_filters(plane, camera, result.wavelengths)
-        planes = [plane(w) for w in (result.wavelengths if spectral else [550e-9])]
-        return np.array(planes) if spectral else planes[0]
+        return _scene_truth(truth, result, sampling, camera)
     values, wavelengths = known
     if not spectral and len(values) != 1:
         raise InputError(
@@ -171,7 +57,33 @@ def read_truth(truth, result, sampling="fit", camera=None):
     return values if spectral else values[0]
 
 
-def _is_scene(path):
+def _scene_truth(
+    truth: Path | str, result: Result, sampling: str, camera: Camera | None
+) -> np.ndarray:
+    """The truth of a scene, which has values at any wavelength."""
+    from plenocli.files.read.scenes import Chart, read_scene
+
+    rows, cols = result.grid
+    spectral = result.wavelengths is not None
+    scene = read_scene(truth, sampling=sampling, spectral=spectral)
+    if not spectral and getattr(scene, "spectral", False):
+        raise InputError(
+            "is spectral, the result is a single picture",
+            truth,
+            "compare with a photograph or with the capture's own scene",
+        )
+    fine = _CHART_OVERSAMPLING if isinstance(scene, Chart) else 1
+
+    def plane(wavelength: float) -> np.ndarray:
+        return _coarser(scene.at(wavelength, rows * fine, cols * fine), rows, cols)
+
+    if spectral and camera is not None:
+        return _through_filters(plane, camera, result.wavelengths)
+    planes = [plane(w) for w in (result.wavelengths if spectral else [550e-9])]
+    return np.array(planes) if spectral else planes[0]
+
+
+def _is_scene(path: Path | str) -> bool:
     """Whether an .h5 is an image with wavelengths, which serves as a scene at any of them."""
     from plenocli.files.artefacts.container import read_artefact
 
@@ -179,7 +91,9 @@ def _is_scene(path):
     return artefact.kind == "image" and artefact.data["image/value"].ndim == 3
 
 
-def _through_filters(plane, camera, bands):
+def _through_filters(
+    plane: Callable[[float], np.ndarray], camera: Camera, bands: np.ndarray
+) -> np.ndarray:
     """Reflectance (band, row, column) as a camera with one filter a band sees it: mean of
     plane(wavelength), weighted with the light's photons, the filter's transmittance and the
     sensor's sensitivity (mean of its colours).
@@ -222,7 +136,7 @@ def _through_filters(plane, camera, bands):
     return total / weights.sum(axis=1)[:, None, None]
 
 
-def _known_truth(truth):
+def _known_truth(truth: Path | str) -> tuple[np.ndarray, np.ndarray | None] | None:
     """(values (band, row, column), wavelengths or None) of a capture or spectra artefact; None
     for everything else.
     """
@@ -250,7 +164,10 @@ def _known_truth(truth):
     )
 
 
-def _at_wavelengths(values, own, asked, where):
+def _at_wavelengths(
+    values: np.ndarray, own: np.ndarray | None, asked: np.ndarray, where: Path | str
+) -> np.ndarray:
+    """Bands (band, row, column) at the wavelengths `own` interpolated to those asked for, m."""
     if own is None:
         if len(values) == len(asked):
             return values
@@ -276,7 +193,7 @@ def _at_wavelengths(values, own, asked, where):
     return (1 - part) * values[low] + part * values[high]
 
 
-def _same_aspect(have, want, where):
+def _same_aspect(have: tuple[int, ...], want: tuple[int, int], where: Path | str) -> None:
     if have[0] * want[1] != have[1] * want[0] or have[0] < want[0]:
         raise InputError(
             f"is {have[0]} x {have[1]} samples, the result {want[0]} x {want[1]} (rows x columns)",
@@ -285,7 +202,7 @@ def _same_aspect(have, want, where):
         )
 
 
-def _coarser(plane, rows, cols):
+def _coarser(plane: np.ndarray, rows: int, cols: int) -> np.ndarray:
     """A plane averaged over areas to (rows, cols), float64; itself where it has that shape."""
     from plenocli.forward.scene.sample import area_average
 
@@ -297,13 +214,16 @@ def _coarser(plane, rows, cols):
     )
 
 
-def read_labels(source, grid):
-    """Label map (row, column) int on the lenslet grid: 0 nothing, 1..24 the ColorChecker's
-    patches row by row.
+def read_labels(source: Path | str, grid: tuple[int, int]) -> np.ndarray:
+    """Label map of a ColorChecker on the lenslet grid.
 
     source: "colorchecker" for the chart as capture-sim lays it out, or a single-channel
         .png/.tif/.exr on this grid or one finer by a whole number, where only lenslets that see one
         label alone keep it.
+    grid: (rows, columns).
+
+    Returns (row, column) int: 0 nothing, 1..24 the patches row by row.
+    Raises InputError where the map does not fit.
     """
     from plenocli.base.tiling import to_blocks
     from plenocli.forward.scene.chart import chart_labels
@@ -329,47 +249,3 @@ def read_labels(source, grid):
         )
     blocks = to_blocks(labels, (values.shape[0] // rows, values.shape[1] // cols))
     return np.where((blocks == blocks[..., :1]).all(-1), blocks[..., 0], 0)
-
-
-def block_of(result, truth, pif=None):
-    """Object samples under one lenslet (h, w) as the files tell it, or None: from the result,
-    the truth or the matrix.
-    """
-    notes = result.attrs.get("notes")
-    if isinstance(notes, dict) and len(notes.get("block") or ()) == 2:
-        return tuple(int(n) for n in notes["block"])
-    if pif is not None:
-        return tuple(int(n) for n in pif.data["pif/object_shape"])
-    if truth is not None and Path(truth).suffix == ".h5":
-        from plenocli.files.artefacts.container import read_artefact
-
-        attrs = read_artefact(truth, ("capture", "spectra", "image")).attrs.get("capture", {})
-        if "lenslet_count" in attrs:
-            count = [int(n) for n in np.ravel(attrs["lenslet_count"])]
-            if all(n % c == 0 for n, c in zip(result.grid, count, strict=True)):
-                return tuple(n // c for n, c in zip(result.grid, count, strict=True))
-    return None
-
-
-def read_whites(paths):
-    """Spectra of white targets by method: dict method -> (values (frame, band, row, column),
-    sigma of the first or None).
-    """
-    groups = {}
-    for path in paths:
-        frame = read_result(path, ("spectra",))
-        group = groups.setdefault(frame.method, [])
-        if group and frame.values.shape != group[0].values.shape:
-            raise UsageError(
-                (
-                    f"has {by(frame.values.shape)} values (band x row x column), {group[0].name} "
-                    f"{by(group[0].values.shape)}"
-                ),
-                path,
-                "give white targets demultiplexed with one calibration",
-            )
-        group.append(frame)
-    return {
-        method: (np.array([frame.values for frame in group]), group[0].sigma)
-        for method, group in groups.items()
-    }

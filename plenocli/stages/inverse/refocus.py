@@ -208,9 +208,7 @@ def _samples(
             capture,
             "demultiplex it first",
         )
-    samples = (
-        _along_tiles(shot, capture) if calibration is None else _along_grid(shot, calibration)
-    )
+    samples = _along_tiles(shot, capture) if calibration is None else _along_grid(shot, calibration)
     if samples.value.size == 0:
         raise InputError(
             "has no lit superpixel on the grid",

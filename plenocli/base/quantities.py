@@ -3,9 +3,19 @@ section that holds them.
 """
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+)
+from pydantic_core import core_schema
 
 from plenocli.base.units import (
     UnitError,
@@ -16,10 +26,44 @@ from plenocli.base.units import (
 )
 
 
-def quantity(parse, example, low, high, show):
-    """An annotated float that is written as text with a unit and lies within [low, high] in SI."""
+@dataclass(frozen=True, eq=False)
+class _Written:
+    """What pydantic does with a float that is written as text.
 
-    def read(value: Any, info) -> float:
+    read: value and context -> SI value.
+    pattern: the JSON Schema of the text.
+    """
+
+    read: Callable[[Any, ValidationInfo], float]
+    pattern: dict[str, Any]
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.with_info_before_validator_function(self.read, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return self.pattern
+
+
+def quantity(
+    parse: Callable[[str], float],
+    example: str,
+    low: float,
+    high: float,
+    show: Callable[[float], str],
+) -> _Written:
+    """What makes Annotated[float, ...] a number that is written as text with a unit.
+
+    parse: text -> SI value.
+    example: of such a text.
+    low, high: ends of what is allowed, SI.
+    show: SI value -> text.
+    """
+
+    def read(value: Any, info: ValidationInfo) -> float:
         """SI value of text with a unit, or of a number where the context says
         that it is SI already.
         """
@@ -37,43 +81,43 @@ def quantity(parse, example, low, high, show):
         "type": "string",
         "description": f"number and unit, such as {example!r}, from {show(low)} to {show(high)}",
     }
-    return Annotated[float, BeforeValidator(read), WithJsonSchema(pattern)]
+    return _Written(read, pattern)
 
 
-def _suffix(unit):
-    def parse(text):
+def _suffix(unit: str) -> Callable[[str], float]:
+    def parse(text: str) -> float:
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*" + re.escape(unit) + r"\s*", text)
         try:
-            return float(match.group(1))
-        except (AttributeError, ValueError):
+            return float(match[1] if match else "")
+        except ValueError:
             raise UnitError(f"{text!r} is no number of {unit}") from None
 
     return parse
 
 
-def _plain(unit):
+def _plain(unit: str) -> Callable[[float], str]:
     return lambda number: f"{number:g} {unit}"
 
 
-Length = quantity(parse_length, "50 mm", 1e-9, 1e6, format_length)
+Length = Annotated[float, quantity(parse_length, "50 mm", 1e-9, 1e6, format_length)]
 
 
-Gap = quantity(parse_length, "0.1 mm", 0.0, 1.0, format_length)
+Gap = Annotated[float, quantity(parse_length, "0.1 mm", 0.0, 1.0, format_length)]
 
 
-Wavelength = quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)
+Wavelength = Annotated[float, quantity(parse_length, "550 nm", 100e-9, 100e-6, format_length)]
 
 
-SignedLength = quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)
+SignedLength = Annotated[float, quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)]
 
 
-Electrons = quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))
+Electrons = Annotated[float, quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))]
 
 
-Gain = quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))
+Gain = Annotated[float, quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain("DN/e"))]
 
 
-Duration = quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)
+Duration = Annotated[float, quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)]
 
 
 Unit = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -86,4 +130,6 @@ FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class Section(BaseModel):
+    """A table of a description: frozen, without unknown keys or numbers that are not finite."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

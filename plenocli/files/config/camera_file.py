@@ -1,6 +1,7 @@
 """The camera's description as TOML, both ways."""
 
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.toml import parse_toml
 from plenocli.base.units import format_duration, format_length
@@ -8,20 +9,27 @@ from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
 
 
-def load_camera(path):
-    """Read and check a camera description; InputError where the file cannot be read,
-    ConfigError for what it says.
+def load_camera(path: str | Path) -> Camera:
+    """Read and check a camera description, a TOML file.
+
+    Raises InputError where the file cannot be read, ConfigError for what it says.
     """
     return parse_camera(read_text(Path(path), "camera"), path)
 
 
-def parse_camera(text, where="camera"):
-    """A Camera from TOML text; ConfigError lists every violation with its path."""
+def parse_camera(text: str, where: str | Path = "camera") -> Camera:
+    """A Camera from TOML text.
+
+    text: of the description.
+    where: what messages call it.
+
+    Raises ConfigError, which lists every violation with its path.
+    """
     return parse_toml(text, where, Camera)
 
 
-def camera_schema():
-    """The JSON Schema of a camera description, as a dict."""
+def camera_schema() -> dict[str, Any]:
+    """The JSON Schema of a camera description."""
     return Camera.model_json_schema()
 
 
@@ -39,7 +47,7 @@ _NUMBERS = {
 }
 
 
-def to_toml(camera):
+def to_toml(camera: Camera) -> str:
     """TOML text of a resolved camera, one key a line, lengths with units; deterministic."""
     lines = []
     for section, values in camera.model_dump(exclude_none=True).items():
@@ -49,7 +57,7 @@ def to_toml(camera):
     return "\n".join(lines)
 
 
-def _toml(key, value):
+def _toml(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {_toml(k, v)}" for k, v in value.items()) + " }"
     if isinstance(value, (tuple, list)):

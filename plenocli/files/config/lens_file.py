@@ -20,8 +20,9 @@ checked whole, read into SI.
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import Field, PlainValidator, WithJsonSchema, model_validator
 
@@ -33,11 +34,11 @@ from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.glass import AIR, Medium, medium
 from plenocli.forward.camera.prescription import Prescription, Surface
 
-Thickness = quantity(parse_length, "5 mm", -10.0, 1e3, format_length)
+Thickness = Annotated[float, quantity(parse_length, "5 mm", -10.0, 1e3, format_length)]
 _MAX_ORDER = 20
 
 
-def _radius(value: Any):
+def _radius(value: Any) -> float:
     """Radius (m, infinite for a plane) of text such as "50 mm" or "flat"."""
     if isinstance(value, str) and value.strip().lower() in ("flat", "inf", "infinity"):
         return math.inf
@@ -66,7 +67,7 @@ Radius = Annotated[
 ]
 
 
-def _coefficients(value: Any):
+def _coefficients(value: Any) -> tuple[float, ...]:
     """(a_1, a_2, ...) in m^(1 - 2i) of a table such as { r4 = "9.6e-05 mm^-3" }."""
     if not isinstance(value, dict):
         raise ValueError('must be a table such as { r4 = "9.6e-05 mm^-3" }')
@@ -79,7 +80,7 @@ def _coefficients(value: Any):
     return tuple(found.get(i, 0.0) for i in range(1, max(found, default=0) + 1))
 
 
-def _per_length(text, power):
+def _per_length(text: Any, power: int) -> float:
     match = (
         re.fullmatch(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*([a-zµμ]+)\^-(\d+)\s*", text)
         if isinstance(text, str)
@@ -133,7 +134,7 @@ class GlassEntry(Section):
     range: tuple[Wavelength, Wavelength] | None = None
 
     @model_validator(mode="after")
-    def _one_formula(self):
+    def _one_formula(self) -> Self:
         given = [
             name
             for name in ("sellmeier", "polynomial", "cauchy", "nd")
@@ -145,9 +146,9 @@ class GlassEntry(Section):
             raise ValueError("range must ascend")
         return self
 
-    def medium(self, name):
-        """The Medium of this entry; without a range it is trusted from 300 nm to 2.5 um, nd and
-        vd from 380 to 780 nm.
+    def medium(self, name: str) -> Medium:
+        """The glass of this entry under the name given; without a range it is trusted from 300 nm
+        to 2.5 um, nd and vd from 380 to 780 nm.
         """
         if self.nd is not None:
             return Medium(name, "abbe", (self.nd, self.vd), self.range or (380e-9, 780e-9))
@@ -173,7 +174,7 @@ class LensFile(Section):
     glass: dict[str, GlassEntry] = {}
 
     @model_validator(mode="after")
-    def _consistent(self):
+    def _consistent(self) -> Self:
         wrong = []
         if self.lens.stop > len(self.surface):
             wrong.append(
@@ -195,15 +196,15 @@ class LensFile(Section):
             raise ValueError("; ".join(wrong))
         return self
 
-    def medium(self, name):
-        """The Medium that this file means by `name`: its own entry, else the catalogue's.
+    def medium(self, name: str) -> Medium:
+        """The glass that this file means by a name: its own entry, else the catalogue's.
 
-        ConfigError for an unknown one.
+        Raises ConfigError for an unknown one.
         """
         return self.glass[name].medium(name) if name in self.glass else medium(name)
 
-    def prescription(self):
-        """The plenocli.forward.camera.prescription.Prescription in SI units."""
+    def prescription(self) -> Prescription:
+        """The lens in SI units."""
         surfaces = tuple(
             Surface(
                 curvature=0.0 if math.isinf(e.radius) else 1 / e.radius,
@@ -226,24 +227,33 @@ class LensFile(Section):
         )
 
 
-def load_lens(path):
-    """The Prescription in the TOML file `path`; InputError where it cannot be read,
-    ConfigError for what it says.
+def load_lens(path: str | Path) -> Prescription:
+    """Read and check a lens description, a TOML file.
+
+    Raises InputError where it cannot be read, ConfigError for what it says.
     """
     return parse_lens(read_text(Path(path), "lens"), path)
 
 
-def parse_lens(text, where="lens"):
-    """A Prescription from TOML text; ConfigError lists every violation with its path."""
+def parse_lens(text: str, where: str | Path = "lens") -> Prescription:
+    """A lens from TOML text.
+
+    text: of the description.
+    where: what messages call it.
+
+    Raises ConfigError, which lists every violation with its path.
+    """
     return parse_toml(text, where, LensFile).prescription()
 
 
 # --- writing --------------------------------------------------------------------------------------
 
 
-def lens_toml(lens, comments=()):
-    """TOML text of a Prescription that parse_lens reads back to an equal one; its
-    glasses are written out.
+def lens_toml(lens: Prescription, comments: Iterable[str] = ()) -> str:
+    """TOML text of a lens that parse_lens reads back to an equal one.
+
+    lens: its glasses are written out.
+    comments: lines for the top.
     """
     lines = [f"# {text}" for text in comments] + ["[lens]"]
     if lens.name:
@@ -263,7 +273,7 @@ def lens_toml(lens, comments=()):
     return "\n".join(lines) + "\n"
 
 
-def _surface_lines(surface):
+def _surface_lines(surface: Surface) -> list[str]:
     lines = [f'radius = "{_shown_radius(surface.curvature)}"']
     if surface.thickness:
         lines.append(f'thickness = "{format_length(surface.thickness)}"')
@@ -281,7 +291,7 @@ def _surface_lines(surface):
     return lines
 
 
-def _shown_radius(curvature):
+def _shown_radius(curvature: float) -> str:
     """The shortest radius whose inverse is this curvature, to the last bit where there is one."""
     if curvature == 0:
         return "flat"
@@ -295,7 +305,7 @@ def _shown_radius(curvature):
     return format_length(next((r for r in near if 1 / r == curvature), radius))
 
 
-def _glass_lines(glass):
+def _glass_lines(glass: Medium) -> list[str]:
     limits = [f'range = ["{format_length(glass.limits[0])}", "{format_length(glass.limits[1])}"]']
     if glass.formula == "abbe":
         return [f"nd = {glass.coefficients[0]!r}", f"vd = {glass.coefficients[1]!r}", *limits]
@@ -307,10 +317,10 @@ def _glass_lines(glass):
     ]
 
 
-def _key(name):
+def _key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
 
 
-def _text(text):
+def _text(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'

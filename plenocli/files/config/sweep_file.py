@@ -8,9 +8,10 @@ computes optics or opens another file.
 
 import difflib
 import re
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -53,10 +54,11 @@ _RANGE = {"from", "to", "steps", "scale", "whole"}
 
 
 class Range(Section):
-    """Values between two ends, which carry the same unit;
+    """Values between two ends, which carry the same unit.
 
-    steps: how many (a grid needs it);
-    scale: how they are spaced;
+    low, high: the ends, "from" and "to" in the file; numbers, or text with a unit.
+    steps: how many (a grid needs it).
+    scale: how they are spaced.
     whole: whole numbers.
     """
 
@@ -67,7 +69,7 @@ class Range(Section):
     whole: bool = False
 
     @model_validator(mode="after")
-    def _ends(self):
+    def _ends(self) -> Self:
         (low, unit), (high, other) = _measure(self.low), _measure(self.high)
         if unit != other:
             raise ValueError(f"{self.low!r} and {self.high!r} are not of one kind")
@@ -82,7 +84,7 @@ class Range(Section):
             raise ValueError("whole = true goes with whole numbers without a unit")
         return self
 
-    def at(self, share):
+    def at(self, share: float) -> Any:
         """The value at a share 0 ... 1 of the way; the nearest step where steps are given."""
         (low, unit), (high, _) = _measure(self.low), _measure(self.high)
         if self.steps is not None:
@@ -95,24 +97,29 @@ class Range(Section):
             return min(max(int(np.floor(value + 0.5)), ends[0]), ends[1])
         return _written(float(f"{value:.{DIGITS}g}"), unit)
 
-    def levels(self):
+    def levels(self) -> list[Any]:
         """The steps in order, each once."""
-        return list(dict.fromkeys(self.at((i + 0.5) / self.steps) for i in range(self.steps)))
+        shares = () if self.steps is None else (np.arange(self.steps) + 0.5) / self.steps
+        return list(dict.fromkeys(self.at(float(share)) for share in shares))
 
 
 class Choice:
     """One of several values, in the order given."""
 
-    def __init__(self, values):
+    def __init__(self, values: Sequence[Any]) -> None:
         self.values = values
 
-    def at(self, share):
+    def at(self, share: float) -> Any:
         """The value at a share 0 ... 1 of the list."""
         return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
 
-    def levels(self):
+    def levels(self) -> list[Any]:
         """All values."""
         return list(self.values)
+
+
+Axis = Range | Choice
+"""The values of a key that varies."""
 
 
 class Sweep(Section):
@@ -122,9 +129,14 @@ class Sweep(Section):
     chain: "spatial" (simulate-pif, capture-sim, reconstruct, score) or "spectral" (simulate-pif,
         capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
         has a filter array.
+    design: how points are chosen.
+    samples: how many points a Latin hypercube has.
+    vary: key -> values or range.
+    point: the points of a list, key -> value each.
+    set: key -> value at all points.
     follow: keys computed from others, products and quotients of keys and numbers.
-    front: what counts as better, metric -> min or max. Sections named like the commands
-        hold their options.
+    front: what counts as better, metric -> min or max.
+    options: stage -> option -> value, in the file sections named like the commands.
     """
 
     camera: FileName
@@ -140,7 +152,7 @@ class Sweep(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _sections(cls, data):
+    def _sections(cls, data: Any) -> dict[str, Any]:
         data = dict(data)
         options = {stage: data.pop(stage) for stage in STAGES if stage in data}
         known = [name for name in cls.model_fields if name != "options"] + list(STAGES)
@@ -162,7 +174,7 @@ class Sweep(Section):
         return data | {"options": options}
 
     @model_validator(mode="after")
-    def _consistent(self):
+    def _consistent(self) -> Self:
         if (self.design == "list") != bool(self.point):
             raise ValueError('[[point]] sections go with design = "list", and only with it')
         if self.design == "list" and self.vary:
@@ -179,7 +191,7 @@ class Sweep(Section):
         return self
 
     @property
-    def varied(self):
+    def varied(self) -> list[str]:
         """The keys that differ between points, in the order of the file."""
         return (
             list(self.vary)
@@ -188,9 +200,11 @@ class Sweep(Section):
         )
 
 
-def load_sweep(path):
-    """(Sweep, axes: key -> Range or Choice) of the TOML file at `path`; InputError where it
-    cannot be read, ConfigError for what it says.
+def load_sweep(path: str | Path) -> tuple[Sweep, dict[str, Axis]]:
+    """Read and check a sweep, a TOML file.
+
+    Returns (the description, the values of each key that varies).
+    Raises InputError where the file cannot be read, ConfigError for what it says.
     """
     path = Path(path)
     sweep = parse_toml(read_text(path, "sweep"), path, Sweep)
@@ -208,17 +222,22 @@ def load_sweep(path):
     return sweep, axes
 
 
-def points(sweep, axes, seed=0):
-    """The points of the design in order, each a dict key -> value.
-
-    ConfigError where there are too many.
+def points(sweep: Sweep, axes: Mapping[str, Axis], seed: int = 0) -> list[dict[str, Any]]:
+    """The points of the design in order.
 
     A grid lists the last key fastest. A Latin hypercube (McKay et al. 1979) cuts every axis into
-    `samples` equal parts and takes each part once; the seed decides which meet.
+    `samples` equal parts and takes each part once.
+
+    sweep: the description.
+    axes: key -> values.
+    seed: decides which parts of a hypercube's axes meet.
+
+    Returns key -> value of each point.
+    Raises ConfigError where there are too many, or a range of a grid has no steps.
     """
     if sweep.design == "list":
         return [dict(point) for point in sweep.point]
-    if sweep.design == "latin-hypercube":
+    if sweep.samples is not None:  # a Latin hypercube
         rng = np.random.default_rng([seed, *b"sweep"])
         shares = np.stack(
             [
@@ -249,7 +268,7 @@ def points(sweep, axes, seed=0):
     return [dict(zip(axes, values)) for values in product(*levels)]
 
 
-def unknown_key(key):
+def unknown_key(key: str) -> str | None:
     """Why a dotted key names nothing, in words; None where it is a key of a camera or an option
     of a stage (whose name is not looked at).
     """
@@ -273,22 +292,35 @@ def unknown_key(key):
     return None
 
 
-def changed(data, values, follow):
-    """A camera description (nested dict as read from TOML) with dotted keys set and the keys of
-    `follow` computed; the options of stages in `values` are left alone. ConfigError where a key is
-    not there or an expression cannot be computed.
+def changed(
+    data: Mapping[str, Any], values: Mapping[str, Any], follow: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A camera description with some keys set and others computed.
+
+    data: nested, as read from TOML; it is left as it was.
+    values: dotted key -> value; the options of stages among them are left alone.
+    follow: dotted key -> product or quotient of keys and numbers.
+
+    Returns the nested description.
+    Raises ConfigError where a key is not there or an expression cannot be computed.
     """
-    data = _copy(data)
+    copy = _copy(data)
     for key, value in values.items():
         if key.partition(".")[0] not in STAGES:
-            _put(data, key, value)
+            _put(copy, key, value)
     for key, expression in follow.items():
-        _put(data, key, _computed(data, key, expression))
-    return data
+        _put(copy, key, _computed(copy, key, expression))
+    return copy
 
 
-def options_of(sweep, point):
-    """Stage -> option -> value at a point: the sections of the file with what varies put in."""
+def options_of(sweep: Sweep, point: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """What the stages are run with at a point: the sections of the file with what varies put in.
+
+    sweep: the description.
+    point: dotted key -> value.
+
+    Returns stage -> option -> value.
+    """
     found = {stage: dict(values) for stage, values in sweep.options.items()}
     for key, value in {**sweep.set, **point}.items():
         stage, _, option = key.partition(".")
@@ -297,7 +329,7 @@ def options_of(sweep, point):
     return found
 
 
-def number(value):
+def number(value: Any) -> float | None:
     """A value as a number: lengths in m, durations in s, others in their own unit; None for
     words, lists and switches.
     """
@@ -307,7 +339,7 @@ def number(value):
         return None
 
 
-def unit(value):
+def unit(value: Any) -> str:
     """The unit of number(value): "m", "s", what the text says, or ""."""
     try:
         return _measure(value)[1] or ""
@@ -318,7 +350,7 @@ def unit(value):
 # --- reading --------------------------------------------------------------------------------------
 
 
-def _axis(values):
+def _axis(values: Any) -> Axis:
     if isinstance(values, dict):
         try:
             made = Range.model_validate(values)
@@ -341,13 +373,13 @@ def _axis(values):
     return Choice(values)
 
 
-def _said(error):
+def _said(error: Exception) -> str:
     return str(error).replace("Value error, ", "")
 
 
-def _flat(table, before=""):
+def _flat(table: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Nested tables as dotted keys; a table that is a range stays one."""
-    out = {}
+    out: dict[str, Any] = {}
     for key, value in table.items():
         if isinstance(value, dict) and value and not set(value) & _RANGE:
             out |= _flat(value, f"{before}{key}.")
@@ -356,7 +388,7 @@ def _flat(table, before=""):
     return out
 
 
-def _measure(value):
+def _measure(value: Any) -> tuple[float, str | None]:
     """(number in SI, unit) of a number or of text with a unit; ValueError for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{shown(value)} is no number and no number with a unit")
@@ -375,7 +407,7 @@ def _measure(value):
     return float(match[1]), match[2]
 
 
-def _written(value, unit):
+def _written(value: float, unit: str | None) -> float | str:
     if unit is None:
         return value
     return {"m": format_length, "s": format_duration}.get(unit, lambda v: f"{v:.{DIGITS}g} {unit}")(
@@ -383,7 +415,7 @@ def _written(value, unit):
     )
 
 
-def _copy(data):
+def _copy(data: Any) -> Any:
     return (
         {k: _copy(v) for k, v in data.items()}
         if isinstance(data, dict)
@@ -393,7 +425,7 @@ def _copy(data):
     )
 
 
-def _put(data, key, value):
+def _put(data: dict[str, Any], key: str, value: Any) -> None:
     """Set a dotted key; * stands for every entry of a list; what excludes the key leaves."""
     *path, last = key.split(".")
     targets = [data]
@@ -416,7 +448,9 @@ def _put(data, key, value):
                         target.pop(other, None)
 
 
-def _entries(target, name, path, key, make=False):
+def _entries(
+    target: Any, name: str, path: Sequence[str], key: str, make: bool = False
+) -> list[Any]:
     if isinstance(target, list):
         return [target[i] for i in _indices(target, name, path[:-1], key)]
     if (
@@ -436,7 +470,7 @@ def _entries(target, name, path, key, make=False):
     return [target[name]]
 
 
-def _indices(target, name, path, key):
+def _indices(target: Sequence[Any], name: str, path: Sequence[str], key: str) -> Sequence[int]:
     if name == "*":
         return range(len(target))
     if not name.isdigit() or int(name) >= len(target):
@@ -451,7 +485,7 @@ def _indices(target, name, path, key):
 _FACTOR = re.compile(r"\s*([*/]?)\s*([^*/]+)")
 
 
-def _computed(data, key, expression):
+def _computed(data: Mapping[str, Any], key: str, expression: Any) -> float | str:
     """The value of a product such as "sensor.pixel_pitch * 13 / 2"; a length where one length is
     left over, else a number.
     """
@@ -488,9 +522,9 @@ def _computed(data, key, expression):
     return _written(float(f"{value:.{DIGITS}g}"), "m" if power else None)
 
 
-def _term(data, key, text):
+def _term(data: Mapping[str, Any], key: str, text: str) -> tuple[float, str | None]:
     """(number, unit) of a key or of a number, with or without a unit."""
-    found = text
+    found: Any = text
     if re.match(r"[A-Za-z_]", text):
         problem = unknown_key(text)
         if problem:

@@ -1,13 +1,21 @@
 """The text of a description file: found, of a sensible size, UTF-8."""
 
+from pathlib import Path
+
 from plenocli.base.errors import InputError
 
 MAX_BYTES = 1 << 20
 """No camera description is longer; what is, is some other file."""
 
 
-def read_text(path, what):
-    """The text of the TOML file of a `what` (camera, scene); InputError where it cannot be read."""
+def read_text(path: Path, what: str) -> str:
+    """The text of a TOML file.
+
+    path: of the file.
+    what: it describes (camera, scene), for messages.
+
+    Raises InputError where it cannot be read.
+    """
     try:
         if path.exists() and not path.is_file():
             raise InputError(

@@ -84,6 +84,7 @@ def capture(system, count, scene, snr, seed):
     from plenocli.base.tiling import to_blocks
     from plenocli.files.read.training import linear_values
     from plenocli.forward.scene.sample import luminance, sample_picture
+    from plenocli.forward.sensor.noise import Noise
     from plenocli.inverse.picture.lenslet_model import Superpixels
 
     whole, kept = count
@@ -96,7 +97,9 @@ def capture(system, count, scene, snr, seed):
     y = truth @ system.own.T
     sigma = float(np.sqrt(np.mean(y**2)) * 10 ** (-snr / 20))
     return Superpixels(
-        y=y + sigma * np.random.default_rng(seed).standard_normal(y.shape), sigma=sigma, scene=scene
+        y=y + sigma * np.random.default_rng(seed).standard_normal(y.shape),
+        noise=Noise.of_sigma(sigma),
+        scene=scene,
     ), truth
 
 

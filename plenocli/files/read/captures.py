@@ -13,7 +13,9 @@ from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.base.tiling import to_blocks
 from plenocli.files.images.mosaic import read_capture
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.capture import Capture
+from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
@@ -59,10 +61,10 @@ def read_superpixels(
     noise = capture.white_noise
     return Superpixels(
         y=to_blocks(signal, shape) / unit,
-        sigma=None if noise is None else noise.sigma / unit,
+        noise=None if noise is None else Noise.of_sigma(noise.sigma / unit),
         scene=capture.metadata.target,
-        accuracy=capture.metadata.accuracy,
-        matrix=capture.metadata.matrix,
+        accuracy=AccuracyRecord.from_json(capture.metadata.accuracy),
+        pif_digest=capture.metadata.matrix,
     )
 
 
@@ -118,7 +120,7 @@ def _along_the_grid(
     lit = np.all(np.isfinite(signal), axis=2)
     scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
     y = np.where(lit[:, :, None], signal, 0) * scale[:, :, None]
-    return Superpixels(y=y, sigma=None, scene=None)
+    return Superpixels(y=y)
 
 
 def _tiles(capture: Capture, system: LensletMatrix, path: str | Path) -> tuple[int, int]:

@@ -5,11 +5,11 @@ units.
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.sensor.noise import Noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,14 +58,19 @@ class Superpixels:
     """A capture as the estimators take it.
 
     y: (lenslet_row, lenslet_column, pixel) in units of A x.
-    sigma: standard deviation of the known noise in these units, or None.
+    noise: in these units, white, or None where it is not known.
     scene: name of what was captured, or None.
-    accuracy: of a simulated capture the record of its accuracy.
-    matrix: SHA-256 of the pif that a simulated capture was made with.
+    accuracy: how accurately a capture was simulated, None of a real one.
+    pif_digest: SHA-256 of the pif that a simulated capture was made with.
     """
 
     y: np.ndarray
-    sigma: float | None
-    scene: str | None
-    accuracy: dict[str, Any] | None = None
-    matrix: str | None = None
+    noise: Noise | None = None
+    scene: str | None = None
+    accuracy: AccuracyRecord | None = None
+    pif_digest: str | None = None
+
+    @property
+    def sigma(self) -> float | None:
+        """Standard deviation of the known noise, in units of A x."""
+        return None if self.noise is None else self.noise.sigma

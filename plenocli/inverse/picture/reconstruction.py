@@ -13,15 +13,15 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.noise_level import NoiseLevel
 
 
-class Told(Protocol):
-    """Something that a result's attributes tell of."""
+class Entry(Protocol):
+    """What a result's attributes tell of: a choice, a finding."""
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""
         ...
 
 
-class Stats(Told, Protocol):
+class Stats(Entry, Protocol):
     """What a method tells of itself."""
 
     @property
@@ -104,7 +104,7 @@ class Account:
     scale: float | None = None
     from_lmmse: float | None = None
     stats: Stats | None = None
-    trace: tuple[Told, ...] = ()
+    trace: tuple[Entry, ...] = ()
 
     @property
     def noise(self) -> Noise | None:

@@ -17,6 +17,7 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
 from plenocli.base.tiling import to_blocks
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, TrialKey
 from plenocli.inverse.picture.footprint import Sizes
@@ -170,7 +171,7 @@ def _compare(
     sigma = relative * float(np.sqrt(np.mean(y**2)))
     y += sigma * rng.standard_normal(y.shape)
     alone, quality = estimators.alone(sigma), {}
-    data = Superpixels(y=y, sigma=sigma, scene=scene)
+    data = Superpixels(y=y, noise=Noise.of_sigma(sigma), scene=scene)
     for method in candidates:
         difference = method.reconstruct(alone, data).value - truth
         error = np.square(difference).reshape(SIDE, TRIALS, -1).mean(axis=(0, 2))

@@ -172,28 +172,8 @@ def run_learn_dict(
     origin = Origin(command, pif, files_of(images))
     kept = _check_files(output, origin, resume, checkpoint, overwrite)
     resume = checkpoint if kept else resume
-    system = read_lenslet_matrix(pif)
-    pictures = split_by_scene(read_training(images, system.object_shape))
-    scenes = Scenes(*(at_scales(part, system.object_shape) for part in pictures))
-    earlier = read_unfinished(resume, system) if resume else None
-    chosen = _resolve(settings, system, earlier, same=kept)
-    if earlier and scenes.training_names != list(earlier.training):
-        raise UsageError(
-            f"the resumed dictionary was trained on {', '.join(earlier.training)}",
-            "--resume",
-            "give the same pictures",
-        )
-    require_learning(system, chosen, pif, synthesis=settings.synthesis)
-    svd = decompose(system.own)
-    machine = _learner(svd, system, scenes, chosen, settings)
-    state = earlier.state if earlier else machine.start()
-    if state.iteration > settings.iterations:
-        raise UsageError(
-            f"{Path(resume or output).name} has done {state.iteration} iterations, more than "
-            f"{settings.iterations}",
-            "--iterations",
-            "ask for more",
-        )
+    learning = _begin(images, settings, pif, resume, same=kept)
+    machine, scenes, state = learning.machine, learning.scenes, learning.state
     left = settings.iterations - state.iteration
     for _ in bar(range(left), left, "iterations"):
         state = machine.step(state)
@@ -201,7 +181,7 @@ def run_learn_dict(
         if checkpoint is not None:
             _write(checkpoint, state, machine, scenes, origin, overwrite=True)
     synthesis = machine.synthesis(state) if settings.synthesis else None
-    summary = _judge(machine, state, synthesis, svd, scenes, output)
+    summary = _judge(learning, state, synthesis, output)
     _write(
         output,
         state,
@@ -221,6 +201,48 @@ def run_learn_dict(
             "dB): reconstruct --method lmmse is the better choice"
         )
     return summary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learning:
+    """A run that has not begun to iterate; svd: of the own block."""
+
+    machine: Learner
+    scenes: Scenes
+    state: State
+    svd: Svd
+
+
+def _begin(
+    images: Sequence[str], settings: Settings, pif: Path, resume: Path | None, *, same: bool
+) -> Learning:
+    """Read what is learnt from, and go on from `resume` where it is given.
+
+    same: as in `_resolve`.
+    """
+    system = read_lenslet_matrix(pif)
+    pictures = split_by_scene(read_training(images, system.object_shape))
+    scenes = Scenes(*(at_scales(part, system.object_shape) for part in pictures))
+    earlier = read_unfinished(resume, system) if resume else None
+    chosen = _resolve(settings, system, earlier, same=same)
+    if earlier and scenes.training_names != list(earlier.training):
+        raise UsageError(
+            f"the resumed dictionary was trained on {', '.join(earlier.training)}",
+            "--resume",
+            "give the same pictures",
+        )
+    require_learning(system, chosen, pif, synthesis=settings.synthesis)
+    svd = decompose(system.own)
+    machine = _learner(svd, system, scenes, chosen, settings)
+    state = earlier.state if earlier else machine.start()
+    if state.iteration > settings.iterations:
+        raise UsageError(
+            f"{Path(resume or pif).name} has done {state.iteration} iterations, more than "
+            f"{settings.iterations}",
+            "--iterations",
+            "ask for more",
+        )
+    return Learning(machine=machine, scenes=scenes, state=state, svd=svd)
 
 
 def _check_files(
@@ -355,12 +377,7 @@ def _tell(state: State) -> None:
 
 
 def _judge(
-    machine: Learner,
-    state: State,
-    synthesis: np.ndarray | None,
-    svd: Svd,
-    scenes: Scenes,
-    output: Path,
+    learning: Learning, state: State, synthesis: np.ndarray | None, output: Path
 ) -> LearnSummary:
     """Validation PSNR of one coding, and of the mean over mirror images that reconstruct takes,
     beside the LMMSE that reconstruct takes of a lenslet by itself: statistics of the same training
@@ -373,6 +390,7 @@ def _judge(
     from plenocli.inverse.prior.scene_prior import PATCHES_A_POINT
     from plenocli.inverse.sparse.dictionary import averaged, psnr
 
+    machine, scenes, svd = learning.machine, learning.scenes, learning.svd
     chosen = machine.settings
     patches = draw_patches(
         [p for _, p in scenes.training],

@@ -327,9 +327,11 @@ def _recipe(
 
 @lru_cache(maxsize=1)
 def _estimators(recipe: Recipe) -> Estimators:
-    """What all captures of a recipe share; it has a pif."""
+    """What all captures of a recipe with a pif share."""
+    if recipe.pif is None:
+        raise ValueError("without a pif there is nothing to estimate with")
     settings, learnt = recipe.settings, recipe.settings.dictionary
-    system = read_lenslet_matrix(recipe.pif or Path(), by_band=True)
+    system = read_lenslet_matrix(recipe.pif, by_band=True)
 
     def read_pictures(scene: str | None) -> list[TrainingPicture]:
         return read_training(settings.training, system.object_shape, not_scene=scene)
@@ -416,7 +418,7 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
 def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     """The picture of one capture; what many captures need is made once a process."""
     settings = recipe.settings
-    if recipe.pif is None:
+    if recipe.pif is None and recipe.calibration is not None:
         choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
         found = Reconstruction(
             value=_white_normalised(capture, recipe.calibration),
@@ -467,15 +469,14 @@ def _limits(
     """
     from plenocli.files.artefacts.provenance import file_digest
     from plenocli.forward.accuracy.limits import what_limits
-    from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
     system = estimators.system
     signal = float(np.sqrt(np.mean(np.square(data.y))))
     limits = what_limits(
         sigma / signal if sigma and signal else None,
         system.accuracy,
-        AccuracyRecord.from_json(data.accuracy),
-        data.matrix is not None and data.matrix == file_digest(system.path),
+        data.accuracy,
+        data.pif_digest is not None and data.pif_digest == file_digest(system.path),
     )
     if limits is None:
         return None
@@ -522,7 +523,7 @@ def _truth(
     return to_blocks(picture, shape)
 
 
-def _white_normalised(capture: Path, calibration: Path | None) -> np.ndarray:
+def _white_normalised(capture: Path, calibration: Path) -> np.ndarray:
     """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the
     white reference; 0 where it cannot be had.
 

@@ -36,7 +36,7 @@ class Problem:
     b: (signal, penalised atom) y^T d.
     threshold: (penalised atom,) lambda w / 2.
     penalised, free: columns of D that are penalised, and that are not.
-    free_basis, free_factor: the free columns' QR factors.
+    free_factor: triangular factor of the free columns.
     free_part: (free atom, signal) of Y along the basis.
     free_overlap: (free atom, penalised atom) of D along the basis.
     """
@@ -47,7 +47,6 @@ class Problem:
     threshold: np.ndarray
     penalised: np.ndarray
     free: np.ndarray
-    free_basis: np.ndarray
     free_factor: np.ndarray
     free_part: np.ndarray
     free_overlap: np.ndarray
@@ -103,7 +102,6 @@ def prepare(
         threshold=lam * w[penalised] / 2,
         penalised=penalised,
         free=unpenalised,
-        free_basis=basis,
         free_factor=factor,
         free_part=part,
         free_overlap=overlap,

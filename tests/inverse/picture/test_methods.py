@@ -1,0 +1,94 @@
+"""The methods of reconstruct as objects: what they say of themselves, and the account of a
+picture.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plenocli.cli.inverse.reconstruct import METHODS as OFFERED
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture.estimators import Estimators, Options
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.methods import METHODS, takers
+from plenocli.inverse.picture.noise_level import NoiseLevel
+from plenocli.inverse.picture.reconstruction import Choice, ContrastScale, Reconstruction
+
+POINTS, PIXELS, SIGMA = (3, 3), (4, 4), 1e-3
+RING = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
+
+
+def made(coupled, **options):
+    """(Estimators, capture, true blocks) of a small random camera."""
+    rng = np.random.default_rng(0)
+    offsets = RING if coupled else np.zeros((1, 2), int)
+    blocks = rng.random((len(offsets), 16, 9)) / 16
+    blocks *= np.where(offsets.any(axis=1), 0.03, 1)[:, None, None]
+    system = LensletMatrix(
+        path=Path("pif.h5"),
+        blocks=blocks,
+        offsets=offsets,
+        pixel_shape=PIXELS,
+        object_shape=POINTS,
+    )
+    pictures = [("noise", rng.random((40, 44)))]
+    estimators = Estimators(system, Options(**options), lambda scene: pictures)
+    x = rng.random((4, 4, 9))
+    y = estimators.sensor((4, 4)).forward(x)
+    y = y + SIGMA * rng.standard_normal(y.shape)
+    return estimators, Superpixels(y=y, noise=Noise.of_sigma(SIGMA)), x
+
+
+def test_the_command_offers_what_there_is():
+    assert set(OFFERED) == set(METHODS)
+    assert takers("lam") == ("dictionary",) and takers("dictionary") == ("auto", "dictionary")
+    assert {name for name, m in METHODS.items() if not m.needs_pif} == {"auto", "block-mean"}
+    assert {name for name, m in METHODS.items() if m.hindsight} == {"tikhonov", "tsvd"}
+    assert {name for name, m in METHODS.items() if m.in_batches} == {"nnls", "dictionary"}
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("name", [n for n in METHODS if n != "dictionary"])
+def test_every_method_gives_a_picture_and_its_account(name, coupled):
+    estimators, data, truth = made(coupled, method=name)
+    method = METHODS[name]
+    found = method.reconstruct(estimators, data)
+    assert found.value.shape == truth.shape
+    assert np.sqrt(np.mean((found.value - truth) ** 2)) < 0.5
+    assert (found.sigma is not None) == (found.method in ("lmmse", "pnp", "tv"))
+    assert found.overlap == (3 if coupled else 1)
+    told = json.loads(json.dumps(found.as_json()))
+    assert told["method"] == found.method and told["reason"] == found.reason
+    assert found.account.as_json() == found.as_json()
+    assert method.makes_joint_estimate(estimators) == (coupled and name != "block-mean")
+    if found.noise is not None:
+        assert told["noise_sigma"] == found.noise.sigma
+        assert told["noise_sigma"] == pytest.approx(SIGMA, rel=0.6)
+    if name == "auto":
+        assert set(told["trial_db"]) == {"lmmse", "pnp"} and found.method in told["trial_db"]
+
+
+def test_an_estimate_leaves_nothing_behind():
+    """The same capture twice: nothing that the first found is in the second's account."""
+    estimators, data, _ = made(True, method="tikhonov")
+    one, other = (METHODS["tikhonov"].reconstruct(estimators, data) for _ in range(2))
+    assert one.as_json() == other.as_json() and one.value.tobytes() == other.value.tobytes()
+    assert [type(entry) for entry in one.trace] == [type(entry) for entry in other.trace]
+
+
+def test_later_findings_overrule_earlier_ones():
+    found = Reconstruction(
+        value=np.zeros((1, 1, 9)),
+        method="lmmse",
+        trace=(
+            Choice(method="lmmse", reason="asked for"),
+            NoiseLevel(sigma=1.0, source="from the capture", excess=0.5),
+            ContrastScale(0.5),
+            NoiseLevel(sigma=2.0, source="given"),
+        ),
+    )
+    told = found.as_json()
+    assert told["noise_sigma"] == 2.0 and told["excess"] == 0.5 and told["scale"] == 0.5
+    assert found.as_picture(POINTS).value.shape == POINTS and found.sigma is None

@@ -6,13 +6,19 @@ arguments: same input, same bytes. What the tags cannot say (gain, band, seed, d
 travels as JSON in the XMP packet.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
+import os
 import struct
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
+from typing import Any
 from xml.sax.saxutils import escape, unescape
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli import __version__
 from plenocli.base.errors import OutputError
@@ -25,12 +31,25 @@ _COLOUR_CODE = {"R": 0, "G": 1, "B": 2}
 # XYZ to linear sRGB, D65 (IEC 61966-2-1): the simulated sensor has no profile of its own
 _COLOUR_MATRIX = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
 _OPEN, _CLOSE = "<plenocli:capture>", "</plenocli:capture>"
+_Tag = tuple[int, int, Sequence[int] | bytes]
+"""Number, type and values of a tag."""
+_Packed = tuple[int, int, int, bytes]
+"""Number, type, count and bytes of a tag."""
 SMALLEST = 22  # LibRaw takes anything smaller for no RAW file
 
 
 def write_dng(
-    path, mosaic, *, cfa, black, white, exposure_s=None, iso=None, xmp_json=None, overwrite=False
-):
+    path: str | os.PathLike[str],
+    mosaic: np.ndarray,
+    *,
+    cfa: str,
+    black: ArrayLike,
+    white: float,
+    exposure_s: float | None = None,
+    iso: float | None = None,
+    xmp_json: Mapping[str, Any] | str | None = None,
+    overwrite: bool = False,
+) -> None:
     """Write a sensor mosaic as DNG; `rawpy` reads the same numbers back.
 
     mosaic: (row, column) unsigned integers below 65536.
@@ -38,8 +57,10 @@ def write_dng(
     black: DN, one number or 2x2 by position.
     white: saturation level, DN.
     exposure_s: s.
+    iso: speed, for the EXIF tag.
     xmp_json: JSON-able dict or JSON text kept in the XMP packet (attributes of a capture artefact
         by their names, "provenance"); black, white and the mosaic's SHA-256 are added to it.
+
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
     values = np.asarray(mosaic)
@@ -90,12 +111,21 @@ def write_dng(
     )
 
 
-def _headers(shape, cfa, black, white, exposure_s, iso, notes, size):
+def _headers(
+    shape: tuple[int, ...],
+    cfa: str,
+    black: np.ndarray,
+    white: int,
+    exposure_s: float | None,
+    iso: float | None,
+    notes: dict[str, Any],
+    size: int,
+) -> bytes:
     """Everything before the pixels.
 
     Laid out twice: the first pass finds the lengths, the second fills in the offsets.
     """
-    exif = [(36864, _UNDEFINED, 4, b"0230")]
+    exif: list[_Packed] = [(36864, _UNDEFINED, 4, b"0230")]
     if exposure_s:
         exif.append((33434, _RATIONAL, 1, _rationals([exposure_s])))
     if iso:
@@ -109,9 +139,19 @@ def _headers(shape, cfa, black, white, exposure_s, iso, notes, size):
     return head.ljust(pixels, b"\0")
 
 
-def _tags(shape, cfa, black, white, notes, size, pixels, exif):
+def _tags(
+    shape: tuple[int, ...],
+    cfa: str,
+    black: np.ndarray,
+    white: int,
+    notes: dict[str, Any],
+    size: int,
+    pixels: int,
+    exif: int,
+) -> list[_Packed]:
+    """Tags of the picture, whose pixels and EXIF directory are at these places of the file."""
     rows, columns = shape
-    tags = [
+    tags: list[_Tag] = [
         (254, _LONG, [0]),
         (256, _LONG, [columns]),
         (257, _LONG, [rows]),
@@ -148,7 +188,7 @@ def _tags(shape, cfa, black, white, notes, size, pixels, exif):
     return [_packed(*tag) for tag in sorted(tags, key=lambda tag: tag[0])]
 
 
-def _black_tags(black):
+def _black_tags(black: np.ndarray) -> list[_Tag]:
     """BlackLevelRepeatDim and BlackLevel, row by row; whole numbers as such,
     others as fractions.
     """
@@ -163,16 +203,16 @@ def _black_tags(black):
     ]
 
 
-def _packed(number, kind, values):
+def _packed(number: int, kind: int, values: Sequence[int] | bytes) -> _Packed:
     """(tag, type, count, bytes)."""
     if kind in _FORMAT and not isinstance(values, bytes):
         return number, kind, len(values), struct.pack(f"<{len(values)}{_FORMAT[kind]}", *values)
     if kind == _SRATIONAL:
         return number, kind, len(values), b"".join(struct.pack("<ii", v, 10_000) for v in values)
-    return number, kind, len(values) // 8 if kind == _RATIONAL else len(values), values
+    return number, kind, len(values) // 8 if kind == _RATIONAL else len(values), bytes(values)
 
 
-def _rationals(values):
+def _rationals(values: Iterable[float]) -> bytes:
     parts = [
         Fraction(float(v)).limit_denominator(10**6)
         if v >= 1e-3
@@ -182,7 +222,7 @@ def _rationals(values):
     return b"".join(struct.pack("<II", min(p.numerator, 2**32 - 1), p.denominator) for p in parts)
 
 
-def _directory(tags, offset):
+def _directory(tags: list[_Packed], offset: int) -> bytes:
     """One image file directory at `offset`, with the values that do not fit into its
     entries behind it.
     """
@@ -198,7 +238,7 @@ def _directory(tags, offset):
     return struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0) + extra
 
 
-def _packet(notes):
+def _packet(notes: dict[str, Any]) -> bytes:
     text = json.dumps(notes, sort_keys=True, ensure_ascii=False, allow_nan=False)
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta '
@@ -209,8 +249,8 @@ def _packet(notes):
     ).encode()
 
 
-def read_notes(path):
-    """The JSON that `write_dng` left in the XMP packet, as a dict; {} where there is none.
+def read_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The JSON that `write_dng` left in the XMP packet; {} where there is none.
 
     Looks at the first 4 MiB only.
     """

@@ -6,10 +6,15 @@ own; the reader verifies it where it is there. The clock is kept out: the same c
 give the same bytes.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import json
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,16 +25,27 @@ from plenocli.base.memory import size_text
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
 
+Name = str | os.PathLike[str]
 DIGEST = "plenocli:sha256"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
 
 
-def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip"):
-    """Write float32 channels (name -> (row, column) array, all of one shape) and text
-    attributes (name -> str).
+def write_exr(
+    path: Name,
+    channels: Mapping[str, np.ndarray],
+    attrs: Mapping[str, str] | None = None,
+    *,
+    overwrite: bool = False,
+    compression: str = "zip",
+) -> None:
+    """Write an EXR. Same input, same bytes.
 
-    Everything is read back and compared before the file takes its place. Same input, same bytes.
+    Everything is read back and compared before the file takes its place.
+    channels: name -> (row, column), all of one shape, stored as float32.
+    attrs: name -> text.
+    compression: one that loses nothing.
+
     Raises ValueError (a bug of the caller: shapes, names), UsageError, OutputError.
     """
     planes, attrs = _checked(channels, attrs or {}, compression)
@@ -60,10 +76,14 @@ def write_exr(path, channels, attrs=None, *, overwrite=False, compression="zip")
         _verify(path, partial, pixels, names, attrs, compression)
 
 
-def read_exr(path, *, most=None):
-    """Channels (name -> (row, column) float32) and text attributes (name -> str) of an EXR file.
+def read_exr(
+    path: Name, *, most: int | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Channels and text attributes of an EXR file.
 
     most: bytes of pixels above which the file is refused, whatever memory there is.
+
+    Returns name -> (row, column) float32, and name -> text.
     Raises InputError for a file that is missing, damaged, above `most`, deep, in several parts, or
     holds integer channels.
     """
@@ -98,8 +118,11 @@ def read_exr(path, *, most=None):
     return channels, {name: value for name, value in attrs.items() if name != _LIST}
 
 
-def channel_names(path):
-    """Names of the channels, from the header alone. Raises InputError."""
+def channel_names(path: Name) -> list[str]:
+    """Names of the channels, from the header alone.
+
+    Raises InputError.
+    """
     with _opened(path) as source:
         return list(source.spec().channelnames)
 
@@ -110,14 +133,16 @@ def channel_names(path):
 _LIST = "plenocli:attributes"
 
 
-def _listed(attrs):
+def _listed(attrs: Mapping[str, str]) -> set[str]:
     try:
         return set(json.loads(attrs.get(_LIST, "[]")))
     except ValueError:
         return set()
 
 
-def _checked(channels, attrs, compression):
+def _checked(
+    channels: Mapping[str, np.ndarray], attrs: Mapping[str, str], compression: str
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     planes = {
         name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()
     }
@@ -137,10 +162,12 @@ def _checked(channels, attrs, compression):
         )
     if compression not in _COMPRESSIONS:
         raise ValueError(f"EXR compression {compression!r} is none of {_COMPRESSIONS}")
-    return planes, attrs
+    return planes, dict(attrs)
 
 
-def _spec(names, rows, columns, attrs, compression):
+def _spec(
+    names: list[str], rows: int, columns: int, attrs: Mapping[str, str], compression: str
+) -> Any:
     import OpenImageIO as oiio
 
     spec = oiio.ImageSpec(columns, rows, len(names), "float")
@@ -154,7 +181,7 @@ def _spec(names, rows, columns, attrs, compression):
     return spec
 
 
-def _digest(planes, attrs):
+def _digest(planes: Mapping[str, np.ndarray], attrs: Mapping[str, str]) -> str:
     digest = hashlib.sha256(json.dumps(sorted(attrs.items())).encode())
     for name in sorted(planes):
         digest.update(f"{name} {planes[name].shape}".encode())
@@ -162,7 +189,14 @@ def _digest(planes, attrs):
     return digest.hexdigest()
 
 
-def _verify(path, partial, pixels, names, attrs, compression):
+def _verify(
+    path: Name,
+    partial: Path,
+    pixels: np.ndarray,
+    names: list[str],
+    attrs: dict[str, str],
+    compression: str,
+) -> None:
     """Compare the file with what went in: OpenImageIO drops what it cannot store, and misses a
     disk that gets full, without an error.
     """
@@ -208,7 +242,7 @@ def _verify(path, partial, pixels, names, attrs, compression):
 
 
 @contextlib.contextmanager
-def _opened(path):
+def _opened(path: Name) -> Iterator[Any]:
     """An open ImageInput of the EXR at `path`, closed afterwards; the type is taken from the
     content, not from the name.
     """
@@ -234,7 +268,7 @@ def _opened(path):
         oiio_error(source)  # an error never fetched is printed when the process ends
 
 
-def _check_header(path, source, spec, most):
+def _check_header(path: Name, source: Any, spec: Any, most: int | None) -> None:
     import OpenImageIO as oiio
 
     if spec.deep:
@@ -253,7 +287,7 @@ def _check_header(path, source, spec, most):
     source.seek_subimage(0, 0)
 
 
-def require_at_most(path, declared, most):
+def require_at_most(path: Name, declared: int, most: int | None) -> None:
     """InputError where a file declares more bytes of values than `most`, unless that is None."""
     if most is not None and declared > most:
         raise InputError(
@@ -263,7 +297,7 @@ def require_at_most(path, declared, most):
         )
 
 
-def oiio_error(handle):
+def oiio_error(handle: Any) -> str:
     """The pending message of an OpenImageIO object (or of the library, for None), its first
     line; fetching clears it.
     """

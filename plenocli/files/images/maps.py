@@ -2,6 +2,9 @@
 error, as square grids.
 """
 
+from __future__ import annotations
+
+import os
 from pathlib import Path
 
 import h5py
@@ -19,12 +22,14 @@ MAX_BYTES = 64 << 20
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read_transmittance(path):
-    """Intensity transmittance (rows, columns) float64 from a grey PNG or the one channel of an EXR.
-    Raises InputError.
+def read_transmittance(path: str | os.PathLike[str]) -> np.ndarray:
+    """Intensity transmittance from a grey PNG or the one channel of an EXR.
 
     PNG: stored numbers over the largest (255 or 65535), not decoded as sRGB; EXR: as stored. An RGB
     picture passes if its three channels are equal; alpha is ignored.
+
+    Returns (row, column) float64.
+    Raises InputError.
     """
     _require_small(path)
     kind = file_type(path)
@@ -41,12 +46,14 @@ def read_transmittance(path):
     return colours[..., 0].astype(float) / (2 ** max(bits, 8) - 1)
 
 
-def read_wavefront(path):
-    """Wavefront error in metres (rows, columns) float64, from the dataset "wavefront" of an HDF5
-    file or the one channel of an EXR.
+def read_wavefront(path: str | os.PathLike[str]) -> np.ndarray:
+    """Wavefront error from the dataset "wavefront" of an HDF5 file or the one channel of an EXR.
 
     A dataset may say its unit in the attribute "units", which must be m, as text of fixed length:
-    HDF5 may read a damaged one of variable length for ever. Raises InputError.
+    HDF5 may read a damaged one of variable length for ever.
+
+    Returns (row, column) float64, m.
+    Raises InputError.
     """
     _require_small(path)
     content = Path(path).read_bytes()
@@ -61,7 +68,7 @@ def read_wavefront(path):
     )
 
 
-def _require_small(path):
+def _require_small(path: str | os.PathLike[str]) -> None:
     size = require_file(path)
     if size > MAX_BYTES:
         raise InputError(
@@ -71,7 +78,7 @@ def _require_small(path):
         )
 
 
-def _one_channel(path):
+def _one_channel(path: str | os.PathLike[str]) -> np.ndarray:
     channels, _ = read_exr(path, most=MAX_BYTES)
     if len(channels) != 1 and "Y" not in channels:
         raise InputError(
@@ -82,7 +89,7 @@ def _one_channel(path):
     return np.asarray(channels.get("Y", next(iter(channels.values()))), float)
 
 
-def _from_hdf5(path, content):
+def _from_hdf5(path: str | os.PathLike[str], content: bytes) -> np.ndarray:
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fapl_core(max(len(content), 1), False)
     access.set_file_image(content)

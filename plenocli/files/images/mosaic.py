@@ -197,7 +197,8 @@ def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
 def _from_image(path: Path, kind: str, cfa: str) -> Capture:
     values, names, bits = read_stored(path, kind)
     keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
-    values, details = values[..., keep], {"bits": bits, "verified": False}
+    values = values[..., keep]
+    details: dict[str, Any] = {"bits": bits, "verified": False}
     if values.dtype.kind not in "uf":
         raise InputError(f"holds {values.dtype} values", path, "give unsigned integers or float")
     if values.shape[-1] > 1:

@@ -1,9 +1,13 @@
 """Photographs and other pictures as linear light."""
 
+from __future__ import annotations
+
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
@@ -21,10 +25,13 @@ _MAGIC = (
 )
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Picture:
-    """values: float32 (row, column, channel), linear;
-    wavelengths: m, one a channel, where `is_spectral`, else None.
+    """Linear light.
+
+    values: (row, column, channel) float32.
+    is_spectral: whether its channels are bands.
+    wavelengths: (channel,) m, of a spectral picture; else None.
     """
 
     values: np.ndarray
@@ -32,12 +39,14 @@ class Picture:
     wavelengths: np.ndarray | None = None
 
 
-def read_picture(path):
+def read_picture(path: str | os.PathLike[str]) -> Picture:
     """Read a photograph (PNG, JPEG, TIFF) or an EXR as linear values with one channel, or R,
     G, B, or one a band.
 
     8 and 16 bit values are taken as sRGB (IEC 61966-2-1) and decoded to 0..1; float values are
-    linear already. Alpha is dropped without touching the colours. Raises InputError.
+    linear already. Alpha is dropped without touching the colours.
+
+    Raises InputError.
     """
     kind = file_type(path)
     if kind == "exr":
@@ -58,7 +67,7 @@ def read_picture(path):
         )
     stored = stored[..., colours]
     if stored.dtype.kind == "f":
-        return Picture(_finite(path, stored.astype(np.float32)))
+        return Picture(values=_finite(path, stored.astype(np.float32)))
     if stored.dtype not in (np.uint8, np.uint16):
         raise InputError(
             f"holds values of the type {stored.dtype}", path, "give 8 or 16 bits, or float"
@@ -66,16 +75,16 @@ def read_picture(path):
     table = srgb_to_linear(
         np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max
     ).astype(np.float32)
-    return Picture(table[stored])
+    return Picture(values=table[stored])
 
 
-def srgb_to_linear(encoded):
+def srgb_to_linear(encoded: ArrayLike) -> np.ndarray:
     """Linear light of sRGB-encoded values, both 0..1 (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, dtype=np.float64)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-def file_type(path):
+def file_type(path: str | os.PathLike[str]) -> str | None:
     """ "png", "jpeg", "tiff", "exr" or None, by the first bytes.
 
     Raises InputError for what is no readable file.
@@ -84,12 +93,17 @@ def file_type(path):
     return next((kind for magic, kind in _MAGIC if head.startswith(magic)), None)
 
 
-def read_stored(path, kind, *, most=None):
-    """(values (row, column, channel) as stored, channel names, bits) of a PNG, JPEG or TIFF.
-    Raises InputError.
+def read_stored(
+    path: str | os.PathLike[str], kind: str, *, most: int | None = None
+) -> tuple[np.ndarray, list[str], int]:
+    """Values of a PNG, JPEG or TIFF as they are stored.
 
-    most: bytes above which it is refused, whatever memory there is. Values of odd bit depths (10,
-    12, 14) come back unscaled in uint16.
+    kind: as of file_type.
+    most: bytes of values above which the file is refused, whatever memory there is.
+
+    Returns (values (row, column, channel), channel names, bits); values of odd bit depths (10, 12,
+    14) come back unscaled in uint16.
+    Raises InputError.
     """
     import OpenImageIO as oiio
 
@@ -128,21 +142,22 @@ def read_stored(path, kind, *, most=None):
         oiio_error(source)
 
 
-def _from_exr(path):
+def _from_exr(path: str | os.PathLike[str]) -> Picture:
     from plenocli.files.images.exr import read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
     if is_spectral(path):
         spectral = read_spectral_exr(path)
         return Picture(
-            _finite(path, np.ascontiguousarray(np.moveaxis(spectral.values, 0, -1))),
-            True,
-            spectral.wavelengths,
+            values=_finite(path, np.ascontiguousarray(np.moveaxis(spectral.values, 0, -1))),
+            is_spectral=True,
+            wavelengths=spectral.wavelengths,
         )
     channels, _ = read_exr(path)
     for names in (("R", "G", "B"), ("Y",), tuple(channels) if len(channels) == 1 else ("Y",)):
         if set(names) <= set(channels):
-            return Picture(_finite(path, np.stack([channels[name] for name in names], axis=-1)))
+            planes = np.stack([channels[name] for name in names], axis=-1)
+            return Picture(values=_finite(path, planes))
     raise InputError(
         f"has the channels {', '.join(list(channels)[:8])}, neither Y nor R, G, B nor wavelengths",
         path,
@@ -150,7 +165,7 @@ def _from_exr(path):
     )
 
 
-def _finite(path, values):
+def _finite(path: str | os.PathLike[str], values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(
             f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite",

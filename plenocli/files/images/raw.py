@@ -113,7 +113,7 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
     )
 
 
-def _from_child(path, timeout_s):
+def _from_child(path: Path, timeout_s: float) -> tuple[dict[str, Any], bytes]:
     """(description, mosaic bytes) from the child process; a crash there becomes
     an InputError here.
     """
@@ -162,7 +162,7 @@ def _from_child(path, timeout_s):
         raise InputError("came back garbled from LibRaw", path, _FIX) from error
 
 
-def _reason(found, size):
+def _reason(found: dict[str, Any], size: int) -> str:
     """A sentence for the user from what LibRaw said."""
     known = _REASONS.get(found.get("error"))
     if known is None:
@@ -170,7 +170,7 @@ def _reason(found, size):
     return f"{known} ({size} bytes; LibRaw: {found['refused']})"
 
 
-def _letters(path, found):
+def _letters(path: Path, found: dict[str, Any]) -> str:
     """ "mono" or four letters, row by row, from LibRaw's colour indices."""
     if found["colour_count"] == 1:
         return "mono"
@@ -190,7 +190,7 @@ def _letters(path, found):
     return letters
 
 
-def _own_notes(path, pixels):
+def _own_notes(path: Path, pixels: bytes) -> dict[str, Any]:
     """What `write_dng` left in the file, if the mosaic is still the one it was written with;
     {} for other files.
     """
@@ -217,7 +217,7 @@ def _own_notes(path, pixels):
     return notes
 
 
-def _exposure(found):
+def _exposure(found: dict[str, Any]) -> float | None:
     """Exposure time, s, or None: the exact fraction of the EXIF tag where it agrees with
     LibRaw's single precision.
     """
@@ -225,7 +225,7 @@ def _exposure(found):
     return exact if exact and (not rounded or abs(exact / rounded - 1) < 1e-3) else rounded or None
 
 
-def _check_plausible(path, values, black, white):
+def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: float) -> None:
     """Refuse a mosaic that opens without error and yet cannot be a photograph: LibRaw fills what
     it could not read with zeros.
     """

@@ -12,13 +12,14 @@ import logging
 import os
 import resource
 import sys
+from typing import Any
 
 COPIES = 4
 """Of a mosaic that exist at the same time while it is read, in this process and the other."""
 
 
-def limit(address_space, cpu_seconds):
-    """Bound this process before any foreign byte is parsed."""
+def limit(address_space: int, cpu_seconds: int) -> None:
+    """Bound this process, in bytes and s, before any foreign byte is parsed."""
     for kind, value in (
         (resource.RLIMIT_AS, address_space),
         (resource.RLIMIT_CPU, cpu_seconds),
@@ -30,7 +31,7 @@ def limit(address_space, cpu_seconds):
         resource.setrlimit(kind, (value, value))
 
 
-def read(path, memory):
+def read(path: str, memory: int) -> tuple[dict[str, Any], bytes]:
     """(description, mosaic bytes) of a RAW file; the description has "refused" with the reason
     where it holds no mosaic, "declared" and "needed" bytes where these are more than `memory`.
     """
@@ -78,7 +79,7 @@ def read(path, memory):
         return found, visible.astype("<u2").tobytes()
 
 
-def exif(path):
+def exif(path: str) -> dict[str, Any]:
     """Make, model and exposure from the EXIF tags, as far as they can be read."""
     import exifread
 
@@ -88,7 +89,7 @@ def exif(path):
             tags = exifread.process_file(stream, details=False)
     except Exception:  # a courtesy: whatever breaks in the tags, the mosaic stands on its own
         return {}
-    found = {}
+    found: dict[str, Any] = {}
     for key, name in (("Image Make", "make"), ("Image Model", "model")):
         if key in tags:
             found[name] = str(tags[key]).strip("\0 ")
@@ -100,7 +101,7 @@ def exif(path):
     return found
 
 
-def main():
+def main() -> None:
     """Read sys.argv and answer on stdout, as said above; every failure becomes an
     answer with "refused".
     """

@@ -4,10 +4,15 @@ its wavelength with a decimal comma ("T.450,000000nm" reflectance, "S0.450,00000
 R, G, B for viewers.
 """
 
+from __future__ import annotations
+
+import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plenocli.base.errors import InputError
 from plenocli.files.images.exr import channel_names, read_exr, write_exr
@@ -43,41 +48,46 @@ _CHANNEL = re.compile(
 )
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Spectral:
-    """values and sigma (or None): (band, row, column) float32;
-    wavelengths: m, ascending;
+    """A spectral picture as its file holds it.
+
+    wavelengths: (band,) m, ascending.
+    values: (band, row, column) float32.
     quantity: "reflectance" or "radiance".
+    sigma: like values, or None.
+    attrs: text attributes by their names.
     """
 
     wavelengths: np.ndarray
     values: np.ndarray
     quantity: str
     sigma: np.ndarray | None = None
-    attrs: dict = field(default_factory=dict)
+    attrs: dict[str, str] = field(default_factory=dict)
 
 
 def write_spectral_exr(
-    path,
-    wavelengths,
-    cube,
-    quantity="reflectance",
-    rgb=None,
-    sigma=None,
-    attrs=None,
+    path: str | os.PathLike[str],
+    wavelengths: ArrayLike,
+    cube: ArrayLike,
+    quantity: str = "reflectance",
+    rgb: np.ndarray | None = None,
+    sigma: np.ndarray | None = None,
+    attrs: Mapping[str, str] | None = None,
     *,
-    overwrite=False,
-    compression="zip",
-):
+    overwrite: bool = False,
+    compression: str = "zip",
+) -> None:
     """Write a spectral picture.
 
     wavelengths: (band,) m, ascending.
-    cube, sigma: (band, row, column).
+    cube: (band, row, column).
     quantity: "reflectance" (channels T) or "radiance" (channels S0, unit W m^-2 sr^-1 in each band,
         or relative where attrs says so with "emissiveUnits").
     rgb: (3, row, column) linear preview; computed where None.
-    attrs: text.
-    sigma goes into channels "sigma.<wavelength>" that other readers skip.
+    sigma: like the cube, into channels "sigma.<wavelength>" that other readers skip.
+    attrs: text by its names.
+
     Raises ValueError, UsageError, OutputError.
     """
     wavelengths, cube = (
@@ -103,21 +113,28 @@ def write_spectral_exr(
     layout = {"spectralLayoutVersion": "1.0"}
     if quantity == "radiance":
         layout |= {"emissiveUnits": "W.m^-2.sr^-1", "polarisationHandedness": "right"}
-    write_exr(path, channels, layout | (attrs or {}), overwrite=overwrite, compression=compression)
+    write_exr(
+        path, channels, layout | dict(attrs or {}), overwrite=overwrite, compression=compression
+    )
 
 
-def is_spectral(path):
-    """Whether the EXR at `path` has spectral channels. Raises InputError."""
+def is_spectral(path: str | os.PathLike[str]) -> bool:
+    """Whether the EXR at `path` has spectral channels.
+
+    Raises InputError.
+    """
     return any(_band(name) for name in channel_names(path))
 
 
-def read_spectral_exr(path, quantity=None):
-    """Read a spectral picture; `quantity` chooses where a file holds both radiance and reflectance.
+def read_spectral_exr(path: str | os.PathLike[str], quantity: str | None = None) -> Spectral:
+    """Read a spectral picture. Polarised (S1 to S3) and bispectral channels are left out.
 
-    Polarised (S1 to S3) and bispectral channels are left out. Raises InputError.
+    quantity: which one, where a file holds both radiance and reflectance.
+
+    Raises InputError.
     """
     channels, attrs = read_exr(path)
-    bands = {}
+    bands: dict[str, dict[float, np.ndarray]] = {}
     for name in channels:
         found = _band(name)
         if found:
@@ -146,16 +163,17 @@ def read_spectral_exr(path, quantity=None):
     planes = bands[_PREFIX[quantity]]
     wavelengths = np.array(sorted(planes))
     sigma = bands.get("sigma", {})
+    complete = set(sigma) == set(planes)
     return Spectral(
-        wavelengths,
-        np.stack([planes[w] for w in wavelengths]),
-        quantity,
-        np.stack([sigma[w] for w in wavelengths]) if set(sigma) == set(planes) else None,
-        attrs,
+        wavelengths=wavelengths,
+        values=np.stack([planes[w] for w in wavelengths]),
+        quantity=quantity,
+        sigma=np.stack([sigma[w] for w in wavelengths]) if complete else None,
+        attrs=attrs,
     )
 
 
-def _band(name):
+def _band(name: str) -> tuple[str, float] | None:
     """("T", "S0".. or "sigma", wavelength in m) of a channel name, or None; frequencies are
     turned into wavelengths.
     """
@@ -173,9 +191,9 @@ def _band(name):
     return match[1], round(value if match[4] == "m" else LIGHT / value, 15)
 
 
-def preview(wavelengths, cube):
-    """Linear sRGB (3, row, column) of a spectral picture under equal energy, for looking at
-    only; a flat unit spectrum gives white.
+def preview(wavelengths: np.ndarray, cube: np.ndarray) -> np.ndarray:
+    """Linear sRGB (3, row, column) of a spectral picture (band, row, column) under equal energy,
+    for looking at only; a flat unit spectrum gives white.
     """
     from plenocli.forward.scene.colour import preview_rgb
 

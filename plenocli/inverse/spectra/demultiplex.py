@@ -20,17 +20,22 @@ BATCH_NUMBERS = 4_000_000
 LARGEST_CONDITION = 1e10
 
 
-def choose_pixels(response):
-    """Pixel (..., band) with the largest response in each band.
+def choose_pixels(response: np.ndarray) -> np.ndarray:
+    """Pixel with the largest response in each band.
 
-    Choose on the calibration, never on a capture (noise wins there).
+    response: (..., pixel, band) of a calibration, never of a capture (noise wins there).
+
+    Returns (..., band).
     """
     return np.where(np.isfinite(response), response, -np.inf).argmax(axis=-2)
 
 
-def condition_number(response):
-    """Condition number (...) of each F by its singular values; inf where a band is invisible,
-    NaN where F is NaN throughout.
+def condition_number(response: np.ndarray) -> np.ndarray:
+    """Condition number of each F by its singular values.
+
+    response: (..., pixel, band).
+
+    Returns (...), inf where a band is invisible, NaN where F is NaN throughout.
     """
     clean = _masked(response)
     value = np.linalg.svd(clean, compute_uv=False)
@@ -38,9 +43,12 @@ def condition_number(response):
         return np.where(value[..., 0] > 0, value[..., 0] / value[..., -1], np.nan)
 
 
-def column_angles(response):
-    """Angles (..., band, band), degrees, between the columns of F: 90 is perfect
-    separation, 0 none.
+def column_angles(response: np.ndarray) -> np.ndarray:
+    """Angles between the columns of F: 90 is perfect separation, 0 none.
+
+    response: (..., pixel, band).
+
+    Returns (..., band, band) degrees.
     """
     clean = _masked(response)
     length = np.sqrt((clean**2).sum(axis=-2))
@@ -48,14 +56,17 @@ def column_angles(response):
     return np.degrees(np.arccos(np.clip(np.swapaxes(unit, -1, -2) @ unit, -1, 1)))
 
 
-def calibration_bias(response, variance):
-    """Errors-in-variables bias B (..., band, band) of least squares with a measured F-hat: its mean
-    answer is (I + B) b.
+def calibration_bias(response: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Errors-in-variables bias B of least squares with a measured F-hat: its mean answer is (I + B)
+    b.
 
-    response (..., pixel, band); variance (pixel, band) of its entries, independent of each other.
-    To second order, B = E[F+ dF F+ dF] - (F^T F)^-1 E[dF^T (I - F F+) dF]: the second term, which
-    dominates with many pixels, attenuates; the first can amplify where pixels are few. Expansion of
-    the pseudo-inverse (G. H. Golub, V. Pereyra 1973).
+    response: (..., pixel, band).
+    variance: (pixel, band) of its entries, independent of each other. To second order, B = E[F+ dF
+        F+ dF] - (F^T F)^-1 E[dF^T (I - F F+) dF]: the second term, which dominates with many
+        pixels, attenuates; the first can amplify where pixels are few.
+
+    Returns (..., band, band).
+    Expansion of the pseudo-inverse: G. H. Golub, V. Pereyra 1973.
     """
     f = _masked(response)
     pseudo = np.linalg.pinv(f)
@@ -94,23 +105,36 @@ def noise_variance(
     return variance
 
 
-def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, prior=None):
-    """Radiances b and their predicted standard deviations: two (..., band) arrays.
+def demultiplex(
+    response: np.ndarray,
+    values: np.ndarray,
+    method: str = "pinv",
+    *,
+    variance: np.ndarray | float | None = None,
+    pixels: np.ndarray | None = None,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiances b and their predicted standard deviations.
 
-    response F (..., pixel, band) or shared (pixel, band); values x (..., pixel). NaN in
-    either masks the pixel.
+    response: F (..., pixel, band) or shared (pixel, band); NaN masks a pixel.
+    values: x (..., pixel); NaN masks a pixel.
     method:
       pinv          b = F^+ x; covariance F^+ S F^+T
       wls           least squares weighted by S^-1; covariance (F^T S^-1 F)^-1
-      lmmse         with prior (mean (band,), covariance (band, band)); covariance
-                    (C^-1 + F^T S^-1 F)^-1
+      lmmse         with the prior; covariance (C^-1 + F^T S^-1 F)^-1
       nnls          b >= 0, otherwise as wls where S is known, as pinv where not; sigma of the
                     unconstrained answer
-      single-pixel  b_k = x[p_k] / F[p_k, k] for the calibrated `pixels` (..., band); sigma without
-                    the crosstalk bias
-    variance S (..., pixel) or scalar: of the values. Without it S is estimated from the residual,
-    one number a superpixel; wls and lmmse then raise NumericsError. Superpixels with fewer good
-    pixels than bands, or whose F has a condition number above 1e10, give NaN.
+      single-pixel  b_k = x[p_k] / F[p_k, k] for the calibrated `pixels`; sigma without the
+      crosstalk
+                    bias
+    variance: S (..., pixel) or scalar, of the values. Without it S is estimated from the residual,
+        one number a superpixel.
+    pixels: (..., band), for single-pixel.
+    prior: mean (band,) and covariance C (band, band) of the radiances, for lmmse.
+
+    Returns two (..., band); NaN for superpixels with fewer good pixels than bands, or whose F has a
+    condition number above 1e10.
+    Raises NumericsError where wls or lmmse lack the variance, or lmmse the prior.
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}")
@@ -147,7 +171,7 @@ def demultiplex(response, values, method="pinv", *, variance=None, pixels=None, 
     return out[0].reshape(*lead, bands), out[1].reshape(*lead, bands)
 
 
-def _masked(response):
+def _masked(response: np.ndarray) -> np.ndarray:
     """F with zero rows where a pixel is not known in every band: such a row takes no
     part in least squares.
     """
@@ -155,7 +179,13 @@ def _masked(response):
     return np.where(np.isfinite(response).all(axis=-1)[..., None], response, 0.0)
 
 
-def _least_squares(response, values, method, variance, prior):
+def _least_squares(
+    response: np.ndarray,
+    values: np.ndarray,
+    method: str,
+    variance: np.ndarray | None,
+    prior: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray]:
     """One batch: response (lenslet or 1, pixel, band), values (lenslet, pixel), variance
     (lenslet, pixel) or None.
     """
@@ -188,7 +218,16 @@ def _least_squares(response, values, method, variance, prior):
     return np.where(enough, b, np.nan), np.where(enough, sigma, np.nan)
 
 
-def _sigma(inverse, q, f, x, b, variance, used, weighted):
+def _sigma(
+    inverse: np.ndarray,
+    q: np.ndarray,
+    f: np.ndarray,
+    x: np.ndarray,
+    b: np.ndarray,
+    variance: np.ndarray | None,
+    used: np.ndarray,
+    weighted: bool,
+) -> np.ndarray:
     """Standard deviations (..., band): R^-1 R^-T for whitened rows, F^+ S F^+T else."""
     if weighted:
         return np.broadcast_to(np.sqrt((inverse**2).sum(axis=-1)), b.shape)
@@ -201,7 +240,7 @@ def _sigma(inverse, q, f, x, b, variance, used, weighted):
     return np.sqrt((pseudo**2 @ np.where(used, variance, 0.0)[..., None])[..., 0])
 
 
-def _non_negative(r, projected, b):
+def _non_negative(r: np.ndarray, projected: np.ndarray, b: np.ndarray) -> np.ndarray:
     """min |R b - Q^T x| with b >= 0 where the free answer b has a negative part; R
     stands for F exactly.
     """
@@ -213,7 +252,9 @@ def _non_negative(r, projected, b):
     return b
 
 
-def _single_pixel(response, values, pixels, variance):
+def _single_pixel(
+    response: np.ndarray, values: np.ndarray, pixels: np.ndarray, variance: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     rows = np.arange(len(values))[:, None]
     picked = values[rows, pixels].astype(float)
     bands = np.arange(response.shape[-1])

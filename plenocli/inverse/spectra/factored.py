@@ -9,32 +9,48 @@ Least Squares Problems, 1996, sections 2.4 and 4.4). Superpixels that lost so ma
 fails are said to be hard, and `plenocli.inverse.spectra.demultiplex.demultiplex` does them.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.inverse.spectra.demultiplex import LARGEST_CONDITION
 
-# pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.inverse.spectra.calibration import MadeResponses
+
 BLOCK_NUMBERS = 90_000, 45_000
-# of a block that is compiled, where only a superpixel must stay there and calls cost more
+"""Pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache."""
 COMPILED_NUMBERS = 360_000
-COMPILED_FROM = 4_000_000  # pixels from which importing numba pays
+"""Of a block that is compiled, where only a superpixel must stay there and calls cost more."""
+COMPILED_FROM = 4_000_000
+"""Pixels from which importing numba pays."""
 FACTOR_NUMBERS = 250_000
-STREAMED_NUMBERS = 2_000_000  # pixels whose factors are held at a time where none are kept
-# least eigenvalue of Q^T Q over the pixels left, below which single precision does not do
+"""Numbers of responses that are factored together."""
+STREAMED_NUMBERS = 2_000_000
+"""Pixels whose factors are held at a time where none are kept."""
 HARD = 1e-3
+"""Least eigenvalue of Q^T Q over the pixels left, below which single precision does not do."""
+Cut = Callable[[slice], np.ndarray]
+"""Values (lenslet, pixel) float32 of a slice of superpixels, which may be overwritten; NaN masks a
+pixel.
+"""
 
 
-@dataclass(frozen=True)
-class Factored:
-    """q (lenslet or 1, band, pixel) float32 and r (lenslet or 1, band, band) of F = Q R.
+@dataclass(frozen=True, kw_only=True)
+class FactoredResponses:
+    """Responses as F = Q R, of one lenslet each or one for all.
 
-    used (lenslet or 1, pixel): known in every band, None where all are;
-    sound (lenslet or 1): condition number below 1e10.
-    q is None where sums were made already.
+    q: (lenslet or 1, band, pixel) float32, Q transposed; None where sums were made already.
+    r: (lenslet or 1, band, band).
+    used: (lenslet or 1, pixel), which are known in every band; None: all.
+    sound: (lenslet or 1,), condition number below 1e10.
     """
 
     q: np.ndarray | None
@@ -43,23 +59,26 @@ class Factored:
     sound: np.ndarray
 
     @property
-    def shared(self):
+    def shared(self) -> bool:
         """Whether one response serves all lenslets."""
         return len(self.r) == 1
 
     @cached_property
-    def inverse(self):
+    def inverse(self) -> np.ndarray:
         """R^-1 (lenslet or 1, band, band), of a unit matrix where F is not sound."""
         return np.linalg.inv(np.where(self.sound[:, None, None], self.r, np.eye(self.r.shape[-1])))
 
     @cached_property
-    def blank(self):
+    def blank(self) -> tuple[np.ndarray, np.ndarray] | None:
         """(lenslets, their pixels) that are not used, ordered by lenslet; None where all are."""
         return None if self.used is None else np.nonzero(~self.used)
 
-    def blanks(self, part):
-        """Indices of the pixels that are not used in a block (lenslet, pixel) of the lenslets in
-        the slice `part`; None: there are none.
+    def blanks(self, part: slice) -> tuple[np.ndarray | slice, np.ndarray] | None:
+        """Pixels that are not used in a block of lenslets.
+
+        part: the lenslets of the block.
+
+        Returns indices into (lenslet, pixel) of the block; None: there are none.
         """
         if self.blank is None:
             return None
@@ -69,33 +88,35 @@ class Factored:
         first, last = np.searchsorted(rows, (part.start, part.stop))
         return rows[first:last] - part.start, pixels[first:last]
 
-    def some(self, which):
-        """The Factored of lenslets by their index."""
+    def some(self, which: np.ndarray) -> FactoredResponses:
+        """The responses of lenslets by their index."""
         if self.shared:
             return self
-        return Factored(
-            self.q[which],
-            self.r[which],
-            None if self.used is None else self.used[which],
-            self.sound[which],
+        return FactoredResponses(
+            q=self.q[which],
+            r=self.r[which],
+            used=None if self.used is None else self.used[which],
+            sound=self.sound[which],
         )
 
 
-@dataclass(frozen=True)
-class Sums:
-    """What superpixels say about their radiances; c = R b are coordinates in the basis Q.
+@dataclass(frozen=True, kw_only=True)
+class NormalEquations:
+    """What superpixels x say about their radiances b; c = R b are coordinates in the basis Q, and W
+    the weights of the pixels.
 
-    plain c (lenslet, band): unweighted least squares;
-    start (lenslet, band, band): its Q^T Q over the pixels there are;
-    normal Q^T W Q, right Q^T W (x - Q c);
-    spread Q^T W^-1 Q, or None;
-    chi: sum of W (x - Q c)^2;
-    count: pixels;
-    hard (lenslet).
+    unweighted: (lenslet, band), c by unweighted least squares.
+    unweighted_normal: (lenslet, band, band), Q^T Q over the pixels there are.
+    normal: (lenslet, band, band), Q^T W Q.
+    right: (lenslet, band), Q^T W (x - Q c).
+    spread: (lenslet, band, band), Q^T W^-1 Q, or None.
+    chi: (lenslet,), sum of W (x - Q c)^2.
+    count: (lenslet,), pixels.
+    hard: (lenslet,), whether single precision does not do.
     """
 
-    plain: np.ndarray
-    start: np.ndarray
+    unweighted: np.ndarray
+    unweighted_normal: np.ndarray
     normal: np.ndarray
     right: np.ndarray
     spread: np.ndarray | None
@@ -104,11 +125,15 @@ class Sums:
     hard: np.ndarray
 
 
-def factor(response, which=None, threads=1):
-    """Factored responses (pixel, band), or (..., pixel, band) at the places `which` (a tuple of
-    index arrays, None: all, flattened).
+def factor(
+    response: np.ndarray | MadeResponses,
+    which: tuple[np.ndarray, ...] | None = None,
+    threads: int = 1,
+) -> FactoredResponses:
+    """Responses factored; the result does not depend on `threads`.
 
-    NaN in any band masks a pixel. The result does not depend on `threads`.
+    response: (pixel, band), or (..., pixel, band); NaN in any band masks a pixel.
+    which: places in its leading axes; None: all, flattened.
     """
     if response.ndim == 2:
         response, which = response[None], (np.zeros(1, int),)
@@ -120,7 +145,7 @@ def factor(response, which=None, threads=1):
     used = np.empty((total, count), bool)
     step = max(1, FACTOR_NUMBERS // (count * bands))
 
-    def work(first):
+    def work(first: int) -> None:
         part = slice(first, first + step)
         f = np.ascontiguousarray(
             np.swapaxes(response[tuple(w[part] for w in which)], -1, -2), float
@@ -139,12 +164,15 @@ def factor(response, which=None, threads=1):
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, firsts))
     singular = np.linalg.svd(r, compute_uv=False)
-    return Factored(
-        q, r, None if used.all() else used, singular[:, -1] > singular[:, 0] / LARGEST_CONDITION
+    return FactoredResponses(
+        q=q,
+        r=r,
+        used=None if used.all() else used,
+        sound=singular[:, -1] > singular[:, 0] / LARGEST_CONDITION,
     )
 
 
-def _orthogonal(f):
+def _orthogonal(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(Q^T, R) of F^T (lenslet, band, pixel): Cholesky factors of Q^T Q twice (Y. Yamamoto et al.,
     ETNA 44, 2015), which is as good as Householder's reflections up to condition numbers of 1e7;
     those where F is worse.
@@ -167,41 +195,43 @@ def _orthogonal(f):
     return q, r
 
 
-def collect(
-    factored,
-    cut,
-    total,
-    noise=None,
-    response_variance=None,
-    radiance=None,
-    doubt=None,
-    sandwich=False,
-    among=None,
-):
-    """Sums of `total` superpixels.
+def normal_equations(
+    factored: FactoredResponses,
+    cut: Cut,
+    total: int,
+    noise: Noise | None = None,
+    response_variance: np.ndarray | None = None,
+    radiance: np.ndarray | None = None,
+    doubt: np.ndarray | None = None,
+    sandwich: bool = False,
+    among: int | None = None,
+) -> NormalEquations:
+    """Normal equations of superpixels.
 
-    cut(part): values (lenslet, pixel) float32 of a slice of them, which may be overwritten;
-        NaN masks a pixel.
-    noise (gain, read variance): pixels weigh as 1 / (gain F b + read variance [+ b^2
-        response_variance (pixel, band)]), b being the plain answer, or `radiance` (lenslet, band);
-        None: all weigh 1.
-    doubt (pixel, band): variance of the response that counts in chi alone.
+    factored: their responses.
+    cut: gives their values.
+    total: how many there are.
+    noise: of the values: pixels weigh as 1 / (gain F b + read variance [+ b^2 response_variance]),
+        b being the unweighted answer, or `radiance`; None: all weigh 1.
+    response_variance: (pixel, band), of the response.
+    radiance: (lenslet, band), or None.
+    doubt: (pixel, band), variance of the response that counts in chi alone.
     sandwich: whether `spread` is wanted.
-    among: superpixels of which these are a part (None: all).
+    among: superpixels of which these are a part; None: all.
     """
     bands = factored.r.shape[-1]
-    basis = (_One if factored.shared else _Each)(factored)
-    variance = None if noise is None else _Variance(factored, noise, response_variance, doubt)
+    basis = (_SharedBasis if factored.shared else _OwnBases)(factored.q)
+    variance = None if noise is None else _PixelVariance(factored, noise, response_variance, doubt)
     square = (total, bands, bands)
-    out = Sums(
-        np.zeros((total, bands)),
-        np.broadcast_to(np.eye(bands), square).copy(),
-        np.empty(square),
-        np.zeros((total, bands)),
-        np.empty(square) if sandwich else None,
-        np.zeros(total),
-        np.full(total, factored.q.shape[-1]),
-        np.zeros(total, bool),
+    out = NormalEquations(
+        unweighted=np.zeros((total, bands)),
+        unweighted_normal=np.broadcast_to(np.eye(bands), square).copy(),
+        normal=np.empty(square),
+        right=np.zeros((total, bands)),
+        spread=np.empty(square) if sandwich else None,
+        chi=np.zeros(total),
+        count=np.full(total, factored.q.shape[-1]),
+        hard=np.zeros(total, bool),
     )
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
@@ -232,9 +262,15 @@ def collect(
     return out
 
 
-def stream(response, which, cut, **settings):
-    """(Factored without q, Sums) of the superpixels at `which`, as collect(factor(response, which),
-    ...), which never holds all of Q: for responses that serve one capture. Arguments as theirs.
+def streamed_equations(
+    response: np.ndarray | MadeResponses, which: tuple[np.ndarray, ...], cut: Cut, **settings: Any
+) -> tuple[FactoredResponses, NormalEquations]:
+    """Normal equations of superpixels whose responses serve one capture: never all of Q is held.
+
+    response, which: as factor's.
+    cut, settings: as normal_equations'.
+
+    Returns the factored responses without q, and the equations.
     """
     total = len(which[0])
     step = max(1, STREAMED_NUMBERS // response.shape[-2])
@@ -246,7 +282,7 @@ def stream(response, which, cut, **settings):
         )
         factored = factor(response, tuple(w[part] for w in which))
         sums.append(
-            collect(
+            normal_equations(
                 factored,
                 lambda inner: cut(slice(first + inner.start, first + inner.stop)),
                 part.stop - first,
@@ -256,16 +292,16 @@ def stream(response, which, cut, **settings):
         )
         factors.append((factored.r, factored.sound))
     r, sound = (np.concatenate(parts) for parts in zip(*factors))
-    joined = (
-        None
+    joined = {
+        one.name: None
         if getattr(sums[0], one.name) is None
         else np.concatenate([getattr(s, one.name) for s in sums])
-        for one in fields(Sums)
-    )
-    return Factored(None, r, None, sound), Sums(*joined)
+        for one in fields(NormalEquations)
+    }
+    return FactoredResponses(q=None, r=r, used=None, sound=sound), NormalEquations(**joined)
 
 
-def _kernel(pixels):
+def _kernel(pixels: int) -> Callable[..., None] | None:
     """The compiled sums where there is enough to do for them, and numba; or None.
 
     One basis for all is as quick without.
@@ -277,7 +313,14 @@ def _kernel(pixels):
     return superpixels
 
 
-def _compiled(kernel, factored, part, x, variance, out):
+def _compiled(
+    kernel: Callable[..., None],
+    factored: FactoredResponses,
+    part: slice,
+    x: np.ndarray,
+    variance: _PixelVariance,
+    out: NormalEquations,
+) -> bool:
     """Fill `out` for one block by the compiled kernel; False where some lenslet lacks pixels,
     which is left to _block.
     """
@@ -294,28 +337,36 @@ def _compiled(kernel, factored, part, x, variance, out):
         variance.read,
         known,
         sandwich,
-        out.plain[part],
+        out.unweighted[part],
         out.normal[part],
         out.right[part],
         out.spread[part] if sandwich else out.normal[part],
         out.chi[part],
     )
-    return not np.isnan(out.plain[part]).any()
+    return not np.isnan(out.unweighted[part]).any()
 
 
-def _block(factored, basis, part, x, variance, radiance, out):
+def _block(
+    factored: FactoredResponses,
+    basis: _SharedBasis | _OwnBases,
+    part: slice,
+    x: np.ndarray,
+    variance: _PixelVariance | None,
+    radiance: np.ndarray | None,
+    out: NormalEquations,
+) -> None:
     """Fill `out` for one block of lenslets."""
     blank = factored.blanks(part)
     if blank is not None:
         x[blank] = 0
     c = basis.project(part, x)
     holes = _holes(factored, basis, part, x, c, blank, out) if np.isnan(c).any() else None
-    out.plain[part] = c
+    out.unweighted[part] = c
     mean = basis.subtract(part, c, x)
     if holes is not None:
         x[holes[0]] *= holes[1]
     if variance is None:
-        out.normal[part] = out.start[part]
+        out.normal[part] = out.unweighted_normal[part]
         out.chi[part] = np.vecdot(x, x)
         return
     weight = variance.of(basis, part, c, mean, radiance)
@@ -327,7 +378,7 @@ def _block(factored, basis, part, x, variance, radiance, out):
         out.spread[part] = basis.normal(part, kept)
     if variance.doubt is not None:
         out.chi[part] = np.vecdot(
-            x / (weight + variance.square(part, c, radiance) @ variance.doubt), x
+            x / (weight + variance.squared_radiances(part, c, radiance) @ variance.doubt), x
         )
     np.reciprocal(weight, out=weight)
     if holes is not None:
@@ -339,7 +390,15 @@ def _block(factored, basis, part, x, variance, radiance, out):
         out.chi[part] = np.vecdot(weight, x)
 
 
-def _holes(factored, basis, part, x, c, blank, out):
+def _holes(
+    factored: FactoredResponses,
+    basis: _SharedBasis | _OwnBases,
+    part: slice,
+    x: np.ndarray,
+    c: np.ndarray,
+    blank: Any,
+    out: NormalEquations,
+) -> tuple[np.ndarray, np.ndarray]:
     """(rows, their masks as numbers) of lenslets in this block that lack pixels; x is 0 there, c
     and `out` made good.
     """
@@ -354,13 +413,13 @@ def _holes(factored, basis, part, x, c, blank, out):
     out.count[at] = mask.sum(axis=1)
     own = basis.rows(part, rows)
     start = own.normal(slice(None), weight)
-    out.start[at], out.hard[at] = start, np.linalg.eigvalsh(start)[:, 0] < HARD
+    out.unweighted_normal[at], out.hard[at] = start, np.linalg.eigvalsh(start)[:, 0] < HARD
     start[out.hard[at]] = np.eye(start.shape[-1])
     c[rows] = np.linalg.solve(start, own.project(slice(None), x[rows])[..., None])[..., 0]
     return rows, weight
 
 
-def _add(target, factor, left, right):
+def _add(target: np.ndarray, factor: float, left: np.ndarray, right: np.ndarray) -> None:
     """target += factor * left @ right in one pass, all float32 (n, k), (k, m), (n, m)."""
     from scipy.linalg.blas import sgemm
 
@@ -370,11 +429,11 @@ def _add(target, factor, left, right):
         target[:] = done.T
 
 
-class _One:
+class _SharedBasis:
     """One basis for all lenslets: plain matrix products."""
 
-    def __init__(self, factored):
-        self.wide = factored.q[0]  # (band, pixel)
+    def __init__(self, q: np.ndarray) -> None:
+        self.wide = q[0]  # (band, pixel)
         self.tall = np.ascontiguousarray(self.wide.T)
         bands = len(self.wide)
         pairs = np.triu_indices(bands)
@@ -383,18 +442,25 @@ class _One:
         self.unfold[pairs] = self.unfold[pairs[::-1]] = np.arange(len(pairs[0]))
         self.buffer, self.terms = np.zeros((0, self.wide.shape[1]), np.float32), None
 
-    def rows(self, part, rows):
+    def rows(self, part: slice, rows: np.ndarray) -> _SharedBasis:
         return self
 
-    def project(self, part, x):
+    def project(self, part: slice, x: np.ndarray) -> np.ndarray:
         """Q^T x (lenslet, band), float64."""
         return (x @ self.tall).astype(float)
 
-    def subtract(self, part, c, x):
-        """x - Q c in place of x; Q c, or None where it was not formed."""
+    def subtract(self, part: slice, c: np.ndarray, x: np.ndarray) -> None:
+        """x - Q c in place of x; Q c was not formed."""
         _add(x, -1.0, c.astype(np.float32), self.wide)
 
-    def mixed(self, part, c, mean, weights, patterns):
+    def mixed(
+        self,
+        part: slice,
+        c: np.ndarray,
+        mean: np.ndarray | None,
+        weights: np.ndarray,
+        patterns: np.ndarray,
+    ) -> np.ndarray:
         """Q c + weights (lenslet, n) @ patterns (n, pixel), in a buffer that the
         next call overwrites.
         """
@@ -408,42 +474,50 @@ class _One:
             out=self.buffer[: len(c)],
         )
 
-    def normal(self, part, weight):
+    def normal(self, part: slice, weight: np.ndarray) -> np.ndarray:
         """Q^T W Q (lenslet, band, band), float64."""
         return (weight @ self.products)[:, self.unfold].astype(float)
 
 
-class _Each:
+class _OwnBases:
     """A basis for every lenslet: products lenslet by lenslet."""
 
-    def __init__(self, factored):
-        self.q = factored.q
+    def __init__(self, q: np.ndarray) -> None:
+        self.q = q
         self.buffer = self.weighted = np.zeros(0, np.float32)
 
-    def rows(self, part, rows):
-        return _Each(Factored(self.q[part][rows], None, None, None))
+    def rows(self, part: slice, rows: np.ndarray) -> _OwnBases:
+        return _OwnBases(self.q[part][rows])
 
-    def project(self, part, x):
+    def project(self, part: slice, x: np.ndarray) -> np.ndarray:
         return np.vecdot(self.q[part], x[:, None]).astype(float)
 
-    def subtract(self, part, c, x):
+    def subtract(self, part: slice, c: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """x - Q c in place of x; returns Q c."""
         mean = self._picture(part, c)
         np.subtract(x, mean, out=x)
         return mean
 
-    def mixed(self, part, c, mean, weights, patterns):
+    def mixed(
+        self,
+        part: slice,
+        c: np.ndarray,
+        mean: np.ndarray | None,
+        weights: np.ndarray,
+        patterns: np.ndarray,
+    ) -> np.ndarray:
         if mean is None:
             mean = self._picture(part, c)
         _add(mean, 1.0, weights.astype(np.float32), patterns)
         return mean
 
-    def _picture(self, part, c):
+    def _picture(self, part: slice, c: np.ndarray) -> np.ndarray:
         q = self.q[part]
         if len(self.buffer) < len(c):
             self.buffer = np.empty((len(c), 1, q.shape[-1]), np.float32)
         return np.matmul(c.astype(np.float32)[:, None], q, out=self.buffer[: len(c)])[:, 0]
 
-    def normal(self, part, weight):
+    def normal(self, part: slice, weight: np.ndarray) -> np.ndarray:
         q = self.q[part]
         if len(self.weighted) < len(q):
             self.weighted = np.empty(q.shape, np.float32)
@@ -451,12 +525,18 @@ class _Each:
         return np.matmul(weighted, np.swapaxes(q, -1, -2)).astype(float)
 
 
-class _Variance:
+class _PixelVariance:
     """Variance of pixel values: gain F b + read variance + b^2 var(F), at least
     the read variance.
     """
 
-    def __init__(self, factored, noise, response_variance, doubt):
+    def __init__(
+        self,
+        factored: FactoredResponses,
+        noise: Noise,
+        response_variance: np.ndarray | None,
+        doubt: np.ndarray | None,
+    ) -> None:
         self.factored = factored
         self.gain = noise.gain
         self.read = np.float32(max(noise.without_signal, 1e-12))
@@ -467,13 +547,20 @@ class _Variance:
         constant = np.full((1, factored.q.shape[-1]), self.read)
         self.patterns = constant if self.known is None else np.concatenate([constant, self.known])
 
-    def of(self, basis, part, c, mean, radiance):
+    def of(
+        self,
+        basis: _SharedBasis | _OwnBases,
+        part: slice,
+        c: np.ndarray,
+        mean: np.ndarray | None,
+        radiance: np.ndarray | None,
+    ) -> np.ndarray:
         """(lenslet, pixel) in the buffer of `basis`; b from c, whose picture `mean` may be, or
         `radiance` where given.
         """
         weights = np.ones((len(c), 1))
         if self.known is not None:
-            weights = np.concatenate([weights, self.square(part, c, radiance)], axis=1)
+            weights = np.concatenate([weights, self.squared_radiances(part, c, radiance)], axis=1)
         if radiance is not None:
             c, mean = (
                 (self._own(self.factored.r, part) @ np.clip(radiance, 0, None)[..., None])[..., 0],
@@ -484,7 +571,9 @@ class _Variance:
         out = basis.mixed(part, self.gain * c, mean, weights, self.patterns)
         return np.maximum(out, self.read, out=out)
 
-    def square(self, part, c, radiance):
+    def squared_radiances(
+        self, part: slice, c: np.ndarray, radiance: np.ndarray | None
+    ) -> np.ndarray:
         """b^2 (lenslet, band) float32, negative radiances counting as 0."""
         b = (
             (self._own(self.factored.inverse, part) @ c[..., None])[..., 0]
@@ -493,52 +582,66 @@ class _Variance:
         )
         return np.square(np.clip(b, 0, None)).astype(np.float32)
 
-    def _own(self, matrices, part):
+    def _own(self, matrices: np.ndarray, part: slice) -> np.ndarray:
         return matrices[part] if len(matrices) > 1 else matrices
 
 
 # --- answers --------------------------------------------------------------------------------------
 
 
-def answer(factored, sums, method, prior=None, weighed=True):
-    """Radiances and their standard deviations, two (lenslet, band), of pinv, wls, lmmse or nnls;
-    NaN where a superpixel has too few good pixels or a condition number above 1e10,
-    and where it is hard.
+def solve(
+    factored: FactoredResponses,
+    sums: NormalEquations,
+    method: str,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    weighed: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiances and their standard deviations.
 
-    prior: (mean (band,), covariance (band, band)) for lmmse.
+    factored, sums: of the superpixels.
+    method: pinv, wls, lmmse or nnls.
+    prior: mean (band,) and covariance (band, band), for lmmse.
     weighed: whether `sums` are, by the noise; where they are not, it is estimated from the
         residual, one number a superpixel.
+
+    Returns two (lenslet, band), NaN where a superpixel has too few good pixels or a condition
+    number above 1e10, and where it is hard.
     """
     bands = factored.r.shape[-1]
     inverse = factored.inverse
     known = factored.sound & ~sums.hard & (sums.count >= (0 if method == "lmmse" else bands))
     normal = np.where(
-        known[:, None, None], sums.start if method == "pinv" else sums.normal, np.eye(bands)
+        known[:, None, None],
+        sums.unweighted_normal if method == "pinv" else sums.normal,
+        np.eye(bands),
     )
     if not weighed:
         covariance, c = (
             np.linalg.inv(normal) * (sums.chi / np.maximum(sums.count - bands, 1))[:, None, None],
-            sums.plain,
+            sums.unweighted,
         )
     elif method == "pinv":
         back = np.linalg.inv(normal)
-        covariance, c = back @ np.where(known[:, None, None], sums.spread, 0) @ back, sums.plain
+        covariance, c = (
+            back @ np.where(known[:, None, None], sums.spread, 0) @ back,
+            sums.unweighted,
+        )
     elif method == "lmmse":
         mean, given = (np.asarray(p, float) for p in prior)
         pull = np.swapaxes(inverse, -1, -2) @ np.linalg.inv(given) @ inverse
         covariance = np.linalg.inv(normal + pull)
         c = (
-            sums.plain
+            sums.unweighted
             + (
                 covariance
-                @ (sums.right + (pull @ (factored.r @ mean - sums.plain)[..., None])[..., 0])[
+                @ (sums.right + (pull @ (factored.r @ mean - sums.unweighted)[..., None])[..., 0])[
                     ..., None
                 ]
             )[..., 0]
         )
     else:
         covariance = np.linalg.inv(normal)
-        c = sums.plain + (covariance @ sums.right[..., None])[..., 0]
+        c = sums.unweighted + (covariance @ sums.right[..., None])[..., 0]
     b = (inverse @ c[..., None])[..., 0]
     sigma = np.sqrt(
         np.diagonal(inverse @ covariance @ np.swapaxes(inverse, -1, -2), axis1=-2, axis2=-1)
@@ -548,7 +651,7 @@ def answer(factored, sums, method, prior=None, weighed=True):
     return np.where(known[:, None], b, np.nan), np.where(known[:, None], sigma, np.nan)
 
 
-def _non_negative(r, normal, c, b):
+def _non_negative(r: np.ndarray, normal: np.ndarray, c: np.ndarray, b: np.ndarray) -> np.ndarray:
     """min |L^T (R b - c)| with b >= 0, L L^T = Q^T W Q, where the free answer b
     has a negative part.
     """

@@ -6,6 +6,8 @@ response predicted"). What stands out of the noise is kept, and shrunk as Gavish
 find it optimal for white noise of known size: nothing is tuned.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,14 +24,18 @@ FILLS = 3
 """Rounds in which pixels that are not known are filled in from what the others say."""
 
 
-def low_rank(response, variance, groups=None):
-    """Responses (lenslet, pixel, band) without most of their noise: (response, share of the noise
-    variance left, largest rank).
+def low_rank(
+    response: np.ndarray, variance: np.ndarray, groups: np.ndarray | None = None
+) -> tuple[np.ndarray, float, int]:
+    """Responses without most of their noise.
 
-    variance (pixel, band): of one entry, mean over lenslets, in the units of response squared.
-    groups (lenslet,): lenslets of one number are alike (windows that begin on one colour of the
-        sensor's filters); each is cleaned for itself. NaN stays NaN, and lenslets in groups of
-        fewer than LEAST stay as they are.
+    response: (lenslet, pixel, band); NaN stays NaN.
+    variance: (pixel, band), of one entry, mean over lenslets, in the units of response squared.
+    groups: (lenslet,), lenslets of one number are alike (windows that begin on one colour of the
+        sensor's filters); each group is cleaned for itself, and lenslets in groups of fewer than
+        LEAST stay as they are.
+
+    Returns the responses, the share of the noise variance left, and the largest rank.
     """
     out = np.array(response, np.float32)
     groups = np.zeros(len(out), int) if groups is None else np.asarray(groups)
@@ -47,10 +53,12 @@ def low_rank(response, variance, groups=None):
 
 @dataclass(frozen=True)
 class Basis:
-    """What responses have in common: pictures (rank, pixel, band) of which each is a mixture, dual
-    (rank, pixel * band), whose products with a response are its coefficients, middle (rank,): mean
-    coefficients, and the share of a response's noise variance that is left in its mixture. NaN in
-    pictures: no response knows it.
+    """What responses have in common.
+
+    pictures: (rank, pixel, band), of which each response is a mixture; NaN: no response knows it.
+    dual: (rank, pixel * band), whose products with a response are its coefficients.
+    middle: (rank,), mean coefficients.
+    left: share of a response's noise variance that is left in its mixture.
     """
 
     pictures: np.ndarray
@@ -58,24 +66,28 @@ class Basis:
     middle: np.ndarray
     left: float
 
-    def coefficients(self, response):
-        """(lenslet, rank) of responses (lenslet, pixel, band); NaN counts as nothing."""
+    def coefficients(self, response: np.ndarray) -> np.ndarray:
+        """Coefficients (lenslet, rank) of responses (lenslet, pixel, band); NaN counts as
+        nothing.
+        """
         found = response.reshape(len(response), -1) @ self.dual.T
         lost = np.isnan(found).any(axis=1)
         if lost.any():
             found[lost] = np.nan_to_num(response[lost]).reshape(int(lost.sum()), -1) @ self.dual.T
         return found
 
-    def mixed(self, coefficients):
+    def mixed(self, coefficients: np.ndarray) -> np.ndarray:
         """Responses (lenslet, pixel, band) of coefficients (lenslet, rank)."""
         return (coefficients @ self.pictures.reshape(len(self.pictures), -1)).reshape(
             -1, *self.pictures.shape[1:]
         )
 
 
-def common(response, variance):
-    """The Basis of responses (lenslet, pixel, band): what stands out of noise of variance
-    (pixel, band); all of it where they are few.
+def common(response: np.ndarray, variance: np.ndarray) -> Basis:
+    """What stands out of the noise in responses; all of it where they are few.
+
+    response: (lenslet, pixel, band).
+    variance: (pixel, band), of one entry.
     """
     matrix, known, scale, _, use = _whitened(response, variance)
     m, n = matrix.shape
@@ -92,15 +104,15 @@ def common(response, variance):
     )
     pictures[:, use], dual[:, use] = unit * scale, unit / scale
     found = Basis(
-        pictures.reshape(-1, *response.shape[1:]),
-        dual,
-        np.zeros(len(unit)),
-        min(1.0, int(keep.sum()) * (1 / m + 1 / n)),
+        pictures=pictures.reshape(-1, *response.shape[1:]),
+        dual=dual,
+        middle=np.zeros(len(unit)),
+        left=min(1.0, int(keep.sum()) * (1 / m + 1 / n)),
     )
     return replace(found, middle=found.coefficients(response).mean(axis=0))
 
 
-def _whitened(response, variance):
+def _whitened(response: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
     """(matrix (lenslet, entry) whose noise has unit variance, which are known, scale by entry,
     by lenslet, entries used).
     """
@@ -118,17 +130,17 @@ def _whitened(response, variance):
     return matrix / rows, known, scale, rows, use
 
 
-def _level(matrix, known):
+def _level(matrix: np.ndarray, known: np.ndarray) -> np.ndarray:
     """What an entry is on average."""
     return np.where(known, matrix, 0).sum(axis=0) / known.sum(axis=0)
 
 
-def _decomposed(matrix):
+def _decomposed(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Squared singular values, ascending, and left vectors."""
     return np.linalg.eigh((matrix @ matrix.T).astype(float))
 
 
-def _cleaned(response, variance):
+def _cleaned(response: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, float, int]:
     """low_rank of one block: (response, share left, rank)."""
     matrix, known, scale, rows, use = _whitened(response, variance)
     filled = np.where(known, matrix, _level(matrix, known))
@@ -140,7 +152,7 @@ def _cleaned(response, variance):
     return out.reshape(response.shape), left, rank
 
 
-def _shrunk(matrix):
+def _shrunk(matrix: np.ndarray) -> tuple[np.ndarray, int, float]:
     """(matrix of low rank, its rank, share of the noise left in it) from one with white
     noise of unit variance.
 

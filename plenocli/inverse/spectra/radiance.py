@@ -156,11 +156,11 @@ def estimate(
             if method == "auto"
             else (method, "asked for")
         )
-        sums = job.collect()
+        sums = job.equations()
     else:
         used, why = (method, "asked for") if method != "auto" else job.best()
         sums = job.weighted(None, sandwich=used == "pinv")
-    value, sigma = job.single_pixel(sums) if used == "single-pixel" else job.answer(sums, used)
+    value, sigma = job.single_pixel(sums) if used == "single-pixel" else job.solved(sums, used)
     return Spectra(
         value=np.moveaxis(job.spread_out(value[:, : job.bands]), -1, 0),
         sigma=np.moveaxis(job.spread_out(sigma[:, : job.bands]), -1, 0),
@@ -172,7 +172,9 @@ def estimate(
     )
 
 
-def _with_stray(c, stray, prior, values):
+def _with_stray(
+    c: LensletResponses, stray: np.ndarray | None, prior: Prior | None, values: Readout | np.ndarray
+) -> tuple[LensletResponses, Prior | None]:
     """Calibration and prior with the patterns of stray light as further bands, scaled to the
     light of the others.
     """
@@ -199,7 +201,7 @@ def _with_stray(c, stray, prior, values):
     ), prior
 
 
-def _brightest(c, values):
+def _brightest(c: LensletResponses, values: Readout | np.ndarray) -> float:
     if isinstance(values, np.ndarray):
         return np.nanmax(values)
     return np.nanmax(values.cut(c.corners[c.sample], c.window))
@@ -236,22 +238,22 @@ class _Estimation:
         else:
             self.cut = values.cutter(c.corners, c.window)
 
-    def collect(self, which=None, **settings):
-        """Sums of all lenslets, or those of an index array."""
-        from plenocli.inverse.spectra.factored import collect, stream
+    def equations(self, which: np.ndarray | None = None, **settings: Any) -> NormalEquations:
+        """Normal equations of all lenslets, or those of an index array."""
+        from plenocli.inverse.spectra.factored import normal_equations, streamed_equations
 
         if which is None and self.widened.passing:
-            self.factored, sums = stream(
+            self.factored, sums = streamed_equations(
                 self.widened.response, self.widened.sites, self.cut, **settings
             )
             return sums
         if which is None:
-            return collect(self.factored, self.cut, self.total, **settings)
-        return collect(
+            return normal_equations(self.factored, self.cut, self.total, **settings)
+        return normal_equations(
             self._some(which), lambda part: self.cut(which[part]), len(which), **settings
         )
 
-    def _some(self, which):
+    def _some(self, which: np.ndarray | None) -> FactoredResponses:
         if which is None or which is self.sample:
             return self.factored if which is None else self.widened.sampled
         if not self.widened.passing:
@@ -260,8 +262,8 @@ class _Estimation:
 
         return factor(self.widened.response, tuple(part[which] for part in self.widened.sites))
 
-    def weighted(self, which=None, sandwich=True):
-        """Sums weighted by the noise that is expected."""
+    def weighted(self, which: np.ndarray | None = None, sandwich: bool = True) -> NormalEquations:
+        """Normal equations weighted by the noise that is expected."""
         known = self.widened.variance
         settings = dict(
             noise=self.noise,
@@ -270,17 +272,17 @@ class _Estimation:
             sandwich=sandwich,
         )
         if not self.starved:
-            return self.collect(which, **settings)
+            return self.equations(which, **settings)
         count = self.total if which is None else len(which)
-        first = self.collect(
+        first = self.equations(
             which, **settings | {"radiance": np.broadcast_to(self.prior[0], (count, self.unknowns))}
         )
-        return self.collect(
-            which, **settings | {"radiance": np.nan_to_num(self.answer(first, "lmmse", which)[0])}
+        return self.equations(
+            which, **settings | {"radiance": np.nan_to_num(self.solved(first, "lmmse", which)[0])}
         )
 
     @cached_property
-    def starved(self):
+    def starved(self) -> bool:
         """Whether noise leaves less than ten levels of the prior's spread: then weights from
         least squares follow the noise.
         """
@@ -292,7 +294,7 @@ class _Estimation:
             response_variance=None if self.ratio else self.widened.variance,
             sandwich=True,
         )
-        sigma = self.answer(self.collect(few, **settings), "pinv", few)[1]
+        sigma = self.solved(self.equations(few, **settings), "pinv", few)[1]
         sigma = sigma[np.isfinite(sigma).all(axis=-1)]
         return not len(sigma) or bool(
             (
@@ -301,11 +303,11 @@ class _Estimation:
             ).any()
         )
 
-    def best(self):
+    def best(self) -> tuple[str, str]:
         """(method, reason) with the least predicted error."""
         sums = self.weighted(self.sample)
         tried = {
-            m: self.answer(sums, m, self.sample)[1][:, : self.bands]
+            m: self.solved(sums, m, self.sample)[1][:, : self.bands]
             for m in ("pinv", "wls", *(["lmmse"] if self.prior else []))
         }
         if not np.isfinite(tried["pinv"]).any():
@@ -324,19 +326,21 @@ class _Estimation:
             f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
         )
 
-    def answer(self, sums, method, which=None):
+    def solved(
+        self, sums: NormalEquations, method: str, which: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(radiances, standard deviations) of lenslets by one method; the few that single
         precision cannot do, in double.
         """
-        from plenocli.inverse.spectra.factored import answer
+        from plenocli.inverse.spectra.factored import solve
 
-        value, sigma = answer(self._some(which), sums, method, self.prior, self.noise is not None)
+        value, sigma = solve(self._some(which), sums, method, self.prior, self.noise is not None)
         hard = np.flatnonzero(sums.hard)
         if len(hard):
             value[hard], sigma[hard] = self._double(hard if which is None else which[hard], method)
         return value, sigma
 
-    def _double(self, which, method):
+    def _double(self, which: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray]:
         from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
 
         f = (
@@ -354,12 +358,12 @@ class _Estimation:
             )
         return demultiplex(f, x, method, variance=variance, prior=self.prior)
 
-    def _radiance(self, sums, which=None):
-        """Plain radiances (lenslet, band) of the calibration's bands."""
-        b = (self._some(which).inverse @ sums.plain[..., None])[..., 0][:, : self.bands]
+    def _radiance(self, sums: NormalEquations, which: np.ndarray | None = None) -> np.ndarray:
+        """Radiances (lenslet, band) of the calibration's bands by unweighted least squares."""
+        b = (self._some(which).inverse @ sums.unweighted[..., None])[..., 0][:, : self.bands]
         return np.where(sums.hard[:, None], np.nan, b)
 
-    def _single_pixel_error(self, radiance):
+    def _single_pixel_error(self, radiance: np.ndarray) -> float:
         """Mean square error that single-pixel extraction would make on the sample: crosstalk
         bias and the noise of one pixel.
         """
@@ -370,7 +374,7 @@ class _Estimation:
             variance = self.noise.variance(own * radiance) / own**2
             return float(np.nanmean(bias**2 + variance))
 
-    def single_pixel(self, sums):
+    def single_pixel(self, sums: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
         """x[p] / F[p] at the calibrated pixels, sigma without the crosstalk bias; NaN sigma
         where the noise is not known.
         """
@@ -394,7 +398,7 @@ class _Estimation:
             variance = noise_variance(rows, np.nan_to_num(self._radiance(sums)), self.noise, known)
             return b, np.where(np.isfinite(b), np.sqrt(np.maximum(variance, 1e-12)) / own, np.nan)
 
-    def residual(self, sums):
+    def residual(self, sums: NormalEquations) -> np.ndarray:
         """Mean square of the residuals over the expected one (lenslet_row, lenslet_column)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             freedom = sums.count - self.unknowns
@@ -404,7 +408,7 @@ class _Estimation:
                 ).astype(np.float32)
             )
 
-    def spread_out(self, values):
+    def spread_out(self, values: np.ndarray) -> np.ndarray:
         """Values by lenslet as an array (R, C, ...), NaN at lenslets that are not valid."""
         out = np.full((*self.c.valid.shape, *values.shape[1:]), np.nan, values.dtype)
         out[self.c.sites] = values

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.frames import Dark
     from plenocli.forward.sensor.readout import DarkWindows
     from plenocli.inverse.registration.reference import Reference
-    from plenocli.inverse.spectra.factored import Factored
+    from plenocli.inverse.spectra.factored import FactoredResponses
 
 SAMPLE = 256
 """Lenslets on which methods are compared."""
@@ -115,7 +115,7 @@ class LensletResponses:
         return DarkWindows(self.dark, self.corners, self.window).keep()
 
     @cached_property
-    def factored(self) -> Factored:
+    def factored(self) -> FactoredResponses:
         """F = Q R of the valid lenslets."""
         from plenocli.inverse.spectra.factored import factor
 
@@ -145,7 +145,7 @@ class LensletResponses:
         )
 
     @cached_property
-    def sampled(self) -> Factored:
+    def sampled(self) -> FactoredResponses:
         """`factored` of the sample."""
         from plenocli.inverse.spectra.factored import factor
 

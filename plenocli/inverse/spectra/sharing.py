@@ -8,6 +8,8 @@ Mallows, Some comments on C_p, Technometrics 15, 1973). docs/model.md, "Spectral
 calibration and demultiplexing".
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,16 +20,17 @@ be said to differ.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Differences:
     """How lenslets' responses differ.
 
     excess: mean square of the errors in radiance that differences from the mean response make, over
-        what the noise of F alone would make (1: alike);
-    error: root mean square error of radiances by the shared F's faults over that by the
-        faults of own ones;
-    worst: the largest single lenslet's excess, and its number;
-    spread (pixel, band): variance of F over lenslets beyond its noise.
+        what the noise of F alone would make (1: alike).
+    error: root mean square error of radiances by the shared F's faults over that by the faults of
+        own ones.
+    worst: the largest single lenslet's excess.
+    number: of that lenslet.
+    spread: (pixel, band), variance of F over lenslets beyond its noise.
     """
 
     excess: float
@@ -37,12 +40,16 @@ class Differences:
     spread: np.ndarray
 
 
-def differences(response, mean, variance, step=256):
-    """Differences of responses (lenslet, pixel, band) from their mean (pixel, band); variance
-    (pixel, band) of one entry, known.
+def differences(
+    response: np.ndarray, mean: np.ndarray, variance: np.ndarray, step: int = 256
+) -> Differences:
+    """How responses differ from their mean.
 
-    Radiances count by the light that they bring (columns of F at length 1). NaN entries
-    differ by nothing.
+    Radiances count by the light that they bring (columns of F at length 1).
+    response: (lenslet, pixel, band); NaN entries differ by nothing.
+    mean: (pixel, band), of the responses.
+    variance: (pixel, band), of one entry, known.
+    step: lenslets that are worked off together.
     """
     count = len(response)
     size = np.sqrt(np.nansum(mean.astype(float) ** 2, axis=0))
@@ -63,4 +70,10 @@ def differences(response, mean, variance, step=256):
     beyond = square / max(count - 1, 1) - variance
     spread = np.where(beyond > SURE * np.sqrt(2 / max(count - 1, 1)) * variance, beyond, 0.0)
     error = float(np.sqrt(max(0.0, excess - 1) * (1 - left) + left))
-    return Differences(excess, error, float(share.max()), int(share.argmax()), spread)
+    return Differences(
+        excess=excess,
+        error=error,
+        worst=float(share.max()),
+        number=int(share.argmax()),
+        spread=spread,
+    )

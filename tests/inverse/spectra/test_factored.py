@@ -8,7 +8,7 @@ import pytest
 import plenocli.inverse.spectra.factored as factored_module
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
-from plenocli.inverse.spectra.factored import answer, collect, factor, stream
+from plenocli.inverse.spectra.factored import factor, normal_equations, solve, streamed_equations
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
 NOISE = Noise(gain=GAIN, read_variance=READ)
@@ -43,7 +43,7 @@ def case(request):
 def both(response, values, method, known=None, **settings):
     """(ours, the reference's) radiances and standard deviations."""
     factored = factor(response)
-    sums = collect(
+    sums = normal_equations(
         factored,
         lambda part: values[part].copy(),
         len(values),
@@ -56,7 +56,7 @@ def both(response, values, method, known=None, **settings):
     variance = np.maximum(
         noise_variance(response, settings.get("radiance", start), NOISE, known), READ
     )
-    return answer(factored, sums, method, PRIOR), demultiplex(
+    return solve(factored, sums, method, PRIOR), demultiplex(
         response, values, method, variance=variance, prior=PRIOR
     )
 
@@ -78,7 +78,7 @@ def test_pixels_that_a_capture_lacks_take_no_part(case, method):
     values[6] = np.nan
     values[8, 2:] = np.nan
     (b, sigma), (expected, spread) = both(response, values, method)
-    hard = collect(factor(response), lambda part: values[part].copy(), len(values)).hard
+    hard = normal_equations(factor(response), lambda part: values[part].copy(), len(values)).hard
     assert hard[6] and hard[8] and hard.sum() < 5 and np.isnan(b[hard]).all()
     np.testing.assert_allclose(b[~hard], expected[~hard], rtol=0, atol=2e-3 * np.nanmin(spread))
     np.testing.assert_allclose(sigma[~hard], spread[~hard], rtol=5e-4)
@@ -106,7 +106,7 @@ def test_chi_is_the_weighted_residual(case, doubted):
     values[rng.uniform(size=values.shape) < 0.02] = np.nan
     known = rng.uniform(0, 2000, (PIXELS, BANDS))
     settings = dict(doubt=known) if doubted else dict(response_variance=known)
-    sums = collect(
+    sums = normal_equations(
         factor(response), lambda part: values[part].copy(), len(values), NOISE, **settings
     )
     b = demultiplex(response, values)[0]
@@ -121,9 +121,9 @@ def test_unknown_noise_comes_from_the_residual(case):
     response, values, rng = case
     values[rng.uniform(size=values.shape) < 0.02] = np.nan
     factored = factor(response)
-    found = answer(
+    found = solve(
         factored,
-        collect(factored, lambda part: values[part].copy(), len(values)),
+        normal_equations(factored, lambda part: values[part].copy(), len(values)),
         "pinv",
         None,
         False,
@@ -157,8 +157,8 @@ def test_threads_change_nothing(monkeypatch):
 def test_a_response_that_cannot_tell_bands_apart_gives_nothing():
     f = np.ones((30, 2)) * np.arange(30)[:, None]
     factored = factor(f)
-    sums = collect(factored, lambda part: np.ones((3, 30), np.float32)[part], 3)
-    assert not factored.sound[0] and np.isnan(answer(factored, sums, "pinv", None, False)[0]).all()
+    sums = normal_equations(factored, lambda part: np.ones((3, 30), np.float32)[part], 3)
+    assert not factored.sound[0] and np.isnan(solve(factored, sums, "pinv", None, False)[0]).all()
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -170,14 +170,14 @@ def test_sums_made_in_passing_are_those_of_all_factors_at_once(case, monkeypatch
     radiance = rng.uniform(0, 1, (LENSLETS, BANDS)) if known else None
     settings = dict(noise=NOISE, sandwich=True, radiance=radiance)
     whole = factor(response)
-    expected = collect(whole, lambda part: values[part].copy(), LENSLETS, **settings)
-    passing, sums = stream(
+    expected = normal_equations(whole, lambda part: values[part].copy(), LENSLETS, **settings)
+    passing, sums = streamed_equations(
         response, (np.arange(LENSLETS),), lambda part: values[part].copy(), **settings
     )
     for method in ("pinv", "wls", "lmmse"):
         for ours, theirs in zip(
-            answer(passing, sums, method, PRIOR),
-            answer(whole, expected, method, PRIOR),
+            solve(passing, sums, method, PRIOR),
+            solve(whole, expected, method, PRIOR),
             strict=True,
         ):
             np.testing.assert_allclose(ours, theirs, rtol=1e-6)

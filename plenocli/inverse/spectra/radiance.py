@@ -19,6 +19,7 @@ from plenocli.inverse.spectra.spectra import Spectra, Trace
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.readout import Readout
+    from plenocli.inverse.spectra.factored import FactoredResponses, NormalEquations
     from plenocli.inverse.spectra.responses import LensletResponses
 
 WORTHWHILE = 1.05

@@ -13,6 +13,7 @@ from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.base.tiling import to_blocks
 from plenocli.files.images.mosaic import read_capture
+from plenocli.files.read.calibrations import read_calibration
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.capture import Capture
 from plenocli.forward.sensor.noise import Noise
@@ -77,33 +78,19 @@ def calibrated(capture: Capture, calibration: str | Path) -> tuple[np.ndarray, n
     superpixel is not wholly on the sensor.
     Raises InputError where the two sensors differ.
     """
-    from plenocli.files.artefacts.container import read_artefact
-
-    found = read_artefact(calibration, "calibration")
-    data = found.data
-    for name in ("response/origin", "response/window", "response/white", "dark/mean"):
-        if name not in data:
-            raise InputError(f"lacks {name}", calibration, "run calibrate again")
-    dark = data["dark/mean"]
-    if np.ndim(dark) == 2 and dark.shape != capture.shape:
+    found = read_calibration(calibration, needs=("windows", "white", "dark"), response=False)
+    dark, windows = found.dark.mean, found.windows
+    if dark.ndim == 2 and dark.shape != capture.shape:
         raise InputError(
             f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
             capture.metadata.path,
             "use captures of the calibrated camera",
         )
-    reference = found.attrs.get("response", {}).get("exposure_s") or found.attrs.get(
-        "white", {}
-    ).get("exposure")
+    reference = found.sensor.exposure
     scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
-    signal = extract(
-        (capture.mosaic - dark) * scale,
-        data["response/origin"],
-        tuple(int(n) for n in data["response/window"]),
-    )
-    valid = data["grid/valid"].astype(bool)
-    signal[~valid] = np.nan
-    white = np.broadcast_to(data["response/white"], signal.shape)
-    return signal, white
+    signal = extract((capture.mosaic - dark) * scale, windows.origin, windows.shape)
+    signal[~found.grid.valid] = np.nan
+    return signal, np.broadcast_to(found.white.superpixels, signal.shape)
 
 
 def _along_the_grid(

@@ -45,7 +45,7 @@ class _Written:
     def __get_pydantic_json_schema__(
         self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        return self.pattern
+        return dict(self.pattern)  # pydantic writes the default of each field into it
 
 
 def quantity(

@@ -19,10 +19,10 @@ Count = tuple[Annotated[int, Field(ge=1, le=4096)], Annotated[int, Field(ge=1, l
 class Scene(Section):
     """A scene as the accuracy dial sees it; what is left out is not narrowed.
 
-    picture: photograph or spectral EXR, relative to this file, whose extent and bands count too.
-    depth: nearest and farthest distance to the main lens, m.
-    spectrum: shortest and longest wavelength with light, m.
-    lenslets: rows and columns of lenslets around the centre that see light.
+    picture: photograph or spectral EXR, relative to this file, whose extent and bands count too;
+    depth: nearest and farthest distance to the main lens;
+    spectrum: shortest and longest wavelength with light;
+    lenslets: rows and columns of lenslets around the centre that see light;
     snr: amplitude ratio of a bright pixel to its noise.
     """
 

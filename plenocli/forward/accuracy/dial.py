@@ -79,19 +79,23 @@ def plan_pif(
     needs: Needs | None = None,
     lenslet: tuple[int, int] | None = None,
 ) -> PifPlan:
-    """Choose how to compute the system matrix of `camera`; no optics is computed.
+    """Choose how to compute a system matrix; no optics is computed.
 
-    wavelengths: metres (default: the camera's);
+    wavelengths: m (default: the camera's);
     superpixels: "auto" or odd (rows, columns);
-    coherent_ring: "auto" or a number of rings (0: isolated lenslets);
+    coherent_ring: "auto" or a number of rings, 0 for isolated lenslets;
     accuracy: relative L2 error of the worst column, against the finest model for model "auto" and
         within the model where one is named; None takes what the noise of the sensor or of the scene
         lets be seen, or the best there is;
+    model: "auto", "ray", "fresnel" or "exact";
     dtype: "auto", float32 or float64 of the stored matrix;
     points: slice of flat point indices;
-    needs: a Needs that narrows the request;
+    needs: what is known of the scene, which narrows the request;
     lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster.
-    Returns a PifPlan; UsageError or NumericsError where the request cannot be met.
+
+    Returns the plan.
+    Raises UsageError or NumericsError where the request cannot be met.
+    docs/model.md, "The dial".
     """
     request = _Request(
         camera,
@@ -542,7 +546,7 @@ def _model_error(request: _Request, best: Candidate) -> float:
 
 
 def seconds_here(candidate: Candidate) -> float:
-    """Seconds of one core of this machine that a Candidate will take."""
+    """Seconds of one core of this machine that a candidate will take."""
     return candidate.seconds(product_rate)
 
 
@@ -607,14 +611,18 @@ def _warnings(request: _Request, best: Candidate) -> list[str]:
 def system_matrix(
     camera: Camera, *, progress: Progress | None = None, **request: Any
 ) -> SystemMatrix:
-    """Plan and compute the SystemMatrix of `camera`; `request` as for plan_pif."""
+    """Plan a system matrix and compute it; `request` as for plan_pif."""
     return build_pif(
         camera, plan_pif(camera, **request), points=request.get("points"), progress=progress
     )
 
 
 def pif_builder(camera: Camera, wavelength: float, **request: Any) -> PifBuilder:
-    """A PifBuilder of `camera` at `wavelength` (m), planned by plan_pif with `request`."""
+    """Columns of a system matrix on demand, as planned.
+
+    wavelength: m;
+    request: as for plan_pif.
+    """
     return PifBuilder(
         camera,
         wavelength,

@@ -19,10 +19,10 @@ LONG = 20.0
 
 
 def explain(plan: PifPlan, memory: int | None = None) -> str:
-    """Several lines of text about a plan: the models considered, the error by source, what was
-    left out, warnings.
+    """A plan as several lines of text: the models considered, the error by source, what was left
+    out, warnings.
 
-    memory: bytes that the chosen one takes as it is written, where known.
+    memory: bytes that the chosen one takes as it is written, None where that is not known.
     """
     rows, columns = plan.superpixels
     head = [
@@ -118,11 +118,12 @@ def candidates(plan: PifPlan) -> list[Considered]:
 
 
 def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str | None:
-    """One line about work that takes long, and the model that would take much less; None
-    where it does not.
+    """One line about work that takes long, and the model that would take much less.
 
-    memory: bytes, where known;
+    memory: bytes, None where they are not known;
     times: how often such a plan is carried out.
+
+    Returns None where the work does not take long.
     """
     chosen = plan.chosen
     if times * chosen.seconds() < LONG:

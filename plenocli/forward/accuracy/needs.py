@@ -45,8 +45,11 @@ def sensor_noise(camera: Camera) -> float:
 
 
 def visible_accuracy(noise: float) -> float:
-    """The finest model error worth computing beside a relative `noise`, within
-    what the dial offers.
+    """The finest model error worth computing, within what the dial offers.
+
+    noise: of a pixel, relative to the signal.
+
+    Returns a relative error.
     """
     return min(0.3, max(1e-8, HIDDEN * noise))
 
@@ -54,8 +57,12 @@ def visible_accuracy(noise: float) -> float:
 def seen_wavelengths(
     wavelengths: Sequence[float], needs: Needs | None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """(those of `wavelengths` that the scene has light at, those left out); all of them where
-    that would leave none.
+    """Part wavelengths into those that the scene has light at and others.
+
+    wavelengths: m;
+    needs: what is known of the scene, None for nothing.
+
+    Returns (kept, left out); all are kept where else none would be.
     """
     if needs is None or needs.spectrum is None:
         return tuple(wavelengths), ()

@@ -40,8 +40,13 @@ of it, times the lenslet's diffraction cells (measured, within a factor of 3).
 
 
 def spectral_nodes(band: Band, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths (m, ascending) and shares of the photons (sum 1) that stand for `band`
-    (plenocli.forward.camera.model.Band): (count,) each.
+    """Wavelengths that stand for a band of light.
+
+    band: its centre, width and shape;
+    count: how many.
+
+    Returns (wavelengths (count,) m, ascending; shares of the photons (count,), of sum 1).
+    Golub and Welsch 1969, for the polynomials orthogonal over the band.
     """
     x, w = _rule(band.shape, count)
     wavelengths = band.center + band.fwhm / 2 * x
@@ -80,8 +85,11 @@ def _transform(shape: str, phase: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rule_error(shape: str, count: int, phase: float) -> float:
-    """Largest error of the rule for cos(p x), p up to `phase` (rad per half width), relative to
-    the band's weight.
+    """Largest error of a band's rule for cos(p x), relative to the band's weight.
+
+    shape: "gaussian" or "box";
+    count: nodes of the rule;
+    phase: largest p, rad per half width.
     """
     x, w = _rule(shape, count)
     p, exact = _transform(shape, float(phase))
@@ -89,13 +97,17 @@ def rule_error(shape: str, count: int, phase: float) -> float:
 
 
 def spectral_error(geometry: Geometry, band: Band, count: int, window: int | None = None) -> float:
-    """Estimated relative L2 error of the worst column when `count` wavelengths stand for `band`.
+    """Estimated error of a few wavelengths in the place of a band.
 
-    geometry: at the centre;
-    window: coherent lenslets on either side (None: isolated). The longest path difference within
-        one lenslet's light is about N wavelengths, N = D2 D1/(lambda z2); the light of neighbours,
-        which mostly meets next to its border, doubles it. Long paths carry little of the light,
-        hence two weights.
+    The longest path difference within one lenslet's light is about N wavelengths, N = D2 D1/(lambda
+    z2); the light of neighbours, which mostly meets next to its border, doubles it. Long paths
+    carry little of the light, hence two weights.
+
+    geometry: at the centre of the band;
+    count: wavelengths;
+    window: coherent lenslets on either side, None for isolated ones.
+
+    Returns the relative L2 error of the worst column.
     """
     cells = geometry.diffraction_cells
     phase = math.pi * cells * band.fwhm / band.center * (1 if window is None else 2)
@@ -110,8 +122,13 @@ def spectral_error(geometry: Geometry, band: Band, count: int, window: int | Non
 
 
 def node_count(geometry: Geometry, band: Band, accuracy: float, window: int | None = None) -> int:
-    """Fewest wavelengths whose spectral_error is at most `accuracy`;
-    NumericsError beyond MAX_NODES.
+    """Fewest wavelengths that stand for a band.
+
+    geometry: at its centre;
+    accuracy: largest spectral_error;
+    window: as for spectral_error.
+
+    Raises NumericsError beyond MAX_NODES.
     """
     for count in range(1, MAX_NODES + 1):
         if spectral_error(geometry, band, count, window) <= accuracy:
@@ -173,9 +190,10 @@ class BandFields(LensletFields):
 def band_fields(
     model: Model, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan
 ) -> BandFields:
-    """Fields of a camera whose light is a band: those of `model` at plan.band_nodes wavelengths
-    of camera.light.band.
+    """Fields of a camera whose light is a band: the sum of those at plan.band_nodes wavelengths.
 
+    model: that computes each of them;
+    geometry: at the centre of the band;
     band: sized for the shortest of the wavelengths; it serves all of them.
     """
     wavelengths, weights = spectral_nodes(camera.light.band, plan.band_nodes)

@@ -187,7 +187,11 @@ class PiecewiseDiagnosis:
         self._few = int(np.prod(object_shape)) <= LARGEST
 
     def add(self, band: int, superpixel: int, slab: np.ndarray) -> None:
-        """Take A (pixel, point) of one band and superpixel into account."""
+        """Take one piece into account.
+
+        band, superpixel: numbers of the piece;
+        slab: A of it, (pixel, point).
+        """
         if superpixel == self._own:
             self._defects[band] = symmetry_defect(slab)
         if self._few and superpixel in self._times:

@@ -51,8 +51,12 @@ class LensletFields(ABC):
 
     @abstractmethod
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
-        neighbourhood, or a bound of it from above: (point,).
+        """Light of points that enters the lenslets of the neighbourhood, or a bound of it from
+        above.
+
+        rows, columns: (point,) indices.
+
+        Returns (point,), shares of the light through the aperture.
         """
 
     def columns(self, rows: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
@@ -65,8 +69,9 @@ class LensletFields(ABC):
             self.on_superpixel(sy, sx)(rows, columns, out[:, sy, sx])
 
     def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
-        """What fills in the pixel energies on superpixel (sy, sx), counted from the corner of
-        the grid; several threads may call it.
+        """What fills in the pixel energies on one superpixel; several threads may call it.
+
+        sy, sx: row and column of the superpixel, from the corner of the grid.
         """
         return partial(self._one_of_all, sy, sx)
 

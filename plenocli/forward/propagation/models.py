@@ -78,8 +78,10 @@ class Model(ABC):
         shape: tuple[int, int, int, int],
         double: bool,
     ) -> Cost:
-        """Cost of the matrix of `shape` (band, superpixel, pixel, point) at one wavelength, with
-        fields in double precision or single.
+        """Cost of the matrix at one wavelength.
+
+        shape: (band, superpixel, pixel, point);
+        double: precision of the fields.
 
         Raises NumericsError where the model would need too much.
         """
@@ -87,7 +89,11 @@ class Model(ABC):
     def fields(
         self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan
     ) -> LensletFields:
-        """The fields at the wavelength of `geometry`, as planned."""
+        """The fields at one wavelength, as planned.
+
+        geometry: at that wavelength;
+        band: node counts there, one of the plan's.
+        """
         return self.lenslets(camera, geometry, plan, band)
 
 

@@ -52,7 +52,7 @@ FOCUSED = 1e-9
 
 
 def valid_for(camera: Camera, geometry: Geometry) -> str | None:
-    """None, or one sentence why rays cannot serve this camera at this geometry."""
+    """As Model.valid_for: the rays must keep the pupil's image affine."""
     lens = at_wavelength(camera, geometry.wavelength).main_lens
     if lens.wavefront is not None or any(term.noll > 4 for term in lens.aberrations or ()):
         return (
@@ -73,8 +73,8 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
 def size_band(
     geometry: Geometry, superpixels: tuple[int, int], ring: int, accuracy: float, tolerance: float
 ) -> BandPlan:
-    """The BandPlan of this rung: no quadrature, every lenslet under the blur of every superpixel
-    kept (ring 0: its own only).
+    """As Model.size: no quadrature; every lenslet under the blur of every superpixel kept counts
+    (ring 0: its own only).
     """
     window = (
         None if ring == 0 else math.ceil(max(geometry.reach(superpixels))) + blur_ring(geometry) + 1
@@ -96,8 +96,10 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
     Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2
     pixel/(lambda z3) cells fit into a pixel. In focus only the rim is an edge, of N = D2 D1/(lambda
     z2) cells; but a point d cells from the border between two lenslets sends its light through
-    both. Out of focus that border cuts every image. Fitted to 132 cases of N from 3 to 47, c from
-    0.06 to 16, blur from 0 to 3 lenslets: within 2.5 of the measured error (docs/model.md).
+    both. Out of focus that border cuts every image.
+
+    Returns a number within 2.5 of the error of 132 cases (N from 3 to 47, c from 0.06 to 16, blur
+    from 0 to 3 lenslets; docs/model.md).
     """
     cells, fit = (
         geometry.diffraction_cells,
@@ -157,9 +159,7 @@ class RayLenslets(LensletFields):
         self._places = {where: place for place, where in geometry.places(plan.superpixels).items()}
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """An upper bound of the share of light entering the lenslets: all that the
-        filters pass, (points,).
-        """
+        """As LensletFields.incident: all that the filters pass."""
         return np.full(len(rows), self._passed)
 
     def on_superpixel(self, sy: int, sx: int) -> PixelEnergies:
@@ -284,9 +284,7 @@ def _affine(lens: MainLens, geometry: Geometry) -> tuple[float, float, float]:
 
 
 def pupil_measure(lens: MainLens) -> PupilMeasure:
-    """A function (y, x) -> share of the open aperture at smaller y and smaller x
-    (m), broadcasting.
-    """
+    """The pupil of a main lens as a measure of what lies below and left of a corner."""
     half = lens.aperture_diameter / 2
     if lens.aperture_shape == "image":
         return _image_measure(lens.samples("aperture_image"), half)
@@ -304,12 +302,15 @@ def pupil_measure(lens: MainLens) -> PupilMeasure:
 
 
 def disc_below(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Area of the part of the unit disc at smaller y and x than given, in closed form;
-    y and x broadcast.
+    """Area of the part of the unit disc at smaller y and x than given, in closed form.
 
     It is the integral over X up to x of min(y, c) + c, c = sqrt(1 - X^2), where positive; the
     integral of c is C(X) = (X c + asin X)/2, and beyond |X| = q = sqrt(1 - y^2) the corner's
     height no longer counts.
+
+    y, x: corners, in radii, broadcasting.
+
+    Returns squared radii.
     """
     y, x = np.clip(y, -1, 1), np.clip(x, -1, 1)
     q = np.sqrt((1 - y) * (1 + y))

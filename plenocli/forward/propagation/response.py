@@ -67,14 +67,19 @@ def valid_for(camera: Camera, model: str) -> str | None:
 def uniform_response(
     camera: Camera, wavelength: float, model: str, shifts: ArrayLike = ((0.0, 0.0),)
 ) -> np.ndarray:
-    """Response (lenslet, pixel) to an even object: mean over object points of what A, all
-    superpixels together, gives a pixel.
+    """Response to an even object: the mean over object points of what A, all superpixels together,
+    gives a pixel.
 
     A uniform object of one unit of light a point (through the clear pupil) puts this much into each
     pixel, per point of the object under one lenslet.
-    model: "ray" or "fresnel", see valid_for.
-    shifts (lenslet, 2): rows and columns in pixels from the superpixel's centre to the middle of
-        its window. At `wavelength` (m); both lenses by their glass.
+
+    wavelength: m; both lenses by their glass;
+    model: "ray" or "fresnel", see valid_for;
+    shifts: (lenslet, 2) rows and columns in pixels from the superpixel's centre to the middle of
+        its window.
+
+    Returns (lenslet, pixel).
+    docs/model.md, "The response predicted".
     """
     geometry, lens = geometry_of(camera, wavelength), at_wavelength(camera, wavelength).main_lens
     shifts = np.atleast_2d(np.asarray(shifts, float))
@@ -114,12 +119,12 @@ def uniform_response(
 
 
 def field_response(builder: PifBuilder) -> np.ndarray:
-    """Response (superpixel, pixel) to the object points of one lenslet's field alone: mean
-    over the columns of A.
+    """Response to the object points of one lenslet's field alone: the mean over the columns of A.
 
-    builder: a plenocli.forward.propagation.system_matrix.PifBuilder. The own superpixel of that
-        field is the one with offset (0, 0); summed over superpixels this is uniform_response, as
-        far as light does not reach beyond those kept.
+    builder: of the matrix; the own superpixel of that field is the one with offset (0, 0). Summed
+        over superpixels this is uniform_response, as far as light does not reach beyond those kept.
+
+    Returns (superpixel, pixel).
     """
     total = 0.0
     for _, block in builder.blocks():
@@ -128,12 +133,14 @@ def field_response(builder: PifBuilder) -> np.ndarray:
 
 
 def own_light(camera: Camera, wavelength: float, count: int = 256) -> float:
-    """Share of a lenslet's light that comes from its own object field, by rays; the rest belongs
-    to its neighbours'.
+    """Share of a lenslet's light that comes from its own object field, by rays; the rest belongs to
+    its neighbours'.
 
     The ray from (y, x) of the pupil that meets the array at u comes from the image point u - z2
-    (eps x + dW/dx). Summed over count x count points of the pupil, which tells a
-    share to about 1/count.
+    (eps x + dW/dx).
+
+    wavelength: m;
+    count: points of the pupil per axis, which tell a share to about 1/count.
     """
     lens = at_wavelength(camera, wavelength).main_lens
     geometry = geometry_of(camera, wavelength)

@@ -59,12 +59,17 @@ over the spread function's cut.
 
 
 def window_error(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
-    """Estimated relative error of a column because lenslets beyond the coherent window are left
-    out; 0 if ring is 0 by choice.
+    """Estimated error because lenslets beyond the coherent window are left out.
 
     Far lenslets interfere with the own one in fringes of (w + 1) c cycles a pixel, which pixels
-    average; fitted to brute force within a factor of 2 (N from 5.6 to 24 diffraction cells, c from
-    0.1 to 7.5, w from 1 to 6; worst point, docs/model.md).
+    average.
+
+    superpixels: (rows, columns) kept;
+    ring: of coherent neighbours.
+
+    Returns the relative L2 error of a column, within a factor of 2 of brute force (N from 5.6 to 24
+    diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md); 0 where ring
+    is 0 by choice.
     """
     if ring == 0:
         return 0.0
@@ -93,9 +98,12 @@ def blur_ring(geometry: Geometry) -> int:
 
 
 def predicted_outside(geometry: Geometry, ring: int) -> float:
-    """Share of a corner point's light that falls outside a window of (2 ring + 1)^2 lenslets, from
-    the asymptotic tail of an in-focus spread function beyond the geometric blur: 2/(pi v), v =
-    pi r D1/(lambda z2).
+    """Share of a corner point's light that falls outside a window of lenslets.
+
+    ring: lenslets on either side of the own one.
+
+    Returns the asymptotic tail of an in-focus spread function beyond the geometric blur, 2/(pi v),
+    v = pi r D1/(lambda z2).
     """
     distance = ring * geometry.D2 - geometry.blur / 2
     if distance <= 0:
@@ -104,11 +112,15 @@ def predicted_outside(geometry: Geometry, ring: int) -> float:
 
 
 def coherent_window(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> int | None:
-    """Lenslets |m| <= window (from the object's own) whose fields add, or None for isolated
-    lenslets (ring 0).
+    """Lenslets on either side of the object's own whose fields add.
 
     All of them act on every superpixel kept: an image point on a border between lenslets would else
     lose the interference of its two halves, which cancels their edge diffraction far out.
+
+    superpixels: (rows, columns) kept;
+    ring: of coherent neighbours.
+
+    Returns None for isolated lenslets, ring 0.
     """
     return (
         None
@@ -125,11 +137,17 @@ def size_band(
     tolerance: float,
     dim: bool = False,
 ) -> BandPlan:
-    """Node counts at one wavelength; the phase across a lenslet counts the far edge of the
-    outermost superpixel it lights.
+    """As Model.size, of the paraxial models; the phase across a lenslet counts the far edge of the
+    outermost superpixel that it lights.
 
+    superpixels: (rows, columns) kept;
+    ring: rings of coherent neighbours, 0 for isolated lenslets;
+    accuracy: that sampling may use up;
+    tolerance: root-energy cut of the spread function;
     dim: whether superpixels beside the object's own may have fewer nodes, where so little light
         falls on them that it does not tell.
+
+    Raises NumericsError as psf_nodes.
     """
     half_width, window = max(geometry.lenslet_extent), coherent_window(geometry, superpixels, ring)
     lit = max(geometry.reach(superpixels, window))
@@ -212,8 +230,11 @@ def superpixels_of(count: int) -> tuple[int, int]:
 
 
 def distinct(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> tuple[int, int]:
-    """What symmetry leaves to compute of a matrix of `shape` (band, superpixel, pixel, point):
-    (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
+    """What symmetry leaves to compute of a matrix.
+
+    shape: (band, superpixel, pixel, point).
+
+    Returns (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
     """
     superpixels, (rows, columns) = superpixels_of(shape[1]), geometry.object_shape
     if shape[3] < rows * columns or not is_symmetric(camera):
@@ -250,14 +271,17 @@ def pixel_nodes(
     blur: float,
     shares: tuple[float, float, float] = WHOLE,
 ) -> tuple[int, int]:
-    """Fewest nodes per axis of a pixel with an error of at most two thirds of `accuracy` (half, for
-    rules that err all over their band), and the step of quadrature.band_rule.
+    """Fewest nodes per axis of a pixel that keep an accuracy.
 
+    accuracy: the error is at most two thirds of it, half of it for rules that err all over their
+        band;
     own: cycles a pixel up to which one lenslet's light makes fringes;
     joint: up to which all lenslets together do;
     cells: diffraction cells of a lenslet;
     blur: of a point out of focus, in lenslets;
     shares: WHOLE or BESIDE.
+
+    Returns (nodes, step of quadrature.band_rule).
     """
     light = own, joint, cells, blur, shares
     count = next((n for n in range(2, 200) if pixel_error(n, 0, *light) <= accuracy / 1.5), None)
@@ -288,12 +312,17 @@ def pixel_error(
     blur: float,
     shares: tuple[float, float, float] = WHOLE,
 ) -> float:
-    """Estimated relative error of a column whose pixels are integrated by `count` nodes per axis,
-    at the step `rule` of band_rule.
+    """Estimated relative error of a column from the quadrature over its pixels.
 
     The light of two lenslets n apart makes fringes of (n - 1) own to (n + 1) own cycles a pixel,
-    most of them in the middle. Against converged columns (770 of 12 cameras, isolated and joined,
-    blurred over up to 5 lenslets, rules 0 to 7): a tenth to twice the measured error.
+    most of them in the middle.
+
+    count: nodes per axis;
+    rule: step of quadrature.band_rule;
+    own, joint, cells, blur, shares: as for pixel_nodes.
+
+    Returns a tenth to twice the error measured against converged columns (770 of 12 cameras,
+    isolated and joined, blurred over up to 5 lenslets, rules 0 to 7).
     """
     # rules of wide bands err where the light is, not at its end; out of focus each lenslet's light
     # is small and has sharp edges
@@ -357,6 +386,13 @@ def _patch_error(count: int, rule: int, own: float, cells: float, blur: float) -
 
 
 def rule_error(count: int, cycles: np.ndarray, rule: int = 0) -> np.ndarray:
-    """Error of the rule for cos(2 pi c t) on a unit pixel at each c of `cycles`."""
+    """Error of a rule for cos(2 pi c t) on a unit pixel.
+
+    count: nodes;
+    cycles: c, of any shape;
+    rule: step of quadrature.band_rule.
+
+    Returns numbers of the shape of c.
+    """
     t, w = band_rule(count, rule)
     return np.abs(np.cos(np.pi * np.outer(cycles, t)) @ w / 2 - np.sinc(cycles))

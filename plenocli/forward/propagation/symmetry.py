@@ -31,7 +31,8 @@ def superpixel_orbits(
 def turned_planes(planes: np.ndarray, how: Turn) -> np.ndarray:
     """The superpixel that a Turn leads to: a view.
 
-    planes: (pixel row, pixel column, point row, point column) of the first of its orbit.
+    planes: (pixel row, pixel column, point row, point column) of the first of its orbit;
+    how: the Turn.
     """
     turned, rows, columns = how
     planes = planes.transpose(1, 0, 3, 2) if turned else planes
@@ -40,11 +41,11 @@ def turned_planes(planes: np.ndarray, how: Turn) -> np.ndarray:
 
 
 def fill_below_diagonal(planes: np.ndarray, share: np.ndarray, count: int) -> None:
-    """Points below the diagonal of the first count x count from those above, rows and columns
-    exchanged.
+    """Fill in points below the diagonal from those above, rows and columns exchanged.
 
     planes: (pixel row, pixel column, point row, point column);
-    share: (point row, point column), filled alike.
+    share: (point row, point column), filled alike;
+    count: of the first count x count points.
     """
     turned = planes.transpose(1, 0, 3, 2)
     for j in range(count):

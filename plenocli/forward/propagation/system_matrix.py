@@ -346,7 +346,8 @@ class PifBuilder:
     ) -> None:
         """Check that no point puts more light on the sensor than entered the lenslets.
 
-        sensor, entered: shares of the light of points (rows, columns), all of one shape.
+        sensor, entered: shares of the light of points, all of one shape;
+        rows, columns: of these points.
 
         Raises NumericsError where one does.
         """

@@ -46,10 +46,13 @@ TRANSFORM_VALUES = 1 << 21
 def spherical_field(
     camera: Camera, geometry: Geometry, dy: np.ndarray, dx: np.ndarray
 ) -> np.ndarray:
-    """h (1/m) on the grid dy x dx (m), both of even length and symmetric about 0: (len(dy),
-    len(dx)), real where a radial pupil makes it so.
+    """Spread function of a main lens whose exit wave is a sphere, by quadrature over any pupil that
+    pupil_rows knows.
 
-    By quadrature over any pupil that pupil_rows knows; source: see the module.
+    dy, dx: m on the array, of even length and symmetric about 0.
+
+    Returns h (len(dy), len(dx)), 1/m, real where a radial pupil makes it so.
+    Born and Wolf, section 8.8.
     """
     if is_radial(camera):
         return radial_field(camera, geometry, dy, dx, spherical_profile)
@@ -67,7 +70,7 @@ def spherical_field(
 
 
 def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
-    """As radial.profile: Chebyshev coefficients of h in 2 |d|^2/reach^2 - 1, |d| <= reach (m)."""
+    """As radial.profile, for a spherical exit wave."""
     g, lens = geometry, camera.main_lens
     outer = lens.aperture_diameter / 2
     inner = outer * (lens.obscuration or 0.0)
@@ -94,8 +97,9 @@ def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.nd
 
 
 def defocus_path(geometry: Geometry, r2: np.ndarray) -> np.ndarray:
-    """Path (m) by which a wave towards the object's image is ahead of one towards the array at
-    squared pupil radius r2 (m^2).
+    """Path (m) by which a wave towards the object's image is ahead of one towards the array.
+
+    r2: squared pupil radii, m^2.
     """
     here, image = 1 / geometry.z2, 1 / geometry.z2 - geometry.eps
     return r2 * (

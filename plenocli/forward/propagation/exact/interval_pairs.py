@@ -164,8 +164,14 @@ class Interval:
         mixing: np.ndarray,
         kept: tuple[np.ndarray, ...],
     ) -> np.ndarray:
-        """X for the pairs kept = (r, i) of `functions`(u, x) -> (r, u, x) and the columns i of
-        `mixing`, terms of this interval: (lines of the sensor x points, kept).
+        """X, what terms of the kernel and of the main lens's field bring to the superpixel.
+
+        other: displacement (m) along the other axis;
+        functions: (u, x) -> (r, u, x), the kernel's residual;
+        mixing: (i', i), terms i of the field in those of this interval;
+        kept: (r, i) of the pairs that are wanted.
+
+        Returns (lines of the sensor x points, pair).
         """
         wave, (kept_r, kept_i) = self.wave(other), kept
         values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(
@@ -194,10 +200,12 @@ class Pair:
         self.weight = float(np.linalg.norm(row.weigh @ self._field @ column.weigh.T))
 
     def factors(self, reach: float, tolerance: float) -> tuple[np.ndarray, np.ndarray, Matrix]:
-        """(X, X', K) with the field X K X'^T up to about `tolerance` (root energy of a mean point);
-        X' is X where symmetric.
+        """The field on the superpixel as a product X K X'^T.
 
-        reach: half width (m) of the superpixel.
+        reach: half width (m) of the superpixel;
+        tolerance: root energy of a mean point's field that may be lost, about.
+
+        Returns (X, X', K); X' is X where the pair is symmetric.
         """
         g = self.row.geometry
         left, field, right = self._terms(tolerance / 2)
@@ -340,7 +348,12 @@ class LocalTerms:
 
 
 def field_norms(field: SeparableField, axis: int) -> np.ndarray:
-    """Root energy of each term of h along one axis: (terms,)."""
+    """Root energy of each term of h along one axis.
+
+    axis: 0 rows, 1 columns.
+
+    Returns (term,).
+    """
     coefficients = field.columns if axis else field.rows
     degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
     return np.sqrt(

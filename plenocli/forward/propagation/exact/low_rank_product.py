@@ -128,10 +128,13 @@ class Product:
         return p, triangle.T
 
     def factors(self, cut: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, B) with M = H B^T up to `cut` (root sum of squares), from a sketch of
-        `count` columns or more.
+        """The product compressed to its own rank, M = H B^T.
 
-        NumericsError where no sketch of MAX_SKETCH columns holds M.
+        cut: root sum of squares that may be lost;
+        count: columns of the first sketch.
+
+        Returns (H, B).
+        Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
         most = min(self.limit, MAX_SKETCH)
         size, q, seen = min(count, most), None, None
@@ -155,9 +158,12 @@ class Product:
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
 
     def narrowed(self, cut: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """(X, Y, K) with M = X K Y^T up to `cut` (root sum of squares), of far fewer columns than
-        M's factors have terms, X orthonormal and Y = X where M is symmetric; or None: M does not
-        have so few terms, or its factors have few enough.
+        """The product through far fewer columns than its factors have terms, M = X K Y^T.
+
+        cut: root sum of squares that may be lost.
+
+        Returns (X, Y, K), X orthonormal and Y = X where M is symmetric; None where M does not have
+        so few terms, or its factors have few enough.
         """
         given = sum(x.shape[1] for x in self.left)
         count = given // NARROW
@@ -219,8 +225,8 @@ def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def thin(matrix: np.ndarray) -> Matrix:
-    """The matrix with its entries below rounding left out, sparse where few are left: couplings
-    of singular vectors are all but diagonal.
+    """A matrix without its entries below rounding, sparse where few are left: couplings of singular
+    vectors are all but diagonal.
     """
     from scipy import sparse
 

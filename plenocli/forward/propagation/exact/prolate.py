@@ -19,9 +19,13 @@ from plenocli.forward.propagation.fresnel.spread_function import legendre
 
 
 def prolate_count(c: float, error: float) -> int:
-    """How many prolate functions leave no more than about `error` (root mean square over t and over
-    a) of exp(j a t), |a| <= c: the law of Landau and Widom (Journal of Mathematical Analysis and
-    Applications 77, 1980), fitted from c = 0.01 to 1000.
+    """How many prolate functions carry waves of all directions up to a largest one.
+
+    c: largest phase, rad over half the interval;
+    error: root mean square, over places and directions, that they may miss.
+
+    Returns the law of Landau and Widom (Journal of Mathematical Analysis and Applications 77,
+    1980), fitted from c = 0.01 to 1000.
     """
     return int(
         math.ceil(2 * c / math.pi + 2 / math.pi**2 * math.log(1 / error) * math.log(c + 8) + 1)
@@ -29,8 +33,14 @@ def prolate_count(c: float, error: float) -> int:
 
 
 def prolate(t: np.ndarray, c: float, count: int) -> np.ndarray:
-    """The first `count` prolate functions of bandwidth c at t in [-1, 1]: (len(t), count),
-    orthonormal over [-1, 1].
+    """Prolate spheroidal functions of order 0, orthonormal over [-1, 1].
+
+    t: (place,) in [-1, 1];
+    c: bandwidth, rad over half the interval;
+    count: how many.
+
+    Returns (place, count).
+    Xiao, Rokhlin and Yarvin 2001.
     """
     series = _series(c, count)
     return legendre(np.asarray(t, float), len(series), 1) @ series

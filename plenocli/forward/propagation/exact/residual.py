@@ -29,11 +29,16 @@ AxisFunctions = Callable[[np.ndarray], np.ndarray]
 
 
 def path(d: np.ndarray, z: float, own: float = 0.0, other: float = 0.0) -> np.ndarray:
-    """One axis's part of R - z at displacements d (m) about the centre (own, other) of both axes,
-    without cancellation.
+    """One axis's part of the path R - z, without cancellation.
 
     path(dy, z, cy, cx) + path(dx, z, cx, cy) is R - z wherever dy = cy or dx = cx; about the centre
     0 it is sqrt(z^2 + d^2) - z.
+
+    d: displacements along the axis, m;
+    z: distance of the planes, m;
+    own, other: centre along this axis and the other, m.
+
+    Returns m, of the shape of d.
     """
     middle = np.sqrt(z * z + own * own + other * other)
     return (d * d - own * own) / (np.sqrt(z * z + d * d + other * other) + middle) + (
@@ -44,8 +49,14 @@ def path(d: np.ndarray, z: float, own: float = 0.0, other: float = 0.0) -> np.nd
 def kappa(
     dy: np.ndarray, dx: np.ndarray, z: float, k: float, centre: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """The residual of the kernel at displacements dy, dx (m) over the distance z
-    (m), about `centre`.
+    """The residual of the kernel: what its two axes do together.
+
+    dy, dx: displacements, m, broadcasting;
+    z: distance of the planes, m;
+    k: wave number, 1/m;
+    centre: displacement (rows, columns) about which it is taken, m.
+
+    Returns complex numbers.
     """
     cy, cx = centre
     r, row, column, middle = (
@@ -58,7 +69,14 @@ def kappa(
 
 
 def ell(y: np.ndarray, x: np.ndarray, f: float, k: float) -> np.ndarray:
-    """The residual of a hyperbolic lens of focal length f (m) at (y, x) from its centre."""
+    """The residual of a hyperbolic lens.
+
+    y, x: m from its centre, broadcasting;
+    f: focal length, m;
+    k: wave number, 1/m.
+
+    Returns complex numbers.
+    """
     q = y * y + x * x
     r = np.sqrt(f * f + q) + f
     psi = y * y * (1 / r - 1 / (np.sqrt(f * f + y * y) + f)) + x * x * (
@@ -136,8 +154,11 @@ class Residual:
             )
 
     def functions(self, axis: int, u: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """P_r (axis 0) or Q_s (1) at sensor positions u and lenslet positions x (m, from their
-        centres): (terms, len(u), len(x)).
+        """The functions of one axis: P_r (axis 0) or Q_s (axis 1).
+
+        u, x: positions on sensor and lenslet, m from their centres.
+
+        Returns (term, len(u), len(x)).
         """
         rows, columns = (
             legendre(place / reach, len(grid), 1) @ _series(grid)
@@ -149,9 +170,13 @@ class Residual:
 def split(
     matrix: np.ndarray, tolerance: float, symmetric: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A, K, B) with orthonormal columns and matrix = A K B^T up to `tolerance` (root sum of
-    squares); K is diagonal, or where the matrix is `symmetric` and A = B as nearly so as equal
-    singular values allow.
+    """A matrix as a short product A K B^T.
+
+    tolerance: root sum of squares that may be lost;
+    symmetric: whether the matrix is, and A = B is wanted.
+
+    Returns (A, K, B), A and B of orthonormal columns; K is diagonal, or where `symmetric` as nearly
+    so as equal singular values allow.
     """
     u, s, vh = np.linalg.svd(matrix, full_matrices=False)
     terms = terms_within(s, tolerance)

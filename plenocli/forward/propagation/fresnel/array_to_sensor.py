@@ -27,13 +27,15 @@ if TYPE_CHECKING:
 def sensor_nodes(
     geometry: Geometry, axis: int, count: int, place: float = 0.0, rule: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (m) from the superpixel's centre and weights (m) of `count` nodes in each pixel
-    along `axis`: (count, pixels).
+    """Quadrature nodes of a superpixel's pixels along one axis.
 
-    rule: the step of quadrature.band_rule, 0 for Gauss-Legendre.
-
+    axis: 0 rows, 1 columns;
+    count: nodes in a pixel;
     place: where the superpixel's centre lies along the axis, in superpixel pitches; it matters on a
-        sensor's own raster only.
+        sensor's own raster only;
+    rule: step of quadrature.band_rule, 0 for Gauss-Legendre.
+
+    Returns (positions from the superpixel's centre (count, pixel) m, weights (count, pixel) m).
     """
     t, w = band_rule(count, rule)
     half = geometry.pixel_active / 2
@@ -50,8 +52,16 @@ def lenslet_kernel(
     x: np.ndarray,
     dtype: np.typing.DTypeLike = complex,
 ) -> np.ndarray:
-    """The per-axis kernel of lenslet n at sensor nodes v (weights folded in as square roots) and
-    lenslet nodes x: (v, x) of `dtype`.
+    """The per-axis kernel from a lenslet to sensor nodes.
+
+    n: lenslets between it and the superpixel;
+    v: (node,) on the sensor, m from the superpixel's centre;
+    weight: (node,) m, folded in as square roots;
+    x: (place,) on the lenslet, m from its centre;
+    dtype: complex64 or complex128.
+
+    Returns (node, place), m^(-1/2).
+    docs/model.md, "From the array to the sensor".
     """
     g = geometry
     relay = 1 / g.z2 + 1 / g.z3
@@ -68,16 +78,21 @@ def lenslet_kernel(
 
 
 def lit_lenslets(reach: int, window: int | None) -> range:
-    """Lenslets (along one axis) whose light is followed: |m| <= window, or each superpixel's own
-    where window is None.
+    """Lenslets along one axis whose light is followed.
+
+    reach: superpixels kept on either side;
+    window: coherent lenslets on either side, None where each superpixel is lit by its own only.
     """
     far = reach if window is None else window
     return range(-far, far + 1)
 
 
 def pixel_energy(field: np.ndarray) -> np.ndarray:
-    """Sum |field|^2 over the sub-nodes of each pixel: (points, p, rows, p, columns) complex,
-    weights included, overwritten.
+    """Energy of each pixel from the field on its nodes.
+
+    field: (point, p, pixel row, p, pixel column) complex, weights included, overwritten.
+
+    Returns (point, pixel row, pixel column), shares of the light.
     """
     count, p, py, _, px = field.shape
     parts = field.view(field.real.dtype).reshape(count, p, py, p, px, 2)

@@ -45,8 +45,11 @@ def is_radial(camera: Camera) -> bool:
 
 
 def profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
-    """Chebyshev coefficients (terms,) of h (1/m) in 2 |d|^2/reach^2 - 1, |d| <= reach
-    (m); real where h is.
+    """The spread function of a radial pupil as a series.
+
+    reach: largest distance |d|, m.
+
+    Returns Chebyshev coefficients (term,) of h (1/m) in 2 |d|^2/reach^2 - 1, real where h is.
     """
     g, lens = geometry, camera.main_lens
     outer = g.D1 / 2
@@ -69,8 +72,13 @@ def profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
 
 
 def hankel_series(rates: np.ndarray, weight: np.ndarray, edge: float) -> np.ndarray:
-    """Chebyshev coefficients in 2 t^2 - 1, 0 <= t <= 1, of the sum of weight J0(rates t); rates
-    at most `edge`; real where it is.
+    """Chebyshev coefficients, in 2 t^2 - 1 for 0 <= t <= 1, of the sum of weight J0(rate t).
+
+    rates: (node,), at most `edge`;
+    weight: (node,) complex;
+    edge: largest rate.
+
+    Returns (term,), real where the sum is.
     """
     from scipy.special import j0
 
@@ -90,11 +98,12 @@ def radial_field(
     dx: np.ndarray,
     profile: Callable[..., np.ndarray] = profile,
 ) -> np.ndarray:
-    """h (1/m) on the grid dy x dx (m): (len(dy), len(dx)), real where h is.
+    """The spread function of a radial pupil (is_radial) on a grid.
 
-    The pupil must be radial (is_radial).
-
+    dy, dx: m;
     profile: what computes the series, this module's or debye.spherical_profile.
+
+    Returns h (len(dy), len(dx)), 1/m, real where it is.
     """
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max()) or geometry.D2
     series = profile(camera, geometry, reach)

@@ -60,8 +60,11 @@ class Factors:
     def superpixel(
         self, sy: int, sx: int, rows: np.ndarray, columns: np.ndarray, out: np.ndarray
     ) -> None:
-        """Pixel energies on one superpixel, as counted in the tables, of points (rows[i],
-        columns[i]) into out (points, pixel rows, pixel columns).
+        """Pixel energies on one superpixel.
+
+        sy, sx: superpixel, as counted in the tables;
+        rows, columns: (point,) indices;
+        out: (point, pixel row, pixel column), filled.
         """
         real = self.high.real.dtype
         lines, terms = self.high.shape[2:]

@@ -71,10 +71,13 @@ class Chords:
 
 
 def chords(shape: str, width: float, slope: float, error: float = 1e-10) -> Chords:
-    """Chords of a "square", "circle" or "hexagon" of `width` (m, across flat sides) for phases of
-    up to `slope` rad/m.
+    """Chords of a lenslet's opening; hexagons have two flat sides facing +-x and are scanned across
+    them.
 
-    error: of the short panels. Hexagons have two flat sides facing +-x and are scanned across them.
+    shape: "square", "circle" or "hexagon";
+    width: m, across flat sides;
+    slope: of the integrand's phase, up to so many rad/m;
+    error: relative, of the short panels.
     """
     half = width / 2
     if shape == "square":
@@ -356,9 +359,7 @@ class ShapedLenslets(LensletFields):
     # the guard
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
-        neighbourhood: (points,).
-        """
+        """As LensletFields.incident."""
         scan, chord = (rows, columns) if self.cut.axis == 0 else (columns, rows)
         share = np.zeros(len(rows))
         for key, products in self._products.items():
@@ -441,8 +442,8 @@ def _slope(camera: Camera, geometry: Geometry, grid: tuple[int, int], window: in
 
 
 def valid_for(camera: Camera, geometry: Geometry) -> str | None:
-    """None: every lenslet shape and lattice of a camera description, and every pupil, can
-    be cut into chords.
+    """As Model.valid_for; None: every lenslet shape and lattice of a camera description, and every
+    pupil, can be cut into chords.
     """
     return
 

@@ -65,8 +65,12 @@ class SeparableField:
         return self.rows.shape[1]
 
     def evaluate(self, d: np.ndarray, axis: int) -> np.ndarray:
-        """a_j (axis 0) or b_j (axis 1) at positions `d` (m): array d.shape + (terms,),
-        complex128, or float64 where h is real.
+        """Terms of h along one axis.
+
+        d: positions, m, of any shape;
+        axis: 0 for a_j, 1 for b_j.
+
+        Returns (*d.shape, term), complex128, or float64 where h is real.
         """
         d = np.asarray(d, float)
         coefficients = np.ascontiguousarray(self.columns if axis else self.rows)
@@ -81,7 +85,13 @@ class SeparableField:
 
 
 def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
-    """Legendre polynomials of degrees 0, step, 2 step, ... at t: (len(t), count)."""
+    """Legendre polynomials of degrees 0, step, 2 step, ...
+
+    t: (place,) in [-1, 1];
+    count: how many.
+
+    Returns (place, count).
+    """
     out = np.empty((count, len(t)))
     previous, current, scaled = np.zeros_like(t), np.ones_like(t), np.empty_like(t)
     for degree in range((count - 1) * step + 1):
@@ -96,8 +106,11 @@ def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
 
 
 def psf_nodes(geometry: Geometry, half: float) -> int:
-    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number;
-    NumericsError for more than MAX_NODES.
+    """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number.
+
+    half: m.
+
+    Raises NumericsError for more than MAX_NODES.
     """
     # the functions are interpolated, not only integrated: a few degrees more than
     # the integration rule
@@ -112,10 +125,12 @@ def psf_nodes(geometry: Geometry, half: float) -> int:
 
 
 def sampled_field(camera: Camera, geometry: Geometry, dy: np.ndarray, dx: np.ndarray) -> np.ndarray:
-    """h (1/m) on the grid dy x dx (m), by quadrature over the pupil: (len(dy), len(dx)), real where
-    a radial pupil makes it so.
+    """The paraxial spread function on a grid, by quadrature over the pupil.
 
-    Source: see the module.
+    dy, dx: m.
+
+    Returns h (len(dy), len(dx)), 1/m, real where a radial pupil makes it so.
+    docs/model.md, "From a point to the lenslet array".
     """
     if is_radial(camera):
         return radial_field(camera, geometry, dy, dx)
@@ -137,8 +152,10 @@ def sampled_field(camera: Camera, geometry: Geometry, dy: np.ndarray, dx: np.nda
 
 
 def mirrored(y: np.ndarray, x: np.ndarray, weight: np.ndarray, axis: int) -> bool:
-    """Whether a quadrature rule is symmetric about the middle of its rows (axis 0) or of
-    its nodes (axis 1).
+    """Whether a quadrature rule is symmetric about its middle.
+
+    y: (row,), x: (row, node), weight: (row, node) of the rule;
+    axis: 0 for the middle of its rows, 1 for that of its nodes.
     """
     if axis == 0:
         return np.allclose(y, -y[::-1], rtol=0, atol=1e-14 * np.abs(y).max()) and np.allclose(
@@ -180,9 +197,12 @@ def _row_transforms(rows: Rows, frequency: np.ndarray) -> np.ndarray:
 
 
 def edge_emphasis(geometry: Geometry, points: np.ndarray) -> np.ndarray:
-    """Weights of `points` (m, on the array, along one axis) in what is left out: those at the
-    lenslet's edge lose light and split it, so that the same error would be a larger
-    share of their columns.
+    """Weights of points in what is left out: those at the lenslet's edge lose light and split it,
+    so that the same error would be a larger share of their columns.
+
+    points: (point,) m on the array, along one axis.
+
+    Returns (point,).
     """
     g = geometry
     return 1 + EDGE * np.exp((np.abs(points) - g.D2 / 2) * g.D1 / (g.wavelength * g.z2))
@@ -195,11 +215,14 @@ def separable_field(
     tolerance: float,
     sample: Callable[..., np.ndarray] = sampled_field,
 ) -> SeparableField:
-    """The SeparableField of `camera` on [-half, half]^2 (m) with a root-energy error of
-    at most `tolerance`.
+    """The spread function on [-half, half]^2 as a short sum of products.
 
-    sample: what computes h on a grid: sampled_field (paraxial) or debye.spherical_field.
-    NumericsError as psf_nodes.
+    half: m;
+    tolerance: root energy that may be lost;
+    sample: what computes h on a grid, sampled_field (paraxial) or debye.spherical_field.
+
+    Raises NumericsError as psf_nodes.
+    docs/model.md, "From a point to the lenslet array".
     """
     count = psf_nodes(geometry, half)
     t, w = gauss(count)
@@ -245,9 +268,11 @@ def separable_field(
 
 
 def terms_within(values: np.ndarray, tolerance: float | np.ndarray, rest: float = 0.0) -> int:
-    """How many of the singular values `values`, the largest first, it takes to leave no more than
-    `tolerance` (root sum of squares, with `rest` that is left in any case), one at the least. A
-    tolerance for each number of terms may be given.
+    """How many singular values it takes to lose no more than a tolerance, one at the least.
+
+    values: (value,), the largest first;
+    tolerance: root sum of squares, one number or one for each number of terms;
+    rest: root sum of squares that is lost in any case.
     """
     tails = np.sqrt(np.cumsum(values.astype(float)[::-1] ** 2)[::-1] + rest**2)
     return max(1, int(np.count_nonzero(tails > tolerance)))

@@ -256,15 +256,16 @@ class SquareLenslets(LensletFields):
         return tables, entering
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Share of the light of points (rows[i], columns[i]) that enters the lenslets of the
-        neighbourhood: (points,).
-        """
+        """As LensletFields.incident."""
         return self._entering[rows, columns]
 
 
 def narrows(geometry: Geometry, band: BandPlan, superpixels: tuple[int, int], double: bool) -> bool:
     """Whether superpixels get factors of their own rank: where many columns with many nodes gain by
     it. In double precision the roots of sums of squares would not know what is that small.
+
+    superpixels: (rows, columns) kept;
+    double: precision of the fields.
     """
     return (
         band.window is not None

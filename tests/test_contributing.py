@@ -103,3 +103,52 @@ def test_a_model_of_propagation(tmp_path, tiny):
     assert summary["rung"] == "pinholes" and summary["rank"] == [1]
     assert summary["energy_min"] == summary["energy_max"] == [pytest.approx(1, abs=1e-6)]
     assert house_stands(folder)
+
+
+def test_a_method_of_reconstruction(tmp_path, tiny):
+    folder = followed("Add a method of reconstruction", tmp_path)
+    steps = (
+        ("simulate-pif", tiny, "--accuracy", "0.1", "-o", "pif.h5"),
+        (
+            "capture-sim",
+            tiny,
+            "--scene",
+            "skimage:camera",
+            "--pif",
+            "pif.h5",
+            "--snr",
+            "60dB",
+            "-o",
+            "capture.h5",
+        ),
+        (
+            "reconstruct",
+            "capture.h5",
+            "--pif",
+            "pif.h5",
+            "--method",
+            "back-projection",
+            "--json",
+            "-o",
+            "image.h5",
+        ),
+    )
+    for step in steps:
+        done = run(folder, "plenocli", *step)
+        assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)["captures"][0]
+    assert summary["method"] == "back-projection" and summary["rule"] == "nothing to choose"
+    score = run(
+        folder,
+        "plenocli",
+        "score",
+        "image.h5",
+        "--truth",
+        "capture.h5",
+        "--json",
+        "-o",
+        "score.json",
+    )
+    assert score.returncode == 0, score.stderr
+    assert json.loads(score.stdout)["metrics"]["psnr_db"] > 10
+    assert house_stands(folder)

@@ -14,11 +14,9 @@ from plenocli.inverse.picture.per_lenslet import (
 from plenocli.inverse.picture.trial import AUTO
 from plenocli.inverse.picture.whole_picture import PNP, TV
 
-METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (AUTO, BLOCK_MEAN, TIKHONOV, TSVD, NNLS, LMMSE, DICTIONARY, TV, PNP)
-}
+ALL: tuple[Method, ...] = (AUTO, BLOCK_MEAN, TIKHONOV, TSVD, NNLS, LMMSE, DICTIONARY, TV, PNP)
 """In the order in which --method offers them."""
+METHODS = {method.name: method for method in ALL}
 
 
 def takers(option: str) -> tuple[str, ...]:

@@ -165,10 +165,11 @@ def superpixel(camera, target):
     from scipy.ndimage import shift
 
     from plenocli.forward.sensor.cfa import cfa_map
-    from plenocli.stages.forward.capture_sim import Settings, _carry, _source
+    from plenocli.forward.sensor.exposure import carry_light
+    from plenocli.stages.forward.capture_sim import Settings, _source
 
     settings = Settings(target=target, superpixels=(3, 3), model="fresnel", accuracy=1e-3)
-    light = _carry(camera, *_source(camera, settings, None), settings, None)
+    light = carry_light(camera, *_source(camera, settings, None), settings.options, None)
     shape = camera.sensor.pixels_per_lenslet
     where = cfa_map(shape, camera.sensor.cfa)
     planes = [plane.reshape(shape) for plane in light.white]

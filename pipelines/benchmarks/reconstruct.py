@@ -107,7 +107,7 @@ def measure(estimators, data, truth, options):
     """{"psnr_db", "ssim", "seconds", "took"} of one method on one capture."""
     from plenocli.base.tiling import to_plane
     from plenocli.evaluation.metrics.quality import psnr, ssim
-    from plenocli.inverse.picture.methods import METHODS as BY_NAME
+    from plenocli.inverse.picture.methods.registry import METHODS as BY_NAME
 
     shape = estimators.system.object_shape
     began = time.process_time()

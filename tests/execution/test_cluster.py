@@ -106,7 +106,7 @@ def described(folder):
 TWO_A_BATCH = """
 import sys
 from plenocli.cli.main import run
-from plenocli.inverse.picture import per_lenslet
+from plenocli.inverse.picture.methods import per_lenslet
 from plenocli.stages.inverse import reconstruct
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.files.read.scenes import Cube, read_scene
+from plenocli.files.read.scenes import read_scene
 from plenocli.forward.accuracy.needs import Needs
+from plenocli.forward.scene.scenes import Cube
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera

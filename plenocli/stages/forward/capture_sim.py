@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import ConfigError, InputError, UsageError
-from plenocli.base.progress import bar, note
-from plenocli.base.random_streams import stream
-from plenocli.files.read.scenes import Chart, Scene, Uniform, read_scene
-from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE, WHITE_LEVEL
-from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+from plenocli.base.errors import InputError, UsageError
+from plenocli.files.read.scenes import read_scene
+from plenocli.forward.scene.scenes import Chart, Scene, Uniform
+from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
+from plenocli.forward.sensor.exposure import (
+    ExposureOptions,
+    SimulatedCapture,
+    StoredMatrix,
+    planned_accuracy,
+    require_memory_for,
+    require_tiling,
+    simulate_capture,
+)
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.scene.light import Quadrature
-
-
-_MOST = 8 << 30
-"""Bytes of memory above which parts of a matrix grow no further: the order of sums, and with it
-the last digits, are the same on all larger machines.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,21 +61,20 @@ class Settings:
     exposure: float | None = None
     seed: int = 0
 
-
-@dataclass(frozen=True, kw_only=True)
-class SensorLight:
-    """Relative light on a sensor tiled with superpixels, before detection.
-
-    colours: letters of the colour filters.
-    superpixels: (colour, lenslet_row, lenslet_column, pixel) of the scene.
-    white: (colour, pixel) a superpixel of a uniform white object.
-    scene: (band, row, column) reflectance of the object as sampled.
-    """
-
-    colours: tuple[str, ...]
-    superpixels: np.ndarray
-    white: np.ndarray
-    scene: np.ndarray
+    @property
+    def options(self) -> ExposureOptions:
+        """What of them the simulation knows."""
+        return ExposureOptions(
+            refine=self.refine,
+            superpixels=self.superpixels,
+            coherent_ring=self.coherent_ring,
+            accuracy=self.accuracy,
+            model=self.model,
+            snr_db=self.snr_db,
+            noise=self.noise,
+            exposure=self.exposure,
+            seed=self.seed,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,17 +170,24 @@ def run_capture_sim(
             suffixes=(".h5", ".exr"),
         )
     camera = read_camera(camera_path)
-    _check_tiling(camera, camera_path)
-    _check_memory(camera, settings, camera_path)
+    options = settings.options
+    require_tiling(camera, camera_path)
+    require_memory_for(camera, options, camera_path)
     source, what = _source(camera, settings, scene)
-    matrix, accuracy = (
-        _read_pif(pif, camera, settings, source.wavelengths, camera_path)
-        if pif
-        else (None, _accuracy(camera, settings, source.wavelengths))
+    if pif:
+        matrices, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path)
+    else:
+        matrices = None
+        accuracy = planned_accuracy(camera, options, source.wavelengths).as_json()
+    found = simulate_capture(
+        camera,
+        source,
+        what,
+        options,
+        matrices=matrices,
+        name=settings.target or str(scene),
+        band_m=_band(settings.target),
     )
-    light = _carry(camera, source, what, settings, matrix)
-    capture, saturated = _detect(camera, light, settings, scene)
-    capture = _described(capture, camera, settings, light.scene, scene)
     roles = camera_files(camera_path, camera) | {
         "pif": pif,
         "scene": scene if scene and Path(scene).is_file() else None,
@@ -193,19 +199,22 @@ def run_capture_sim(
         config=to_toml(camera),
         accuracy=accuracy,
     )
-    bands = np.array(camera.light.wavelengths[: len(light.scene)])
     write_capture(
-        output, capture, provenance, scene=light.scene, wavelengths=bands, overwrite=overwrite
+        output,
+        found.capture,
+        provenance,
+        scene=found.scene,
+        wavelengths=found.wavelengths,
+        overwrite=overwrite,
     )
     if scene_out:
-        _write_scene(scene_out, light.scene, bands, provenance, overwrite)
-    return _summary(output, capture, len(source.wavelengths), saturated)
+        _write_scene(scene_out, found.scene, found.wavelengths, provenance, overwrite)
+    return _summary(output, found, len(source.wavelengths))
 
 
-def _summary(
-    output: Path, capture: Capture, wavelengths: int, saturated: float | None
-) -> CaptureSummary:
-    peak, relative = capture.mosaic.max(), saturated is None
+def _summary(output: Path, found: SimulatedCapture, wavelengths: int) -> CaptureSummary:
+    capture, relative = found.capture, found.saturated is None
+    peak = capture.mosaic.max()
     return CaptureSummary(
         output=output,
         rows=capture.shape[0],
@@ -213,59 +222,19 @@ def _summary(
         wavelengths=wavelengths,
         units=capture.units,
         peak=float(peak) if relative else int(peak),
-        noise_sigma=capture.noise.sigma if capture.noise is not None and relative else None,
-        saturated=saturated,
+        noise_sigma=capture.noise.sigma if relative else None,
+        saturated=found.saturated,
         exposure_s=capture.exposure_s,
     )
 
 
-def _check_tiling(camera: Camera, where: str | Path) -> None:
-    """ConfigError unless superpixels of whole pixels tile the sensor."""
-    if camera.lenslet_array.lattice != "square":
-        raise ConfigError(
-            "capture-sim tiles a sensor with superpixels, which a hexagonal lattice does not allow",
-            where,
-            'set lenslet_array.lattice = "square"',
-        )
-    drift = max(abs(m) * n / 2 for m, n in zip(camera.pixel_mismatch, camera.lenslet_array.count))
-    if drift > 0.05:
-        rows, columns = camera.sensor.pixels_per_lenslet
-        raise ConfigError(
-            (
-                "the superpixel pitch is "
-                f"{camera.superpixel_pitch / camera.sensor.pixel_pitch:.4f} pixels, not {rows} x "
-                f"{columns}: at the array's edge superpixels would be {drift:.2f} pixels off"
-            ),
-            where,
-            (
-                "set lenslet_array.superpixel_pitch = "
-                f'"{rows * camera.sensor.pixel_pitch * 1e6:.6g} um" instead of pitch'
-            ),
-        )
+def _band(target: str | None) -> float | None:
+    """Centre of the band that --target mono names, m."""
+    from plenocli.base.units import parse_length
 
-
-def _check_memory(camera: Camera, settings: Settings, where: str | Path) -> None:
-    """Refuse, before any work, a sensor or an object larger than the memory granted: light,
-    white and mosaic, float64, by colour.
-    """
-    from plenocli.base.budget import budget
-
-    lenslets, pixels, points = (
-        int(np.prod(n, dtype=object))
-        for n in (
-            camera.lenslet_array.count,
-            camera.sensor.pixels_per_lenslet,
-            camera.object.samples_per_lenslet,
-        )
-    )
-    colours = 1 if camera.sensor.cfa == "mono" else 3
-    needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * settings.refine**2)
-    budget().require(
-        needed,
-        "the capture",
-        where,
-        "take fewer lenslets, pixels or points, a smaller --refine",
-    )
+    if target is None or not target.startswith("mono:"):
+        return None
+    return parse_length(target.removeprefix("mono:"))
 
 
 def _source(
@@ -317,35 +286,6 @@ def _source(
             "choose white, dark, mono:450nm or colorchecker",
         )
     return white, scenes[target]
-
-
-class MatrixByPoints(Protocol):
-    """A system matrix at one wavelength that comes in blocks of object points."""
-
-    @property
-    def offsets(self) -> np.ndarray:
-        """(lenslet offset, 2) lenslets, rows and columns."""
-        ...
-
-    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Pairs (object points, (lenslet offset, pixel, point)) of at most `size` points each."""
-        ...
-
-
-@dataclass(frozen=True)
-class StoredMatrix:
-    """The system matrix of a pif artefact at one of its wavelengths, in one block.
-
-    matrix: (lenslet offset, pixel, point).
-    offsets: (lenslet offset, 2).
-    """
-
-    matrix: np.ndarray
-    offsets: np.ndarray
-
-    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """All points at once: they are in memory."""
-        yield np.arange(self.matrix.shape[2]), self.matrix
 
 
 _OF_THE_DETECTOR = {
@@ -409,234 +349,6 @@ def _read_pif(
             )
         stored[wavelength] = StoredMatrix(matrices[band], offsets)
     return stored, artefact.provenance.accuracy
-
-
-def _carry(
-    camera: Camera,
-    source: Quadrature,
-    scene: Scene,
-    settings: Settings,
-    matrix: Mapping[float, MatrixByPoints] | None,
-) -> SensorLight:
-    """Light of the scene on every superpixel, band by band through the system matrix."""
-    from plenocli.base.budget import budget
-    from plenocli.forward.sensor.cfa import sensitivity
-    from plenocli.forward.sensor.irradiance import superpixel_light
-
-    letters, efficiency = sensitivity(camera, source.wavelengths)
-    count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
-    fine = (samples[0] * settings.refine, samples[1] * settings.refine)
-    grid = (count[0] * fine[0], count[1] * fine[1])
-    finer = (
-        camera.replace(**{"object.samples_per_lenslet": fine}) if settings.refine > 1 else camera
-    )
-    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
-    light, whites, picture = np.zeros(()), np.zeros(()), None
-    for index, wavelength in enumerate(
-        bar(source.wavelengths, len(source.wavelengths), "wavelengths")
-    ):
-        system = matrix[wavelength] if matrix else _build(finer, wavelength, settings)
-        if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
-            picture = scene.at(wavelength, *grid)
-        size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
-        carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
-        if isinstance(scene, Uniform):
-            carried = np.broadcast_to(scene.level * white, (*count, pixels))
-        weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / settings.refine**2
-        light = light + weight[:, :, None, None] * carried[None]
-        whites = whites + weight * white[None]
-    return SensorLight(
-        colours=letters,
-        superpixels=light,
-        white=whites,
-        scene=_truth(camera, scene, grid, settings.refine),
-    )
-
-
-def _build(camera: Camera, wavelength: float, settings: Settings) -> MatrixByPoints:
-    from plenocli.forward.accuracy.dial import pif_builder
-
-    return pif_builder(camera, wavelength, **_request(settings))
-
-
-def _request(settings: Settings) -> dict[str, Any]:
-    """What the dial is asked: with --snr its noise stands in for the sensor's where no
-    accuracy is named.
-    """
-    from plenocli.forward.accuracy.needs import Needs
-
-    needs = (
-        None
-        if settings.snr_db is None or settings.accuracy is not None
-        else Needs(noise=10 ** (-settings.snr_db / 20), source="--snr")
-    )
-    return dict(
-        superpixels=settings.superpixels,
-        coherent_ring=settings.coherent_ring,
-        accuracy=settings.accuracy,
-        model=settings.model,
-        needs=needs,
-    )
-
-
-def _accuracy(camera: Camera, settings: Settings, wavelengths: np.ndarray) -> dict[str, Any]:
-    """The accuracy record of a capture that computes its own system matrices: that of the middle
-    wavelength's plan. Says how long all will take.
-    """
-    from plenocli.forward.accuracy.dial import plan_pif
-    from plenocli.forward.accuracy.explain import expectation
-
-    plan = plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(settings))
-    expected = expectation(plan, times=len(wavelengths) * settings.refine**2)
-    if expected:
-        note(expected)
-    return plan.accuracy_record().as_json()
-
-
-def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> np.ndarray:
-    """The object (band, row, column) on the grid that reconstruction uses: area
-    averages of the finer one.
-    """
-    from plenocli.forward.scene.sample import block_mean
-
-    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
-    return np.stack([block_mean(scene.at(w, *grid), (refine, refine)) for w in bands]).astype(
-        np.float32
-    )
-
-
-def _detect(
-    camera: Camera, light: SensorLight, settings: Settings, scene: str | Path | None
-) -> tuple[Capture, float | None]:
-    """What the sensor reports of relative light, and the share of pixels over full well (None in
-    relative units).
-    """
-    mosaic = _through_the_filters(camera, light)
-    if not float(light.white.max()) > 0:
-        raise ConfigError(
-            "no light of this source reaches the sensor",
-            "camera",
-            "check filters, wavelengths and illuminant",
-        )
-    rng = stream(settings.seed, "capture-sim")
-    if settings.snr_db is not None or settings.noise == "none":
-        return _relative(camera, mosaic, settings, rng), None
-    return _exposed(camera, mosaic, float(light.white.max()), settings, scene, rng)
-
-
-def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
-    """(row, column) light that the sensor's colour filters leave, relative."""
-    from plenocli.base.tiling import to_plane
-    from plenocli.forward.sensor.cfa import cfa_map
-
-    shape = camera.sensor.pixels_per_lenslet
-    planes = {c: to_plane(plane, shape) for c, plane in zip(light.colours, light.superpixels)}
-    mosaic = next(iter(planes.values()))
-    if camera.sensor.cfa == "mono":
-        return mosaic
-    where = cfa_map(mosaic.shape, camera.sensor.cfa)
-    filtered = (np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
-    return sum(filtered, start=np.zeros(()))
-
-
-def _relative(
-    camera: Camera, mosaic: np.ndarray, settings: Settings, rng: np.random.Generator
-) -> Capture:
-    """A capture in relative units, with white noise or none: with one wavelength and no colour
-    the mosaic is A x itself.
-    """
-    from plenocli.forward.sensor.noise import Noise, add_white_noise
-
-    sensor, noise = camera.sensor, Noise()
-    mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
-    if settings.snr_db is not None:
-        mosaic, noise = add_white_noise(mosaic, settings.snr_db, rng)
-    return Capture(
-        mosaic=mosaic.astype(np.float64),
-        units="relative",
-        cfa=sensor.cfa,
-        noise=noise,
-        metadata=CaptureMetadata(snr_db=settings.snr_db, noise_from="--snr and --noise"),
-    )
-
-
-def _exposed(
-    camera: Camera,
-    mosaic: np.ndarray,
-    peak: float,
-    settings: Settings,
-    scene: str | Path | None,
-    rng: np.random.Generator,
-) -> tuple[Capture, float]:
-    """A capture in digital numbers, and the share of its pixels over full well.
-
-    peak: relative light of the brightest pixel under a uniform white object.
-    """
-    from plenocli.forward.sensor.noise import SensorModel
-
-    sensor = camera.sensor
-    exposure = settings.exposure or camera.light.white_exposure
-    scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
-    model = SensorModel.from_camera(camera)
-    if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
-        raise InputError(
-            "holds values below 0 or beyond all numbers, which no light has",
-            scene,
-            "clip it (reconstruct --clip), or use --noise none",
-        )
-    values = model.expose(mosaic * scale, rng)
-    saturated = float(np.mean(mosaic * scale >= sensor.full_well))
-    if saturated > 0.001:
-        note(
-            f"{saturated:.1%} of the pixels are over full well; a shorter "
-            "--exposure would keep them"
-        )
-    capture = Capture(
-        mosaic=values,
-        cfa=sensor.cfa,
-        levels=Levels(
-            black=np.full((2, 2), float(sensor.black_level)),
-            white=float(model.white_level),
-            gain=sensor.gain,
-        ),
-        exposure_s=exposure,
-        noise=model.noise,
-        metadata=CaptureMetadata(
-            noise_from="camera",
-            electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),
-        ),
-    )
-    return capture, saturated
-
-
-def _described(
-    capture: Capture,
-    camera: Camera,
-    settings: Settings,
-    truth: np.ndarray,
-    scene: str | Path | None,
-) -> Capture:
-    """The capture with what later stages need to know beside the mosaic."""
-    from plenocli.base.units import parse_length
-
-    rows, columns = camera.sensor.pixels_per_lenslet
-    count = camera.lenslet_array.count
-    first = np.array([(rows - 1) / 2, (columns - 1) / 2])
-    index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
-    target = settings.target or ""
-    metadata = replace(
-        capture.metadata,
-        scene_shape=tuple(truth.shape[1:]),
-        target=settings.target or str(Path(str(scene)).name),
-        illuminant=camera.light.illuminant,
-        band_m=parse_length(target.removeprefix("mono:")) if target.startswith("mono:") else None,
-    )
-    grid = SuperpixelGrid(
-        shape=(rows, columns),
-        count=tuple(count),
-        centre=first + index * np.array([rows, columns]),
-    )
-    return replace(capture, grid=grid, metadata=metadata)
 
 
 def _write_scene(

@@ -25,7 +25,7 @@ from plenocli.inverse.picture.diagnosis import Seen, loss_db, what_is_seen
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.methods import METHODS, takers
+from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 
 if TYPE_CHECKING:

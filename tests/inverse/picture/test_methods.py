@@ -12,7 +12,7 @@ from plenocli.cli.inverse.reconstruct import METHODS as OFFERED
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.methods import METHODS, takers
+from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.noise_level import NoiseLevel
 from plenocli.inverse.picture.reconstruction import Choice, ContrastScale, Reconstruction
 

@@ -17,7 +17,7 @@ from plenocli.base.progress import note
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.joint import believed_noise
-from plenocli.inverse.picture.method import Estimate, Estimator, OwnLight, Sees
+from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.reconstruction import Stats
 from plenocli.inverse.picture.solvers import least_squares
 from plenocli.inverse.sparse.dictionary import Averaged

@@ -14,8 +14,8 @@ from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.joint import believed_noise
-from plenocli.inverse.picture.method import Estimate, Estimator, OwnLight, Sees
-from plenocli.inverse.picture.per_lenslet import adaptive_lmmse
+from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
+from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
 from plenocli.inverse.picture.solvers import whole_sensor
 
 Solve = Callable[

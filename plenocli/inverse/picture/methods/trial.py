@@ -23,10 +23,10 @@ from plenocli.inverse.picture.estimators import Estimators, TrialKey
 from plenocli.inverse.picture.footprint import Sizes
 from plenocli.inverse.picture.joint import noise_of
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.method import Method, Sees
-from plenocli.inverse.picture.per_lenslet import DICTIONARY, LMMSE
+from plenocli.inverse.picture.methods.method import Method, Sees
+from plenocli.inverse.picture.methods.per_lenslet import DICTIONARY, LMMSE
+from plenocli.inverse.picture.methods.whole_picture import PNP
 from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
-from plenocli.inverse.picture.whole_picture import PNP
 from plenocli.inverse.prior.natural_images import draw_patches
 
 TRIALS, SIDE = 5, 3

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from plenocli.inverse.picture.method import Method
-from plenocli.inverse.picture.per_lenslet import (
+from plenocli.inverse.picture.methods.method import Method
+from plenocli.inverse.picture.methods.per_lenslet import (
     BLOCK_MEAN,
     DICTIONARY,
     LMMSE,
@@ -11,8 +11,8 @@ from plenocli.inverse.picture.per_lenslet import (
     TIKHONOV,
     TSVD,
 )
-from plenocli.inverse.picture.trial import AUTO
-from plenocli.inverse.picture.whole_picture import PNP, TV
+from plenocli.inverse.picture.methods.trial import AUTO
+from plenocli.inverse.picture.methods.whole_picture import PNP, TV
 
 ALL: tuple[Method, ...] = (AUTO, BLOCK_MEAN, TIKHONOV, TSVD, NNLS, LMMSE, DICTIONARY, TV, PNP)
 """In the order in which --method offers them."""

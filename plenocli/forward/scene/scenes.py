@@ -1,0 +1,95 @@
+"""What is in front of the camera: a photograph, a spectral picture, a chart or an even target.
+
+A scene answers one question: its reflectance at a wavelength on a grid of object points, in
+image orientation.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+_RGB_CENTRES = np.array([450e-9, 545e-9, 630e-9])
+"""Where the blue, green and red channels of a photograph stand in the spectrum; linear in
+between, constant outside.
+"""
+
+
+class Scene(Protocol):
+    """What is in front of the camera.
+
+    spectral: whether its reflectance depends on the wavelength.
+    """
+
+    spectral: bool
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m) on rows x columns object points."""
+        ...
+
+
+class Uniform:
+    """The same reflectance everywhere, beyond the array's edge too."""
+
+    spectral = False
+
+    def __init__(self, level: float) -> None:
+        self.level = level
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column), the level everywhere."""
+        return np.full((rows, columns), self.level, dtype=np.float32)
+
+
+class Photograph:
+    """A linear picture (row, column, channel); in colour its reflectance is interpolated
+    between B, G and R.
+    """
+
+    def __init__(self, values: np.ndarray, sampling: str, spectral: bool) -> None:
+        self.values, self.sampling = values, sampling
+        self.spectral = spectral and values.shape[2] >= 3
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m), of a grey picture its luminance."""
+        from plenocli.forward.scene.sample import luminance, sample_picture
+
+        if not self.spectral:
+            return sample_picture(luminance(self.values), rows, columns, self.sampling)
+        weights = [np.interp(wavelength, _RGB_CENTRES, one) for one in np.eye(3)]
+        picture = sum(w * self.values[:, :, 2 - band] for band, w in enumerate(weights) if w)
+        return sample_picture(picture, rows, columns, self.sampling)
+
+
+class Cube:
+    """A spectral picture (band, row, column); linear between its bands, constant outside them."""
+
+    spectral = True
+
+    def __init__(self, wavelengths: np.ndarray, values: np.ndarray, sampling: str) -> None:
+        self.wavelengths, self.values, self.sampling = np.asarray(wavelengths), values, sampling
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m), linear between the bands."""
+        from plenocli.forward.scene.sample import sample_picture
+
+        position = np.interp(wavelength, self.wavelengths, np.arange(len(self.wavelengths)))
+        low = min(int(position), len(self.wavelengths) - 1)
+        high = min(low + 1, len(self.wavelengths) - 1)
+        part = position - low
+        return sample_picture(
+            (1 - part) * self.values[low] + part * self.values[high], rows, columns, self.sampling
+        )
+
+
+class Chart:
+    """The ColorChecker over the whole array."""
+
+    spectral = True
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) of the chart at a wavelength (m)."""
+        from plenocli.forward.scene.chart import chart_scene
+
+        return chart_scene(rows, columns, np.array([wavelength]))[0][0]

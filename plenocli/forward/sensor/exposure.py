@@ -1,0 +1,418 @@
+"""One exposure: source -> optics -> detector, from a scene to what the sensor records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from plenocli.base.errors import ConfigError, InputError
+from plenocli.base.progress import bar, note
+from plenocli.base.random_streams import stream
+from plenocli.forward.scene.scenes import Uniform
+from plenocli.forward.scene.white_reference import WHITE_LEVEL
+from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+    from plenocli.forward.scene.light import Quadrature
+    from plenocli.forward.scene.scenes import Scene
+
+_MOST = 8 << 30
+"""Bytes of memory above which parts of a matrix grow no further: the order of sums, and with it
+the last digits, are the same on all larger machines.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExposureOptions:
+    """How an exposure is computed.
+
+    refine: object points per side for each point of the camera description.
+    superpixels: (rows, columns) that one lenslet's light may reach, or "auto".
+    coherent_ring: lenslets whose light interferes, or "auto".
+    accuracy: relative, None as the noise needs.
+    model: of the propagation, "auto", "ray", "fresnel" or "exact".
+    snr_db: of white noise instead of the sensor's own, dB.
+    noise: "sensor" or "none".
+    exposure: s, None for the camera's white exposure.
+    seed: of the noise.
+    """
+
+    refine: int = 1
+    superpixels: str | tuple[int, int] = "auto"
+    coherent_ring: str | int = "auto"
+    accuracy: float | None = None
+    model: str = "auto"
+    snr_db: float | None = None
+    noise: str = "sensor"
+    exposure: float | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedCapture:
+    """What a simulated sensor records, and the truth.
+
+    capture: what it records.
+    scene: (band, row, column) reflectance of the object on the points of reconstruction.
+    wavelengths: (band,) m, of the scene's bands.
+    saturated: share of the pixels over full well, None in relative units.
+    """
+
+    capture: Capture
+    scene: np.ndarray
+    wavelengths: np.ndarray
+    saturated: float | None
+
+
+def simulate_capture(
+    camera: Camera,
+    source: Quadrature,
+    scene: Scene,
+    options: ExposureOptions,
+    *,
+    matrices: Mapping[float, MatrixByPoints] | None = None,
+    name: str = "scene",
+    band_m: float | None = None,
+) -> SimulatedCapture:
+    """One exposure of a scene.
+
+    source: wavelengths of the light and their photons.
+    scene: what is in front of the camera.
+    options: how it is computed, the noise, the exposure.
+    matrices: system matrices by wavelength (m); None: computed as the options ask.
+    name: of the scene, for later stages and messages.
+    band_m: centre of the narrow band that lights the scene, m, where there is one.
+
+    Raises ConfigError where superpixels do not tile the sensor or no light reaches it,
+    NumericsError where memory or accuracy do not suffice, InputError for a scene below zero.
+    Berkner et al. 2013, section 2.
+    """
+    light = carry_light(camera, source, scene, options, matrices)
+    capture, saturated = detect(camera, light, options, name)
+    return SimulatedCapture(
+        capture=_described(capture, camera, light.scene, name, band_m),
+        scene=light.scene,
+        wavelengths=np.array(camera.light.wavelengths[: len(light.scene)]),
+        saturated=saturated,
+    )
+
+
+class MatrixByPoints(Protocol):
+    """A system matrix at one wavelength that comes in blocks of object points."""
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """(lenslet offset, 2) lenslets, rows and columns."""
+        ...
+
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Pairs (object points, (lenslet offset, pixel, point)) of at most `size` points each."""
+        ...
+
+
+@dataclass(frozen=True)
+class StoredMatrix:
+    """The system matrix of a pif artefact at one of its wavelengths, in one block.
+
+    matrix: (lenslet offset, pixel, point).
+    offsets: (lenslet offset, 2).
+    """
+
+    matrix: np.ndarray
+    offsets: np.ndarray
+
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """All points at once: they are in memory."""
+        yield np.arange(self.matrix.shape[2]), self.matrix
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorLight:
+    """Relative light on a sensor tiled with superpixels, before detection.
+
+    colours: letters of the colour filters.
+    superpixels: (colour, lenslet_row, lenslet_column, pixel) of the scene.
+    white: (colour, pixel) a superpixel of a uniform white object.
+    scene: (band, row, column) reflectance of the object as sampled.
+    """
+
+    colours: tuple[str, ...]
+    superpixels: np.ndarray
+    white: np.ndarray
+    scene: np.ndarray
+
+
+def require_tiling(camera: Camera, where: str | Path) -> None:
+    """ConfigError unless superpixels of whole pixels tile the sensor."""
+    if camera.lenslet_array.lattice != "square":
+        raise ConfigError(
+            "capture-sim tiles a sensor with superpixels, which a hexagonal lattice does not allow",
+            where,
+            'set lenslet_array.lattice = "square"',
+        )
+    drift = max(abs(m) * n / 2 for m, n in zip(camera.pixel_mismatch, camera.lenslet_array.count))
+    if drift > 0.05:
+        rows, columns = camera.sensor.pixels_per_lenslet
+        raise ConfigError(
+            (
+                "the superpixel pitch is "
+                f"{camera.superpixel_pitch / camera.sensor.pixel_pitch:.4f} pixels, not {rows} x "
+                f"{columns}: at the array's edge superpixels would be {drift:.2f} pixels off"
+            ),
+            where,
+            (
+                "set lenslet_array.superpixel_pitch = "
+                f'"{rows * camera.sensor.pixel_pitch * 1e6:.6g} um" instead of pitch'
+            ),
+        )
+
+
+def require_memory_for(camera: Camera, options: ExposureOptions, where: str | Path) -> None:
+    """Refuse, before any work, a sensor or an object larger than the memory granted: light,
+    white and mosaic, float64, by colour.
+    """
+    from plenocli.base.budget import budget
+
+    lenslets, pixels, points = (
+        int(np.prod(n, dtype=object))
+        for n in (
+            camera.lenslet_array.count,
+            camera.sensor.pixels_per_lenslet,
+            camera.object.samples_per_lenslet,
+        )
+    )
+    colours = 1 if camera.sensor.cfa == "mono" else 3
+    needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * options.refine**2)
+    budget().require(
+        needed,
+        "the capture",
+        where,
+        "take fewer lenslets, pixels or points, a smaller --refine",
+    )
+
+
+def planned_accuracy(
+    camera: Camera, options: ExposureOptions, wavelengths: np.ndarray
+) -> AccuracyRecord:
+    """The accuracy record of a capture that computes its own system matrices: that of the middle
+    wavelength's plan. Says how long all will take.
+    """
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.forward.accuracy.explain import expectation
+
+    plan = plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(options))
+    expected = expectation(plan, times=len(wavelengths) * options.refine**2)
+    if expected:
+        note(expected)
+    return plan.accuracy_record()
+
+
+def _request(options: ExposureOptions) -> dict[str, Any]:
+    """What the dial is asked: with --snr its noise stands in for the sensor's where no
+    accuracy is named.
+    """
+    from plenocli.forward.accuracy.needs import Needs
+
+    needs = (
+        None
+        if options.snr_db is None or options.accuracy is not None
+        else Needs(noise=10 ** (-options.snr_db / 20), source="--snr")
+    )
+    return dict(
+        superpixels=options.superpixels,
+        coherent_ring=options.coherent_ring,
+        accuracy=options.accuracy,
+        model=options.model,
+        needs=needs,
+    )
+
+
+def carry_light(
+    camera: Camera,
+    source: Quadrature,
+    scene: Scene,
+    options: ExposureOptions,
+    matrix: Mapping[float, MatrixByPoints] | None,
+) -> SensorLight:
+    """Light of the scene on every superpixel, band by band through the system matrix."""
+    from plenocli.base.budget import budget
+    from plenocli.forward.sensor.cfa import sensitivity
+    from plenocli.forward.sensor.irradiance import superpixel_light
+
+    letters, efficiency = sensitivity(camera, source.wavelengths)
+    count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
+    fine = (samples[0] * options.refine, samples[1] * options.refine)
+    grid = (count[0] * fine[0], count[1] * fine[1])
+    finer = camera.replace(**{"object.samples_per_lenslet": fine}) if options.refine > 1 else camera
+    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
+    light, whites, picture = np.zeros(()), np.zeros(()), None
+    for index, wavelength in enumerate(
+        bar(source.wavelengths, len(source.wavelengths), "wavelengths")
+    ):
+        system = matrix[wavelength] if matrix else _build(finer, wavelength, options)
+        if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
+            picture = scene.at(wavelength, *grid)
+        size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
+        carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
+        if isinstance(scene, Uniform):
+            carried = np.broadcast_to(scene.level * white, (*count, pixels))
+        weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / options.refine**2
+        light = light + weight[:, :, None, None] * carried[None]
+        whites = whites + weight * white[None]
+    return SensorLight(
+        colours=letters,
+        superpixels=light,
+        white=whites,
+        scene=_truth(camera, scene, grid, options.refine),
+    )
+
+
+def _build(camera: Camera, wavelength: float, options: ExposureOptions) -> MatrixByPoints:
+    from plenocli.forward.accuracy.dial import pif_builder
+
+    return pif_builder(camera, wavelength, **_request(options))
+
+
+def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> np.ndarray:
+    """The object (band, row, column) on the grid that reconstruction uses: area
+    averages of the finer one.
+    """
+    from plenocli.forward.scene.sample import block_mean
+
+    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
+    return np.stack([block_mean(scene.at(w, *grid), (refine, refine)) for w in bands]).astype(
+        np.float32
+    )
+
+
+def detect(
+    camera: Camera, light: SensorLight, options: ExposureOptions, scene: str
+) -> tuple[Capture, float | None]:
+    """What the sensor reports of relative light, and the share of pixels over full well (None in
+    relative units).
+    """
+    mosaic = _through_the_filters(camera, light)
+    if not float(light.white.max()) > 0:
+        raise ConfigError(
+            "no light of this source reaches the sensor",
+            "camera",
+            "check filters, wavelengths and illuminant",
+        )
+    rng = stream(options.seed, "capture-sim")
+    if options.snr_db is not None or options.noise == "none":
+        return _relative(camera, mosaic, options, rng), None
+    return _exposed(camera, mosaic, float(light.white.max()), options, scene, rng)
+
+
+def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
+    """(row, column) light that the sensor's colour filters leave, relative."""
+    from plenocli.base.tiling import to_plane
+    from plenocli.forward.sensor.cfa import cfa_map
+
+    shape = camera.sensor.pixels_per_lenslet
+    planes = {c: to_plane(plane, shape) for c, plane in zip(light.colours, light.superpixels)}
+    mosaic = next(iter(planes.values()))
+    if camera.sensor.cfa == "mono":
+        return mosaic
+    where = cfa_map(mosaic.shape, camera.sensor.cfa)
+    filtered = (np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
+    return sum(filtered, start=np.zeros(()))
+
+
+def _relative(
+    camera: Camera, mosaic: np.ndarray, options: ExposureOptions, rng: np.random.Generator
+) -> Capture:
+    """A capture in relative units, with white noise or none: with one wavelength and no colour
+    the mosaic is A x itself.
+    """
+    from plenocli.forward.sensor.noise import Noise, add_white_noise
+
+    sensor, noise = camera.sensor, Noise()
+    mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
+    if options.snr_db is not None:
+        mosaic, noise = add_white_noise(mosaic, options.snr_db, rng)
+    return Capture(
+        mosaic=mosaic.astype(np.float64),
+        units="relative",
+        cfa=sensor.cfa,
+        noise=noise,
+        metadata=CaptureMetadata(snr_db=options.snr_db, noise_from="--snr and --noise"),
+    )
+
+
+def _exposed(
+    camera: Camera,
+    mosaic: np.ndarray,
+    peak: float,
+    options: ExposureOptions,
+    scene: str,
+    rng: np.random.Generator,
+) -> tuple[Capture, float]:
+    """A capture in digital numbers, and the share of its pixels over full well.
+
+    peak: relative light of the brightest pixel under a uniform white object.
+    """
+    from plenocli.forward.sensor.noise import SensorModel
+
+    sensor = camera.sensor
+    exposure = options.exposure or camera.light.white_exposure
+    scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
+    model = SensorModel.from_camera(camera)
+    if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
+        raise InputError(
+            "holds values below 0 or beyond all numbers, which no light has",
+            scene,
+            "clip it (reconstruct --clip), or use --noise none",
+        )
+    values = model.expose(mosaic * scale, rng)
+    saturated = float(np.mean(mosaic * scale >= sensor.full_well))
+    if saturated > 0.001:
+        note(
+            f"{saturated:.1%} of the pixels are over full well; a shorter "
+            "--exposure would keep them"
+        )
+    capture = Capture(
+        mosaic=values,
+        cfa=sensor.cfa,
+        levels=Levels(
+            black=np.full((2, 2), float(sensor.black_level)),
+            white=float(model.white_level),
+            gain=sensor.gain,
+        ),
+        exposure_s=exposure,
+        noise=model.noise,
+        metadata=CaptureMetadata(
+            noise_from="camera",
+            electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),
+        ),
+    )
+    return capture, saturated
+
+
+def _described(
+    capture: Capture, camera: Camera, truth: np.ndarray, name: str, band_m: float | None
+) -> Capture:
+    """The capture with what later stages need to know beside the mosaic."""
+    rows, columns = camera.sensor.pixels_per_lenslet
+    count = camera.lenslet_array.count
+    first = np.array([(rows - 1) / 2, (columns - 1) / 2])
+    index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
+    metadata = replace(
+        capture.metadata,
+        scene_shape=tuple(truth.shape[1:]),
+        target=Path(name).name,
+        illuminant=camera.light.illuminant,
+        band_m=band_m,
+    )
+    grid = SuperpixelGrid(
+        shape=(rows, columns),
+        count=tuple(count),
+        centre=first + index * np.array([rows, columns]),
+    )
+    return replace(capture, grid=grid, metadata=metadata)

@@ -43,13 +43,14 @@ from plenocli.files.config.camera_file import load_camera
 from plenocli.forward.accuracy import dial
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.model import Camera
-from plenocli.forward.propagation import costs, rays
+from plenocli.forward.propagation import costs
 from plenocli.forward.propagation.costs import Features, Law, priced
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact.term_counts import ExactBand, TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.spread_terms import SpreadLaw
 from plenocli.forward.propagation.plan import NOMINAL_RATE
+from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
 EXACT, SPREAD = "exact, low rank", "spread function"

@@ -13,13 +13,13 @@ from abc import ABC, abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING
 
-from plenocli.forward.propagation import rays
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
 from plenocli.forward.propagation.lenslet_fields import LensletFields
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
+from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.sampling import (
     size_band,
 )

@@ -27,7 +27,7 @@ from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, aperture_picture, filter_cells, wavefront
 from plenocli.forward.camera.quadrature import cell_chords, gauss, nodes_for
-from plenocli.forward.propagation.rays import pupil_measure
+from plenocli.forward.propagation.ray.rays import pupil_measure
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

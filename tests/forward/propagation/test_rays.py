@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.propagation.rays import (
+from plenocli.forward.propagation.ray.rays import (
     RayLenslets,
     disc_below,
     error_bound,

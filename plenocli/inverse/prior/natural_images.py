@@ -102,7 +102,7 @@ def autocovariance(images: Sequence[np.ndarray], reach: int) -> tuple[float, np.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
-    total, pairs = np.zeros((2 * reach + 1,) * 2), np.zeros((2 * reach + 1,) * 2)
+    total, overlap = np.zeros((2 * reach + 1,) * 2), np.zeros((2 * reach + 1,) * 2)
     mean = np.sum([i.sum(dtype=float) for i in images]) / np.sum([i.size for i in images])
     lags = np.arange(-reach, reach + 1)
     for image in images:
@@ -116,8 +116,8 @@ def autocovariance(images: Sequence[np.ndarray], reach: int) -> tuple[float, np.
             np.abs(lags)[None, :] < image.shape[1]
         )
         total += np.where(reached, lag_sum[np.ix_(lags, lags)], 0)
-        pairs += np.where(reached, np.round(lag_count[np.ix_(lags, lags)]), 0)
-    field = total / np.maximum(pairs, 1)
+        overlap += np.where(reached, np.round(lag_count[np.ix_(lags, lags)]), 0)
+    field = total / np.maximum(overlap, 1)
     field = (field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]) / 4
     half = np.median([min(i.shape) for i in images]) / 2
     taper = (
@@ -126,7 +126,9 @@ def autocovariance(images: Sequence[np.ndarray], reach: int) -> tuple[float, np.
         else 1.0 + 0 * lags
     )
     field *= taper[:, None] * taper[None, :]
-    cut = np.fft.fftshift(
+    proper = np.fft.fftshift(
         np.fft.ifft2(np.maximum(np.fft.fft2(np.fft.ifftshift(field)).real, 0)).real
     )
-    return float(mean), cut * (field[reach, reach] / max(cut[reach, reach], np.finfo(float).tiny))
+    return float(mean), proper * (
+        field[reach, reach] / max(proper[reach, reach], np.finfo(float).tiny)
+    )

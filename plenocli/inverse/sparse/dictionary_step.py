@@ -84,9 +84,10 @@ def gradient_step(
     ahead, momentum = atoms, 1.0
     for _ in range(steps):
         pull = delta * (basis @ (energy[:, None] * (basis.T @ ahead))) if delta else 0.0
-        moved = ahead - length * (ahead @ gram + ridge * ahead - right + pull)
+        stepped = ahead - length * (ahead @ gram + ridge * ahead - right + pull)
         after = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
-        ahead, atoms, momentum = moved + (momentum - 1) / after * (moved - atoms), moved, after
+        ahead = stepped + (momentum - 1) / after * (stepped - atoms)
+        atoms, momentum = stepped, after
     return atoms, _normal_residual(energy, basis, gram, right, delta, atoms)
 
 

@@ -252,8 +252,8 @@ def adaptive_lmmse(
     """
     rows, columns = y.shape[:2]
     lmmse = estimators.prior.lmmse(sigma, scene)
-    x, spread, _ = lmmse.adaptive(y.reshape(rows * columns, -1).T)
-    return x.T.reshape(rows, columns, -1), spread.T.reshape(rows, columns, -1)
+    x, sigma_of_x, _ = lmmse.adaptive(y.reshape(rows * columns, -1).T)
+    return x.T.reshape(rows, columns, -1), sigma_of_x.T.reshape(rows, columns, -1)
 
 
 def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:

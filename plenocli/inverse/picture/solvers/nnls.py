@@ -90,9 +90,9 @@ def projected_gradient(
     x = np.zeros_like(target)
     ahead, momentum = x, np.ones(z.shape[1])
     for _ in range(iterations):
-        moved = np.maximum(ahead - step * (gram @ ahead - target), 0)
-        restart = np.einsum("ij,ij->j", ahead - moved, moved - x) > 0
+        stepped = np.maximum(ahead - step * (gram @ ahead - target), 0)
+        restart = np.einsum("ij,ij->j", ahead - stepped, stepped - x) > 0
         after = np.where(restart, 1.0, (1 + np.sqrt(1 + 4 * momentum**2)) / 2)
         pull = np.where(restart, 0.0, (momentum - 1) / after)
-        ahead, x, momentum = moved + pull * (moved - x), moved, after
+        ahead, x, momentum = stepped + pull * (stepped - x), stepped, after
     return NonNegative(x, kkt_violation(matrix, z, x), iterations)

@@ -2,8 +2,8 @@
 signal, updated, never rebuilt.
 
 Imported late (by plenocli.inverse.sparse.l1.solve), because importing numba takes a second; without
-numba plenocli.inverse.sparse.l1.plain does the work. The problem of one signal is min c^T G c - 2
-b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
+numba plenocli.inverse.sparse.l1.uncompiled does the work. The problem of one signal is min c^T G c
+- 2 b^T c + 2 sum_j threshold_j |c_j|, with q = b - G c, half the downhill slope.
 
 Three nested sets of atoms keep the cost down: all (q from whole rows of G, a few times a signal), a
 working set of those with the largest |q| / threshold, which grows (its block of G is copied close
@@ -69,7 +69,7 @@ def _copy(values: np.ndarray, n: int, target: np.ndarray) -> None:
 
 
 @_jit
-def _spread(values: np.ndarray, index: np.ndarray, target: np.ndarray) -> None:
+def _scatter(values: np.ndarray, index: np.ndarray, target: np.ndarray) -> None:
     """target[index] = values, zero elsewhere."""
     for i in range(target.shape[0]):
         target[i] = 0.0
@@ -414,11 +414,11 @@ def _extend(w: Work, size: int, gram: np.ndarray, ratio: np.ndarray, more: int) 
     """`more` atoms of the largest ratios join the `size` of the working set. Returns its size."""
     for j in w.working[:size]:
         ratio[j] = -1.0
-    cut, first = _kth_largest(ratio, more), size
-    spare = more - np.count_nonzero(ratio > cut)
+    bound, first = _kth_largest(ratio, more), size
+    spare = more - np.count_nonzero(ratio > bound)
     for j in range(ratio.shape[0]):
-        if ratio[j] > cut or (ratio[j] == cut and spare > 0):
-            if ratio[j] == cut:
+        if ratio[j] > bound or (ratio[j] == bound and spare > 0):
+            if ratio[j] == bound:
                 spare -= 1
             w.working[size], w.active[size] = j, False
             size += 1
@@ -478,7 +478,7 @@ def solve_signal(
         _subtract(near, w.x, n, w.block, w.local)
         n = _solve_working_set(w, n, b[index], near, threshold[index], 0.25 * tol)
         index = w.working[w.local[:n]]
-        _spread(w.x, index, c)
+        _scatter(w.x, index, c)
     q = b.copy()
     _subtract(q, w.x, n, gram, index)
     objective, gap = relative_gap(b, q, w.x, index, signal_energy, threshold)
@@ -496,7 +496,7 @@ def solve_signal(
             w, n, b[working], q[working], raised * threshold[working], 0.25 * tol
         )
         index = working[w.local[:n]]
-        _spread(w.x, index, c)
+        _scatter(w.x, index, c)
         if passes == pass_limit:
             break
         _copy(b, q.shape[0], q)

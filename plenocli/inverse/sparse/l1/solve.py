@@ -13,6 +13,7 @@ the same certificate.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -141,12 +142,12 @@ def fista(
     done = 0
     while done < iterations and np.any(gap > tol):
         done += 1
-        moved = ahead - step * (ahead @ gram - problem.b)
-        moved = np.sign(moved) * np.maximum(np.abs(moved) - step * problem.threshold, 0)
-        restart = np.einsum("ij,ij->i", ahead - moved, moved - c) > 0
+        stepped = ahead - step * (ahead @ gram - problem.b)
+        stepped = np.sign(stepped) * np.maximum(np.abs(stepped) - step * problem.threshold, 0)
+        restart = np.einsum("ij,ij->i", ahead - stepped, stepped - c) > 0
         after = np.where(restart, 1.0, (1 + np.sqrt(1 + 4 * momentum**2)) / 2)
         pull = np.where(restart, 0.0, (momentum - 1) / after)
-        ahead, c, momentum = moved + pull[:, None] * (moved - c), moved, after
+        ahead, c, momentum = stepped + pull[:, None] * (stepped - c), stepped, after
         if done % 10 == 0 or done == iterations:
             objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
     return SparseCode(
@@ -156,6 +157,111 @@ def fista(
 
 BLOCK = 1024
 """Signals certified together: bounds the memory of residuals and slopes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ActiveSet:
+    """The active-set method at work on a prepared problem; its last four arrays are filled in.
+
+    problem: see there.
+    gram: (atom, atom) D^T D.
+    threshold: (atom,) lambda w / 2.
+    tol: relative duality gap to reach.
+    workers: threads over signals, None for all cores.
+    c: (signal, atom) coefficients, to begin with a guess.
+    done: (signal,) outer passes.
+    objective, gap: (signal,) as in SparseCode.
+    """
+
+    problem: Problem
+    gram: np.ndarray
+    threshold: np.ndarray
+    tol: float
+    workers: int | None
+    c: np.ndarray
+    done: np.ndarray
+    objective: np.ndarray
+    gap: np.ndarray
+
+    def certify(self, which: slice | np.ndarray) -> None:
+        """Into objective and gap of the signals `which` (a slice, or indices), BLOCK at a time."""
+        index, y = np.arange(len(self.c))[which], self.problem.y
+        for first in range(0, len(index), BLOCK):
+            part = as_slice(index[first : first + BLOCK])
+            self.objective[part], self.gap[part], _ = duality_gap(
+                self.problem.d, y[:, part], self.c[part], self.threshold
+            )
+
+    def solve_one(self, signal: int, passes: int, *, factored: bool = False) -> None:
+        """One signal without the compiled kernel; factored: not through D^T D."""
+        from plenocli.inverse.sparse.l1 import uncompiled
+
+        self.done[signal] += uncompiled.solve_signal(
+            self.problem.d,
+            self.problem.y[:, signal],
+            None if factored else self.gram,
+            self.threshold,
+            self.tol,
+            passes,
+            self.c[signal],
+        )
+
+    def solve_compiled(
+        self, kernel: Callable[..., None], which: slice | np.ndarray, passes: int
+    ) -> None:
+        """The signals `which` (a slice, or indices), in threads; each signal is solved by itself,
+        so the result does not depend on how they are dealt out.
+        """
+        import os
+        from concurrent.futures import ThreadPoolExecutor
+
+        y, b = self.problem.y[:, which], self.problem.b[which]
+        found, steps = self.c[which], self.done[which]
+        count = len(found)
+        energy, unused = np.einsum("ij,ij->j", y, y), np.empty((2, count))
+        before = steps.copy()
+
+        def solve(part: slice) -> None:
+            kernel(
+                self.gram,
+                b[part],
+                energy[part],
+                self.threshold,
+                float(self.tol),
+                int(passes),
+                found[part],
+                unused[0, part],
+                unused[1, part],
+                steps[part],
+            )
+
+        workers = max(1, min(int(self.workers or os.cpu_count() or 1), count))
+        size = max(1, min(64, -(-count // workers)))
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(solve, [slice(first, first + size) for first in range(0, count, size)]))
+        steps += before
+        if not isinstance(which, slice):  # indices gave copies
+            self.c[which], self.done[which] = found, steps
+
+    def solve_all(self, passes: int) -> None:
+        """Every signal through D^T D, and its certificate."""
+        everything = slice(0, len(self.c))
+        try:
+            from plenocli.inverse.sparse.l1.kernel import solve_signals
+        except ImportError:  # no numba: many times slower, the same result
+            for signal in range(len(self.c)):
+                self.solve_one(signal, passes)
+            self.certify(everything)
+            return
+        # from a good start one pass nearly always does; the certificate tells, for less
+        # than the kernel's own
+        first = min(passes, 1) if self.c.any() else passes
+        self.solve_compiled(solve_signals, everything, first)
+        self.certify(everything)
+        again = np.flatnonzero(~(self.gap <= self.tol)) if first < passes else np.arange(0)
+        if len(again):
+            self.solve_compiled(solve_signals, again, passes - first)
+            self.certify(again)
 
 
 def _active_set(
@@ -170,128 +276,34 @@ def _active_set(
     """SparseCode of a prepared problem: Gram form for all signals, then the factored form for
     those it could not certify.
     """
-    from plenocli.inverse.sparse.l1 import plain as l1_plain
     from plenocli.inverse.sparse.l1.guess import guess
 
     count = len(problem.b)
-    c = (
-        guess(problem, threshold)
+    run = _ActiveSet(
+        problem=problem,
+        gram=gram,
+        threshold=threshold,
+        tol=tol,
+        workers=workers,
+        c=guess(problem, threshold)
         if start is None
-        else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T)
+        else np.ascontiguousarray(np.asarray(start, float)[problem.penalised].T),
+        done=np.zeros(count, np.int64),
+        objective=np.empty(count),
+        gap=np.empty(count),
     )
-    done, objective, gap = np.zeros(count, np.int64), np.empty(count), np.empty(count)
-    everything = slice(0, count)
-    try:
-        from plenocli.inverse.sparse.l1 import kernel as l1_kernel
-    except ImportError:  # no numba: many times slower, the same result
-        for i in range(count):
-            done[i] = l1_plain.solve_signal(
-                problem.d, problem.y[:, i], gram, threshold, tol, passes, c[i]
-            )
-        _certify(problem, threshold, everything, c, objective, gap)
-    else:
-        # from a good start one pass nearly always does; the certificate tells, for less
-        # than the kernel's own
-        first = min(passes, 1) if c.any() else passes
-        _compiled(
-            l1_kernel.solve_signals,
-            gram,
-            problem,
-            threshold,
-            tol,
-            first,
-            everything,
-            c,
-            done,
-            workers,
-        )
-        _certify(problem, threshold, everything, c, objective, gap)
-        again = np.flatnonzero(~(gap <= tol)) if first < passes else np.arange(0)
-        if len(again):
-            _compiled(
-                l1_kernel.solve_signals,
-                gram,
-                problem,
-                threshold,
-                tol,
-                passes - first,
-                again,
-                c,
-                done,
-                workers,
-            )
-            _certify(problem, threshold, again, c, objective, gap)
-    missed = np.flatnonzero(~(gap <= tol)).tolist() if passes > 0 else []
-    for i in missed:
-        if objective[i] > problem.y[:, i] @ problem.y[:, i]:
-            c[i] = 0
-        done[i] += l1_plain.solve_signal(
-            problem.d, problem.y[:, i], None, threshold, tol, passes, c[i]
-        )
-        _certify(problem, threshold, slice(i, i + 1), c, objective, gap)
+    run.solve_all(passes)
+    missed = np.flatnonzero(~(run.gap <= tol)).tolist() if passes > 0 else []
+    for signal in missed:
+        y = problem.y[:, signal]
+        if run.objective[signal] > y @ y:
+            run.c[signal] = 0
+        run.solve_one(signal, passes, factored=True)
+        run.certify(slice(signal, signal + 1))
     return SparseCode(
-        c=problem.restore(c), objective=objective, gap=gap, passes=done, factored=len(missed)
+        c=problem.restore(run.c),
+        objective=run.objective,
+        gap=run.gap,
+        passes=run.done,
+        factored=len(missed),
     )
-
-
-def _certify(
-    problem: Problem,
-    threshold: np.ndarray,
-    which: slice | np.ndarray,
-    c: np.ndarray,
-    objective: np.ndarray,
-    gap: np.ndarray,
-) -> None:
-    """Into objective and gap of the signals `which` (a slice, or indices), BLOCK at a time."""
-    which = np.arange(len(c))[which]
-    for first in range(0, len(which), BLOCK):
-        part = as_slice(which[first : first + BLOCK])
-        objective[part], gap[part], _ = duality_gap(
-            problem.d, problem.y[:, part], c[part], threshold
-        )
-
-
-def _compiled(
-    solve_signals: Callable[..., None],
-    gram: np.ndarray,
-    problem: Problem,
-    threshold: np.ndarray,
-    tol: float,
-    passes: int,
-    which: slice | np.ndarray,
-    c: np.ndarray,
-    done: np.ndarray,
-    workers: int | None,
-) -> None:
-    """Into c and done of the signals `which` (a slice, or indices), in threads; each signal is
-    solved by itself, so the result does not depend on how they are dealt out.
-    """
-    import os
-    from concurrent.futures import ThreadPoolExecutor
-
-    y, b, found, steps = problem.y[:, which], problem.b[which], c[which], done[which]
-    count = len(found)
-    energy, unused = np.einsum("ij,ij->j", y, y), np.empty((2, count))
-    before = steps.copy()
-
-    def solve(part):
-        solve_signals(
-            gram,
-            b[part],
-            energy[part],
-            threshold,
-            float(tol),
-            int(passes),
-            found[part],
-            unused[0, part],
-            unused[1, part],
-            steps[part],
-        )
-
-    workers = max(1, min(int(workers or os.cpu_count() or 1), count))
-    size = max(1, min(64, -(-count // workers)))
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(solve, [slice(first, first + size) for first in range(0, count, size)]))
-    steps += before
-    if not isinstance(which, slice):  # indices gave copies
-        c[which], done[which] = found, steps

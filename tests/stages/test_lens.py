@@ -400,15 +400,15 @@ def test_rays_wavefront_and_focal_shift_are_optiland_s(shared_data, name):
 
     from optiland.wavefront import Wavefront as Theirs
 
+    from plenocli.files.config import prescription_file
     from plenocli.forward.camera import lens as ours
-    from plenocli.stages.forward import lens as stage
 
     path = shared_data / "lens" / "optiland" / name
-    found, _ = stage.import_lens(path)
+    found, _ = prescription_file.import_lens(path)
     lens = parse_lens(lens_toml(found))  # through the file
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        optic, _ = stage._read(path)
+        optic, _ = prescription_file._read(path)
         top = max(field.y for field in optic.fields.fields)
         index = {w: float(np.ravel(optic.surfaces.n(w))[0]) for w in (0.45, 0.55, 0.65)}
         assert set(index.values()) == {1.0}
@@ -489,7 +489,7 @@ def _paraxially_aimed(ours, lens, wavelength, points, angle):
 )
 def test_import_says_which_surface_is_none_of_ours(tmp_path, monkeypatch, change, words):
     """As optiland's objects are, without it."""
-    from plenocli.stages.forward import lens as stage
+    from plenocli.files.config import prescription_file
 
     straight = SimpleNamespace(x=0, y=0, z=0, rx=0, ry=0, rz=0)
     flat = type("Plane", (), {"cs": straight, "radius": math.inf})()
@@ -506,17 +506,17 @@ def test_import_says_which_surface_is_none_of_ours(tmp_path, monkeypatch, change
         SimpleNamespace(**plain | {"is_stop": False}),
     ]
     monkeypatch.setattr(
-        stage,
+        prescription_file,
         "_read",
         lambda path: (SimpleNamespace(surfaces=change.get("surfaces", surfaces)), []),
     )
     (tmp_path / "a.seq").write_text("x")
     with pytest.raises(InputError, match=words):
-        stage.import_lens(tmp_path / "a.seq")
+        prescription_file.import_lens(tmp_path / "a.seq")
 
 
 def test_what_optiland_cannot_read_is_an_input_error(tmp_path, monkeypatch):
-    from plenocli.stages.forward import lens as stage
+    from plenocli.files.config import prescription_file
 
     def load(path):
         raise IndexError("list index out of range")
@@ -525,4 +525,4 @@ def test_what_optiland_cannot_read_is_an_input_error(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optiland", SimpleNamespace(fileio=fileio))
     (tmp_path / "a.zmx").write_text("x")
     with pytest.raises(InputError, match="a.zmx: optiland cannot read it .IndexError"):
-        stage.import_lens(tmp_path / "a.zmx")
+        prescription_file.import_lens(tmp_path / "a.zmx")

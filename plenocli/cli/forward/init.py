@@ -33,5 +33,5 @@ def command(
     from plenocli.stages.forward.init import run_init
 
     made = run_init(folder, overwrite=overwrite)
-    line = f"{folder}: {len(made['files'])} files; next: make -C {shlex.quote(str(folder))}"
-    options.summary(made, as_json, line)
+    line = f"{folder}: {len(made.files)} files; next: make -C {shlex.quote(str(folder))}"
+    options.summary(made.as_json(), as_json, line)

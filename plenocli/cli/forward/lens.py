@@ -76,7 +76,7 @@ def import_command(
     from plenocli.stages.forward.lens import line, run_lens_import
 
     report = run_lens_import(prescription, output, focal_length=focal_length, overwrite=overwrite)
-    options.summary(report, as_json, line(report))
+    options.summary(report.as_json(), as_json, line(report))
 
 
 @command.command(
@@ -132,4 +132,4 @@ def show_command(
     report = run_lens_show(
         lens, wavelengths=wavelengths, fields=fields, object_distance=object_distance
     )
-    options.summary(report, as_json, describe(report))
+    options.summary(report.as_json(), as_json, describe(report))

@@ -2,10 +2,11 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.errors import InputError, OutputError
 
@@ -20,13 +21,24 @@ class Sample:
     content: bytes
 
 
-def run_init(folder: Path, *, overwrite: bool = False) -> dict[str, str | list[str]]:
+@dataclass(frozen=True, kw_only=True)
+class InitSummary:
+    """What was written: the folder and the names in it, the Makefile last."""
+
+    folder: str
+    files: list[str]
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary for `--json`."""
+        return asdict(self)
+
+
+def run_init(folder: Path, *, overwrite: bool = False) -> InitSummary:
     """Write the samples into a folder.
 
     folder: where to; made where it is missing, its parent must be there.
     overwrite: replace files of the same names; else nothing is written where there is one.
 
-    Returns {"folder", "files"}: the folder and the names in it, the Makefile last.
     Raises UsageError where a file exists, OutputError where one cannot be written.
     """
     from plenocli.files.atomic import check_output, publish
@@ -48,7 +60,7 @@ def run_init(folder: Path, *, overwrite: bool = False) -> dict[str, str | list[s
             raise OutputError(f"the folder cannot be made ({error.strerror})", place, fix) from None
     for sample in found:
         publish(targets[sample.name], sample.content, overwrite=overwrite)
-    return {"folder": str(folder), "files": [sample.name for sample in found]}
+    return InitSummary(folder=str(folder), files=[sample.name for sample in found])
 
 
 def samples() -> list[Sample]:

@@ -1,19 +1,18 @@
-"""Lens prescriptions: import through optiland, and what a lens does, as numbers and as text."""
+"""Lenses: prescriptions imported, and what a lens does, as numbers and as text."""
 
-import contextlib
-import io
+from __future__ import annotations
+
 import math
-import warnings
-from dataclasses import replace
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from plenocli.base.errors import InputError, NumericsError, UsageError
-from plenocli.base.extras import how_to_install
+from plenocli.base.errors import NumericsError
 from plenocli.base.units import format_length
 from plenocli.files.config.lens_file import lens_toml, load_lens
-from plenocli.forward.camera.glass import AIR, GLASSES, Medium, medium
+from plenocli.files.config.prescription_file import import_lens
 from plenocli.forward.camera.lens import (
     disc_points,
     distortion,
@@ -26,172 +25,301 @@ from plenocli.forward.camera.lens import (
     transmitted,
     wavefront,
 )
-from plenocli.forward.camera.prescription import Prescription, Surface
-from plenocli.forward.camera.raytrace import entrance_pupil
+from plenocli.forward.camera.prescription import Prescription
+from plenocli.forward.camera.raytrace import Pupil
 
-MAX_BYTES = 4 << 20
-"""No prescription is longer; what is, is some other file."""
-SUFFIXES = (".zmx", ".seq", ".json")
+Name = str | os.PathLike[str]
 
 
 # --- show -----------------------------------------------------------------------------------------
 
 
-def run_lens_show(path, *, wavelengths=(), fields=(0.0,), object_distance=None):
-    """What the lens in the TOML file `path` does, as a JSON-able dict; lengths in m, angles in rad.
+@dataclass(frozen=True, kw_only=True)
+class PupilSummary:
+    """Where a pupil is and how wide; None at infinity."""
 
-    wavelengths: m, default C, d and F lines with the design wavelength;
-    fields: rad;
+    position_m: float | None
+    radius_m: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstOrderSummary:
+    """What a lens does to paraxial light of one wavelength.
+
+    focal_shift_m: from the focus of the design wavelength.
+    f_number: None where the exit pupil is at infinity.
+    """
+
+    wavelength_m: float
+    focal_length_m: float
+    back_focus_m: float
+    focal_shift_m: float
+    f_number: float | None
+    front_principal_m: float
+    rear_principal_m: float
+    entrance_pupil: PupilSummary
+    exit_pupil: PupilSummary
+
+
+@dataclass(frozen=True, kw_only=True)
+class AberrationSummary:
+    """What a lens does to light of one wavelength from one field.
+
+    lateral_colour_m: shift of the image from that of the design wavelength.
+    noll_m: coefficients of the Zernike terms, in Noll's order.
+    noll_rest_m: root mean square of what they leave.
+    """
+
+    wavelength_m: float
+    lateral_colour_m: float
+    image_height_m: float
+    wavefront_rms_m: float
+    wavefront_rms_waves: float
+    noll_m: list[float]
+    noll_rest_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldSummary:
+    """What a lens does to light from one field, as far as its rays arrive.
+
+    transmitted: share of the stop that is lit.
+    distortion: relative.
+    trouble: why the rest is missing.
+    """
+
+    angle_rad: float
+    transmitted: float | None = None
+    distortion: float | None = None
+    wavelengths: list[AberrationSummary] | None = None
+    trouble: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensSummary:
+    """What a lens does; lengths in m, angles in rad.
+
+    file: name of its file.
+    stop: number of the surface, from 1.
+    object_distance_m: from the first vertex, None for infinity.
+    """
+
+    file: str
+    name: str
+    surfaces: int
+    stop: int
+    stop_diameter_m: float
+    design_wavelength_m: float
+    object_distance_m: float | None
+    image_distance_m: float
+    paraxial_image_distance_m: float
+    wavelengths: list[FirstOrderSummary]
+    fields: list[FieldSummary]
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary for `--json`; what a field has not got is left out."""
+        told = asdict(self)
+        fields = [
+            {name: value for name, value in field.items() if value is not None}
+            for field in told.pop("fields")
+        ]
+        return told | {"fields": fields}
+
+
+def run_lens_show(
+    path: Name,
+    *,
+    wavelengths: Iterable[float] = (),
+    fields: Iterable[float] = (0.0,),
+    object_distance: float | None = None,
+) -> LensSummary:
+    """What the lens in the TOML file `path` does.
+
+    wavelengths: m, default C, d and F lines with the design wavelength.
+    fields: angles, rad.
     object_distance: m from the first vertex, default the lens's own.
+
     Raises InputError and ConfigError as load_lens does, NumericsError for a lens without power.
     """
-    lens = load_lens(path)
+    lens = load_lens(Path(path))
     distance = lens.object_distance if object_distance is None else object_distance
     chosen = sorted(set(wavelengths) or {486.1327e-9, 656.2725e-9, lens.design_wavelength})
-    report = {
-        "file": Path(path).name,
-        "name": lens.name,
-        "surfaces": len(lens.surfaces),
-        "stop": lens.stop + 1,
-        "stop_diameter_m": 2 * lens.stop_radius,
-        "design_wavelength_m": lens.design_wavelength,
-        "object_distance_m": distance if math.isfinite(distance) else None,
-        "image_distance_m": image_plane(lens, distance),
-        "paraxial_image_distance_m": paraxial_image(lens, lens.design_wavelength, distance),
-    }
+    image = image_plane(lens, distance)
+    paraxial = paraxial_image(lens, lens.design_wavelength, distance)
     shifts = focal_shift(lens, chosen, distance)
-    report["wavelengths"] = [_chromatic(lens, w, float(shift)) for w, shift in zip(chosen, shifts)]
-    report["fields"] = [_field(lens, chosen, angle, distance) for angle in fields]
-    return report
+    return LensSummary(
+        file=Path(path).name,
+        name=lens.name,
+        surfaces=len(lens.surfaces),
+        stop=lens.stop + 1,
+        stop_diameter_m=2 * lens.stop_radius,
+        design_wavelength_m=lens.design_wavelength,
+        object_distance_m=_finite(distance),
+        image_distance_m=image,
+        paraxial_image_distance_m=paraxial,
+        wavelengths=[_first_order(lens, w, float(shift)) for w, shift in zip(chosen, shifts)],
+        fields=[_field(lens, chosen, angle, distance) for angle in fields],
+    )
 
 
-def _chromatic(lens, wavelength, shift):
+def _first_order(lens: Prescription, wavelength: float, shift: float) -> FirstOrderSummary:
     data = first_order(lens, wavelength)
-    return {
-        "wavelength_m": wavelength,
-        "focal_length_m": data.focal_length,
-        "back_focus_m": data.back_focus,
-        "focal_shift_m": shift,
-        "f_number": _finite(data.f_number),
-        "front_principal_m": data.front_principal,
-        "rear_principal_m": data.rear_principal,
-        "entrance_pupil": {
-            "position_m": _finite(data.entrance_pupil.position),
-            "radius_m": _finite(data.entrance_pupil.radius),
-        },
-        "exit_pupil": {
-            "position_m": _finite(data.exit_pupil.position),
-            "radius_m": _finite(data.exit_pupil.radius),
-        },
-    }
+    return FirstOrderSummary(
+        wavelength_m=wavelength,
+        focal_length_m=data.focal_length,
+        back_focus_m=data.back_focus,
+        focal_shift_m=shift,
+        f_number=_finite(data.f_number),
+        front_principal_m=data.front_principal,
+        rear_principal_m=data.rear_principal,
+        entrance_pupil=_pupil(data.entrance_pupil),
+        exit_pupil=_pupil(data.exit_pupil),
+    )
 
 
-def _finite(value):
+def _pupil(pupil: Pupil) -> PupilSummary:
+    return PupilSummary(position_m=_finite(pupil.position), radius_m=_finite(pupil.radius))
+
+
+def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _field(lens, wavelengths, angle, distance):
+def _field(
+    lens: Prescription, wavelengths: Sequence[float], angle: float, distance: float
+) -> FieldSummary:
     """W, lateral colour, distortion and vignetting at one field; a field whose chief ray
     fails says so instead.
     """
-    report = {"angle_rad": angle}
+    found: dict[str, Any] = {}
     try:
-        report["transmitted"] = transmitted(lens, lens.design_wavelength, angle, distance)
-        report["distortion"] = (
-            distortion(lens, lens.design_wavelength, angle, distance) if angle else 0.0
+        found.update(transmitted=transmitted(lens, lens.design_wavelength, angle, distance))
+        found.update(
+            distortion=distortion(lens, lens.design_wavelength, angle, distance) if angle else 0.0
         )
         colour = lateral_colour(lens, wavelengths, angle, distance)
-        points, weights = disc_points(16, 64)
-        report["wavelengths"] = []
-        for w, shift in zip(wavelengths, colour):
-            wave = wavefront(lens, w, points, angle=angle, object_distance=distance)
-            rms = wave.rms(weights)
-            terms, rest = noll_coefficients(lens, w, 22, angle=angle, object_distance=distance)
-            report["wavelengths"].append(
-                {
-                    "wavelength_m": w,
-                    "lateral_colour_m": float(shift),
-                    "image_height_m": float(wave.centre[1]),
-                    "wavefront_rms_m": rms,
-                    "wavefront_rms_waves": rms / w,
-                    "noll_m": [float(c) for c in terms],
-                    "noll_rest_m": rest,
-                }
-            )
+        found.update(wavelengths=(rows := []))
+        for wavelength, shift in zip(wavelengths, colour):
+            rows.append(_aberration(lens, wavelength, float(shift), angle, distance))
     except NumericsError as error:
-        report["trouble"] = error.what
-    return report
+        found.update(trouble=error.what)
+    return FieldSummary(angle_rad=angle, **found)
 
 
-def describe(report):
-    """The report of `run_lens_show` as lines for a terminal."""
-    design = report["design_wavelength_m"]
-    distance = report["object_distance_m"]
+def _aberration(
+    lens: Prescription, wavelength: float, shift: float, angle: float, distance: float
+) -> AberrationSummary:
+    points, weights = disc_points(16, 64)
+    wave = wavefront(lens, wavelength, points, angle=angle, object_distance=distance)
+    rms = wave.rms(weights)
+    terms, rest = noll_coefficients(lens, wavelength, 22, angle=angle, object_distance=distance)
+    return AberrationSummary(
+        wavelength_m=wavelength,
+        lateral_colour_m=shift,
+        image_height_m=float(wave.centre[1]),
+        wavefront_rms_m=rms,
+        wavefront_rms_waves=rms / wavelength,
+        noll_m=[float(c) for c in terms],
+        noll_rest_m=rest,
+    )
+
+
+def describe(summary: LensSummary) -> str:
+    """The summary of a lens as lines for a terminal."""
+    distance = summary.object_distance_m
     lines = [
         (
-            f"{report['file']}: {report['name'] or 'lens'}, {report['surfaces']} surfaces, stop at "
-            f"{report['stop']}, {report['stop_diameter_m'] * 1e3:.6g} mm wide, designed at "
-            f"{format_length(design)}"
+            f"{summary.file}: {summary.name or 'lens'}, {summary.surfaces} surfaces, stop at "
+            f"{summary.stop}, {summary.stop_diameter_m * 1e3:.6g} mm wide, designed at "
+            f"{format_length(summary.design_wavelength_m)}"
         ),
         (
             f"  object at {'infinity' if distance is None else format_length(distance)}, image "
-            f"plane {report['image_distance_m'] * 1e3:.5f} mm behind the last vertex (paraxial "
-            f"{report['paraxial_image_distance_m'] * 1e3:.5f} mm)"
+            f"plane {summary.image_distance_m * 1e3:.5f} mm behind the last vertex (paraxial "
+            f"{summary.paraxial_image_distance_m * 1e3:.5f} mm)"
         ),
         (
             "  wavelength   focal length   back focus     focal shift   F-number  entrance pupil: "
             "place, diameter   exit pupil: place, diameter"
         ),
     ]
-    for row in report["wavelengths"]:
-        lines.append(
-            f"  {row['wavelength_m'] * 1e9:7.2f} nm  {row['focal_length_m'] * 1e3:10.5f} mm  "
-            f"{row['back_focus_m'] * 1e3:9.5f} mm  {row['focal_shift_m'] * 1e6:+9.2f} um  "
-            f"{_shown(row['f_number']):>8}  {_pupil(row['entrance_pupil'])}  "
-            f"{_pupil(row['exit_pupil'])}"
-        )
-    for field in report["fields"]:
-        head = f"  field {math.degrees(field['angle_rad']):.4g} deg: "
-        if "trouble" in field:
-            lines.append(head + field["trouble"])
-            continue
-        lines.append(
-            head
-            + f"{field['transmitted']:.1%} of the stop lit, distortion {field['distortion']:+.3%}"
-        )
-        lines += [
-            (
-                f"    {row['wavelength_m'] * 1e9:7.2f} nm  W rms {row['wavefront_rms_waves']:.4f} "
-                f"waves = {row['wavefront_rms_m'] * 1e9:.1f} nm  image height "
-                f"{row['image_height_m'] * 1e3:.5f} mm  lateral colour "
-                f"{row['lateral_colour_m'] * 1e6:+.2f} um"
-            )
-            for row in field["wavelengths"]
-        ]
+    lines += [
+        f"  {row.wavelength_m * 1e9:7.2f} nm  {row.focal_length_m * 1e3:10.5f} mm  "
+        f"{row.back_focus_m * 1e3:9.5f} mm  {row.focal_shift_m * 1e6:+9.2f} um  "
+        f"{_shown(row.f_number):>8}  {_place(row.entrance_pupil)}  {_place(row.exit_pupil)}"
+        for row in summary.wavelengths
+    ]
+    for field in summary.fields:
+        lines += _field_lines(field)
     return "\n".join(lines)
 
 
-def _shown(value, form=".4f"):
+def _field_lines(field: FieldSummary) -> list[str]:
+    head = f"  field {math.degrees(field.angle_rad):.4g} deg: "
+    if field.trouble is not None:
+        return [head + field.trouble]
+    return [
+        head + f"{field.transmitted:.1%} of the stop lit, distortion {field.distortion:+.3%}",
+        *(
+            f"    {row.wavelength_m * 1e9:7.2f} nm  W rms {row.wavefront_rms_waves:.4f} "
+            f"waves = {row.wavefront_rms_m * 1e9:.1f} nm  image height "
+            f"{row.image_height_m * 1e3:.5f} mm  lateral colour "
+            f"{row.lateral_colour_m * 1e6:+.2f} um"
+            for row in field.wavelengths or ()
+        ),
+    ]
+
+
+def _shown(value: float | None, form: str = ".4f") -> str:
     return "-" if value is None else f"{value:{form}}"
 
 
-def _pupil(pupil):
-    if pupil["position_m"] is None:
+def _place(pupil: PupilSummary) -> str:
+    if pupil.position_m is None or pupil.radius_m is None:
         return f"{'at infinity':>28}"
-    return f"{pupil['position_m'] * 1e3:+12.5f}, {2 * pupil['radius_m'] * 1e3:9.5f} mm"
+    return f"{pupil.position_m * 1e3:+12.5f}, {2 * pupil.radius_m * 1e3:9.5f} mm"
 
 
 # --- import ---------------------------------------------------------------------------------------
 
 
-def run_lens_import(path, output, *, focal_length=None, overwrite=False):
-    """Convert the prescription at `path` (.zmx, CODE V .seq, optiland's .json) into a lens file
-    at `output`, .toml.
+@dataclass(frozen=True, kw_only=True)
+class ImportSummary:
+    """What was imported.
 
-    Glasses are written out with their dispersion formulas.
-    focal_length (m): scale the lens to it.
-    Returns a JSON-able report with notes on what could not be kept. InputError for what cannot be
-    read or modelled, UsageError without optiland.
+    output: the lens file.
+    input: name of the prescription.
+    glasses: names of the media but air.
+    f_number: None where the exit pupil is at infinity.
+    notes: what could not be kept.
+    """
+
+    output: str
+    input: str
+    surfaces: int
+    glasses: list[str]
+    focal_length_m: float
+    f_number: float | None
+    notes: list[str]
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary for `--json`."""
+        return asdict(self)
+
+
+def run_lens_import(
+    path: Name, output: Name, *, focal_length: float | None = None, overwrite: bool = False
+) -> ImportSummary:
+    """Convert a prescription into a lens file. Glasses are written out with their dispersion
+    formulas.
+
+    path: .zmx, CODE V .seq or optiland's .json.
+    output: .toml.
+    focal_length: to scale the lens to, m.
+    overwrite: replace a file that is there.
+
+    Raises InputError for what cannot be read or modelled, UsageError without optiland or where a
+    file exists.
     """
     from plenocli.files.atomic import check_output, publish
 
@@ -202,291 +330,22 @@ def run_lens_import(path, output, *, focal_length=None, overwrite=False):
         lens = lens.scaled(focal_length / first_order(lens, lens.design_wavelength).focal_length)
     data = first_order(lens, lens.design_wavelength)
     publish(output, lens_toml(lens, [f"from {path.name}", *notes]).encode(), overwrite=overwrite)
-    return {
-        "output": str(output),
-        "input": path.name,
-        "surfaces": len(lens.surfaces),
-        "glasses": sorted({s.medium.name for s in lens.surfaces} - {"air"}),
-        "focal_length_m": data.focal_length,
-        "f_number": _finite(data.f_number),
-        "notes": notes,
-    }
-
-
-def line(report):
-    """The report of `run_lens_import` as one line, and one for each note."""
-    return "\n".join(
-        [
-            (
-                f"{report['output']}: {report['surfaces']} surfaces, f = "
-                f"{report['focal_length_m'] * 1e3:.6g} mm, F/{_shown(report['f_number'], '.4g')}, "
-                f"glasses {', '.join(report['glasses'])}"
-            ),
-            *(f"  note: {note}" for note in report["notes"]),
-        ]
+    return ImportSummary(
+        output=str(output),
+        input=path.name,
+        surfaces=len(lens.surfaces),
+        glasses=sorted({s.medium.name for s in lens.surfaces} - {"air"}),
+        focal_length_m=data.focal_length,
+        f_number=_finite(data.f_number),
+        notes=notes,
     )
 
 
-def import_lens(path):
-    """(Prescription, notes) of a .zmx, .seq or .json prescription, read by optiland; errors
-    as `run_lens_import`.
-    """
-    path = Path(path)
-    optic, said = _read(path)
-    if path.suffix.lower() == ".zmx":
-        names, indices = _zmx_glasses(path)
-    else:
-        names, indices = {}, {}
-    notes = sorted({text for text in said})
-    surfaces = list(optic.surfaces)
-    places = [_number(s.geometry.cs.z) / 1e3 for s in surfaces[1:]]
-    if len(places) < 2:
-        raise InputError(
-            "holds no surface between object and image", path, "give the prescription of a lens"
-        )
-    found, stops = [], []
-    for i, surface in enumerate(surfaces[1:-1], 1):
-        if surface.is_stop:
-            stops.append(i - 1)
-        found.append(
-            _surface(
-                surface, i, path, places[i] - places[i - 1], names.get(i), indices.get(i), notes
-            )
-        )
-    if len(stops) != 1:
-        raise InputError(
-            f"has {len(stops)} stops instead of one", path, "mark one surface as the stop"
-        )
-    # CODE V keeps the defocus behind the image surface
-    extra = getattr(surfaces[-1], "thickness", 0.0)
-    extra = 0.0 if extra is None or not math.isfinite(_number(extra)) else _number(extra) / 1e3
-    found[-1] = replace(found[-1], thickness=found[-1].thickness + extra)
-    object_z = _number(surfaces[0].geometry.cs.z) / 1e3
-    far = math.inf if math.isinf(object_z) or abs(object_z) > 1e4 else places[0] - object_z
-    wavelength = float(optic.primary_wavelength) * 1e-6
-    lens = Prescription(
-        surfaces=tuple(found),
-        stop=stops[0],
-        stop_radius=1.0,
-        design_wavelength=wavelength,
-        object_distance=far,
-        name=(getattr(optic, "name", "") or path.stem).strip(),
+def line(summary: ImportSummary) -> str:
+    """The summary of an import as one line, and one for each note."""
+    head = (
+        f"{summary.output}: {summary.surfaces} surfaces, f = "
+        f"{summary.focal_length_m * 1e3:.6g} mm, F/{_shown(summary.f_number, '.4g')}, "
+        f"glasses {', '.join(summary.glasses)}"
     )
-    radius = (
-        _number(optic.paraxial.EPD())
-        / 1e3
-        / 2
-        / abs(entrance_pupil(lens, wavelength).magnification)
-    )
-    return _pruned(replace(lens, stop_radius=radius)), notes
-
-
-def _read(path):
-    """(optiland's Optic, list of what it said); every failure is an InputError
-    that names the file.
-    """
-    from plenocli.files.artefacts.provenance import require_file
-
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(
-            (
-                f"is {path.suffix or 'a file without a suffix'}; prescriptions are read as "
-                f"{', '.join(SUFFIXES)}"
-            ),
-            path,
-            "convert it to .zmx",
-        )
-    if require_file(path) > MAX_BYTES:
-        raise InputError(
-            f"is larger than {MAX_BYTES} bytes and so no prescription", path, "give a .zmx file"
-        )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            from optiland import fileio
-    except ImportError as error:
-        raise UsageError(
-            f"importing a prescription needs optiland ({error})",
-            path,
-            how_to_install("lens"),
-        ) from None
-    load = {
-        ".zmx": fileio.load_zemax_file,
-        ".seq": fileio.load_codev_file,
-        ".json": fileio.load_optiland_file,
-    }[path.suffix.lower()]
-    printed = io.StringIO()
-    try:
-        with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stdout(printed):
-            warnings.simplefilter("always")
-            optic = load(str(path))
-    except Exception as error:  # a parser of others meets any file
-        raise InputError(
-            f"optiland cannot read it ({type(error).__name__}: {error})",
-            path,
-            "check that it is a sequential prescription",
-        ) from None
-    said = [
-        str(w.message).splitlines()[0]
-        for w in caught
-        if "optiland" in str(w.category) or issubclass(w.category, UserWarning)
-    ]
-    return optic, [
-        text.strip().removeprefix("Warning: ")
-        for text in [*said, *printed.getvalue().splitlines()]
-        if text.strip()
-    ]
-
-
-def _number(value):
-    return float(np.ravel(value)[0])
-
-
-def _surface(surface, number, path, thickness, name, model, notes):
-    """One Surface from optiland's; refuses mirrors, tilts and shapes that the
-    tracer does not know.
-    """
-    geometry = surface.geometry
-    kind = type(geometry).__name__
-    where = f"surface {number}"
-    if getattr(surface.interaction_model, "is_reflective", False):
-        raise InputError(f"{where} is a mirror", path, "only refracting lenses are modelled")
-    if kind not in ("StandardGeometry", "EvenAsphere", "Plane"):
-        raise InputError(
-            f"{where} is of the kind {kind}", path, "spheres, conics and even aspheres are modelled"
-        )
-    if any(
-        abs(_number(getattr(geometry.cs, axis))) > 1e-12 for axis in ("x", "y", "rx", "ry", "rz")
-    ):
-        raise InputError(f"{where} is tilted or off axis", path, "only centred lenses are modelled")
-    radius = _number(geometry.radius) / 1e3
-    coefficients = (
-        [_number(c) for c in getattr(geometry, "coefficients", None) or ()]
-        if kind == "EvenAsphere"
-        else []
-    )
-    while coefficients and coefficients[-1] == 0:
-        coefficients.pop()
-    asphere = tuple(c * 1e3 ** (2 * i - 1) for i, c in enumerate(coefficients, 1))
-    outer = getattr(surface.aperture, "r_max", None)
-    if surface.aperture is not None and (outer is None or _number(surface.aperture.r_min)):
-        notes.append(f"{where}: its aperture is no full disc and is left out")
-    semi = (
-        _number(outer) / 1e3
-        if outer is not None and math.isfinite(_number(outer)) and _number(outer) > 0
-        else math.inf
-    )
-    return Surface(
-        curvature=0.0 if math.isinf(radius) else 1 / radius,
-        thickness=thickness,
-        medium=_medium(surface.material_post, where, name, model, notes),
-        conic=_number(getattr(geometry, "k", 0.0) or 0.0),
-        asphere=asphere,
-        semi_diameter=semi,
-    )
-
-
-def _medium(material, where, name, model, notes):
-    """The Medium of optiland's material: its dispersion formula where plenocli has it, else a
-    fit; nd and Vd as they are.
-    """
-    kind = type(material).__name__
-    if kind == "IdealMaterial":
-        n = _number(material.index)
-        return AIR if n == 1 else Medium(name or f"n{n:.5f}", "constant", (n,))
-    if kind.startswith("AbbeMaterial"):
-        nd, vd = model if model else (_number(material.index), float(np.ravel(material.abbe)[0]))
-        if name in GLASSES:
-            return medium(name)
-        notes.append(
-            (
-                f"{where}: glass {name or '?'} is in no catalogue at hand; nd = {nd:g}, Vd = "
-                f"{vd:g} of the file stand for it"
-            )
-            + (
-                " (Zemax's placeholder: give the glass its true data)"
-                if (nd, vd) == (1.5, 40.0)
-                else ""
-            )
-        )
-        return Medium(name or f"nd{nd:.5f}vd{vd:.2f}", "abbe", (nd, vd), (380e-9, 780e-9))
-    label = str(getattr(material, "name", None) or name or f"glass of {where}")
-    limits = tuple(
-        float(l) * 1e-6
-        for l in getattr(material, "_formula_wavelength_range", None) or (0.38, 0.78)
-    )
-    values = [float(v) for v in np.ravel(getattr(material, "coefficients", ()))]
-    pairs = tuple(zip(values[1::2], values[2::2]))
-    formula = getattr(material, "_n_formula", None)
-    if formula == "formula 1" and values[0] == 0:
-        return Medium(label, "sellmeier", tuple((b, c * c) for b, c in pairs), limits)
-    if formula == "formula 2" and values[0] == 0:
-        return Medium(label, "sellmeier", pairs, limits)
-    if formula in ("formula 3", "formula 5"):
-        return Medium(
-            label,
-            "polynomial" if formula == "formula 3" else "cauchy",
-            ((values[0], 0.0), *pairs),
-            limits,
-        )
-    return _fitted(material, label, where, limits, notes)
-
-
-def _fitted(material, label, where, limits, notes):
-    """A polynomial n^2 through 81 values of any other dispersion law, within the visible; the
-    note names what it leaves.
-    """
-    low, high = max(limits[0], 380e-9), min(limits[1], 780e-9)
-    l = np.linspace(low, high, 81) * 1e6
-    n = np.array([_number(material.n(float(w))) for w in l])
-    powers = (0.0, 2.0, -2.0, -4.0, -6.0, -8.0)
-    found = np.linalg.lstsq(np.stack([l**p for p in powers], axis=1), n * n, rcond=None)[0]
-    rest = np.abs(np.sqrt(sum(a * l**p for a, p in zip(found, powers))) - n).max()
-    notes.append(
-        f"{where}: the dispersion of {label} is fitted from {low * 1e9:.0f} to {high * 1e9:.0f} "
-        f"nm, to {rest:.1g} of its index"
-    )
-    return Medium(
-        label, "polynomial", tuple((float(a), p) for a, p in zip(found, powers)), (low, high)
-    )
-
-
-def _zmx_glasses(path):
-    """({surface number: glass name}, {surface number: (nd, Vd)}) as a Zemax file writes them:
-    optiland forgets unknown names.
-    """
-    data = path.read_bytes()
-    text = data.decode(
-        "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", errors="replace"
-    )
-    names, models, number = {}, {}, None
-    for words in (line.split() for line in text.splitlines()):
-        if words[:1] == ["SURF"] and len(words) > 1 and words[1].isdigit():
-            number = int(words[1])
-        elif words[:1] == ["GLAS"] and number is not None and len(words) > 1:
-            names[number] = words[1]
-            try:
-                models[number] = (float(words[4]), float(words[5]))
-            except (IndexError, ValueError):
-                continue
-    return names, {i: m for i, m in models.items() if m[0] > 1 and m[1] > 0}
-
-
-def _pruned(lens):
-    """The lens without surfaces that do nothing: flat, air on both sides, not the stop, no
-    aperture, not first or last.
-    """
-    surfaces, stop = list(lens.surfaces), lens.stop
-    for i in range(len(surfaces) - 2, 0, -1):
-        surface, before = surfaces[i], surfaces[i - 1]
-        if (
-            i != stop
-            and surface.vertex_curvature == 0
-            and not any(surface.asphere)
-            and surface.medium == before.medium
-            and math.isinf(surface.semi_diameter)
-        ):
-            surfaces[i - 1] = replace(before, thickness=before.thickness + surface.thickness)
-            del surfaces[i]
-            stop -= i < stop
-    return replace(lens, surfaces=tuple(surfaces), stop=stop)
+    return "\n".join([head, *(f"  note: {note}" for note in summary.notes)])

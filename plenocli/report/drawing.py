@@ -5,7 +5,7 @@ back as PNG bytes.
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +31,7 @@ SIGN_MAP = "RdBu_r"  # differences, white is none
 GRID_LINE = "#56B4E9"
 DPI = 130
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -79,7 +79,9 @@ class Drawing:
 
 
 @contextmanager
-def drawing(width: float, height: float, layout: str | None = "constrained") -> Iterator[Drawing]:
+def drawing(
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Iterator[Drawing]:
     """A Drawing in the house style; rendered when the block ends.
 
     width, height: inches.
@@ -108,7 +110,9 @@ def drawing(width: float, height: float, layout: str | None = "constrained") -> 
 def show_picture(axes: "Axes", values: ArrayLike, title: str = "", **options: Any) -> None:
     """A picture without ticks, encoded for the screen as sRGB is.
 
+    axes: that show it.
     values: (row, column) linear light, white at 1, or (row, column, 3).
+    title: above it.
     options: of imshow.
     """
     from plenocli.forward.scene.colour import encode_srgb

@@ -13,7 +13,7 @@ from plenocli.report.drawing import Figures
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
-    from plenocli.inverse.spectra.calibration import Calibration
+    from plenocli.inverse.spectra.calibration import Calibration, Response
 
 Place = tuple[int, int]
 
@@ -21,6 +21,7 @@ Place = tuple[int, int]
 def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = None) -> Figures:
     """A capture with its lenslet grid.
 
+    capture: of any target.
     name: for the caption.
     centres: (lenslet_row, lenslet_column, 2) px, else the superpixels it tells of.
     """
@@ -46,6 +47,7 @@ def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = 
 def matrix_figures(matrix: StoredMatrix, points: Sequence[Place] | None = None) -> Figures:
     """Columns of A on the superpixels, A itself, singular values and energy.
 
+    matrix: as it is stored.
     points: (row, column) of the object points whose columns are shown, else an even choice.
     """
     from plenocli.report.pictures import matrix_picture, matrix_summary, pif_columns
@@ -100,7 +102,7 @@ def calibration_figures(calibration: "Calibration") -> Figures:
             else "The lenslet grid found on the white image.",
         )
     ]
-    matrix = None if response is None else _middle_response(calibration)
+    matrix = None if response is None else _middle_response(response, grid.valid)
     if response is None or windows is None or matrix is None:
         return figures
     return [
@@ -115,12 +117,16 @@ def calibration_figures(calibration: "Calibration") -> Figures:
     ]
 
 
-def _middle_response(calibration: "Calibration") -> np.ndarray | None:
-    """F (pixel, band) of the lenslet nearest to the middle that has one, or of all."""
-    matrix = calibration.response.matrix
+def _middle_response(response: "Response", valid: np.ndarray) -> np.ndarray | None:
+    """F (pixel, band) of the lenslet nearest to the middle that has one, or of all.
+
+    response: of a calibration.
+    valid: (lenslet_row, lenslet_column) bool.
+    """
+    matrix = response.matrix
     if matrix.ndim != 4:
         return matrix
-    seen = np.argwhere(np.isfinite(matrix).all(axis=(2, 3)) & calibration.grid.valid)
+    seen = np.argwhere(np.isfinite(matrix).all(axis=(2, 3)) & valid)
     if not len(seen):
         return None
     row, col = seen[np.argmin(((seen - np.array(matrix.shape[:2]) / 2) ** 2).sum(axis=1))]
@@ -162,7 +168,7 @@ def dictionary_figures(
 
 
 def spectra_figures(result: Result, name: str, lenslets: Sequence[Place] | None = None) -> Figures:
-    """Bands as pictures, and spectra with error bars.
+    """Bands as pictures, and spectra with error bars; nothing of a result without bands.
 
     result: with bands.
     name: for the caption.
@@ -170,6 +176,8 @@ def spectra_figures(result: Result, name: str, lenslets: Sequence[Place] | None 
     """
     from plenocli.report.spectral_pictures import band_pictures, lenslet_spectra
 
+    if result.wavelengths is None:
+        return []
     quantity = result.quantity or "value"
     return [
         (
@@ -186,6 +194,8 @@ def spectra_figures(result: Result, name: str, lenslets: Sequence[Place] | None 
 def image_figures(result: Result, name: str, seen: np.ndarray | None = None) -> Figures:
     """One picture without truth.
 
+    result: with a picture.
+    name: for the caption.
     seen: (object_row, object_column) share of each lenslet's object that the sensor sees, drawn
         too where it is given.
     """

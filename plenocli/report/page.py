@@ -73,6 +73,9 @@ class Page:
     ) -> None:
         """A table of text cells.
 
+        header: of the columns.
+        rows: cells of each row.
+        caption: below it.
         best: row number -> set of columns set in bold.
         text: cells are words, aligned left.
         """

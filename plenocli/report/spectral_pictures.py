@@ -115,7 +115,7 @@ def calibration_picture(
 
 
 def response_picture(
-    response: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float]
+    response: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float] | np.ndarray
 ) -> bytes:
     """Which pixels of the superpixel answer to which band, each band on its own scale.
 

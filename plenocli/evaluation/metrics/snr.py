@@ -124,7 +124,7 @@ def snr_sensor(signal: ArrayLike, sigma: float, noisy: bool = False) -> float:
     Returns dB; -inf where nothing is left.
     """
     power = np.mean(np.asarray(signal, dtype=np.float64) ** 2) - (sigma**2 if noisy else 0.0)
-    return float(_ratio(np.sqrt(max(power, 0.0)), float(sigma)))
+    return float(_ratio(np.sqrt(max(float(power), 0.0)), float(sigma)))
 
 
 def _ratio(mean: ArrayLike, deviation: ArrayLike) -> np.ndarray:

@@ -10,7 +10,9 @@ from plenocli.forward.camera.model import Camera
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read and check a camera description, a TOML file.
+    """Read and check a camera description.
+
+    path: of the TOML file.
 
     Raises InputError where the file cannot be read, ConfigError for what it says.
     """

@@ -228,7 +228,9 @@ class LensFile(Section):
 
 
 def load_lens(path: str | Path) -> Prescription:
-    """Read and check a lens description, a TOML file.
+    """Read and check a lens description.
+
+    path: of the TOML file.
 
     Raises InputError where it cannot be read, ConfigError for what it says.
     """

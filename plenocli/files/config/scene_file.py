@@ -42,7 +42,9 @@ class Scene(Section):
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Read and check a scene description, a TOML file.
+    """Read and check a scene description.
+
+    path: of the TOML file.
 
     Raises InputError where the file cannot be read, ConfigError for what it says.
     """

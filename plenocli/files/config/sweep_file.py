@@ -107,6 +107,7 @@ class Choice:
     """One of several values, in the order given."""
 
     def __init__(self, values: Sequence[Any]) -> None:
+        """values: at least one."""
         self.values = values
 
     def at(self, share: float) -> Any:
@@ -201,7 +202,9 @@ class Sweep(Section):
 
 
 def load_sweep(path: str | Path) -> tuple[Sweep, dict[str, Axis]]:
-    """Read and check a sweep, a TOML file.
+    """Read and check a sweep.
+
+    path: of the TOML file.
 
     Returns (the description, the values of each key that varies).
     Raises InputError where the file cannot be read, ConfigError for what it says.

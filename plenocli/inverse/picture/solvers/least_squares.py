@@ -157,12 +157,17 @@ def discrepancy_alpha(svd: Svd, z: np.ndarray, sigma: float) -> float:
 
 
 def best_rank(svd: Svd, z: np.ndarray, sigma: float) -> int:
-    """The truncation with the least estimated mean square error of x, all signals together, from z
-    = U^T y (k, signal) with noise of standard deviation sigma.
+    """The truncation with the least estimated mean square error of x, all signals together.
 
     An unbiased estimate in the manner of Stein and Mallows: direction k costs 2 sigma^2 / s_k^2 of
     noise and saves z_k^2 / s_k^2 of picture, on average. (Morozov's rule keeps far too many
     directions here: it asks the cut to explain the weak ones too.)
+
+    svd: of A.
+    z: (k, signal) U^T y.
+    sigma: standard deviation of the noise in y.
+
+    Returns how many directions are kept.
     """
     top = svd.rank()
     change = np.sum(2 * sigma**2 - z[:top] ** 2, axis=1) / svd.s[:top] ** 2
@@ -170,9 +175,13 @@ def best_rank(svd: Svd, z: np.ndarray, sigma: float) -> int:
 
 
 def oracle_alpha(svd: Svd, z: np.ndarray, truth: np.ndarray) -> float:
-    """The alpha with the least mean square error against `truth` (point, signal).
+    """The alpha with the least mean square error. It needs the truth: a bound, not a method.
 
-    Needs the truth: a bound, not a method.
+    svd: of A.
+    z: (k, signal) U^T y.
+    truth: (point, signal).
+
+    Returns alpha in the square of A's unit, for `tikhonov`.
     """
     from scipy.optimize import minimize_scalar
 
@@ -191,9 +200,13 @@ def oracle_alpha(svd: Svd, z: np.ndarray, truth: np.ndarray) -> float:
 
 
 def oracle_rank(svd: Svd, z: np.ndarray, truth: np.ndarray) -> int:
-    """The truncation with the least mean square error against `truth` (point, signal).
+    """The truncation with the least mean square error. It needs the truth: a bound, not a method.
 
-    Needs the truth.
+    svd: of A.
+    z: (k, signal) U^T y.
+    truth: (point, signal).
+
+    Returns how many directions are kept, for `truncated`.
     """
     top = svd.rank()
     coordinates = svd.vt[:top] @ truth

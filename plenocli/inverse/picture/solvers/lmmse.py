@@ -125,11 +125,15 @@ class Lmmse:
         return self.analysis @ y - self.offset[:, None]
 
     def scales(self, y: np.ndarray) -> np.ndarray:
-        """The scale of each signal of y (pixel, signal): the posterior mean of its logarithm.
+        """The scale of each signal: the posterior mean of its logarithm.
 
         Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the
         mean and the deviation (at least 0.2) that make all signals together most likely; one signal
         alone says little where noise is strong.
+
+        y: (pixel, signal).
+
+        Returns (signal,).
         """
         likelihood = self._likelihood(self._coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))

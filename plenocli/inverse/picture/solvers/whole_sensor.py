@@ -105,6 +105,8 @@ def plug_and_play(
 ) -> np.ndarray:
     """The picture after a round of v = denoise(x, tau), x = term.proximal(v, tau) for each tau.
 
+    term: what the data say.
+    denoise: of a picture and the standard deviation of its noise.
     start: the first x, (row, column) or (band, row, column).
     taus: falling, see `schedule`.
     """
@@ -119,6 +121,7 @@ def total_variation(
 ) -> np.ndarray:
     """argmin |y - A x|^2/(2 sigma^2) + TV_WEIGHT/error TV(x), isotropic, by ADMM.
 
+    term: what the data say.
     start: the first x, (row, column) or (band, row, column).
     error: root mean square error expected of it; it also scales the penalty, tau = error.
     rounds: one a round.

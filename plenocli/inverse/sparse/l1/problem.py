@@ -74,8 +74,9 @@ def prepare(
     weights: ArrayLike | None,
     free: Sequence[int],
 ) -> Problem:
-    """The problem with its free atoms projected out; arguments as of
-    plenocli.inverse.sparse.l1.solve.sparse_code.
+    """The problem with its free atoms projected out.
+
+    dictionary, signals, lam, weights, free: as of plenocli.inverse.sparse.l1.solve.sparse_code.
 
     Raises ValueError, which says what is wrong with the arguments.
     """

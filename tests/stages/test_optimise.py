@@ -12,6 +12,7 @@ from plenocli.cli.main import run
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.stages.sweep import optimise
 from plenocli.stages.sweep import store as sweep_store
+from plenocli.stages.sweep.task import PointResult
 
 pytest.importorskip("optuna")
 ROOT = Path(__file__).resolve().parents[2]
@@ -89,17 +90,12 @@ def test_the_search_finds_what_chance_does_not(space, tmp_path, monkeypatch):
     than the first ones.
     """
 
-    def figures(store, rows, *surroundings, **options):
-        for row in rows:
-            f, choice = row.point["main_lens.f_number"], row.point["reconstruct.method"]
-            row.result = {
-                "status": 0,
-                "reason": "",
-                "notes": [],
-                "seconds": 0.0,
-                "metrics": {"psnr_db": -abs(f - 7) - (choice == "block-mean")},
-            }
-        return len(rows)
+    def figures(store, points, *surroundings, **options):
+        for point in points:
+            f, choice = point.values["main_lens.f_number"], point.values["reconstruct.method"]
+            quality = -abs(f - 7) - (choice == "block-mean")
+            point.result = PointResult(metrics={"psnr_db": quality})
+        return len(points)
 
     monkeypatch.setattr(sweep_store.Store, "evaluate", figures)
     assert run(["optimise", str(space), "--trials", "80", "-o", str(tmp_path / "best.h5")]) == 0

@@ -19,7 +19,8 @@ from plenocli.base.errors import ConfigError, InputError, OutputError, PlenoErro
 from plenocli.cli.sections import read_options
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.config.sweep_file import number
-from plenocli.stages.sweep import point as chain
+from plenocli.stages.sweep import task as chain
+from plenocli.stages.sweep.point import run_point
 from plenocli.stages.sweep.sweep import run_sweep
 from plenocli.stages.sweep.table import lines
 
@@ -178,9 +179,9 @@ def test_the_front_is_what_brute_force_finds(whole):
         if not any(all(x >= y for x, y in zip(b, a)) and b != a for b in figures)
     ]
     assert [i for i, r in enumerate(rows) if r["front"] == "1"] == expected
-    assert sorted(entry["point"] for entry in report["front"]) == expected and 0 < len(
-        expected
-    ) < len(rows)
+    assert sorted(entry["point"] for entry in report.front) == expected and 0 < len(expected) < len(
+        rows
+    )
     assert np.flatnonzero(read_artefact(table, "sweep").data["sweep/front"]).tolist() == expected
     assert f"{len(expected)} on the front of psnr_db max, sensor_pixels min" in lines(report)
 
@@ -195,13 +196,13 @@ def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):
     )
     report = sweep(described(tmp_path), tmp_path / "out.h5")
     # two signal-to-noise ratios share each camera's matrix
-    assert report["computed"] == 8 and len(calls) == 4
+    assert report.computed == 8 and len(calls) == 4
     assert same(tmp_path / "out.h5", whole[1])
     assert not list((tmp_path / "out.parts").rglob("*.h5")), "matrices go when they have served"
     # more values: only those are computed; a finished sweep again: nothing
     described(tmp_path, SMALL.replace('"50 dB"', '"50 dB", "60 dB"'))
-    assert sweep(tmp_path / "sweep.toml", tmp_path / "out.h5", overwrite=True)["computed"] == 4
-    assert sweep(described(tmp_path), tmp_path / "out.h5", overwrite=True)["computed"] == 0
+    assert sweep(tmp_path / "sweep.toml", tmp_path / "out.h5", overwrite=True).computed == 4
+    assert sweep(described(tmp_path), tmp_path / "out.h5", overwrite=True).computed == 0
     assert same(tmp_path / "out.h5", whole[1])
 
 
@@ -244,7 +245,7 @@ def test_a_sweep_that_is_killed_goes_on_where_it_was(whole, tmp_path, seed):
     with open(kept, "ab") as file:
         file.write(b"0123456789abcdef {torn")
     before = len({key for key, record in journal_lines(kept) if "status" in record})
-    assert sweep(path, out)["computed"] == 8 - before
+    assert sweep(path, out).computed == 8 - before
     assert same(out, table)
     assert [p.name for p in (tmp_path / "whole.parts").iterdir()] == ["points.jsonl"]
 
@@ -287,7 +288,7 @@ def journal_lines(path):
 
 def test_two_processes_give_the_same_bytes(whole, tmp_path):
     report = sweep(whole[0], tmp_path / "two.h5", workers=2)
-    assert report["computed"] == 8 and same(tmp_path / "two.h5", whole[1])
+    assert report.computed == 8 and same(tmp_path / "two.h5", whole[1])
 
 
 def test_cameras_that_are_refused_are_rows_with_the_reason(tmp_path):
@@ -299,7 +300,7 @@ def test_cameras_that_are_refused_are_rows_with_the_reason(tmp_path):
     report = sweep(described(tmp_path, text), tmp_path / "out.h5")
     artefact = read_artefact(tmp_path / "out.h5", "sweep")
     reasons = artefact.attrs["sweep"]["reasons"]
-    assert artefact.data["sweep/status"].tolist() == [0, 2, 2, 2] and report["refused"] == 3
+    assert artefact.data["sweep/status"].tolist() == [0, 2, 2, 2] and report.refused == 3
     assert (
         "f_number" in reasons["2"]
         and "superpixel pitch is 9.0000 pixels, not 9 x 10" in reasons["1"]
@@ -391,9 +392,7 @@ def test_damaged_lines_of_the_journal_are_computed_again(whole, tmp_path):
     points = [i for i, line in enumerate(content) if b'"status"' in line]
     content[points[2]] = content[points[2]].replace(b'"psnr_db": ', b'"psnr_db": 9', 1)
     (parts / "points.jsonl").write_bytes(b"".join(content))
-    assert sweep(path, tmp_path / "whole.h5")["computed"] == 1 and same(
-        tmp_path / "whole.h5", table
-    )
+    assert sweep(path, tmp_path / "whole.h5").computed == 1 and same(tmp_path / "whole.h5", table)
 
 
 def test_keys_follow_what_figures_depend_on_and_nothing_else(tmp_path):
@@ -472,19 +471,20 @@ def test_memory_that_does_not_suffice_is_no_verdict_for_good(tmp_path):
         sweep(path, tmp_path / "out.h5")
     assert caught.value.exit_code == 5
     report = sweep(path, tmp_path / "out.h5", overwrite=True)
-    assert report["computed"] == 2 and report["refused"] == 0
+    assert report.computed == 2 and report.refused == 0
 
 
 def test_files_that_a_worker_does_not_see_are_no_verdict_on_the_design(tmp_path):
     from plenocli.files.config.camera_file import parse_camera
 
     task = chain.task_of("spatial", parse_camera(camera_text()), {}, 0)
-    for missing in (
-        {"matrix": str(tmp_path / "gone.h5"), "info": {}},
-        {"files": [str(tmp_path / "gone.png")]},
+    cost = chain.MatrixCost(matrix_seconds=1.0, matrix_bytes=1)
+    for job in (
+        chain.Job(task=task, matrix=chain.SharedMatrix(str(tmp_path / "gone.h5"), cost)),
+        chain.Job(task=task, files=(str(tmp_path / "gone.png"),)),
     ):
         with pytest.raises(OutputError, match="does not see this file"):
-            chain.run_point(task | missing)
+            run_point(job)
 
 
 def test_show_and_report_draw_the_front(whole, tmp_path):
@@ -554,7 +554,7 @@ def test_values_are_written_as_given_and_read_as_numbers(whole):
 
 def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
     from plenocli.execution.pool import Lost
-    from plenocli.stages.sweep.space import Row
+    from plenocli.stages.sweep.space import DesignPoint
     from plenocli.stages.sweep.store import open_store
 
     class Pool:
@@ -574,4 +574,5 @@ def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
             match="1 of 1 points have no result: the worker died.*run the command again",
         ),
     ):
-        store.evaluate([Row(0, {}, {}, "a", "m")], Pool())
+        task = chain.Task(chain="spatial", camera="", settings={})
+        store.evaluate([DesignPoint(number=0, values={}, task=task, key="a", matrix="m")], Pool())

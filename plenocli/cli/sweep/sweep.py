@@ -66,4 +66,4 @@ def command(
         scheduler=scheduler,
         overwrite=overwrite,
     )
-    options.summary(report, as_json, lines(report))
+    options.summary(report.as_json(), as_json, lines(report))

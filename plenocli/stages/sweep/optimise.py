@@ -6,35 +6,48 @@ in which it proposed, so that the search does not depend on how many work at the
 since results are kept, a run that was stopped is repeated from its journal up to where it was.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from plenocli.base.errors import ConfigError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.execution.pool import open_pool
-from plenocli.stages.sweep.space import open_space
+from plenocli.stages.sweep.space import DesignPoint, ReadOptions, Space, open_space
 from plenocli.stages.sweep.store import open_store
-from plenocli.stages.sweep.table import finish, objectives_of
+from plenocli.stages.sweep.table import SweepSummary, finish, objectives_of, result_of
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
 
 
 def run_optimise(
-    path,
-    output,
+    path: Path | str,
+    output: Path | str,
     *,
-    read_options,
-    trials=100,
-    batch=4,
-    seed=0,
-    workers=1,
-    scheduler=None,
-    plot=None,
-    overwrite=False,
-    command="",
-):
-    """Try `trials` points of the space in the sweep file at `path`, `batch` at a time, and write
-    the table as run_sweep does; returns its summary.
+    read_options: ReadOptions,
+    trials: int = 100,
+    batch: int = 4,
+    seed: int = 0,
+    workers: int = 1,
+    scheduler: str | None = None,
+    plot: Path | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> SweepSummary:
+    """Try points of a design space where earlier ones were good, and write the table as run_sweep
+    does.
 
-    ConfigError where nothing varies freely (design = "list"), UsageError where Optuna is missing;
-    else as run_sweep.
+    trials: points to try.
+    batch: of them proposed at a time.
+    The others as run_sweep's.
+
+    Raises ConfigError where nothing varies freely (design = "list"), UsageError where Optuna is
+    missing; else as run_sweep.
     """
     space = open_space(path, read_options, seed)
     if not space.axes:
@@ -42,31 +55,32 @@ def run_optimise(
             'design = "list" leaves nothing to search', path, "give [vary], or use sweep"
         )
     objectives = objectives_of(
-        space, [space.row(0, {key: axis.at(0.0) for key, axis in space.axes.items()})]
+        space, [space.point(0, {key: axis.at(0.0) for key, axis in space.axes.items()})]
     )
     with (
         open_store(output, plot, overwrite, [path, space.camera_path]) as store,
         open_pool(workers, scheduler) as pool,
     ):
-        study, rows, computed = _study(objectives, seed), {}, 0
+        study, computed = _study(objectives, seed), 0
+        tried: dict[str, DesignPoint] = {}
         for start in range(0, trials, batch):
             asked = [_ask(study, space) for _ in range(min(batch, trials - start))]
-            found = [space.row(start + i, point) for i, (_, point) in enumerate(asked)]
+            found = [space.point(start + i, values) for i, (_, values) in enumerate(asked)]
             computed += store.evaluate(
                 found,
                 pool,
                 list(space.files),
                 label=f"points {start + 1} to {start + len(asked)} of {trials}",
             )
-            for (trial, _), row in zip(asked, found):
-                _tell(study, trial, row, objectives)
-                rows.setdefault(row.key, row)
-        for number, row in enumerate(rows.values()):
-            row.number = number
-        return finish(space, list(rows.values()), objectives, store, computed, command)
+            for (trial, _), point in zip(asked, found):
+                _tell(study, trial, point, objectives)
+                tried.setdefault(point.key, point)
+        for number, point in enumerate(tried.values()):
+            point.number = number
+        return finish(space, list(tried.values()), objectives, store, computed, command)
 
 
-def _study(objectives, seed):
+def _study(objectives: Mapping[str, str], seed: int) -> Study:
     try:
         import optuna
     except ImportError as error:
@@ -74,14 +88,14 @@ def _study(objectives, seed):
             "optimise needs Optuna, which is not installed", fix=how_to_install("optimise")
         ) from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    directions = ["maximize" if way == "max" else "minimize" for way in objectives.values()]
+    directions = ["maximize" if aim == "max" else "minimize" for aim in objectives.values()]
     return optuna.create_study(
         directions=directions,
         sampler=optuna.samplers.TPESampler(seed=seed % 2**32, multivariate=False),
     )
 
 
-def _ask(study, space):
+def _ask(study: Study, space: Space) -> tuple[Trial, dict[str, Any]]:
     """(trial, point) that the sampler proposes.
 
     Values in an order are places in it, so that neighbours are seen as such.
@@ -108,13 +122,14 @@ def _ask(study, space):
     return trial, point
 
 
-def _tell(study, trial, row, objectives):
+def _tell(study: Study, trial: Trial, point: DesignPoint, objectives: Mapping[str, str]) -> None:
     from optuna.trial import TrialState
 
     from plenocli.files.config.sweep_file import number
 
-    figures = [row.result["metrics"].get(name, number(row.point.get(name))) for name in objectives]
-    if row.result["status"] or any(value is None for value in figures):
+    result = result_of(point)
+    figures = [result.metrics.get(name, number(point.values.get(name))) for name in objectives]
+    if result.status or any(value is None for value in figures):
         study.tell(trial, state=TrialState.FAIL)
     else:
         study.tell(trial, figures)

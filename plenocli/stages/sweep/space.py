@@ -1,14 +1,33 @@
 """The points that a sweep file describes, each with the task that the chain makes of it."""
 
+from __future__ import annotations
+
 import tomllib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError
 from plenocli.base.text import plain
-from plenocli.stages.sweep.point import CHAINS, matrix_key, point_key, refused, task_of
+from plenocli.stages.sweep.task import (
+    CHAINS,
+    PointResult,
+    Task,
+    digest_of,
+    matrix_key,
+    point_key,
+    refused,
+    task_of,
+)
+
+if TYPE_CHECKING:
+    from plenocli.files.config.sweep_file import Choice, Range, Sweep
+    from plenocli.forward.camera.model import Camera
+
+ReadOptions = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 
 _FILES = ("aperture_image", "wavefront", "prescription")
 """Keys of the main lens that name files."""
@@ -16,69 +35,82 @@ _EXTERNAL = ("scene", "dictionary", "training")
 """Options that may name files."""
 
 
-@dataclass
-class Row:
-    """A point: its number, values by key, task with its keys, and what came of it."""
+@dataclass(kw_only=True, eq=False)
+class DesignPoint:
+    """A point of the design space, and what came of it.
+
+    number: its place in the table.
+    values: by key, as they would stand in the sweep file.
+    task: None where no such camera can be.
+    key, matrix: what point and matrix are known by.
+    result: None until it is there.
+    """
 
     number: int
-    point: dict
-    task: dict | None = None
+    values: Mapping[str, Any]
+    task: Task | None = None
     key: str = ""
     matrix: str = ""
-    camera: object = None
-    result: dict | None = None
+    result: PointResult | None = None
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Space:
-    """A sweep file with all that it names: the description, its axes, the camera it starts from
-    and how options are read.
+    """A sweep file with all that it names.
+
+    path: of the file, `sweep` what it says, `axes` what varies freely.
+    chain: "spatial" or "spectral".
+    base: the camera it starts from, as its TOML says, from camera_path.
+    read_options: (stage, values) -> option -> value, as the command line reads them.
+    files: path -> SHA-256 of the files named so far.
     """
 
     path: Path
-    sweep: object
-    axes: dict
+    sweep: Sweep
+    axes: Mapping[str, Range | Choice]
     chain: str
-    base: dict
+    base: Mapping[str, Any]
     camera_path: Path
-    read_options: object
+    read_options: ReadOptions
     seed: int
-    files: dict = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
 
-    def row(self, number, point):
-        """The Row of a point; refused already where no such camera can be."""
+    def point(self, number: int, values: Mapping[str, Any]) -> DesignPoint:
+        """The point of these values; refused already where no such camera can be."""
         from plenocli.files.config.sweep_file import changed, options_of
 
         options = {
-            stage: self.read_options(stage, self._located(values))
-            for stage, values in options_of(self.sweep, point).items()
+            stage: self.read_options(stage, self._located(given))
+            for stage, given in options_of(self.sweep, values).items()
         }
         self._remember(options)
-        row = Row(number, point)
         try:
-            row.camera = self._camera(
-                changed(self.base, {**self.sweep.set, **point}, self.sweep.follow)
+            camera = self._camera(
+                changed(self.base, {**self.sweep.set, **values}, self.sweep.follow)
             )
         except ConfigError as error:
-            row.result = refused(error)
-            row.key = point_key(
-                {
-                    "refused": point,
-                    "options": plain(options),
-                    "base": self.base,
-                    "chain": self.chain,
-                },
-                self.files,
+            known_by = {
+                "refused": values,
+                "options": plain(options),
+                "base": self.base,
+                "chain": self.chain,
+            }
+            return DesignPoint(
+                number=number,
+                values=values,
+                key=digest_of(known_by, self.files),
+                result=refused(error),
             )
-            return row
-        row.task = task_of(self.chain, row.camera, plain(options), self.seed)
-        row.key, row.matrix = (
-            point_key(row.task, self.files),
-            matrix_key(row.task, row.camera, self.files),
+        task = task_of(self.chain, camera, plain(options), self.seed)
+        return DesignPoint(
+            number=number,
+            values=values,
+            task=task,
+            key=point_key(task, self.files),
+            matrix=matrix_key(task, camera, self.files),
         )
-        return row
 
-    def _camera(self, data):
+    def _camera(self, data: dict[str, Any]) -> Camera:
         from pydantic import ValidationError
 
         from plenocli.base.toml import violations
@@ -94,17 +126,18 @@ class Space:
         except ValidationError as error:
             raise violations(error, "camera", Camera) from None
 
-    def _digested(self, path):
+    def _digested(self, path: Path) -> str:
+        """The path as text; its content is known from now on."""
         from plenocli.files.artefacts.provenance import file_digest
 
         if str(path) not in self.files:
             self.files[str(path)] = file_digest(path)
         return str(path)
 
-    def _located(self, values):
+    def _located(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Options whose files, named relative to the sweep file, are found from anywhere."""
 
-        def place(value):
+        def place(value: Any) -> Any:
             if isinstance(value, list):
                 return [place(v) for v in value]
             known = isinstance(value, str) and (self.path.parent / value).is_file()
@@ -114,7 +147,8 @@ class Space:
             name: place(value) if name in _EXTERNAL else value for name, value in values.items()
         }
 
-    def _remember(self, options):
+    def _remember(self, options: Mapping[str, Mapping[str, Any]]) -> None:
+        """Digest the files that options name."""
         for values in options.values():
             for name in _EXTERNAL:
                 for value in np.ravel(values.get(name) or []):
@@ -122,11 +156,13 @@ class Space:
                         self._digested(Path(str(value)))
 
 
-def open_space(path, read_options, seed=0):
-    """The Space of the sweep file at `path`.
+def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Space:
+    """The Space of a sweep file.
 
-    read_options(stage, values): option -> value of a stage as its command line reads them;
-    UsageError. Errors: InputError for files, ConfigError for what they say.
+    read_options: (stage, values) -> option -> value, as the command line reads them.
+    seed: of captures and reconstructions.
+
+    Raises InputError for files, ConfigError for what they say, UsageError for options.
     """
     from plenocli.files.config.sweep_file import STAGES, load_sweep
     from plenocli.files.config.toml_file import read_text
@@ -153,4 +189,13 @@ def open_space(path, read_options, seed=0):
                     f'"{"spatial" if chain == "spectral" else "spectral"}"'
                 ),
             )
-    return Space(path, sweep, axes, chain, base, camera_path, read_options, seed)
+    return Space(
+        path=path,
+        sweep=sweep,
+        axes=axes,
+        chain=chain,
+        base=base,
+        camera_path=camera_path,
+        read_options=read_options,
+        seed=seed,
+    )

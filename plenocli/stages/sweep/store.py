@@ -1,24 +1,52 @@
-"""Where results of single points are kept while a sweep runs and after it, and how points that
-are missing are computed.
+"""Where results of single points are kept while a sweep runs and after it, and how points that are
+missing are computed.
 """
+
+from __future__ import annotations
 
 import contextlib
 import shutil
 from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost
-from plenocli.stages.sweep.point import refused, run_matrix, run_point
+from plenocli.stages.sweep.point import run_matrix, run_point
+from plenocli.stages.sweep.task import (
+    Job,
+    MadeMatrix,
+    MatrixCost,
+    PointResult,
+    SharedMatrix,
+    refused,
+)
+
+if TYPE_CHECKING:
+    from plenocli.stages.sweep.space import DesignPoint
+
+LACKED_MEMORY = 5
+"""Exit code of a point that may have a result within another budget of memory."""
 
 
 @contextlib.contextmanager
-def open_store(output, plot, overwrite, inputs):
-    """The Store of results beside `output`, checked before any work."""
+def open_store(
+    output: Path | str, plot: Path | None, overwrite: bool, inputs: Sequence[Path | str]
+) -> Iterator[Store]:
+    """The Store of results beside a table, checked before any work.
+
+    output: the table.
+    plot: picture of the front, or None.
+    inputs: files that must not be overwritten.
+
+    Raises UsageError, OutputError.
+    """
     from plenocli.files.atomic import check_output
 
     output = Path(output)
@@ -46,7 +74,18 @@ class Store:
     the matrices that points share.
     """
 
-    def __init__(self, folder, output, plot=None, overwrite=False, again=False):
+    def __init__(
+        self,
+        folder: Path,
+        output: Path,
+        plot: Path | None = None,
+        overwrite: bool = False,
+        again: bool = False,
+    ) -> None:
+        """Open or make the folder; `again`: CSV and picture may be overwritten.
+
+        Raises OutputError.
+        """
         from plenocli.execution.journal import Journal
 
         self.folder, self.output, self.plot, self.overwrite, self.again = (
@@ -67,56 +106,67 @@ class Store:
                 f"cannot be made ({error.strerror})", folder, "check the folder and its permissions"
             ) from None
 
-    def close(self):
+    def close(self) -> None:
         """Let go of the folder; scratch files go, and all of it where no point was finished."""
         shutil.rmtree(
             self.folder / "scratch" if self.journal.records else self.folder, ignore_errors=True
         )
         self.journal.close()
 
-    def evaluate(self, rows, pool, files=(), label="points"):
-        """Give every row its result, from the journal or through `pool`; returns the number
-        of points computed.
+    def evaluate(
+        self,
+        points: Sequence[DesignPoint],
+        pool: Any,
+        files: Sequence[str] = (),
+        label: str = "points",
+    ) -> int:
+        """Give every point its result, from the journal or through a pool.
 
-        Rows of one content key are computed once, a matrix that several need is computed
-        once, before them.
-        files: what tasks read;
-        What was refused within another budget of memory is tried again.
-        OutputError at the end where a worker was lost: all others are done then.
+        points: those of one content key are computed once, a matrix that several need is computed
+            once, before them. What was refused within another budget of memory is tried again.
+        pool: of plenocli.execution.pool.
+        files: what tasks read.
+        label: of the progress bar.
+
+        Returns the number of points computed.
+        Raises OutputError at the end where a worker was lost: all others are done then.
         """
-        todo = {}
-        for row in rows:
-            known = self.journal.records.get(row.key)
-            if (
-                row.task is not None
-                and row.key not in todo
-                and (
-                    known is None
-                    or (known["status"] == 5 and known.get("mem_limit") != budget().memory)
-                )
-            ):
-                todo[row.key] = row
-        groups = {}
-        for row in todo.values():
-            groups.setdefault(row.matrix, []).append(row)
-        with bar(None, len(todo), label) as progress:
+        missing: dict[str, DesignPoint] = {}
+        for point in points:
+            if point.task is not None and not self._is_known(point.key):
+                missing.setdefault(point.key, point)
+        groups: dict[str, list[DesignPoint]] = {}
+        for point in missing.values():
+            groups.setdefault(point.matrix, []).append(point)
+        with bar(None, len(missing), label) as progress:
             scratch = None if pool.far else str((self.folder / "scratch").resolve())
-            lost = _Work(
-                self,
-                groups,
-                pool,
-                {"scratch": scratch, "files": list(files)},
-            ).run(progress)
+            lost = _Work(self, groups, pool, tuple(files), scratch).run(progress)
         if lost:
             raise OutputError(
-                f"{len(lost)} of {len(todo)} points have no result: {lost[0]}",
+                f"{len(lost)} of {len(missing)} points have no result: {lost[0]}",
                 self.output,
                 "the others are kept; run the command again",
             )
-        for row in rows:
-            if row.task is not None:
-                row.result = self.journal.records[row.key]
-        return len(todo)
+        for point in points:
+            if point.task is not None:
+                point.result = PointResult.from_json(self.journal.records[point.key])
+        return len(missing)
+
+    def _is_known(self, key: str) -> bool:
+        """Whether the journal has a result that stands."""
+        record = self.journal.records.get(key)
+        if record is None:
+            return False
+        lacked = PointResult.from_json(record).status == LACKED_MEMORY
+        return not (lacked and record.get("mem_limit") != budget().memory)
+
+
+@dataclass(frozen=True, eq=False)
+class _Token:
+    """What a job in a pool is for: the matrix of a group, or one point of it."""
+
+    group: str
+    point: DesignPoint | None = None
 
 
 class _Work:
@@ -124,17 +174,23 @@ class _Work:
     disk as are in use.
     """
 
-    def __init__(self, store, groups, pool, surroundings):
-        self.store, self.pool, self.surroundings = store, pool, surroundings
-        self.groups, self.waiting, self.ready = (
-            {key: list(rows) for key, rows in groups.items()},
-            deque(groups),
-            deque(),
-        )
-        self.left = {key: len(rows) for key, rows in groups.items()}
-        self.lost, self.running = [], 0
+    def __init__(
+        self,
+        store: Store,
+        groups: Mapping[str, Sequence[DesignPoint]],
+        pool: Any,
+        files: tuple[str, ...],
+        scratch: str | None,
+    ) -> None:
+        self.store, self.pool, self.files, self.scratch = store, pool, files, scratch
+        self.groups = {key: list(points) for key, points in groups.items()}
+        self.left = {key: len(points) for key, points in groups.items()}
+        self.waiting = deque(groups)
+        self.ready: deque[tuple[_Token, Callable[[Job], Any], Job]] = deque()
+        self.lost: list[Lost] = []
+        self.running = 0
 
-    def run(self, progress):
+    def run(self, progress: Any) -> list[Lost]:
         """Do everything; returns the errors of what was lost."""
         while True:
             while self.pool.room and (self.ready or self.waiting):
@@ -144,63 +200,62 @@ class _Work:
                 self.running += 1
             if not self.running:
                 return self.lost
-            (kind, key, row), result = self.pool.next()
+            token, result = self.pool.next()
             self.running -= 1
             if isinstance(result, Lost):
-                self.lost += [result] * (1 if kind == "point" else len(self.groups[key]))
+                self.lost += [result] * (1 if token.point else len(self.groups[token.group]))
             elif isinstance(result, OutputError):
                 raise result
-            elif kind == "matrix":
-                progress.update(self._matrix(key, result))
+            elif token.point is None:
+                progress.update(self._keep_matrix(token.group, result))
             else:
-                self._done(key, row, result)
+                self._keep(token.group, token.point, result)
                 progress.update()
 
-    def _open(self, key):
-        """Make the first tasks of a group ready: its matrix, or its points where that lies there
-        or serves one alone.
+    def _job(self, point: DesignPoint, matrix: SharedMatrix | None = None) -> Job:
+        return Job(task=point.task, matrix=matrix, files=self.files, scratch=self.scratch)
+
+    def _open(self, group: str) -> None:
+        """Make the first jobs of a group ready: its matrix, or its points where that lies there or
+        serves one alone.
         """
-        rows, path = self.groups[key], self._path(key)
-        info = self.store.journal.records.get(f"matrix {key}")
-        if info is not None and path.is_file():
-            self._points(key, str(path.resolve()), info)
-        elif len(rows) > 1:
-            self.ready.append((("matrix", key, None), run_matrix, rows[0].task | self.surroundings))
-        else:
-            self._points(key, None, None)
-
-    def _points(self, key, path, info):
-        for row in self.groups[key]:
-            self.ready.append(
-                (
-                    ("point", key, row),
-                    run_point,
-                    row.task | self.surroundings | {"matrix": path, "info": info},
-                )
+        points, path = self.groups[group], self._path(group)
+        record = self.store.journal.records.get(f"matrix {group}")
+        if record is not None and path.is_file():
+            self._open_points(
+                group, SharedMatrix(str(path.resolve()), MatrixCost.from_json(record))
             )
+        elif len(points) > 1:
+            self.ready.append((_Token(group), run_matrix, self._job(points[0])))
+        else:
+            self._open_points(group, None)
 
-    def _matrix(self, key, result):
-        """Keep a matrix and make its points ready, or refuse them all; returns how
-        many were refused.
+    def _open_points(self, group: str, matrix: SharedMatrix | None) -> None:
+        for point in self.groups[group]:
+            self.ready.append((_Token(group, point), run_point, self._job(point, matrix)))
+
+    def _keep_matrix(self, group: str, result: MadeMatrix | PlenoError) -> int:
+        """Keep a matrix and make its points ready, or refuse them all; returns how many were
+        refused.
         """
         from plenocli.files.atomic import publish
 
         if isinstance(result, PlenoError):
-            for row in self.groups[key]:
-                self._done(key, row, refused(result))
-            return len(self.groups[key])
-        publish(self._path(key), result["content"], overwrite=True)
-        self.store.journal.add(f"matrix {key}", result["info"])
-        self._points(key, str(self._path(key).resolve()), result["info"])
+            for point in self.groups[group]:
+                self._keep(group, point, result)
+            return len(self.groups[group])
+        publish(self._path(group), result.content, overwrite=True)
+        self.store.journal.add(f"matrix {group}", result.cost.as_json())
+        self._open_points(group, SharedMatrix(str(self._path(group).resolve()), result.cost))
         return 0
 
-    def _done(self, key, row, result):
-        if isinstance(result, PlenoError):
-            result = refused(result)
-        self.store.journal.add(row.key, result | {"mem_limit": budget().memory})
-        self.left[key] -= 1
-        if not self.left[key]:
-            self._path(key).unlink(missing_ok=True)
+    def _keep(self, group: str, point: DesignPoint, result: PointResult | PlenoError) -> None:
+        """Keep the result of a point; its matrix goes after the last one of the group."""
+        found = refused(result) if isinstance(result, PlenoError) else result
+        self.store.journal.add(point.key, found.as_json() | {"mem_limit": budget().memory})
+        self.left[group] -= 1
+        if not self.left[group]:
+            self._path(group).unlink(missing_ok=True)
 
-    def _path(self, key):
-        return self.store.folder / "matrices" / f"{key}.h5"
+    def _path(self, group: str) -> Path:
+        return self.store.folder / "matrices" / f"{group}.h5"

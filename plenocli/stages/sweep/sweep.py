@@ -2,43 +2,51 @@
 those that none beats.
 """
 
+from pathlib import Path
+
 from plenocli.execution.pool import open_pool
-from plenocli.stages.sweep.space import open_space
+from plenocli.stages.sweep.space import ReadOptions, open_space
 from plenocli.stages.sweep.store import open_store
-from plenocli.stages.sweep.table import finish, objectives_of
+from plenocli.stages.sweep.table import SweepSummary, finish, objectives_of
 
 
 def run_sweep(
-    path,
-    output,
+    path: Path | str,
+    output: Path | str,
     *,
-    read_options,
-    seed=0,
-    workers=1,
-    scheduler=None,
-    plot=None,
-    overwrite=False,
-    command="",
-):
-    """Carry every point of the design through the chain and write the table `output` (.h5), the
-    same as .csv, and perhaps the front as a picture; returns a summary dict.
+    read_options: ReadOptions,
+    seed: int = 0,
+    workers: int = 1,
+    scheduler: str | None = None,
+    plot: Path | None = None,
+    overwrite: bool = False,
+    command: str = "",
+) -> SweepSummary:
+    """Carry every point of the design through the chain and write the table.
+
+    path: of the sweep file.
+    output: .h5; the same as .csv beside it.
+    read_options: (stage, values) -> option -> value, as the command line reads them.
+    workers, scheduler: as plenocli.execution.pool.open_pool.
+    plot: picture of the front, where it is wanted.
 
     Finished points lie in the folder OUT.parts and are never computed again, whatever ended the
     run. A point that a stage refuses is a row with the reason.
-    workers, scheduler: see execution.pool. Errors: as open_space;
-    UsageError for the front, OutputError where nothing can be written or a worker was lost.
+
+    Raises ConfigError, InputError and UsageError as open_space, ConfigError for the front,
+    OutputError where nothing can be written or a worker was lost.
     """
-    from plenocli.files.config.sweep_file import points
+    from plenocli.files.config.sweep_file import points as points_of
 
     space = open_space(path, read_options, seed)
-    rows = [
-        space.row(number, point)
-        for number, point in enumerate(points(space.sweep, space.axes, seed))
+    points = [
+        space.point(number, values)
+        for number, values in enumerate(points_of(space.sweep, space.axes, seed))
     ]
-    objectives = objectives_of(space, rows)
+    objectives = objectives_of(space, points)
     with (
         open_store(output, plot, overwrite, [path, space.camera_path]) as store,
         open_pool(workers, scheduler) as pool,
     ):
-        computed = store.evaluate(rows, pool, list(space.files))
-        return finish(space, rows, objectives, store, computed, command)
+        computed = store.evaluate(points, pool, list(space.files))
+        return finish(space, points, objectives, store, computed, command)

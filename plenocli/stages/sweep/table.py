@@ -1,27 +1,80 @@
-"""What comes of a sweep: one table with a row a point, as artefact and CSV, and the front of
-those that none beats.
+"""What comes of a sweep: one table with a row a point, as artefact and CSV, and the front of those
+that none beats.
 """
+
+from __future__ import annotations
 
 import csv
 import io
 import json
 import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError, InputError, NumericsError
 from plenocli.base.progress import note
 from plenocli.base.text import plain
-from plenocli.stages.sweep.point import DESIGN
+from plenocli.evaluation.designs import DesignTable, Metric, Parameter
+from plenocli.stages.sweep.task import DESIGN, PointResult
+
+if TYPE_CHECKING:
+    from plenocli.stages.sweep.space import DesignPoint, Space
+    from plenocli.stages.sweep.store import Store
 
 FRONTS = {
     "spatial": {"psnr_db": "max", "sensor_pixels": "min"},
     "spectral": {"six_patch_rmse": "min", "lenslet_field_m": "min"},
 }
 """What counts as better where the file does not say."""
+MOST_SHOWN = 20
+"""Rows of the front that people are shown."""
 
 
-def _definitions():
+@dataclass(frozen=True, kw_only=True)
+class SweepSummary:
+    """What a sweep did.
+
+    output: the table; plot: picture of its front, None where there is none.
+    points: in the table, of which `computed` are new, `refused` were refused by a stage and
+        `with_remarks` have remarks; the first reason and the first remark.
+    objectives: metric or key -> "max" or "min".
+    front: number, objectives and values of the points that none beats, best first.
+    cpu_seconds: of all points, when they were computed.
+    """
+
+    output: str
+    points: int
+    computed: int
+    refused: int
+    with_remarks: int
+    first_reason: str
+    first_remark: str
+    objectives: Mapping[str, str]
+    front: list[dict[str, Any]]
+    cpu_seconds: float
+    plot: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary of --json."""
+        return {
+            "output": self.output,
+            "points": self.points,
+            "computed": self.computed,
+            "refused": self.refused,
+            "with_remarks": self.with_remarks,
+            "first_reason": self.first_reason,
+            "first_remark": self.first_remark,
+            "objectives": dict(self.objectives),
+            "front": self.front,
+            "cpu_seconds": self.cpu_seconds,
+        } | ({} if self.plot is None else {"plot": self.plot})
+
+
+def _definitions() -> dict[str, str]:
+    """What the figures of a point mean."""
     from plenocli.evaluation.metrics import classify, quality, snr, spectral
 
     return {
@@ -31,8 +84,11 @@ def _definitions():
     } | DESIGN
 
 
-def objectives_of(space, rows):
-    """Metric or numeric key -> "max" or "min"; ConfigError for a name that no point can have."""
+def objectives_of(space: Space, points: Sequence[DesignPoint]) -> dict[str, str]:
+    """Metric or numeric key -> "max" or "min".
+
+    Raises ConfigError for a name that no point can have.
+    """
     import difflib
 
     from plenocli.files.config.sweep_file import number
@@ -41,7 +97,7 @@ def objectives_of(space, rows):
     numeric = [
         key
         for key in space.sweep.varied
-        if rows and all(number(row.point.get(key)) is not None for row in rows)
+        if points and all(number(point.values.get(key)) is not None for point in points)
     ]
     known = [*_definitions(), *numeric]
     for name in wanted:
@@ -55,152 +111,175 @@ def objectives_of(space, rows):
     return dict(wanted)
 
 
-def _columns(space, rows):
-    """(parameters, metrics, values (point, parameter), figures (point, metric)): dicts that
-    describe the columns, NaN where there is nothing.
+def result_of(point: DesignPoint) -> PointResult:
+    """What came of a point that was evaluated."""
+    if point.result is None:
+        raise ValueError(f"point {point.number} has no result")
+    return point.result
+
+
+def _parameter(key: str, given: Sequence[Any]) -> tuple[Parameter, list[float]]:
+    """A column of what varied: numbers, or places in a list of choices; NaN where there is
+    nothing.
     """
     from plenocli.files.config.sweep_file import number, unit
 
-    parameters, values = [], []
-    for key in space.sweep.varied:
-        given = [row.point.get(key) for row in rows]
-        numbers = [None if value is None else number(value) for value in given]
-        if all(value is None or n is not None for value, n in zip(given, numbers)):
-            parameters.append(
-                {"key": key, "unit": next((unit(v) for v in given if v is not None), "")}
-            )
-            values.append([np.nan if n is None else n for n in numbers])
-        else:
-            choices = list({json.dumps(v): v for v in given if v is not None}.values())
-            parameters.append({"key": key, "unit": "", "choices": choices})
-            values.append(
-                [
-                    np.nan
-                    if v is None
-                    else next(i for i, c in enumerate(choices) if c == v and type(c) is type(v))
-                    for v in given
-                ]
-            )
-    names = dict.fromkeys(name for row in rows for name in row.result["metrics"])
+    numbers = [None if value is None else number(value) for value in given]
+    if all(value is None or n is not None for value, n in zip(given, numbers)):
+        of = next((unit(v) for v in given if v is not None), "")
+        return Parameter(key, of), [np.nan if n is None else n for n in numbers]
+    choices = list({json.dumps(v): v for v in given if v is not None}.values())
+    places = [
+        np.nan
+        if v is None
+        else next(i for i, c in enumerate(choices) if c == v and type(c) is type(v))
+        for v in given
+    ]
+    return Parameter(key, "", choices), places
+
+
+def design_table(
+    space: Space, points: Sequence[DesignPoint], objectives: Mapping[str, str]
+) -> DesignTable:
+    """The table of points that were evaluated."""
+    from plenocli.evaluation.metrics.pareto import front
+
+    results = [result_of(point) for point in points]
+    columns = [
+        _parameter(key, [point.values.get(key) for point in points]) for key in space.sweep.varied
+    ]
+    names = dict.fromkeys(name for result in results for name in result.metrics)
     order = [
         *(name for name in names if name not in DESIGN),
         *(name for name in DESIGN if name in names),
     ]
     known = _definitions()
     figures = [
-        [np.nan if (v := row.result["metrics"].get(name)) is None else v for name in order]
-        for row in rows
+        [np.nan if (v := result.metrics.get(name)) is None else v for name in order]
+        for result in results
     ]
-    return (
-        parameters,
-        [{"name": name, "meaning": known.get(name, "")} for name in order],
-        np.array(values, float).reshape(len(values), len(rows)).T,
-        np.array(figures, float).reshape(len(rows), len(order)),
+    status = np.array([result.status for result in results])
+    table = DesignTable(
+        parameters=[parameter for parameter, _ in columns],
+        metrics=[Metric(name, known.get(name, "")) for name in order],
+        objectives=objectives,
+        values=np.array([v for _, v in columns], float).reshape(len(columns), len(points)).T,
+        figures=np.array(figures, float).reshape(len(points), len(order)),
+        status=status,
+        ahead=np.zeros(len(points), bool),
+        keys=np.array([point.key for point in points], dtype="S64"),
+        chain=space.chain,
+        reasons={
+            str(point.number): result.reason
+            for point, result in zip(points, results)
+            if result.status
+        },
+        notes={
+            str(point.number): list(result.notes)
+            for point, result in zip(points, results)
+            if result.notes
+        },
+        description=plain(space.sweep.model_dump(by_alias=True, exclude_none=True)),
+    )
+    signs = [1 if aim == "max" else -1 for aim in objectives.values()]
+    merit = np.where(status[:, None] == 0, _merit(table).T, np.nan)
+    return replace(table, ahead=front(merit, signs))
+
+
+def _merit(table: DesignTable) -> np.ndarray:
+    """(objective, point) figures that the front is drawn from, NaN where there is nothing."""
+    columns = [table.column(name) for name in table.objectives]
+    return np.array(
+        [np.full(len(table.status), np.nan) if column is None else column for column in columns]
     )
 
 
-def finish(space, rows, objectives, store, computed, command):
-    """Write table, CSV and picture; returns the summary.
+def finish(
+    space: Space,
+    points: Sequence[DesignPoint],
+    objectives: Mapping[str, str],
+    store: Store,
+    computed: int,
+    command: str,
+) -> SweepSummary:
+    """Write table, CSV and picture.
 
-    The error of the first point is raised where no point worked.
+    points: evaluated.
+    objectives: metric or key -> "max" or "min".
+    computed: number of points that are new.
+
+    Raises the error of the first point where no point worked.
     """
-    from plenocli.evaluation.metrics.pareto import front
-    from plenocli.files.artefacts.container import Artefact, write_artefact
+    from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import publish
+    from plenocli.files.results.design_tables import design_artefact
 
-    parameters, metrics, values, figures = _columns(space, rows)
-    names = [m["name"] for m in metrics]
-    keys = [p["key"] for p in parameters]
-    merit = [
-        figures[:, names.index(n)]
-        if n in names
-        else values[:, keys.index(n)]
-        if n in keys
-        else np.full(len(rows), np.nan)
-        for n in objectives
-    ]
-    status = np.array([row.result["status"] for row in rows])
-    ahead = front(
-        np.where(status[:, None] == 0, np.array(merit).T, np.nan),
-        [1 if way == "max" else -1 for way in objectives.values()],
-    )
-    reasons = {str(row.number): row.result["reason"] for row in rows if row.result["status"]}
-    remarks = {str(row.number): row.result["notes"] for row in rows if row.result["notes"]}
-    attrs = {
-        "chain": space.chain,
-        "parameters": parameters,
-        "metrics": metrics,
-        "objectives": list(objectives.items()),
-        "reasons": reasons,
-        "notes": remarks,
-        "description": plain(space.sweep.model_dump(by_alias=True, exclude_none=True)),
-    }
-    data = {
-        "sweep/parameter": values,
-        "sweep/metric": figures if names else None,
-        "sweep/status": status.astype(np.int32),
-        "sweep/front": ahead,
-        "sweep/key": np.array([row.key for row in rows], dtype="S64"),
-    }
+    table = design_table(space, points, objectives)
     inputs = {"sweep": space.path, "camera": space.camera_path, "file": sorted(space.files) or None}
     provenance = Provenance(command, describe_inputs(inputs), space.seed, _base_text(space))
     publish(
         store.output.with_suffix(".csv"),
-        _csv(rows, keys, names, figures, ahead).encode(),
+        _csv(points, table).encode(),
         overwrite=store.again,
     )
-    artefact = Artefact("sweep", data, {"sweep": attrs}, provenance)
-    if store.plot is not None and not ahead.any():
+    if store.plot is not None and not table.ahead.any():
         note("no point has all figures of the front: there is nothing to draw")
     elif store.plot is not None:
-        from plenocli.files.results.design_tables import designs_of
         from plenocli.report.front import front_picture
 
-        publish(store.plot, front_picture(designs_of(artefact)), overwrite=store.again)
-    write_artefact(store.output, artefact, overwrite=store.overwrite)
+        publish(store.plot, front_picture(table), overwrite=store.again)
+    write_artefact(store.output, design_artefact(table, provenance), overwrite=store.overwrite)
     shutil.rmtree(store.folder / "matrices", ignore_errors=True)
-    if not (status == 0).any():
-        worst = max((row for row in rows), key=lambda row: row.result["status"])
-        raise _CLASSES[worst.result["status"]](
-            f"none of {len(rows)} points could be computed; the first: {rows[0].result['reason']}",
+    results = [result_of(point) for point in points]
+    if not (table.status == 0).any():
+        worst = max(result.status for result in results)
+        raise _CLASSES[worst](
+            f"none of {len(points)} points could be computed; the first: {results[0].reason}",
             space.path,
             f"{store.output} holds all reasons",
         )
+    return SweepSummary(
+        output=str(store.output),
+        points=len(points),
+        computed=computed,
+        refused=len(table.reasons),
+        with_remarks=len(table.notes),
+        first_reason=next(iter(table.reasons.values()), ""),
+        first_remark=next(iter(table.notes.values()), [""])[0],
+        objectives=objectives,
+        front=_front(points, table),
+        cpu_seconds=sum(result.seconds for result in results),
+        plot=str(store.plot) if store.plot is not None and table.ahead.any() else None,
+    )
+
+
+def _front(points: Sequence[DesignPoint], table: DesignTable) -> list[dict[str, Any]]:
+    """Number, objectives and values of the points that none beats, best first."""
+    merit, aims = _merit(table), table.objectives
+    keys = [parameter.key for parameter in table.parameters]
     best = sorted(
-        np.flatnonzero(ahead),
+        np.flatnonzero(table.ahead),
         key=lambda i: tuple(
-            -m[i] if way == "max" else m[i] for m, way in zip(merit, objectives.values())
+            -m[i] if aim == "max" else m[i] for m, aim in zip(merit, aims.values())
         ),
     )
-    shown = [
+    return [
         {
-            "point": rows[i].number,
-            **{name: float(m[i]) for name, m in zip(objectives, merit) if name not in keys},
-            **rows[i].point,
+            "point": points[i].number,
+            **{name: float(m[i]) for name, m in zip(aims, merit) if name not in keys},
+            **points[i].values,
         }
         for i in best
     ]
-    return {
-        "output": str(store.output),
-        "points": len(rows),
-        "computed": computed,
-        "refused": len(reasons),
-        "with_remarks": len(remarks),
-        "first_reason": next(iter(reasons.values()), ""),
-        "first_remark": next(iter(remarks.values()), [""])[0],
-        "objectives": objectives,
-        "front": shown,
-        "cpu_seconds": sum(row.result["seconds"] for row in rows),
-    } | ({"plot": str(store.plot)} if store.plot is not None and ahead.any() else {})
 
 
 _CLASSES = {error.exit_code: error for error in (ConfigError, InputError, NumericsError)}
 
 
-def _base_text(space):
-    """The camera that all points start from, as resolved TOML; as it stands where it is no
-    camera before something is put in.
+def _base_text(space: Space) -> str:
+    """The camera that all points start from, as resolved TOML; as it stands where it is no camera
+    before something is put in.
     """
     from plenocli.files.config.camera_file import parse_camera, to_toml
 
@@ -211,63 +290,64 @@ def _base_text(space):
         return text
 
 
-def _csv(rows, keys, names, figures, ahead):
+def _csv(points: Sequence[DesignPoint], table: DesignTable) -> str:
     """The table as text: values as they stand in the sweep file, figures to the last digit,
     nothing for what is not there.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
+    keys = [parameter.key for parameter in table.parameters]
+    names = [metric.name for metric in table.metrics]
     writer.writerow(["point", *keys, "status", "front", *names, "reason"])
-    for i, row in enumerate(rows):
+    for i, point in enumerate(points):
         shown = [
             v
             if isinstance(v, (str, int, float)) and not isinstance(v, bool)
             else ""
             if v is None
             else json.dumps(v)
-            for v in (row.point.get(key) for key in keys)
+            for v in (point.values.get(key) for key in keys)
         ]
+        result = result_of(point)
         writer.writerow(
             [
-                row.number,
+                point.number,
                 *shown,
-                row.result["status"],
-                int(ahead[i]),
-                *("" if np.isnan(v) else repr(float(v)) for v in figures[i]),
-                " ".join(row.result["reason"].split()),
+                result.status,
+                int(table.ahead[i]),
+                *("" if np.isnan(v) else repr(float(v)) for v in table.figures[i]),
+                " ".join(result.reason.split()),
             ]
         )
     return out.getvalue()
 
 
-def lines(report):
-    """What run_sweep did, for people: a sentence, and the front as a table, at most
-    twenty rows of it.
-    """
-    aims = ", ".join(f"{name} {way}" for name, way in report["objectives"].items())
+def lines(report: SweepSummary) -> str:
+    """What a sweep did, for people: a sentence, and the front as a table."""
+    aims = ", ".join(f"{name} {aim}" for name, aim in report.objectives.items())
     text = [
         (
-            f"{report['output']}: {report['points']} points, {report['computed']} computed now, "
-            f"{report['refused']} refused; {len(report['front'])} on the front of {aims}"
+            f"{report.output}: {report.points} points, {report.computed} computed now, "
+            f"{report.refused} refused; {len(report.front)} on the front of {aims}"
         )
     ]
     for count, what, said in (
-        (report["refused"], "refused", report["first_reason"]),
-        (report["with_remarks"], "with remarks of the stages", report["first_remark"]),
+        (report.refused, "refused", report.first_reason),
+        (report.with_remarks, "with remarks of the stages", report.first_remark),
     ):
         if count:
             text.append(f"  {count} {what}, the first: {' '.join(said.split())[:200]}")
-    if report["front"]:
-        heads = list(report["front"][0])
+    if report.front:
+        heads = list(report.front[0])
         cells = [heads] + [
             [
                 f"{v:.6g}" if isinstance(v, float) else str(v)
                 for v in (entry.get(h, "") for h in heads)
             ]
-            for entry in report["front"][:20]
+            for entry in report.front[:MOST_SHOWN]
         ]
         widths = [max(len(row[i]) for row in cells) for i in range(len(heads))]
         text += ["  " + "  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in cells]
-        if len(report["front"]) > 20:
-            text.append(f"  and {len(report['front']) - 20} more")
+        if len(report.front) > MOST_SHOWN:
+            text.append(f"  and {len(report.front) - MOST_SHOWN} more")
     return "\n".join(text)

@@ -1,0 +1,247 @@
+"""What is asked of one point of a sweep, and what came of it: types that pass through pools, and as
+JSON through the journal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from plenocli.base.errors import PlenoError
+    from plenocli.forward.camera.model import Camera
+
+Options = Mapping[str, Any]
+"""Option -> value of one stage, JSON-able."""
+
+CHAINS = {
+    "spatial": ("simulate-pif", "capture-sim", "reconstruct", "score"),
+    "spectral": ("simulate-pif", "capture-sim", "simulate-response", "calibrate", "demux", "score"),
+}
+"""Stages of each chain, whose options may be set."""
+
+DESIGN = {
+    "matrix_seconds": (
+        "time to compute the system matrix on one core at nominal speed, as its plan counts it, s"
+    ),
+    "matrix_bytes": "size of the system matrix, bytes",
+    "lenslets": "lenslets of the array",
+    "sensor_pixels": "pixels of the sensor",
+    "object_points": "object points over the whole array",
+    "lenslet_field_m": (
+        "width of one lenslet's field on the object: pitch times object distance "
+        "over array distance, m"
+    ),
+}
+"""Figures of every point beside those of score."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One point, as everything that its figures depend on.
+
+    chain: "spatial" or "spectral".
+    camera: resolved description, TOML text.
+    settings: stage -> its options.
+    """
+
+    chain: str
+    camera: str
+    settings: Mapping[str, Options]
+
+    def options(self, stage: str) -> Options:
+        """Those of one stage; empty where it has none."""
+        return self.settings.get(stage, {})
+
+    def as_json(self) -> dict[str, Any]:
+        """What the point is known by."""
+        return {"chain": self.chain, "camera": self.camera, "settings": self.settings}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatrixCost:
+    """What a system matrix costs, and what simulate-pif said.
+
+    matrix_seconds: on one core at nominal speed, as planned.
+    matrix_bytes: of its file.
+    """
+
+    matrix_seconds: float
+    matrix_bytes: int
+    notes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """As the journal keeps it."""
+        return {
+            "matrix_seconds": self.matrix_seconds,
+            "matrix_bytes": self.matrix_bytes,
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> MatrixCost:
+        """What as_json wrote."""
+        return cls(
+            matrix_seconds=record.get("matrix_seconds", 0.0),
+            matrix_bytes=record.get("matrix_bytes", 0),
+            notes=tuple(record.get("notes", ())),
+        )
+
+
+@dataclass(frozen=True)
+class SharedMatrix:
+    """A system matrix that lies there already: its file and its cost."""
+
+    path: str
+    cost: MatrixCost
+
+
+@dataclass(frozen=True)
+class MadeMatrix:
+    """A system matrix as bytes of its artefact, and its cost."""
+
+    content: bytes
+    cost: MatrixCost
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A task with where it finds things.
+
+    matrix: that points share, None where the point computes its own.
+    files: what else is read.
+    scratch: folder for files while the task lasts, None for the system's.
+    """
+
+    task: Task
+    matrix: SharedMatrix | None = None
+    files: tuple[str, ...] = ()
+    scratch: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointResult:
+    """What came of a point.
+
+    status: exit code, 0 where all went well.
+    reason: why a stage refused it.
+    metrics: name -> figure; empty for a refused one.
+    notes: what the stages said.
+    seconds: of the processor.
+    """
+
+    status: int = 0
+    reason: str = ""
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """As the journal keeps it."""
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            "metrics": dict(self.metrics),
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> PointResult:
+        """What as_json wrote."""
+        return cls(
+            status=record.get("status", 0),
+            reason=record.get("reason", ""),
+            metrics=record.get("metrics", {}),
+            notes=tuple(record.get("notes", ())),
+            seconds=record.get("seconds", 0.0),
+        )
+
+
+def refused(error: PlenoError) -> PointResult:
+    """The result of a point that a stage refused."""
+    return PointResult(status=error.exit_code, reason=str(error))
+
+
+def task_of(chain: str, camera: Camera, options: Mapping[str, Options], seed: int) -> Task:
+    """The task of one point, with what the chain supposes.
+
+    options: stage -> options as the command line reads them, only those given.
+    seed: of captures and reconstructions, where none is given.
+    """
+    from plenocli.files.config.camera_file import to_toml
+
+    capture: dict[str, Any] = {"seed": seed}
+    if not options.get("capture-sim", {}).keys() & {"scene", "target"}:
+        capture |= (
+            {"scene": "skimage:astronaut"} if chain == "spatial" else {"target": "colorchecker"}
+        )
+    banded = chain == "spectral" and "wavelengths" not in options.get("simulate-pif", {})
+    supposed: dict[str, Options] = {
+        "capture-sim": capture,
+        "simulate-pif": {"spectral_step": "auto"} if banded else {},
+        # auto would try several methods at every point
+        "reconstruct": {"method": "lmmse", "seed": seed},
+    }
+    settings = {
+        stage: {**supposed.get(stage, {}), **options.get(stage, {})}
+        for stage in CHAINS[chain]
+        if stage != "calibrate" or stage in options
+    }
+    return Task(chain=chain, camera=to_toml(camera), settings=settings)
+
+
+def point_key(task: Task, files: Mapping[str, str]) -> str:
+    """What a point is known by: SHA-256 of everything that its figures depend on.
+
+    files: path -> SHA-256 of the files it names.
+    """
+    return digest_of(task.as_json(), files)
+
+
+def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
+    """What the matrix of a point is known by: of the camera only what A depends on, so that points
+    share it.
+
+    files: path -> SHA-256 of the files it names.
+    """
+    settings = task.options("simulate-pif")
+    kept = camera.model_dump(mode="json")
+    # without an accuracy asked for, the sensor's noise decides how exact the matrix is
+    noise = {"full_well", "read_noise"} if settings.get("accuracy") is not None else set()
+    colour = set() if task.chain == "spectral" else {"cfa"}
+    for section, names in (
+        ("lenslet_array", {"count"}),
+        ("light", {"illuminant", "white_exposure"}),
+        (
+            "sensor",
+            {"camera", "bits", "black_level", "gain", "quantum_efficiency"} | colour | noise,
+        ),
+    ):
+        kept[section] = {name: value for name, value in kept[section].items() if name not in names}
+    return digest_of({"camera": kept, "settings": settings}, files)
+
+
+def digest_of(value: Any, files: Mapping[str, str]) -> str:
+    """SHA-256 of the version and of a JSON-able value, with paths of `files` (path -> digest)
+    standing as what they hold.
+    """
+    from plenocli import __version__
+
+    def content(part: Any) -> Any:
+        """`part` with every path in its strings replaced by what the file holds."""
+        if isinstance(part, dict):
+            return {key: content(inner) for key, inner in part.items()}
+        if isinstance(part, (list, tuple)):
+            return [content(inner) for inner in part]
+        if isinstance(part, str):
+            for path, digest in files.items():
+                part = part.replace(path, f"sha256 {digest}")
+        return part
+
+    return hashlib.sha256(
+        json.dumps([__version__, content(value)], sort_keys=True).encode()
+    ).hexdigest()

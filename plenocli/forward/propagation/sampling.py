@@ -129,6 +129,22 @@ def coherent_window(geometry: Geometry, superpixels: tuple[int, int], ring: int)
     )
 
 
+def _half_phase(geometry: Geometry, far: float) -> float:
+    """Largest change of the phase (rad over half a lenslet) where its light is followed to a
+    superpixel `far` lenslets away.
+    """
+    half_width = max(geometry.lenslet_extent)
+    raster = 0 if geometry.pixel_shift is None else 1
+    reach = (
+        max(geometry.pixel_shape) + raster
+    ) * geometry.pixel_pitch / 2 + far * geometry.superpixel_pitch
+    return (
+        half_width
+        * geometry.k
+        * (reach / geometry.z3 + geometry.D1 / 2 / geometry.z2 + abs(geometry.kappa) * half_width)
+    )
+
+
 def size_band(
     geometry: Geometry,
     superpixels: tuple[int, int],
@@ -149,23 +165,12 @@ def size_band(
 
     Raises NumericsError as psf_nodes.
     """
-    half_width, window = max(geometry.lenslet_extent), coherent_window(geometry, superpixels, ring)
+    window = coherent_window(geometry, superpixels, ring)
     lit = max(geometry.reach(superpixels, window))
     far = 0 if window is None else max(geometry.reach(superpixels)) + lit
-    raster = 0 if geometry.pixel_shift is None else 1
-    reach = (
-        max(geometry.pixel_shape) + raster
-    ) * geometry.pixel_pitch / 2 + far * geometry.superpixel_pitch
-    slope = (
-        half_width
-        * geometry.k
-        * (reach / geometry.z3 + geometry.D1 / 2 / geometry.z2 + abs(geometry.kappa) * half_width)
-    )
     active = geometry.pixel_active / (geometry.wavelength * geometry.z3)
-    own, joint = (
-        2 * half_width * active,
-        (1 if window is None else 2 * lit + 1) * geometry.D2 * active,
-    )
+    own = 2 * max(geometry.lenslet_extent) * active
+    joint = (1 if window is None else 2 * lit + 1) * geometry.D2 * active
     half = geometry.field_half(superpixels, window)
     count = psf_nodes(geometry, half)
     terms = expected_terms(geometry.k * geometry.D1 / 2 * half / geometry.z2, tolerance)
@@ -175,22 +180,17 @@ def size_band(
     light = own, joint, geometry.diffraction_cells, geometry.blur / geometry.D2
     nodes, rule = pixel_nodes(accuracy / faint, *light)
     errors, beside = [PSF_CUT_EFFECT * tolerance, faint * pixel_error(nodes, rule, *light)], None
-    if (
-        dim
-        and window is not None
-        and geometry.blur == 0
-        and geometry.diffraction_cells > BESIDE_CELLS
-    ):
+    sharp = geometry.blur == 0 and geometry.diffraction_cells > BESIDE_CELLS
+    if dim and sharp and window is not None:
         fewer = pixel_nodes(accuracy / faint, *light, BESIDE)
-        if fewer[0] < nodes:  # a point at a corner lights two of them
-            beside, errors = (
-                fewer,
-                [*errors, math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE)],
-            )
+        if fewer[0] < nodes:
+            beside = fewer
+            # a point at a corner lights two of them
+            errors.append(math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE))
     return BandPlan(
         wavelength=geometry.wavelength,
         window=window,
-        lenslet_nodes=nodes_for(slope),
+        lenslet_nodes=nodes_for(_half_phase(geometry, far)),
         pixel_nodes=nodes,
         psf_nodes=count,
         terms=terms,

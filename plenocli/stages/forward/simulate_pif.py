@@ -15,6 +15,7 @@ from plenocli.base.progress import bar, note
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.accuracy.explain import Considered
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
@@ -170,28 +171,66 @@ def run_simulate_pif(
     """
     from plenocli.base.budget import budget, one_thread, within
     from plenocli.files.artefacts import pif_pieces
-    from plenocli.files.artefacts.container import Artefact, write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output
-    from plenocli.files.config.camera_file import to_toml
-    from plenocli.files.read.cameras import camera_files, read_camera
-    from plenocli.files.read.scene_needs import read_needs
-    from plenocli.forward.accuracy.dial import plan_pif
-    from plenocli.forward.accuracy.explain import expectation
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.read.cameras import read_camera
     from plenocli.forward.propagation.diagnosis import describe
     from plenocli.forward.propagation.system_matrix import build_pif
 
     if not explain:
-        if output is None:
-            raise UsageError(
-                "no output file given",
-                "--output",
-                "write -o pif.h5, or --explain to see the plan only",
-            )
-        check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
+        _require_output(camera_path, output, overwrite)
     camera = read_camera(camera_path)
-    needs = read_needs(settings.scene, camera) if settings.scene else None
-    plan = plan_pif(
+    plan = _planned(camera, settings)
+    if explain:
+        return _explained(plan, pif_pieces.cost(plan)[1])
+    chosen = pif_pieces.layout(plan, camera_path)
+    _announce(plan, pif_pieces.cost(plan)[1])
+    provenance = _provenance(camera_path, camera, settings, plan, command)
+
+    def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
+        return _artefact(camera, settings, matrix, found, provenance)
+
+    # the diagnosis too: its singular values must not depend on the cores of a machine
+    with (
+        one_thread(),
+        within(replace(budget(), threads=workers)),
+        bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown,
+    ):
+
+        def progress(done: int, total: int) -> None:
+            shown.update(done - shown.n)
+
+        if chosen.streamed:
+            matrix, found = pif_pieces.stream_pif(
+                camera, plan, output, chosen, finish, overwrite=overwrite, progress=progress
+            )
+        else:
+            matrix = build_pif(camera, plan, progress=progress)
+            found = describe(matrix)
+    for warning in found.warnings:
+        note(warning)
+    if not chosen.streamed:
+        write_artefact(output, finish(matrix, found), overwrite=overwrite)
+    return _summary(str(output), matrix, found, plan)
+
+
+def _require_output(camera_path: Path | str, output: Path | str | None, overwrite: bool) -> None:
+    """UsageError or OutputError where the artefact could not be written."""
+    from plenocli.files.atomic import check_output
+
+    if output is None:
+        raise UsageError(
+            "no output file given",
+            "--output",
+            "write -o pif.h5, or --explain to see the plan only",
+        )
+    check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
+
+
+def _planned(camera: Camera, settings: Settings) -> PifPlan:
+    from plenocli.files.read.scene_needs import read_needs
+    from plenocli.forward.accuracy.dial import plan_pif
+
+    return plan_pif(
         camera,
         wavelengths=_wavelengths(camera, settings),
         superpixels=settings.superpixels,
@@ -199,50 +238,35 @@ def run_simulate_pif(
         accuracy=settings.accuracy,
         model=settings.model,
         dtype=settings.dtype,
-        needs=needs,
+        needs=read_needs(settings.scene, camera) if settings.scene else None,
         lenslet=settings.lenslet,
     )
-    if explain:
-        return _explained(plan, pif_pieces.cost(plan)[1])
-    chosen = pif_pieces.layout(plan, camera_path)
-    for line in (*plan.warnings, expectation(plan, pif_pieces.cost(plan)[1])):
+
+
+def _announce(plan: PifPlan, memory: int) -> None:
+    """Tell the warnings of a plan, and that the work takes long where it does."""
+    from plenocli.forward.accuracy.explain import expectation
+
+    for line in (*plan.warnings, expectation(plan, memory)):
         if line:
             note(line)
+
+
+def _provenance(
+    camera_path: Path | str, camera: Camera, settings: Settings, plan: PifPlan, command: str
+) -> Provenance:
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.read.cameras import camera_files
+
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
-    provenance = Provenance(
+    return Provenance(
         command,
         describe_inputs(camera_files(camera_path, camera) | {"scene": scene}),
         None,
         to_toml(camera),
         plan.accuracy_record().as_json(),
     )
-
-    def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
-        if settings.lenslet is not None:
-            window = _window(camera, settings.lenslet)
-            matrix = replace(matrix, notes=replace(matrix.notes, window=window))
-        contents = _contents(matrix, found, camera.lenslet_array.lattice)
-        return Artefact("pif", *contents, provenance)
-
-    # the diagnosis too: its singular values must not depend on the cores of a machine
-    with (
-        one_thread(),
-        within(replace(budget(), threads=workers)),
-        bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as progress,
-    ):
-        options = dict(progress=lambda done, total: progress.update(done - progress.n))
-        if chosen.streamed:
-            matrix, found = pif_pieces.stream_pif(
-                camera, plan, output, chosen, finish, overwrite=overwrite, **options
-            )
-        else:
-            matrix = build_pif(camera, plan, **options)
-            found = describe(matrix)
-    for warning in found.warnings:
-        note(warning)
-    if not chosen.streamed:
-        write_artefact(output, finish(matrix, found), overwrite=overwrite)
-    return _summary(output, matrix, found, plan)
 
 
 def _explained(plan: PifPlan, memory: int) -> PlanSummary:
@@ -291,6 +315,23 @@ def _window(camera: Camera, lenslet: tuple[int, int]) -> LensletWindow:
     return LensletWindow(lenslet=lenslet, first_pixel=(row, column), pixel_shift=shift)
 
 
+def _artefact(
+    camera: Camera,
+    settings: Settings,
+    matrix: SystemMatrix,
+    found: Diagnosis,
+    provenance: Provenance,
+) -> Artefact:
+    from plenocli.files.artefacts.container import Artefact
+
+    if settings.lenslet is not None:
+        window = _window(camera, settings.lenslet)
+        matrix = replace(matrix, notes=replace(matrix.notes, window=window))
+    return Artefact(
+        "pif", *_contents(matrix, found, camera.lenslet_array.lattice), provenance=provenance
+    )
+
+
 def _contents(
     matrix: SystemMatrix, found: Diagnosis, lattice: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -323,12 +364,10 @@ def _contents(
     )
 
 
-def _summary(
-    output: Path | str, matrix: SystemMatrix, found: Diagnosis, plan: PifPlan
-) -> PifSummary:
+def _summary(output: str, matrix: SystemMatrix, found: Diagnosis, plan: PifPlan) -> PifSummary:
     bands, _, pixels, points = plan.shape
     return PifSummary(
-        output=str(output),
+        output=output,
         bands=bands,
         superpixels=plan.superpixels,
         pixels=pixels,

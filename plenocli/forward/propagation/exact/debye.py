@@ -1,5 +1,5 @@
 """The field behind a main lens whose exit wave is a sphere, in direction cosines: what the
-exact rung has for h.
+exact model has for h.
 
 A well corrected lens sends a wave towards the image point that is spherical, not paraxially so.
 Expanded about the image point, what is left of the phase k(|xi - x| - |xi - xp|) from the pupil

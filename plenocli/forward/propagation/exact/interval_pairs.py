@@ -1,9 +1,9 @@
 """The light of one lenslet on one superpixel by the exact kernel: an interval of each axis, and the
 product of two of them.
 
-With the kernel's and the lens's residual sum_rs P_r C_rs Q_s (optics.residual) and the main lens's
-field sum_ij e_i S_ij e'_j on the displacements from the object's points to the lenslet, the field
-on the superpixel is X (C (x) S) X'^T,
+With the kernel's and the lens's residual sum_rs P_r C_rs Q_s (residual.Residual) and the main
+lens's field sum_ij e_i S_ij e'_j on the displacements from the object's points to the lenslet, the
+field on the superpixel is X (C (x) S) X'^T,
 
     X[(u, p), (r, i)] = integral of W(u, x) P_r(u, x) e_i(m D2 + x - p) dx   over the lenslet.
 

@@ -2,7 +2,7 @@
 integral as low rank.
 
 The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor,
-or of an isolated lenslet as prolate functions across the superpixel (optics.prolate), which are
+or of an isolated lenslet as prolate functions across the superpixel (exact.prolate), which are
 fewer. The kernel's path along each axis, the lens and the curvature of h separate; the rest is the
 short sum of residual.Residuals, and so is h (debye.spherical_field), hence
 
@@ -10,8 +10,8 @@ short sum of residual.Residuals, and so is h (debye.spherical_field), hence
     X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
 
 Terms (r, i) that all couplings leave too weak to matter are left out, and M is compressed to its
-own rank (optics.product): what is left are factor tables as the paraxial rung has
-them (optics.factors).
+own rank (low_rank_product): what is left are factor tables as the paraxial model has
+them (separable_fields).
 """
 
 from __future__ import annotations

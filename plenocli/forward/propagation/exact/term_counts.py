@@ -30,7 +30,7 @@ FINE_DECADES = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class ExactBand(BandPlan):
-    """A BandPlan of the exact rung.
+    """A BandPlan of the exact model.
 
     cut: root-energy error of a mean point's field;
     sensor_count: prolate functions across a superpixel that carry the field before it goes to the

@@ -1,4 +1,4 @@
-"""From factor tables to pixel energies: the inner loop of every rung whose sensor field is a
+"""From factor tables to pixel energies: the inner loop of every model whose sensor field is a
 short sum of products.
 
 The field of the point (row r, column c) on superpixel (sy, sx) is
@@ -25,7 +25,7 @@ class Factors:
 
     high: (superpixel rows, point rows, nodes x pixel rows, terms), wide: (superpixel columns, point
         columns, nodes x pixel columns, terms), both complex and of one type; the nodes of a pixel
-        run slowest along v and u (as relay.sensor_nodes orders them), square roots of the
+        run slowest along v and u (as array_to_sensor.sensor_nodes orders them), square roots of the
         quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel is the
         share of the light that it receives.
     pixel_shape: (rows, columns);

@@ -1,5 +1,5 @@
 """Sensor fields behind lenslets of any convex mirror-symmetric shape by matrix triple products: the
-general Fresnel rung.
+general Fresnel model.
 
 The opening is cut into chords at quadrature nodes of one axis, the scan axis. A chord's integral is
 that over the next shorter chord plus two short panels at its ends, so that all chords together cost

@@ -1,4 +1,4 @@
-"""Sensor fields behind square lenslets by low-rank factors: the Fresnel rung
+"""Sensor fields behind square lenslets by low-rank factors: the Fresnel model
 of separable arrays.
 """
 

@@ -59,7 +59,7 @@ def changed(code, copy, file, old, new):
         (f"{PROPAGATION}/fresnel/shaped.py", "PIECES = 6", "PIECES = 7", NAMES[2:3]),
         (f"{PROPAGATION}/exact/lenslets.py", "GAPS = 3.0", "GAPS = 4.0", NAMES[3:]),
         (f"{PROPAGATION}/exact/prolate.py", "return ", "return 2 * ", NAMES[3:]),
-        (f"{PROPAGATION}/rays.py", "FOCUSED = 1e-9", "FOCUSED = 1e-8", NAMES[:1]),
+        (f"{PROPAGATION}/ray/rays.py", "FOCUSED = 1e-9", "FOCUSED = 1e-8", NAMES[:1]),
         ("plenocli/forward/camera/quadrature.py", "return ", "return 2 * ", NAMES),
     ],
 )
@@ -74,8 +74,8 @@ def test_a_change_of_what_computes_is_seen(code, copy, file, old, new, models):
         (f"{PROPAGATION}/diagnosis.py", "LARGEST = 4000", "LARGEST = 5000"),
         (f"{PROPAGATION}/response.py", "TAIL = 6", "TAIL = 7"),
         (f"{PROPAGATION}/costs.toml", "[", "# measured again\n["),
-        (f"{PROPAGATION}/rays.py", '"""', '"""Words. '),
-        (f"{PROPAGATION}/rays.py", "def cost(", "def cost(_=0, *, "),
+        (f"{PROPAGATION}/ray/rays.py", '"""', '"""Words. '),
+        (f"{PROPAGATION}/ray/rays.py", "def cost(", "def cost(_=0, *, "),
     ],
 )
 def test_what_does_not_compute_changes_nothing(code, copy, file, old, new):
@@ -84,7 +84,7 @@ def test_what_does_not_compute_changes_nothing(code, copy, file, old, new):
 
 def test_a_model_is_computed_by_its_own_modules_and_what_they_share(code):
     found = {name: code.modules_of(name, ROOT) for name in NAMES}
-    for name, own in zip(NAMES, ("rays", "fresnel.square", "fresnel.shaped", "exact.lenslets")):
+    for name, own in zip(NAMES, ("ray.rays", "fresnel.square", "fresnel.shaped", "exact.lenslets")):
         of = [n for n in NAMES if f"plenocli.forward.propagation.{own}" in found[n]]
         assert of == [name]
         assert "plenocli.forward.propagation.system_matrix" in found[name]

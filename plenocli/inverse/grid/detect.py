@@ -6,6 +6,9 @@ illumination-flattened image (vignetting left in biases the pitch) and the simpl
 the places support. See docs/model.md, "Spectral response: calibration and demultiplexing".
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,40 +17,54 @@ from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.text import by
 from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
+from plenocli.inverse.grid.distortion import GridModel
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 STRUCTURED = 0.2
-# of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it
+"""Correlation half a step away, over that of a whole step, above which superpixels hold several
+bright parts.
+"""
 BORDER_WEIGHT = 0.1
-# px by which a cell's edge may seem to lie outside the frame: sensors end where the array does
+"""Of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it."""
 FRAME_TOLERANCE = 0.4
+"""px by which a cell's edge may seem to lie outside the frame: sensors end where the array does."""
 FIX = (
     "give a white image (even light through the main lens) of a lenslet array "
     "in focus on the sensor"
 )
 
 
-def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, window=1024):
-    """Find the lenslet grid of `white` (rows, columns); `dark` of the same shape or scalar
-    is subtracted first.
+def find_grid(
+    white: np.ndarray,
+    cfa: str = "mono",
+    dark: np.ndarray | float | None = None,
+    lattice_kind: str = "auto",
+    near: Sequence[float] | None = None,
+    crop: int = 1024,
+) -> LensletGrid:
+    """Find the lenslet grid of a white image.
 
-    cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is
-        scaled to the same mean.
+    white: (row, column).
+    cfa: "mono" or four letters (RGGB ...): each position of the 2x2 pattern is scaled to the same
+        mean.
+    dark: of the same shape or one number, taken off first.
     lattice_kind: "auto", "square" or "hexagonal".
     near: (row, column) px close to the centre of any one superpixel; needed only where filters in
         the pupil divide superpixels by dark lines as dark as their borders: then the phase that
         fits most whole superpixels into the frame is taken, or else the darkest lines.
+    crop: px, side of the part in which the lattice is looked for first.
+
     Raises NumericsError, saying what was seen, where there is no lattice, InputError for an image
     too small or not finite.
+    docs/model.md, "Spectral response: calibration and demultiplexing".
     """
     mosaic = prepare(white, cfa, dark)
     # what is left of the 2x2 pattern goes
     image = mosaic if cfa == "mono" else template.smoothed(mosaic)
-    crop = _brightest_crop(image, window)
-    basis, _, structure = lattice.find_basis(crop)
-    if basis is None:
-        raise NumericsError(f"no lenslet lattice in the image: {structure}", fix=FIX)
-    structured = structure > STRUCTURED
+    found = lattice.find_basis(_brightest_crop(image, crop))
+    if found.basis is None:
+        raise NumericsError(f"no lenslet lattice in the image: {found.reason}", fix=FIX)
+    basis, structured = found.basis, found.structure > STRUCTURED
     kind = lattice.kind_of(basis) if lattice_kind == "auto" else lattice_kind
     basis = lattice.oriented(basis, kind)
     sides = np.hypot(*basis.T)
@@ -95,9 +112,13 @@ def find_grid(white, cfa="mono", dark=None, lattice_kind="auto", near=None, wind
     return _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
 
 
-def prepare(white, cfa="mono", dark=None):
-    """Float image with dark removed, CFA positions equalised, dead and hot pixels replaced,
-    background at zero.
+def prepare(
+    white: np.ndarray, cfa: str = "mono", dark: np.ndarray | float | None = None
+) -> np.ndarray:
+    """Float image with dark removed, the mosaic's colours equalised, dead and hot pixels replaced,
+    and the background at zero; arguments as find_grid's.
+
+    Raises as find_grid for an image that cannot hold a grid.
     """
     white = np.asarray(white)
     if white.ndim != 2 or min(white.shape) < 24:
@@ -132,7 +153,7 @@ def prepare(white, cfa="mono", dark=None):
     return image - np.float32(np.percentile(sample, 0.5))
 
 
-def _replace_dead(image, step):
+def _replace_dead(image: np.ndarray, step: int) -> np.ndarray:
     bad = dead_pixels(image, step)
     if not bad.any():
         return image
@@ -143,13 +164,13 @@ def _replace_dead(image, step):
     return out
 
 
-def _brightest_crop(image, window):
-    """Up to `window` px a side around the centroid of the light."""
+def _brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
+    """Up to `most` px a side around the centroid of the light."""
     clipped = np.clip(image[::4, ::4], 0, None).astype(float)
     total = clipped.sum()
     low = []
     for axis in (0, 1):
-        size = min(window, image.shape[axis])
+        size = min(most, image.shape[axis])
         profile = clipped.sum(axis=1 - axis)
         centre = (
             4 * (profile * np.arange(len(profile))).sum() / total
@@ -157,10 +178,12 @@ def _brightest_crop(image, window):
             else image.shape[axis] / 2
         )
         low.append(int(np.clip(centre - size / 2, 0, image.shape[axis] - size)))
-    return image[low[0] : low[0] + window, low[1] : low[1] + window]
+    return image[low[0] : low[0] + most, low[1] : low[1] + most]
 
 
-def _measured_sites(image, basis, kind, pitch, structured):
+def _measured_sites(
+    image: np.ndarray, basis: np.ndarray, kind: str, pitch: float, structured: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool."""
     window = spots.WIDE_WINDOW if structured else spots.WINDOW
     maxima = spots.find_maxima(image, pitch, 0.28 if structured else 0.18)
@@ -203,7 +226,9 @@ def _measured_sites(image, basis, kind, pitch, structured):
     return index, first, level > 0.3, slope
 
 
-def _illumination(position, flux, shape, whole):
+def _illumination(
+    position: np.ndarray, flux: np.ndarray, shape: tuple[int, ...], whole: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Smooth surface (order up to 4) through the fluxes of `whole` lenslets: values (N,) and
     gradients (N, 2) per px.
     """
@@ -232,7 +257,13 @@ def _illumination(position, flux, shape, whole):
     return surface, np.stack([down, right], axis=1)
 
 
-def _to_dark_borders(image, model, index, pitch, near):
+def _to_dark_borders(
+    image: np.ndarray,
+    model: GridModel,
+    index: np.ndarray,
+    pitch: float,
+    near: Sequence[float] | None,
+) -> GridModel:
     """The map moved so that cell borders lie on dark lines between superpixels.
 
     The brightness of several parts draws a centroid towards the brightest; dark lines, seen in
@@ -259,7 +290,9 @@ def _to_dark_borders(image, model, index, pitch, near):
     return chosen
 
 
-def _dark_lines(image, model, index, pitch, axis):
+def _dark_lines(
+    image: np.ndarray, model: GridModel, index: np.ndarray, pitch: float, axis: int
+) -> list[tuple[float, float]]:
     """Dark lines across one lattice direction: [(distance of the line from the cell's
     border, cells; depth)].
     """
@@ -291,7 +324,7 @@ def _dark_lines(image, model, index, pitch, axis):
     return lines
 
 
-def _between(image, where):
+def _between(image: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Values of `image` at places (..., 2) px by linear interpolation, those
     outside at the border.
     """
@@ -303,7 +336,7 @@ def _between(image, where):
     return above * (1 - down) + (image[i + 1, j] * (1 - right) + image[i + 1, j + 1] * right) * down
 
 
-def _line(along, profile, start, reach):
+def _line(along: np.ndarray, profile: np.ndarray, start: float, reach: float) -> float:
     """Middle of the dark line at `start` less `start`, cells: midway between two blurred edges,
     each of its own side's brightness.
 
@@ -335,7 +368,7 @@ def _line(along, profile, start, reach):
     return float(found.x[0])
 
 
-def _index_at(model, position):
+def _index_at(model: GridModel, position: Sequence[float] | np.ndarray) -> np.ndarray:
     """Index (2,), not whole, that the map takes to `position`: Newton steps
     from the affine part.
     """
@@ -347,7 +380,7 @@ def _index_at(model, position):
     return site
 
 
-def _cells(model, shape):
+def _cells(model: GridModel, shape: tuple[int, ...]) -> np.ndarray:
     """Indices (M, N, 2) of a block of sites that covers the frame."""
     corners = np.array([_index_at(model, c) for c in [(0, 0), (0, shape[1]), (shape[0], 0), shape]])
     low, high = (
@@ -359,7 +392,7 @@ def _cells(model, shape):
     )
 
 
-def _lit_cells(image, model):
+def _lit_cells(image: np.ndarray, model: GridModel) -> np.ndarray:
     """Indices (N, 2) of the sites whose cell holds at least 0.3 of the typical light."""
     cells = _cells(model, image.shape)
     inner = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 9)] * 2, indexing="ij"), axis=-1)
@@ -371,12 +404,21 @@ def _lit_cells(image, model):
     return cells[inside & (light > 0.3 * np.median(light[inside]))]
 
 
-def _whole(position, shape, margin):
+def _whole(position: np.ndarray, shape: tuple[int, ...], margin: float) -> np.ndarray:
     low = margin - 0.5 - FRAME_TOLERANCE
     return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
 
 
-def _assemble(kind, model, index, miss, clean, shape, pitch, lit):
+def _assemble(
+    kind: str,
+    model: GridModel,
+    index: np.ndarray,
+    miss: np.ndarray,
+    clean: np.ndarray,
+    shape: tuple[int, ...],
+    pitch: float,
+    lit: np.ndarray | None,
+) -> LensletGrid:
     """Lay the sites out as an array (R, C) without empty border rows and columns;
 
     lit (N, 2): more sites that hold light.

@@ -2,26 +2,36 @@
 distortion, polynomials; fitted robustly and chosen by the data.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 ORDER = {"affine": 1, "poly2": 2, "poly3": 3, "poly5": 5}
-# parameters, simplest first
+"""Polynomials' degrees."""
 FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20, "poly5": 42}
+"""Parameters of each kind of map, simplest first."""
+MARGIN = 0.12
+"""Of the residual, by which a richer map must be better."""
+ENOUGH = 2000
+"""Sites for the first, rough part of a fit."""
 
-MARGIN = 0.12  # of the residual
-ENOUGH = 2000  # sites for the first, rough part of a fit
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GridModel:
-    """Map from lattice index (m, n) to (row, column) px. `at` evaluates it; kind names its form.
+    """Map from lattice index (m, n) to (row, column) px.
 
-    With u = (index - shift) / scale, coefficients (K, 2) are those of the monomials of u for
-    "affine" and "polyN". Homography: rows 0-2 affine q, row 3 the perspective p: q / (1 + u.p).
-    Radial: that, then with d = (q - middle) / span q + span (k |d|^2 d + 2 (d.g) d + |d|^2 g); row
-    4 is g, which moves the centre of the distortion, row 5 is (k, 0).
+    With u = (index - shift) / scale, coefficients are those of the monomials of u for "affine" and
+    "polyN". Homography: rows 0-2 affine q, row 3 the perspective p: q / (1 + u.p). Radial: that,
+    then with d = (q - middle) / span q + span (k |d|^2 d + 2 (d.g) d + |d|^2 g); row 4 is g, which
+    moves the centre of the distortion, row 5 is (k, 0).
+    kind: name of its form.
+    coefficients: (K, 2).
+    shift: (2,), of indices.
+    scale: of indices.
+    middle: (2,) px.
+    span: px.
     """
 
     kind: str
@@ -31,7 +41,7 @@ class GridModel:
     middle: np.ndarray
     span: float
 
-    def at(self, index):
+    def at(self, index: np.ndarray) -> np.ndarray:
         """Positions (..., 2), px, of indices (..., 2) (need not be integers)."""
         u = (np.asarray(index, float) - self.shift) / self.scale
         if self.kind in ORDER:
@@ -45,12 +55,21 @@ class GridModel:
         return q + self.span * ((k * square + 2 * (d @ g)[..., None]) * d + square * g)
 
 
-def fit_model(kind, index, position, weight=None, robust=True):
+def fit_model(
+    kind: str,
+    index: np.ndarray,
+    position: np.ndarray,
+    weight: np.ndarray | None = None,
+    robust: bool = True,
+) -> GridModel:
     """Robust fit of one kind of map: least absolute residuals first, which a wrong border row does
     not tilt, then Tukey weights.
 
-    index (N, 2), position (N, 2) px, weight (N,) of the sites; robust=False: plain least squares.
-    Returns GridModel.
+    kind: of FREEDOM.
+    index: (N, 2) of the sites.
+    position: (N, 2) px.
+    weight: (N,); None: all alike.
+    robust: False takes plain least squares.
     """
     index, position = np.asarray(index, float), np.asarray(position, float)
     prior = np.ones(len(index)) if weight is None else np.asarray(weight, float)
@@ -75,16 +94,23 @@ def fit_model(kind, index, position, weight=None, robust=True):
     return model
 
 
-def choose_model(index, position, weight=None):
+def choose_model(
+    index: np.ndarray, position: np.ndarray, weight: np.ndarray | None = None
+) -> tuple[GridModel, dict[str, float]]:
     """The simplest map whose leave-one-out residual is within a margin of the best one.
 
     All kinds are compared with one common set of weights, those of the richest (trimming each by
     its own residual would flatter the stiff ones) and the weights squared: sites of little weight
     shall not choose. Leaving one out needs no second fit: the residual grows by 1 / (1 - leverage).
-    The margin is two standard errors of an rms over N sites, at least MARGIN: what sampling and the
-    frame's edges do to exact lattices (a bend of half a site's own scatter passes unseen). index
-    (N, 2), position (N, 2) px, weight (N,). Returns (GridModel fitted to all, {kind:
-    leave-one-out rms in px}).
+    The margin is
+    two standard errors of an rms over N sites, at least MARGIN: what sampling and the frame's edges
+        do
+    to exact lattices (a bend of half a site's own scatter passes unseen).
+    index: (N, 2) of the sites.
+    position: (N, 2) px.
+    weight: (N,); None: all alike.
+
+    Returns the map fitted to all, and {kind: leave-one-out rms in px}.
     """
     count = len(index) if weight is None else weight.sum()
     allowed = [kind for kind, size in FREEDOM.items() if count >= 1.5 * size]
@@ -102,15 +128,17 @@ def choose_model(index, position, weight=None):
     return fitted[kind], error
 
 
-def _tukey(miss):
+def _tukey(miss: np.ndarray) -> np.ndarray:
     return np.clip(1 - (miss / (5 * max(1.48 * np.median(miss), 1e-9))) ** 2, 0, None) ** 2
 
 
-def _miss(model, index, position):
+def _miss(model: GridModel, index: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.hypot(*(position - model.at(index)).T)
 
 
-def _left_out(model, index, position, weight):
+def _left_out(
+    model: GridModel, index: np.ndarray, position: np.ndarray, weight: np.ndarray
+) -> float:
     """Weighted rms of the residuals, px, each as if its site had had no part in the fit."""
     for _ in range(1 if model.kind in ORDER else 2):
         model = _least_squares(model, index, position, weight)
@@ -128,7 +156,7 @@ def _left_out(model, index, position, weight):
     return float(np.sqrt((weight[:, None] * rest**2).sum() / weight.sum()))
 
 
-def _start(kind, index, position):
+def _start(kind: str, index: np.ndarray, position: np.ndarray) -> GridModel:
     shift = index.mean(axis=0)
     scale = max(1.0, np.abs(index - shift).max())
     middle, span = position.mean(axis=0), max(1.0, np.abs(position - position.mean(axis=0)).max())
@@ -137,7 +165,14 @@ def _start(kind, index, position):
         if kind in ORDER
         else {"homography": 4, "radial": 6}[kind]
     )
-    blank = GridModel(kind, np.zeros((rows, 2)), shift, scale, middle, span)
+    blank = GridModel(
+        kind=kind,
+        coefficients=np.zeros((rows, 2)),
+        shift=shift,
+        scale=scale,
+        middle=middle,
+        span=span,
+    )
     if kind in ORDER:
         return blank
     affine = _least_squares(
@@ -150,7 +185,9 @@ def _start(kind, index, position):
     return blank
 
 
-def _least_squares(model, index, position, weight):
+def _least_squares(
+    model: GridModel, index: np.ndarray, position: np.ndarray, weight: np.ndarray
+) -> GridModel:
     """The model after weighted least squares; for kinds not linear in their parameters, after
     one step towards it.
     """
@@ -169,7 +206,7 @@ def _least_squares(model, index, position, weight):
     return replace(model, coefficients=model.coefficients + step.reshape(-1, 2))
 
 
-def _solve(normal, right):
+def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solution of the normal equations, columns scaled to one, null directions left at zero."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * scale[:, None] * scale, rcond=1e-13, hermitian=True)
@@ -180,7 +217,7 @@ def _solve(normal, right):
     )
 
 
-def _jacobian(model, index):
+def _jacobian(model: GridModel, index: np.ndarray) -> np.ndarray:
     """Derivatives (N, 2, parameters) of the position with the parameters: the
     coefficients, row by row.
     """
@@ -205,7 +242,7 @@ def _jacobian(model, index):
     return np.concatenate([turn @ design, shift], axis=2)
 
 
-def _monomials(u, order):
+def _monomials(u: np.ndarray, order: int) -> np.ndarray:
     powers = [np.ones(u.shape)]
     for _ in range(order):
         powers.append(powers[-1] * u)

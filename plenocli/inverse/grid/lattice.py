@@ -5,6 +5,10 @@ Vectors are (row, column) in pixels. A basis is a (2, 2) array whose first vecto
 picture and whose second points right; a site (m, n) lies at origin + m * basis[0] + n * basis[1].
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import numpy as np
 
 SMALLEST_PITCH, LARGEST_PITCH = 4.5, 330.0
@@ -12,13 +16,16 @@ SQUARE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 HEXAGONAL_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)])
 
 
-def autocorrelation(image):
-    """Autocorrelation of a (rows, columns) image after removal of a quadratic trend, 1 at zero lag.
+def autocorrelation(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelation of an image after removal of a quadratic trend, 1 at zero lag.
 
     The image is tapered (Hann) and every lag is divided by the taper's own overlap, so that peaks
     of a periodic image keep their height. Unlike a Fourier peak, an autocorrelation peak does not
-    vanish where the form factor of a single lenslet has a zero. Returns (lags x lags, overlap),
-    zero lag in the middle, lags up to half the image.
+    vanish where the form factor of a single lenslet has a zero.
+    image: (row, column).
+
+    Returns the correlation (lag, lag) and the overlap, zero lag in the middle, lags up to half the
+    image.
     """
     from scipy import fft
 
@@ -27,7 +34,7 @@ def autocorrelation(image):
     taper = np.hanning(rows + 2)[1:-1, None] * np.hanning(columns + 2)[None, 1:-1]
     shape = [fft.next_fast_len(int(1.5 * n) + 1, real=True) for n in (rows, columns)]
 
-    def correlate(x):
+    def correlate(x: np.ndarray) -> np.ndarray:
         spectrum = fft.rfft2(x, shape)
         return fft.irfft2(spectrum.real**2 + spectrum.imag**2, shape)
 
@@ -39,14 +46,26 @@ def autocorrelation(image):
     return (value / peak if peak > 0 else value * 0), overlap / overlap.max()
 
 
-def find_basis(image):
-    """Two shortest independent vectors of the lattice in `image`, (2, 2) px, and the strength
-    of its peaks (0..1).
+@dataclass(frozen=True)
+class Periodicity:
+    """How an image repeats.
 
-    Returns (None, strength, reason) when the autocorrelation has no lattice of peaks; else (basis,
-    strength, structure), structure being the correlation half a step away relative to a whole step:
-    above about 0.3 the superpixels hold several bright parts (filters in the pupil) rather than one
-    spot. The search covers lags of 4.5 to 330 px that fit into 0.48 of the image.
+    basis: (2, 2) px, the two shortest independent vectors; None: there is no lattice of peaks.
+    structure: the correlation half a step away relative to a whole step: above about 0.3 the
+        superpixels hold several bright parts (filters in the pupil) rather than one spot.
+    reason: why there is no lattice, in words.
+    """
+
+    basis: np.ndarray | None = None
+    structure: float = 0.0
+    reason: str = ""
+
+
+def find_basis(image: np.ndarray) -> Periodicity:
+    """The two shortest independent vectors of the lattice in an image, by its autocorrelation; the
+    search covers lags of 4.5 to 330 px that fit into 0.48 of the image.
+
+    image: (row, column).
     """
     from scipy import ndimage
 
@@ -56,7 +75,9 @@ def find_basis(image):
     radius = np.hypot(*lag)
     ring = _first_negative_ring(value, radius)
     if ring is None:
-        return None, 0.0, "its autocorrelation never turns negative (no repeating structure)"
+        return Periodicity(
+            reason="its autocorrelation never turns negative (no repeating structure)"
+        )
     smooth = ndimage.gaussian_filter(value, max(0.6, 0.2 * ring))
     reach = min(LARGEST_PITCH * 2.1, 0.96 * min(centre))
     size = int(max(3, 2 * (ring // 2) + 1))
@@ -66,11 +87,11 @@ def find_basis(image):
     peak &= (radius < reach) & (overlap > 0.05) & ((lag[0] > 0) | ((lag[0] == 0) & (lag[1] > 0)))
     where = np.argwhere(peak)
     if len(where) < 2:
-        return None, 0.0, "its autocorrelation has no second peak"
+        return Periodicity(reason="its autocorrelation has no second peak")
     height = smooth[tuple(where.T)]
     strength = float(height.max())
     if strength < 0.03:
-        return None, strength, f"the strongest repeat correlates by only {strength:.3f} (noise)"
+        return Periodicity(reason=f"the strongest repeat correlates by only {strength:.3f} (noise)")
     # parts of a superpixel repeat too, but less well
     strong = where[height > 0.85 * strength] - centre
     strong = strong[np.argsort(np.hypot(*strong.T))]
@@ -82,17 +103,16 @@ def find_basis(image):
     )
     rest = strong[sine > 0.4]
     if not len(rest) or np.hypot(*rest[0]) > 2.1 * np.hypot(*first):
-        return None, strength, "it repeats in one direction only"
+        return Periodicity(reason="it repeats in one direction only")
     basis = _refine_basis(smooth, centre, reduced(np.array([first, rest[0]], float)))
     basis = reduced(basis)
     half = np.rint(centre + 0.5 * np.array([basis[0], basis[1], basis[0] + basis[1]])).astype(int)
-    return basis, strength, float(smooth[tuple(half.T)].max()) / strength
+    return Periodicity(basis, float(smooth[tuple(half.T)].max()) / strength)
 
 
-def reduced(basis):
-    """Gauss-Lagrange reduction of a (2, 2)
-
-    basis: the shortest pair, at an angle of 60 to 90 degrees.
+def reduced(basis: np.ndarray) -> np.ndarray:
+    """Gauss-Lagrange reduction of a basis (2, 2): the shortest pair, at an angle of 60 to 90
+    degrees.
     """
     a, b = np.array(basis, float)
     for _ in range(50):
@@ -105,7 +125,7 @@ def reduced(basis):
     return np.array([a, b if a @ b >= 0 else -b])
 
 
-def kind_of(basis):
+def kind_of(basis: np.ndarray) -> str:
     """ "square" or "hexagonal": whichever the reduced `basis` is nearer to in angle
     and in side ratio.
     """
@@ -117,11 +137,13 @@ def kind_of(basis):
     return "hexagonal" if cosine > 0.25 and ratio > 0.7 else "square"
 
 
-def oriented(basis, kind):
-    """The basis in the order of the picture: [down, right], right being the short vector nearest
-    to the +column axis.
+def oriented(basis: np.ndarray, kind: str) -> np.ndarray:
+    """The basis in the order of the picture: [down, right], right being the short vector nearest to
+    the +column axis.
 
     On a hexagonal lattice `down` makes 60 degrees with `right` (towards the next column).
+    basis: (2, 2) px.
+    kind: "square" or "hexagonal".
     """
     a, b = reduced(basis)
     short = [a, b, a - b] if kind == "hexagonal" else [a, b]
@@ -133,13 +155,18 @@ def oriented(basis, kind):
     return np.array([short[np.argmin(off)], right])
 
 
-def index_sites(spots, basis, kind, start, gate=0.28):
-    """Number the spots by walking outwards from spot `start`, one lattice step at a time.
+def index_sites(
+    spots: np.ndarray, basis: np.ndarray, kind: str, start: int, gate: float = 0.28
+) -> tuple[np.ndarray, np.ndarray]:
+    """Number spots by walking outwards from one of them, one lattice step at a time. Every site
+    passes its own slowly adapted basis on, so perspective and distortion do not add up.
 
-    spots (N, 2) px;
-    basis (2, 2) px as `oriented`;
-    gate: largest miss of a prediction, in pitches. Every site passes its own slowly adapted basis
-        on, so perspective and distortion do not add up.
+    spots: (N, 2) px.
+    basis: (2, 2) px as `oriented`.
+    kind: "square" or "hexagonal".
+    start: number of the first spot.
+    gate: largest miss of a prediction, in pitches.
+
     Returns index (N, 2) int and found (N,) bool.
     """
     from scipy.spatial import cKDTree
@@ -174,16 +201,21 @@ def index_sites(spots, basis, kind, start, gate=0.28):
     return index, found
 
 
-def surrounded(index, kind):
+def surrounded(index: np.ndarray, kind: str) -> np.ndarray:
     """Which (N,) of the sites `index` (N, 2) have all neighbours, 6 on a hexagonal and 8 on a
     square lattice, among them.
     """
     return _neighbours(index, np.ones(len(index), bool), kind) == len(_ring(kind))
 
 
-def enclosed(there, possible, index, kind):
-    """Which (R, C) of the `possible` (R, C) sites with indices (R, C, 2) have three quarters of
-    their possible neighbours `there` (R, C).
+def enclosed(there: np.ndarray, possible: np.ndarray, index: np.ndarray, kind: str) -> np.ndarray:
+    """Sites of which three quarters of their possible neighbours are there.
+
+    there, possible: (lenslet_row, lenslet_column) bool.
+    index: (lenslet_row, lenslet_column, 2).
+    kind: "square" or "hexagonal".
+
+    Returns which of the possible ones, (lenslet_row, lenslet_column).
     """
     have, could = (
         _neighbours(index.reshape(-1, 2), x.ravel(), kind).reshape(there.shape)
@@ -192,7 +224,7 @@ def enclosed(there, possible, index, kind):
     return possible & (have >= 0.75 * could) & (have >= 2)
 
 
-def _ring(kind):
+def _ring(kind: str) -> np.ndarray:
     return (
         HEXAGONAL_STEPS
         if kind == "hexagonal"
@@ -200,7 +232,7 @@ def _ring(kind):
     )
 
 
-def _neighbours(index, there, kind):
+def _neighbours(index: np.ndarray, there: np.ndarray, kind: str) -> np.ndarray:
     """How many (N,) neighbours of each site are `there` (N,)."""
     site = index - index.min(axis=0) + 1
     taken = np.zeros(site.max(axis=0) + 2, int)
@@ -208,7 +240,7 @@ def _neighbours(index, there, kind):
     return sum(taken[tuple((site + step).T)] for step in _ring(kind))
 
 
-def to_array(index, kind):
+def to_array(index: np.ndarray, kind: str) -> np.ndarray:
     """(row, column) of the lenslet array for lattice indices (m, n): hexagonal rows stay
     upright (offset rows).
     """
@@ -217,14 +249,14 @@ def to_array(index, kind):
     return np.stack([index[..., 0], index[..., 1] + shift], axis=-1)
 
 
-def from_array(site, kind):
+def from_array(site: np.ndarray, kind: str) -> np.ndarray:
     """Inverse of `to_array`."""
     site = np.asarray(site)
     shift = site[..., 0] // 2 if kind == "hexagonal" else 0
     return np.stack([site[..., 0], site[..., 1] - shift], axis=-1)
 
 
-def _quadratic_trend(image):
+def _quadratic_trend(image: np.ndarray) -> np.ndarray:
     """Least-squares quadratic surface, fitted on a coarse sub-sample."""
     y, x = (np.linspace(-1, 1, n) for n in image.shape)
     step = max(1, min(image.shape) // 128)
@@ -235,14 +267,14 @@ def _quadratic_trend(image):
     return sum(c * (y[:, None] ** i) * (x[None, :] ** j) for c, (i, j) in zip(fit, basis))
 
 
-def _centre(value, half):
+def _centre(value: np.ndarray, half: tuple[int, int]) -> np.ndarray:
     """Lags -half..half of a circular correlation, as one array with zero lag at index `half`."""
     rows = np.arange(-half[0], half[0] + 1)
     columns = np.arange(-half[1], half[1] + 1)
     return value[np.ix_(rows, columns)]
 
 
-def _first_negative_ring(value, radius):
+def _first_negative_ring(value: np.ndarray, radius: np.ndarray) -> int | None:
     """First radius, px, at which the mean over directions is negative: the end
     of the central peak.
     """
@@ -254,7 +286,7 @@ def _first_negative_ring(value, radius):
     return int(negative[0]) + 1 if negative.size else None
 
 
-def _refine_basis(value, centre, basis):
+def _refine_basis(value: np.ndarray, centre: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Least squares of the basis on the sub-pixel peaks at combinations of up to six steps."""
     limit = 0.92 * centre
     for reach in (1, 2, 4, 6):
@@ -275,7 +307,7 @@ def _refine_basis(value, centre, basis):
     return basis
 
 
-def _peak_near(value, guess, radius):
+def _peak_near(value: np.ndarray, guess: np.ndarray, radius: float) -> np.ndarray | None:
     """Sub-pixel maximum of `value` within `radius` of `guess` (parabola through three samples
     an axis), or None.
     """

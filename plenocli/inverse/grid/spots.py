@@ -9,11 +9,18 @@ WIDE_WINDOW = (0.33, 0.95)
 CORE_SIGMA = 0.13
 
 
-def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
-    """Maxima (N, 2), px, of `image` smoothed by a Gaussian of `sigma` pitches, above `threshold`
-    of its bright level.
+def find_maxima(
+    image: np.ndarray, pitch: float, sigma: float = 0.18, threshold: float = 0.06
+) -> np.ndarray:
+    """Maxima of an image smoothed by a Gaussian; large spots are searched in a picture shrunk by
+    whole block means.
 
-    Large spots are searched in a picture shrunk by whole block means.
+    image: (row, column).
+    pitch: px.
+    sigma: of the Gaussian, pitches.
+    threshold: share of the bright level above which a maximum counts.
+
+    Returns (N, 2) px.
     """
     from scipy import ndimage
 
@@ -31,14 +38,25 @@ def find_maxima(image, pitch, sigma=0.18, threshold=0.06):
     return np.argwhere(peak) * float(shrink) + (shrink - 1) / 2
 
 
-def windowed_centroids(image, centres, pitch, iterations=3, window=WINDOW, batch_pixels=3_000_000):
+def windowed_centroids(
+    image: np.ndarray,
+    centres: np.ndarray,
+    pitch: float,
+    iterations: int = 3,
+    window: tuple[float, float] = WINDOW,
+    batch_pixels: int = 3_000_000,
+) -> tuple[np.ndarray, np.ndarray]:
     """Windowed centroids: where the tapered-Gaussian-weighted first moment vanishes (Newton steps).
 
-    image (rows, columns);
-    centres (N, 2) px, first guesses;
-    pitch px;
-    window: sigma and radius in pitches. Where the frame cuts a window, only pixels whose mirror
-        image about the centre is also in the frame count, so that a cut does not pull.
+    Where the frame cuts a window, only pixels whose mirror image about the centre is also in the
+    frame count, so that a cut does not pull.
+    image: (row, column).
+    centres: (N, 2) px, first guesses.
+    pitch: px.
+    iterations: Newton steps.
+    window: sigma and radius in pitches.
+    batch_pixels: that are worked off together.
+
     Returns positions (N, 2) px and flux (N,): mean of the middle of the spot.
     """
     image = np.ascontiguousarray(image, np.float32)
@@ -52,7 +70,14 @@ def windowed_centroids(image, centres, pitch, iterations=3, window=WINDOW, batch
     return centres, flux
 
 
-def _newton(image, centre, pitch, half, iterations, window):
+def _newton(
+    image: np.ndarray,
+    centre: np.ndarray,
+    pitch: float,
+    half: int,
+    iterations: int,
+    window: tuple[float, float],
+) -> tuple[np.ndarray, np.ndarray]:
     first = np.rint(centre).astype(int)
     reach = np.arange(-half, half + 1)
     line = [np.clip(first[:, axis, None] + reach, 0, image.shape[axis] - 1) for axis in (0, 1)]

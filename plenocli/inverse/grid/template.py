@@ -6,6 +6,9 @@ of the mean superpixel is not, since pixels that do not follow it lose their wei
 as much as they tell.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,25 +25,30 @@ DEGENERATE = 0.1
 SMOOTHING = 0.8  # px: sampled discs and edges are aliased beyond
 
 
-@dataclass(frozen=True)
-class _Window:
-    """Pixels (K, 2) of a patch that count, their taper (K,), interpolation of P samples (a spline
-    with P values) and, for all pixels (P, P, 2) of a patch, their place and the place of the
-    superpixel that they belong to.
+@dataclass(frozen=True, kw_only=True)
+class _Patch:
+    """What counts of a patch of P x P pixels around a superpixel.
+
+    half: px from its middle to its edge.
+    pixels: (K, 2) px from the middle, which count.
+    taper: (K,), how much.
+    spline: interpolation of P samples (a spline with P values).
+    place: (P, P, 2) px, of all pixels.
+    owner: (P, P, 2) px, of the superpixel that they belong to.
     """
 
     half: int
     pixels: np.ndarray
     taper: np.ndarray
-    spline: object
+    spline: Callable[..., np.ndarray]
     place: np.ndarray
     owner: np.ndarray
 
     @property
-    def flat(self):
+    def flat(self) -> np.ndarray:
         return np.ravel_multi_index(tuple(self.pixels.T + self.half), (2 * self.half + 1,) * 2)
 
-    def shifted(self, by, derivative=0):
+    def shifted(self, by: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Matrices (N, P, P) that take P samples to their values, or slopes, at places
         moved `by` (N,) px.
         """
@@ -49,30 +57,39 @@ class _Window:
             np.float32
         )
 
-    def lever(self, share):
+    def lever(self, share: float) -> np.ndarray:
         """Arms (P, P, 2), px, on which the illumination's slope acts: see `register`."""
         return (share * self.place + (1 - share) * self.owner).astype(np.float32)
 
 
-def register(image, centres, basis, slope=None, symmetric=True):
-    """Places (N, 2), px, of the superpixels near `centres` (N, 2) px, of whole cells in
-    `image` (rows, columns).
+def register(
+    image: np.ndarray,
+    centres: np.ndarray,
+    basis: np.ndarray,
+    slope: np.ndarray | None = None,
+    symmetric: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places of superpixels by a fit of their common look.
 
-    Each patch is a * template(r - shift) + b under light that changes by `slope` (N, 2), relative
-    per px: a share of it continuously, the rest from one superpixel to the next (a lenslet dimmed
-    as a whole); the share is estimated.
-    basis (2, 2) px: the lattice, which says whose light a pixel shows.
+    Each patch is a * template(r - shift) + b under light that changes by `slope`: a share of it
+    continuously, the rest from one superpixel to the next (a lenslet dimmed as a whole); the share
+    is estimated.
+    image: (row, column).
+    centres: (N, 2) px, near those of whole cells.
+    basis: (2, 2) px, the lattice, which says whose light a pixel shows.
+    slope: (N, 2), of the light, relative per px; None: none.
     symmetric: superpixels have a centre, that of the template's point symmetry; otherwise
         (superpixels of several parts) the median shift is zero: the phase stays that of `centres`.
-    Returns (positions, quality): quality (N,) is the share of a patch's pixels that
-    follow the template.
+
+    Returns positions (N, 2) px, and quality (N,), the share of a patch's pixels that follow the
+    template.
     """
     pitch = np.hypot(*np.asarray(basis).T).min()
     shrink = max(1, int(pitch // SIZE))
     small = _block_means(np.asarray(image, np.float32), shrink)
     place = (np.asarray(centres, float) - (shrink - 1) / 2) / shrink
     slope = np.zeros_like(place) if slope is None else slope * shrink
-    window = _make_window(np.asarray(basis) / shrink)
+    window = _make_patch(np.asarray(basis) / shrink)
     share, quality = 1.0, np.ones(len(place))
     first = place.copy()
     for turn in range(2):
@@ -80,7 +97,7 @@ def register(image, centres, basis, slope=None, symmetric=True):
             small = smoothed(small)
         template = _template(small, place, slope, window.lever(share), quality, window)
         bank = _bank(template, window)
-        spread = _spread(small, place, slope, window.lever(share), bank, window)
+        spread = _usual_miss(small, place, slope, window.lever(share), bank, window)
         if turn == 0:
             share = _share_within(small, place, slope, bank, spread, window)
         place, quality = _fit_all(small, place, slope, window.lever(share), bank, spread, window)
@@ -91,7 +108,7 @@ def register(image, centres, basis, slope=None, symmetric=True):
     return place * shrink + (shrink - 1) / 2, quality
 
 
-def _block_means(image, shrink):
+def _block_means(image: np.ndarray, shrink: int) -> np.ndarray:
     rows, columns = (n // shrink for n in image.shape)
     return np.ascontiguousarray(
         image[: rows * shrink, : columns * shrink]
@@ -100,7 +117,7 @@ def _block_means(image, shrink):
     )
 
 
-def smoothed(image):
+def smoothed(image: np.ndarray) -> np.ndarray:
     """(1 2 1)/4 smoothing of `image` (rows, columns) along both axes: a pattern of period
     two vanishes exactly.
     """
@@ -115,8 +132,8 @@ def smoothed(image):
     return np.ascontiguousarray(image)
 
 
-def _make_window(basis):
-    """Window for a lattice in (shrunk) px.
+def _make_patch(basis: np.ndarray) -> _Patch:
+    """What counts of a patch for a lattice in (shrunk) px.
 
     Shifting is cubic spline interpolation, a matrix per phase.
     """
@@ -131,10 +148,17 @@ def _make_window(basis):
     owner = sites[np.argmin(((place[:, :, None] - sites) ** 2).sum(axis=-1), axis=-1)]
     pixels = np.argwhere(np.hypot(*np.moveaxis(place, -1, 0)) < REACH * pitch) - half
     taper = np.clip((1 - np.hypot(*pixels.T) / (REACH * pitch)) / 0.2, 0, 1)
-    return _Window(half, pixels, taper.astype(np.float32), unit, place, owner)
+    return _Patch(
+        half=half,
+        pixels=pixels,
+        taper=taper.astype(np.float32),
+        spline=unit,
+        place=place,
+        owner=owner,
+    )
 
 
-def _centre(template, window):
+def _centre(template: np.ndarray, window: _Patch) -> np.ndarray:
     """Centre (2,), px, of the template: about which it, smoothed as far as its sampling demands,
     is best its own point reflection.
     """
@@ -152,7 +176,7 @@ def _centre(template, window):
     return centre
 
 
-def _bank(template, window):
+def _bank(template: np.ndarray, window: _Patch) -> np.ndarray:
     """The template at all sub-pixel phases: columns (PHASES^2, 4, K) template, minus
     its gradient, one.
     """
@@ -167,7 +191,9 @@ def _bank(template, window):
     return np.stack([*columns, np.ones_like(columns[0])], axis=1)
 
 
-def _groups(place, most):
+def _groups(
+    place: np.ndarray, most: int
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
     """Sites that share a sub-pixel phase, at most `most` at a time: (phase number, phase (2,)
     px, sites, their pixels (n, 2)).
     """
@@ -181,7 +207,9 @@ def _groups(place, most):
             yield number[part[0]], (step[part[0]] + 0.5) / PHASES - 0.5, part, pixel[part]
 
 
-def _patches(image, pixel, slope, lever, window):
+def _patches(
+    image: np.ndarray, pixel: np.ndarray, slope: np.ndarray, lever: np.ndarray, window: _Patch
+) -> tuple[np.ndarray, np.ndarray | bool]:
     """Pixels (N, K) around `pixel` with the illumination divided out, and which (N, K) lie in
     the frame; lever (P, P, 2) px.
     """
@@ -202,7 +230,9 @@ def _patches(image, pixel, slope, lever, window):
     return patch, inside
 
 
-def _sample(place, shape, half, quality, most):
+def _sample(
+    place: np.ndarray, shape: tuple[int, ...], half: int, quality: np.ndarray, most: int
+) -> np.ndarray:
     """Up to `most` sites, evenly taken, whose patch lies in the frame (or else any) and
     follows the template.
     """
@@ -214,7 +244,14 @@ def _sample(place, shape, half, quality, most):
     return chosen[:: max(1, -(-len(chosen) // most))]
 
 
-def _template(image, place, slope, lever, quality, window):
+def _template(
+    image: np.ndarray,
+    place: np.ndarray,
+    slope: np.ndarray,
+    lever: np.ndarray,
+    quality: np.ndarray,
+    window: _Patch,
+) -> np.ndarray:
     """Mean look (P, P) of a superpixel of unit level: the mean of the middle half of all
     patches, shifted to their centres.
     """
@@ -242,7 +279,9 @@ def _template(image, place, slope, lever, quality, window):
     return mean
 
 
-def _solve(columns, patch, weight):
+def _solve(
+    columns: np.ndarray, patch: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Weighted least squares of patches (N, K) on columns (C, K): coefficients (N, C) and normal
     matrices (N, C, C).
     """
@@ -257,7 +296,9 @@ def _solve(columns, patch, weight):
     return np.linalg.solve(normal, right[..., None].astype(float))[..., 0], normal
 
 
-def _trust(fit, columns, patch, spread):
+def _trust(
+    fit: np.ndarray, columns: np.ndarray, patch: np.ndarray, spread: np.ndarray
+) -> np.ndarray:
     """Tukey weights (N, K) of pixels by their miss from the fit, six times the usual one
     being worth nothing.
     """
@@ -270,7 +311,14 @@ def _trust(fit, columns, patch, spread):
     return np.multiply(miss, miss, out=miss)
 
 
-def _spread(image, place, slope, lever, bank, window):
+def _usual_miss(
+    image: np.ndarray,
+    place: np.ndarray,
+    slope: np.ndarray,
+    lever: np.ndarray,
+    bank: np.ndarray,
+    window: _Patch,
+) -> np.ndarray:
     """Usual miss (K,) of a patch of unit level from the template, pixel by pixel: noise and what
     varies from one to the next.
     """
@@ -286,7 +334,16 @@ def _spread(image, place, slope, lever, bank, window):
     return np.maximum(spread, 0.3 * np.percentile(spread, 90) + 1e-9).astype(np.float32)
 
 
-def _fit_all(image, place, slope, lever, bank, spread, window, iterations=4):
+def _fit_all(
+    image: np.ndarray,
+    place: np.ndarray,
+    slope: np.ndarray,
+    lever: np.ndarray,
+    bank: np.ndarray,
+    spread: np.ndarray,
+    window: _Patch,
+    iterations: int = 4,
+) -> tuple[np.ndarray, np.ndarray]:
     """New places (N, 2) and the share (N,) of pixels that follow the template: Tukey weights,
     from where the lattice expects each.
     """
@@ -309,7 +366,14 @@ def _fit_all(image, place, slope, lever, bank, spread, window, iterations=4):
     return out, quality
 
 
-def _share_within(image, place, slope, bank, spread, window):
+def _share_within(
+    image: np.ndarray,
+    place: np.ndarray,
+    slope: np.ndarray,
+    bank: np.ndarray,
+    spread: np.ndarray,
+    window: _Patch,
+) -> float:
     """How much (0..1) of the illumination's gradient across lenslets also holds
     within a superpixel.
 

@@ -144,7 +144,7 @@ def align(
     if "motion" in corrected:
         c = moved_with(c, motion)
     if "offset" in corrected:
-        signal = signal - np.float32(motion.offset)
+        signal = signal - float(np.float32(motion.offset))
     stray = even_light(c.window, c.cfa) if "stray light" in corrected else None
     return Aligned(c, signal, stray, Registration(tuple(corrected), motion))
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from plenocli.inverse.registration.reference import (
     REACH,
+    Reference,
     evenly,
     own_pixels,
     stacked,
@@ -25,7 +26,9 @@ from plenocli.inverse.registration.reference import (
 from plenocli.inverse.registration.smooth_response import LEAST_SHIFT
 
 if TYPE_CHECKING:
-    pass
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.forward.sensor.readout import Readout
+    from plenocli.inverse.registration.smooth_response import SmoothResponses
 
 ITERATIONS = 8
 SIGNIFICANT = 4.0
@@ -38,18 +41,21 @@ GOOD_FIT = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Displacement of superpixels at c (rows, columns) px: shift + matrix (c - middle).
+    """Displacement of superpixels: shift + matrix (c - middle) at c (row, column) px.
 
-    offset: in the values' unit.
-
-    sigma: standard deviations of (row shift, column shift, offset);
-    offset NaN where no pixel of a superpixel tells it from light.
+    shift: (2,) px, rows and columns.
+    matrix: (2, 2), rigid motion with stretch.
+    middle: (2,) px, of the array.
+    offset: that all pixels share, in the values' unit; NaN sigma where no pixel of a superpixel
+        tells it from light.
     stray: light that the calibration does not know, spread over superpixels, in shares of their
-        mean light, and its standard deviation (NaN where all lenslets are alike).
+        mean light.
+    sigma: (3,), standard deviations of row shift, column shift and offset.
+    stray_sigma: of `stray`, NaN where all lenslets are alike.
     before, after: mean square of the residual over the expected one, median over the lenslets used,
         without and with the motion.
-    lenslets: how many were used;
-    reach: of the largest displacement over the array, px.
+    lenslets: how many were used.
+    reach: px, largest displacement over the array.
     """
 
     shift: np.ndarray
@@ -64,19 +70,19 @@ class Motion:
     lenslets: int
     reach: float
 
-    def at(self, centres):
+    def at(self, centres: np.ndarray) -> np.ndarray:
         """Displacements (..., 2) px at centres (..., 2) px."""
         return self.shift + (np.asarray(centres, float) - self.middle) @ self.matrix.T
 
     @property
-    def rotation(self):
+    def rotation(self) -> float:
         """Radians, positive where columns to the right move up (counter-clockwise in a picture
         whose rows go down).
         """
         return float(self.matrix[1, 0] - self.matrix[0, 1]) / 2
 
     @property
-    def moved(self):
+    def moved(self) -> bool:
         """Whether the lenslets moved by more than chance, enough to matter and not further
         than can be followed.
         """
@@ -86,24 +92,27 @@ class Motion:
         )
 
     @property
-    def lifted(self):
+    def lifted(self) -> bool:
         """Whether there is an offset by more than chance."""
         return bool(abs(self.offset) > SIGNIFICANT * self.sigma[2])
 
     @property
-    def strayed(self):
+    def strayed(self) -> bool:
         """Whether there is light that the calibration does not know."""
         return bool(abs(self.stray) > max(0.002, SIGNIFICANT * self.stray_sigma))
 
 
-def motion_since(reference, signal, noise=None):
-    """Motion of the lenslets of a capture since their calibration; None where fewer than
-    three lenslets show it.
+def motion_since(
+    reference: Reference, signal: np.ndarray | Readout, noise: Noise | None = None
+) -> Motion | None:
+    """Motion of the lenslets of a capture since their calibration.
 
-    signal (rows, columns), or a plenocli.forward.sensor.readout.Readout: dark removed,
-    NaN where saturated.
-    noise: (gain, read variance) of the signal, None: unknown, all pixels weigh the same.
-        Displacements beyond REACH px are not found.
+    reference: of the calibration.
+    signal: (row, column), dark removed, NaN where saturated.
+    noise: of the signal; None: unknown, all pixels weigh the same.
+
+    Returns None where fewer than three lenslets show it. Displacements beyond REACH px are not
+    found.
     """
     data = _LensletSample(reference, signal, noise)
     if data.count < 3:
@@ -122,7 +131,9 @@ def motion_since(reference, signal, noise=None):
 class _LensletSample:
     """The lenslets that tell the motion: bright, whole and spread over the array."""
 
-    def __init__(self, reference, signal, noise):
+    def __init__(
+        self, reference: Reference, signal: np.ndarray | Readout, noise: Noise | None
+    ) -> None:
         from plenocli.forward.sensor.superpixel import extract
 
         values = extract(signal, reference.origin[:, None], reference.window)[:, 0]
@@ -150,14 +161,15 @@ class _LensletSample:
         self.middle, self.extremes = reference.middle, reference.extremes
 
     @cached_property
-    def response(self):
+    def response(self) -> np.ndarray:
         return self.reference.response(self.which)
 
     @cached_property
-    def smooth(self):
+    def smooth(self) -> SmoothResponses:
         return self.reference.smooth(self.which)
 
-    def values(self, whole):
+    def values(self, whole: np.ndarray) -> np.ndarray:
+        """Values (lenslet, pixel) of windows moved by whole pixels, NaN at their borders."""
         from plenocli.forward.sensor.superpixel import extract
 
         return np.where(
@@ -166,7 +178,7 @@ class _LensletSample:
             np.nan,
         )
 
-    def search(self):
+    def search(self) -> np.ndarray:
         """Displacement (2,) in whole pixels (an even number where there is a colour mosaic) that
         leaves the least residual.
         """
@@ -186,7 +198,7 @@ class _LensletSample:
                     best, where = np.median(part), np.array([row, column], float)
         return where
 
-    def fit(self, start):
+    def fit(self, start: np.ndarray) -> Motion:
         """Gauss-Newton from displacement `start`: the common motion that leaves the least
         weighted residual.
         """
@@ -242,7 +254,9 @@ class _LensletSample:
             reach=float(reach),
         )
 
-    def _equations(self, shifts, arms):
+    def _equations(
+        self, shifts: np.ndarray, arms: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Normal equations of (displacement coefficients, offset, stray) with radiances eliminated,
         and chi^2 a lenslet.
 
@@ -286,12 +300,12 @@ class _LensletSample:
         right = (turned @ product[:, :4, 4:]).sum(axis=0)[:, 0]
         return normal, right, chi, product
 
-    def _parts(self, origin, shifts):
+    def _parts(self, origin: np.ndarray, shifts: np.ndarray) -> np.ndarray:
         """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel)."""
         return stacked(self.smooth.at(origin, shifts, derivatives=True, sharp=False))
 
 
-def _rough(f, x):
+def _rough(f: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Radiances (lenslet, band) by normal equations, good enough for weights; f
     (lenslet, band, pixel).
     """
@@ -302,7 +316,7 @@ def _rough(f, x):
     return np.linalg.solve(gram, (f @ x[..., None]))[..., 0]
 
 
-def _reduced(gram, bands, mean):
+def _reduced(gram: np.ndarray, bands: int, mean: np.ndarray) -> np.ndarray:
     """Products (lenslet, 5, 5) of what remains, outside the span of F, of the columns (row shift,
     column shift, offset, stray, x).
 
@@ -322,7 +336,7 @@ def _reduced(gram, bands, mean):
     return np.swapaxes(mix, -1, -2) @ rest @ mix
 
 
-def _chi_after(product, chi, step):
+def _chi_after(product: np.ndarray, chi: np.ndarray, step: np.ndarray) -> np.ndarray:
     """chi a lenslet after a small displacement `step` (lenslet, 2), from the products of the
     equations before it.
     """
@@ -333,7 +347,7 @@ def _chi_after(product, chi, step):
     return chi * (1 - gain / np.maximum(product[:, 4, 4], 1e-300))
 
 
-def _solve(normal, right):
+def _solve(normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Solution and standard deviations; what the data do not tell is 0 with deviation NaN:
     stray before offset.
     """

@@ -5,9 +5,18 @@ A sensor of thousands of superpixels has hundreds of megabytes of responses; one
 of them never exists whole.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from plenocli.inverse.registration.smooth_response import PARITIES, SmoothResponses, parity
+
+if TYPE_CHECKING:
+    from plenocli.inverse.registration.reference import Reference
+    from plenocli.inverse.spectra.calibration import MadeResponses
+    from plenocli.inverse.spectra.low_rank import Basis
 
 NODES = 1 / 16
 """px between displacements for which pictures are moved, where lenslets have many: the rest is
@@ -18,21 +27,29 @@ KEPT = 64
 
 
 class MovedResponses:
-    """Responses (R, C, pixel, band) whose light is displaced by `rest` (R, C, 2) px within windows
-    that went from `before` to `after` (R, C, 2) by whole periods of the mosaic.
-
-    response: of the calibration, (pixel, band) or (R, C, pixel, band).
-    reference: plenocli.inverse.registration.reference.Reference of it. `moved[rows, columns]` makes
-        (lenslet, pixel, band).
+    """Responses (lenslet_row, lenslet_column, pixel, band) after a motion, made by
+    `moved[rows, columns]` as (lenslet, pixel, band).
 
     What lenslets have in common is moved, and its change added to each lenslet's own response: a
     spline would spread the noise of single responses, magnified where a colour is weak, and what a
     lenslet has alone is as good as its noise or belongs to the pixels.
+    response: of the calibration, (pixel, band) or (lenslet_row, lenslet_column, pixel, band).
+    before, after: (lenslet_row, lenslet_column, 2), first pixels of the windows, which moved by
+        whole periods of the mosaic.
+    rest: (lenslet_row, lenslet_column, 2) px, by which the light is displaced within them.
+    reference: of the response.
     """
 
     ndim = 4
 
-    def __init__(self, response, before, after, rest, reference):
+    def __init__(
+        self,
+        response: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
+        rest: np.ndarray,
+        reference: Reference,
+    ) -> None:
         self.shape = (*before.shape[:2], *response.shape[-2:])
         self._response, self._before, self._after, self._rest, self._reference = (
             response,
@@ -42,9 +59,9 @@ class MovedResponses:
             reference,
         )
         self._even = bool(np.ptp(self._rest.reshape(-1, 2), axis=0).max() == 0)
-        self._made = {}
+        self._made: dict[Any, tuple[np.ndarray, np.ndarray, Basis | None]] = {}
 
-    def __getitem__(self, places):
+    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
         out = (
             self._response[places]
             if self._response.ndim > 2
@@ -67,7 +84,9 @@ class MovedResponses:
                 out[some] = part
         return out
 
-    def _change(self, kind, node, places, one):
+    def _change(
+        self, kind: int, node: tuple[float, ...], places: tuple[np.ndarray, ...], one: int
+    ) -> tuple[np.ndarray, np.ndarray, Basis | None]:
         """(what a displacement by `node` changes in the common pictures and its derivatives (3
         rank, pixel, band), which pixels (pixel,) cannot be told after it, the Basis or None).
         """
@@ -99,13 +118,18 @@ class MovedResponses:
 
 
 class WidenedResponses:
-    """Responses (R, C, pixel, band + n) with `patterns` (4, pixel, n) as further bands, chosen by
-    the parity of windows' first pixels `origin` (R, C, 2).
+    """Responses (lenslet_row, lenslet_column, pixel, band + n) with patterns as further bands.
+
+    response: (pixel, band) or (lenslet_row, lenslet_column, pixel, band).
+    patterns: (4, pixel, n), by the parity of the window's first pixel.
+    origin: (lenslet_row, lenslet_column, 2), first pixels of the windows.
     """
 
     ndim = 4
 
-    def __init__(self, response, patterns, origin):
+    def __init__(
+        self, response: np.ndarray | MadeResponses, patterns: np.ndarray, origin: np.ndarray
+    ) -> None:
         self.shape = (
             *origin.shape[:2],
             response.shape[-2],
@@ -113,7 +137,7 @@ class WidenedResponses:
         )
         self._response, self._patterns, self._origin = response, patterns, origin
 
-    def __getitem__(self, places):
+    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
         more = self._patterns[parity(self._origin[places])]
         own = (
             self._response[places]
@@ -123,7 +147,12 @@ class WidenedResponses:
         return np.concatenate([own, more], axis=-1)
 
 
-def widened(response, patterns, origin, sites):
+def widened(
+    response: np.ndarray | MadeResponses,
+    patterns: np.ndarray,
+    origin: np.ndarray,
+    sites: tuple[np.ndarray, ...],
+) -> np.ndarray | WidenedResponses:
     """As WidenedResponses, one array (pixel, band + n) where one response and one pattern serve all
     lenslets at `sites`.
     """
@@ -133,10 +162,14 @@ def widened(response, patterns, origin, sites):
     return WidenedResponses(response, patterns, origin)
 
 
-def even_light(window, cfa):
-    """Patterns (4, pixel, colour) of stray light that is even over a superpixel, by the parity of
-    the window's first pixel: 1 where a pixel has that colour, NaN at the border, where the
-    neighbours' light cannot be told from stray light.
+def even_light(window: tuple[int, int], cfa: str) -> np.ndarray:
+    """Patterns of stray light that is even over a superpixel.
+
+    window: rows and columns, px.
+    cfa: "mono" or four letters.
+
+    Returns (4, pixel, colour), by the parity of the window's first pixel: 1 where a pixel has that
+    colour, NaN at the border, where the neighbours' light cannot be told from stray light.
     """
     from plenocli.forward.sensor.cfa import MONO, cfa_map
     from plenocli.inverse.registration.reference import own_pixels

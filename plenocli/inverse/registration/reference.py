@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.inverse.registration.smooth_response import SmoothResponses, parity
 
 if TYPE_CHECKING:
-    pass
+    from plenocli.inverse.spectra.calibration import MadeResponses
+    from plenocli.inverse.spectra.low_rank import Basis
 
 REACH = 4
 """px: how far the search for a whole-pixel displacement goes."""
@@ -23,7 +25,7 @@ EXACT = 1e-3
 """Of a band's peak: what a response without a variance is taken to be known to."""
 
 
-def evenly(count, wanted):
+def evenly(count: int, wanted: int) -> np.ndarray:
     """Indices of at most `wanted` of `count` things, evenly."""
     return (
         np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int))
@@ -32,10 +34,11 @@ def evenly(count, wanted):
     )
 
 
-def own_pixels(window):
+def own_pixels(window: tuple[int, ...]) -> np.ndarray:
     """Mask (pixel,) without the outermost pixels of a window, where the neighbours' light, which
-    follows another radiance, would pass for an offset or stray light: none below 16 px, one
-    below 32, two above.
+    follows
+    another radiance, would pass for an offset or stray light: none below 16 px, one below 32, two
+    above.
     """
     keep = np.ones(tuple(window), bool)
     for axis, count in enumerate(window):
@@ -50,19 +53,31 @@ class Reference:
     """What registration needs of a calibration, whatever the capture: where lenslets are, and
     smooth responses of a few of them, made when first asked for.
 
-    response (R, C, pixel, band), or (pixel, band) for all;
-    origin (R, C, 2) first pixels of the windows (h, w), those of lenslets without
-        response far outside;
-    centres (R, C, 2) px;
-    shape (rows, columns) of the sensor;
-    variance (pixel, band) of the response, None: known to EXACT.
-    sample: lenslets that tell a motion.
+    response: (lenslet_row, lenslet_column, pixel, band), or (pixel, band) for all.
+    origin: (lenslet_row, lenslet_column, 2), first pixels of the windows, those of lenslets without
+        response far outside.
+    window: rows and columns of a superpixel, px.
+    centres: (lenslet_row, lenslet_column, 2) px.
+    cfa: "mono" or four letters.
+    shape: rows and columns of the sensor.
+    variance: (pixel, band) of the response; None: known to EXACT.
+    sample: how many lenslets tell a motion.
     """
 
-    def __init__(self, response, origin, window, centres, cfa, shape, variance=None, sample=SAMPLE):
+    def __init__(
+        self,
+        response: np.ndarray | MadeResponses,
+        origin: np.ndarray,
+        window: tuple[int, int],
+        centres: np.ndarray,
+        cfa: str,
+        shape: tuple[int, ...],
+        variance: np.ndarray | None = None,
+        sample: int = SAMPLE,
+    ) -> None:
         from plenocli.forward.sensor.superpixel import inside
 
-        self.window, self.cfa, self.sample = tuple(window), cfa, sample
+        self.window, self.cfa, self.sample = window, cfa, sample
         whole = inside(origin - REACH, np.asarray(window) + 2 * REACH, shape)
         place = np.argwhere(whole)
         place = place[evenly(len(place), 4 * sample)]
@@ -71,7 +86,8 @@ class Reference:
         place = tuple(place.T)
         self.origin, self.centres = origin[place], centres[place]
         self.shared = response.ndim == 2
-        self.bases, self.variance = None, variance
+        self.bases: dict[int, Basis] = {}
+        self.variance = variance
         self._response = np.asarray(response[None] if self.shared else response[place], np.float32)
         if not self.shared and len(self.origin):
             self._response = self._clean(self._response)
@@ -89,7 +105,7 @@ class Reference:
         self._smooth, self._still = {}, {}
         self._lock = threading.Lock()
 
-    def _clean(self, response):
+    def _clean(self, response: np.ndarray) -> np.ndarray:
         """Responses without most of their noise, which would draw a motion towards none; `bases` of
         what they have in common by the colours under their windows, and what is
         left of the variance.
@@ -114,14 +130,14 @@ class Reference:
             self.variance = self.variance * max(basis.left for basis in self.bases.values())
         return np.where(known, out, np.float32(np.nan))
 
-    def kinds(self, origin):
+    def kinds(self, origin: np.ndarray) -> np.ndarray:
         """Which colours (lenslet,) windows at `origin` (lenslet, 2) begin on, an index into
         PARITIES; 0 without a mosaic.
         """
         return parity(origin) if self.cfa != "mono" else np.zeros(len(origin), int)
 
     @cached_property
-    def gains(self):
+    def gains(self) -> np.ndarray:
         """Of the mosaic's colours, from lenslets all over the array, fewer where
         they have many pixels.
         """
@@ -133,7 +149,7 @@ class Reference:
         )
         return SmoothResponses(self._response[some], self.origin[some], self.window, self.cfa).gains
 
-    def response(self, which):
+    def response(self, which: np.ndarray) -> np.ndarray:
         """F (lenslet, pixel, band) of lenslets by their index."""
         return (
             np.broadcast_to(self._response[0], (len(which), *self._response.shape[1:]))
@@ -141,7 +157,7 @@ class Reference:
             else self._response[which]
         )
 
-    def smooth(self, which):
+    def smooth(self, which: np.ndarray) -> SmoothResponses:
         """Smooth responses of lenslets by their index."""
         self._make(which)
         return SmoothResponses.of(
@@ -151,14 +167,14 @@ class Reference:
             self.gains,
         )
 
-    def still(self, which):
+    def still(self, which: np.ndarray) -> np.ndarray:
         """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel)
         where nothing moved.
         """
         self._make(which)
         return np.stack([self._still[key] for key in self._keys(which)])
 
-    def _keys(self, which):
+    def _keys(self, which: np.ndarray) -> list[Any]:
         """What lenslets have in common if they share a response: the colours
         under their windows.
         """
@@ -166,7 +182,7 @@ class Reference:
             [tuple(o % 2) for o in self.origin[which]] if self.shared else [int(n) for n in which]
         )
 
-    def _make(self, which):
+    def _make(self, which: np.ndarray) -> None:
         with self._lock:
             missing = {
                 key: number
@@ -186,6 +202,6 @@ class Reference:
                 self._smooth[key], self._still[key] = smooth.smooth[k], parts[k]
 
 
-def stacked(parts):
+def stacked(parts: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
     """Three (lenslet, pixel, band) as one (lenslet, 3 * band, pixel), float64."""
     return np.ascontiguousarray(np.swapaxes(np.concatenate(parts, axis=-1), -1, -2), float)

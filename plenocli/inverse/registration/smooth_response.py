@@ -4,6 +4,8 @@ pixel. docs/model.md, "Registration".
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 DEGREE = 5
@@ -25,11 +27,18 @@ def parity(origin: np.ndarray) -> np.ndarray:
     return origin[:, 0] % 2 * 2 + origin[:, 1] % 2
 
 
-def spline_matrix(count, shift, degree=DEGREE, derivative=False):
-    """Matrices (..., count, count): samples f(0..count-1) to samples of f(x - shift), or to its
-    derivative by shift.
+def spline_matrix(
+    count: int, shift: np.ndarray, degree: int = DEGREE, derivative: bool = False
+) -> np.ndarray:
+    """Matrices that move samples by a part of a pixel.
 
-    f is the interpolating spline of `degree` 3 or 5 with mirrored ends. shift (...), in px.
+    f is the interpolating spline through the samples, with mirrored ends.
+    count: of the samples f(0), f(1) ...
+    shift: (...) px.
+    degree: of the spline, 3 or 5.
+    derivative: by the shift, instead of the moved samples.
+
+    Returns (..., count, count), samples f(x) to samples of f(x - shift).
     """
     from scipy.interpolate import BSpline
 
@@ -37,7 +46,7 @@ def spline_matrix(count, shift, degree=DEGREE, derivative=False):
     half = (degree + 1) // 2
     kernel = BSpline.basis_element(np.arange(degree + 2) - (degree + 1) / 2, extrapolate=False)
 
-    def weights(position, order):
+    def weights(position: np.ndarray, order: int) -> np.ndarray:
         """Coefficients of the B-spline (position..., count) that its value, or derivative for
         order 1, at `position` (px) takes.
         """
@@ -64,17 +73,25 @@ class SmoothResponses:
     """Responses without the colours of the mosaic: F = gain(colour of the pixel, band) * smooth,
     and smooth can be moved.
 
-    response (lenslet, pixel, band) with NaN at pixels that are not known;
-    origin (lenslet, 2) first pixels;
-    window (h, w);
-    cfa "mono" or four letters. Under narrow-band light the mosaic's filters multiply the picture of
-        the pupil by one number each, which is why a motion by an odd number of pixels can
-        be followed at all.
-    gains (letter, band): None measures them.
-    smooth (lenslet, band, h, w).
+    Under narrow-band light the mosaic's filters multiply the picture of the pupil by one number
+    each, which is why a motion by an odd number of pixels can be followed at all.
+    response: (lenslet, pixel, band), NaN at pixels that are not known.
+    origin: (lenslet, 2), first pixels.
+    window: rows and columns, px.
+    cfa: "mono" or four letters.
+    gains: (letter, band); None: measured.
+
+    smooth: (lenslet, band, row, column).
     """
 
-    def __init__(self, response, origin, window, cfa, gains=None):
+    def __init__(
+        self,
+        response: np.ndarray,
+        origin: np.ndarray,
+        window: tuple[int, int],
+        cfa: str,
+        gains: np.ndarray | None = None,
+    ) -> None:
         self._set(window, cfa, gains)
         response = np.ascontiguousarray(np.swapaxes(response, -1, -2), np.float32).reshape(
             len(response), -1, *self.window
@@ -91,15 +108,17 @@ class SmoothResponses:
         self.smooth = self._without_colours(response, known, origin)
 
     @classmethod
-    def of(cls, pictures, window, cfa, gains):
-        """From smooth pictures (lenslet, band, h, w) made before."""
+    def of(
+        cls, pictures: np.ndarray | None, window: tuple[int, int], cfa: str, gains: np.ndarray
+    ) -> SmoothResponses:
+        """From smooth pictures (lenslet, band, row, column) made before."""
         out = cls.__new__(cls)
         out._set(window, cfa, gains)
         out.smooth = pictures
         return out
 
-    def _set(self, window, cfa, gains):
-        self.window, self.cfa, self.gains = tuple(window), cfa, gains
+    def _set(self, window: tuple[int, int], cfa: str, gains: np.ndarray | None) -> None:
+        self.window, self.cfa, self.gains = window, cfa, gains
         self.letters = tuple(dict.fromkeys(cfa)) if cfa != "mono" else ("Y",)
         self._tiles = (
             None
@@ -107,7 +126,9 @@ class SmoothResponses:
             else np.moveaxis(np.asarray(gains, np.float32)[self._colours(PARITIES)], -1, 1).copy()
         )
 
-    def _without_colours(self, response, known, origin):
+    def _without_colours(
+        self, response: np.ndarray, known: np.ndarray, origin: np.ndarray
+    ) -> np.ndarray:
         """Pictures (lenslet, band, h, w) over their gains; unknown pixels and weak colours
         filled in from their neighbours.
         """
@@ -130,7 +151,7 @@ class SmoothResponses:
         smooth[:, some] = _filled(smooth[:, some], good[:, some])
         return smooth
 
-    def _measure(self, response, known, origin):
+    def _measure(self, response: np.ndarray, known: np.ndarray, origin: np.ndarray) -> np.ndarray:
         where = self._colours(origin)
         sites = [known & (where == k) for k in range(len(self.letters))]
         mean = np.stack(
@@ -148,7 +169,7 @@ class SmoothResponses:
             )
         ).astype(np.float32)
 
-    def _colours(self, origin):
+    def _colours(self, origin: np.ndarray) -> np.ndarray:
         """Index (lenslet, h, w) into letters."""
         tile = (
             np.array([self.letters.index(c) for c in self.cfa]).reshape(2, 2)
@@ -159,18 +180,23 @@ class SmoothResponses:
         columns = (origin[:, 1, None] + np.arange(self.window[1])) % 2
         return tile[rows[:, :, None], columns[:, None, :]]
 
-    def gain(self, origin):
+    def gain(self, origin: np.ndarray) -> np.ndarray | np.float32:
         """Gains (lenslet, band, h, w) of the colours under windows at `origin` (lenslet, 2); the
         number 1 without a mosaic.
         """
         return np.float32(1) if self._tiles is None else self._tiles[parity(origin)]
 
-    def moved_variance(self, variance, before, after, shift):
-        """Variance (pixel, band) of a response that `at` moved from windows at `before` to `after`
-        (2,) by shift (2,) px;
+    def moved_variance(
+        self, variance: np.ndarray, before: np.ndarray, after: np.ndarray, shift: np.ndarray
+    ) -> np.ndarray:
+        """Variance of a response that `at` moved. A pixel that takes its value from a weak colour
+        takes its noise, which was magnified, too.
 
-        variance (pixel, band): its own. A pixel that takes its value from a weak colour takes its
-            noise, which was magnified, too.
+        variance: (pixel, band), its own.
+        before, after: (2,), first pixels of the windows it was moved between.
+        shift: (2,) px.
+
+        Returns (pixel, band).
         """
         h, w = self.window
         planes = np.nan_to_num(variance).T.reshape(-1, h, w).astype(np.float32)
@@ -183,7 +209,7 @@ class SmoothResponses:
         rows, columns = (spline_matrix(n, shift[k]) ** 2 for k, n in enumerate((h, w)))
         return ((rows @ planes @ columns.T) * gains[1] ** 2).reshape(len(planes), -1).T
 
-    def _sure(self, shift):
+    def _sure(self, shift: np.ndarray) -> np.ndarray:
         """Mask (lenslet, h, w) of pixels whose spline is good: a sixth difference shows what a
         spline cannot know.
 
@@ -207,11 +233,18 @@ class SmoothResponses:
         )
         return good | (kept < 0.5).any(axis=-1)[:, None, None]
 
-    def at(self, origin, shift, derivatives=False, sharp=True):
-        """Responses (lenslet, pixel, band) of windows at `origin` (lenslet, 2) whose light is
-        displaced by `shift` (lenslet or 1, 2) px within them; with derivatives also those by row
-        and by column shift. Rows and columns that the shift brings in from outside are NaN, and so
-        are pixels that the spline cannot be trusted at unless sharp is False.
+    def at(
+        self, origin: np.ndarray, shift: np.ndarray, derivatives: bool = False, sharp: bool = True
+    ) -> np.ndarray | list[np.ndarray]:
+        """Responses whose light is displaced.
+
+        origin: (lenslet, 2), first pixels of the windows.
+        shift: (lenslet or 1, 2) px, within them.
+        derivatives: whether those by row and by column shift are wanted, too.
+        sharp: whether pixels are NaN at which the spline cannot be trusted.
+
+        Returns (lenslet, pixel, band), three of them with derivatives. Rows and columns that the
+        shift brings in from outside are NaN.
         """
         h, w = self.window
         rows, columns = (_matrices(n, shift[:, k]) for k, n in enumerate((h, w)))
@@ -237,12 +270,12 @@ class SmoothResponses:
         return flat if derivatives else flat[0]
 
 
-def _matrices(count, shift, **kind):
+def _matrices(count: int, shift: np.ndarray, **kind: Any) -> np.ndarray:
     """spline_matrix for every band of a lenslet, (lenslet, 1, count, count) float32."""
     return spline_matrix(count, shift, **kind).astype(np.float32)[:, None]
 
 
-def _flat_ratios(pictures, sites):
+def _flat_ratios(pictures: np.ndarray, sites: list[np.ndarray]) -> np.ndarray:
     """Median (site class, band) of pictures (lenslet, band, h, w) over their local means,
     where there is light.
 
@@ -265,7 +298,7 @@ def _flat_ratios(pictures, sites):
     return out
 
 
-def _seen(index, shift, count):
+def _seen(index: np.ndarray, shift: np.ndarray, count: int) -> np.ndarray:
     """Which samples (lenslet, count) come from inside, a pixel's margin kept where there
     is a shift at all.
     """
@@ -274,7 +307,7 @@ def _seen(index, shift, count):
     return (position >= margin) & (position <= count - 1 - margin)
 
 
-def _sixth_difference(pictures, axis):
+def _sixth_difference(pictures: np.ndarray, axis: int) -> np.ndarray:
     """Largest |[1, -6, 15, -20, 15, -6, 1] / 64| of each sample and its two neighbours along an
     axis; edges go on as they end.
     """
@@ -292,7 +325,7 @@ def _sixth_difference(pictures, axis):
     return out
 
 
-def _filled(values, good):
+def _filled(values: np.ndarray, good: np.ndarray) -> np.ndarray:
     """Values (..., h, w), those that are not good replaced by means of their good neighbours,
     farther ones where it takes that.
     """
@@ -308,7 +341,7 @@ def _filled(values, good):
     return out
 
 
-def _box(values, size):
+def _box(values: np.ndarray, size: int) -> np.ndarray:
     """Sums over size x size neighbours (..., h, w), nothing beyond the edges."""
     for axis in (-2, -1):
         out = values.copy()

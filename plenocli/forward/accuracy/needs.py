@@ -4,10 +4,11 @@ noise lets anyone see.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from plenocli.forward.sensor.noise import SensorModel
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -40,8 +41,7 @@ def sensor_noise(camera: Camera) -> float:
     """Relative noise of a pixel of `camera` at full well: shot and read noise over the
     signal (EMVA 1288).
     """
-    sensor = camera.sensor
-    return math.sqrt(sensor.full_well + sensor.read_noise**2) / sensor.full_well
+    return SensorModel.from_camera(camera).noise_at_full_well
 
 
 def visible_accuracy(noise: float) -> float:

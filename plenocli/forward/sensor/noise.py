@@ -110,6 +110,12 @@ class SensorModel:
         return Noise(gain=self.gain, read_variance=(self.gain * self.read_noise) ** 2 + ROUNDING)
 
     @property
+    def noise_at_full_well(self) -> float:
+        """Shot and read noise of a pixel at full well, as a share of its signal."""
+        electrons = Noise(gain=1.0, read_variance=self.read_noise**2)
+        return math.sqrt(electrons.variance(self.full_well)) / self.full_well
+
+    @property
     def white_level(self) -> int:
         """Largest digital number a pixel can report: the converter's or the full well's,
         whichever comes first.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.calibration import Response, Windows
 from plenocli.inverse.spectra.quality import mean_of_known, quality_of
 
@@ -119,18 +120,19 @@ class GatheredResponses:
             self.light[:, k], self.times[:, k] = sums / known
         self.energy[k], self.shares[k] = energy, share
 
-    def variance(self, gain: float, read_variance: float, dark_variance: float) -> np.ndarray:
+    def variance(self, noise: Noise, dark_variance: float) -> np.ndarray:
         """Variance of one lenslet's response, mean over lenslets: shot noise, read noise, which
         comes once a frame, however short, and that of the dark image.
 
-        gain: units per electron.
-        read_variance: of a frame, units^2.
+        noise: of one frame.
         dark_variance: of the dark image, units^2.
 
         Returns (pixel, band), units^2.
         """
         return (
-            gain * self.light + read_variance / self.shares * self.times + dark_variance
+            noise.gain * self.light
+            + noise.without_signal / self.shares * self.times
+            + dark_variance
         ) / self.energy**2
 
 

@@ -13,6 +13,7 @@ from plenocli.base.errors import InputError, NumericsError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.files.read.series import check_exposure_times, read_series, true_centres
 from plenocli.forward.sensor.capture import Capture
+from plenocli.forward.sensor.noise import ROUNDING, Noise
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -42,13 +43,18 @@ class KnownNoise:
         """With the rounding's variance where nothing else is known, and the source of an unknown
         gain said to be unknown.
         """
-        from plenocli.forward.sensor.noise import ROUNDING
-
         return KnownNoise(
             self.gain,
             ROUNDING if self.read_variance is None else self.read_variance,
             "unknown" if self.gain is None else self.source,
         )
+
+    def known(self) -> Noise | None:
+        """The noise, with the rounding's where no read noise is known; None without a gain."""
+        if self.gain is None:
+            return None
+        read = ROUNDING if self.read_variance is None else self.read_variance
+        return Noise(gain=self.gain, read_variance=read)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -361,9 +367,8 @@ def _response(
             (r for w, r in captures.radiances.items() if abs(w - wavelength) < 1e-12), 1.0
         )
         gathered.add(k, wavelength, signal, weight, np.mean(shares), energy)
-    known, variance = noise.filled(), None
-    if known.gain is not None:
-        variance = gathered.variance(known.gain, known.read_variance, dark.variance)
+    known = noise.known()
+    variance = None if known is None else gathered.variance(known, dark.variance)
     found = measured_response(
         asked,
         gathered,

@@ -96,13 +96,6 @@ class Lmmse:
         """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
         return self.even.mean(axis=0) @ (self.levels @ y)
 
-    def seen(self) -> np.ndarray:
-        """Share of each point's variance about the brightness of its field that the superpixel
-        determines at scale 1, (point,).
-        """
-        determined = self.gain**2 @ (1 / (self.power + self.sigma**2))
-        return np.clip(determined / np.maximum(self.variance, np.finfo(float).tiny), 0, 1)
-
     def common_scale(self, y: np.ndarray) -> float:
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
         return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])

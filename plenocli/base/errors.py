@@ -3,21 +3,27 @@
 A message says what is wrong, where (file, field, option) and what to do about it.
 """
 
+from __future__ import annotations
+
 
 class PlenoError(Exception):
     """Root of all expected failures. `exit_code` is what the process returns."""
 
     exit_code = 70
 
-    def __init__(self, what, where=None, fix=None):
+    def __init__(self, what: object, where: object = None, fix: str | None = None) -> None:
+        """what: is wrong, a predicate of `where` where that is a file.
+        where: file, field or option.
+        fix: what to do about it.
+        """
         super().__init__(what)
         self.what, self.where, self.fix = str(what), None if where is None else str(where), fix
 
-    def __str__(self):
+    def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
         return f"{text}; {self.fix}" if self.fix else text
 
-    def at(self, where):
+    def at(self, where: object) -> PlenoError:
         """The same error, with the place that whoever raised it could not know."""
         return type(self)(self.what, where, self.fix)
 

@@ -5,6 +5,8 @@ Every map has `domain` and `range` (Space), `dtype`, `forward(x)` and `adjoint(y
 keep leading axes out: x has exactly `domain.shape` and y exactly `range.shape`.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from math import prod
 from typing import Protocol
@@ -20,7 +22,8 @@ class Space:
     shape: tuple[int, ...]
 
     @property
-    def size(self):
+    def size(self) -> int:
+        """How many numbers an array of it has."""
         return prod(self.shape)
 
 
@@ -33,15 +36,19 @@ class LinearMap(Protocol):
     range: Space
     dtype: np.dtype
 
-    def forward(self, x: np.ndarray) -> np.ndarray: ...
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        """A x, of `range.shape`."""
+        ...
 
-    def adjoint(self, y: np.ndarray) -> np.ndarray: ...
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
+        """A* y, of `domain.shape`."""
+        ...
 
 
 class Dense:
     """y = A x for one matrix A (pixel, point)."""
 
-    def __init__(self, matrix):
+    def __init__(self, matrix: np.ndarray) -> None:
         self.matrix = np.asarray(matrix)
         if self.matrix.ndim != 2:
             raise ValueError(
@@ -51,11 +58,11 @@ class Dense:
         self.range = Space(("pixel",), self.matrix.shape[:1])
         self.domain = Space(("point",), self.matrix.shape[1:])
 
-    def forward(self, x):
+    def forward(self, x: np.ndarray) -> np.ndarray:
         """(point,) -> (pixel,): A x."""
         return self.matrix @ _checked(x, self.domain)
 
-    def adjoint(self, y):
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
         """(pixel,) -> (point,): A^T y."""
         return self.matrix.T @ _checked(y, self.range)
 
@@ -67,12 +74,13 @@ class BlockToeplitz:
     blocks: A_o, (lenslet offset, pixel, point): light from an object block that lands in the
         superpixel `offset` rows and columns away from the block's own.
     offsets: (lenslet offset, 2) integers, row then column (rows downwards).
-    count: (rows, columns) of lenslets. The full matrix (for 11 x 11 lenslets 2.5e9 entries) is
-        never formed. Source: Berkner et al. 2013, section 3-2 (one on-axis response
-        serves all lenslets).
+    count: (rows, columns) of lenslets.
+
+    The full matrix (for 11 x 11 lenslets 2.5e9 entries) is never formed.
+    Berkner et al. 2013, section 3-2 (one on-axis response serves all lenslets).
     """
 
-    def __init__(self, blocks, offsets, count):
+    def __init__(self, blocks: np.ndarray, offsets: np.ndarray, count: tuple[int, ...]) -> None:
         self.blocks, self.offsets = np.asarray(blocks), np.asarray(offsets, dtype=int)
         if self.blocks.ndim != 3 or self.offsets.shape != (len(self.blocks), 2):
             raise ValueError(
@@ -90,7 +98,7 @@ class BlockToeplitz:
             ("lenslet_row", "lenslet_column", "pixel"), (rows, columns, self.blocks.shape[1])
         )
 
-    def forward(self, x):
+    def forward(self, x: np.ndarray) -> np.ndarray:
         """(lenslet_row, lenslet_column, point) -> (lenslet_row, lenslet_column, pixel):
         sum_o A_o x[l - o].
         """
@@ -101,7 +109,7 @@ class BlockToeplitz:
             y[target] += x[source] @ block.T
         return y
 
-    def adjoint(self, y):
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
         """(lenslet_row, lenslet_column, pixel) -> (lenslet_row, lenslet_column, point):
         sum_o A_o^T y[l + o].
         """
@@ -112,15 +120,19 @@ class BlockToeplitz:
             x[source] += y[target] @ block
         return x
 
-    def neighbours_only(self):
+    def neighbours_only(self) -> BlockToeplitz:
         """The same map without the block's own superpixel: what the neighbours' light adds."""
         keep = np.any(self.offsets != 0, axis=1)
         return BlockToeplitz(self.blocks[keep], self.offsets[keep], self.domain.shape[:2])
 
 
-def adjoint_gap(op, seed=0):
-    """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y: about 1-10 for a correct pair
-    at any shape and scale.
+def adjoint_gap(op: LinearMap, seed: int = 0) -> float:
+    """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y.
+
+    op: the map.
+    seed: of x and y.
+
+    Returns about 1-10 for a correct pair of forward and adjoint, at any shape and scale.
 
     Divided by |Ax| |y| / sqrt(size of y), not by the inner product itself, which may be near zero
     by chance. An adjoint that is wrong by 0.1 % gives hundreds (float32) or more, so 100
@@ -135,14 +147,16 @@ def adjoint_gap(op, seed=0):
     return float(abs(np.vdot(ax, y) - np.vdot(x, aty)) / (np.finfo(op.dtype).eps * scale))
 
 
-def _checked(array, space):
+def _checked(array: np.ndarray, space: Space) -> np.ndarray:
     array = np.asarray(array)
     if array.shape != space.shape:
         raise ValueError(f"expected {dict(zip(space.axes, space.shape))}, got shape {array.shape}")
     return array
 
 
-def _overlap(offset, count):
+def _overlap(
+    offset: np.ndarray, count: tuple[int, ...]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Slices of the sources l - offset and the targets l that are both inside the array."""
     source, target = [], []
     for shift, n in zip(offset, count):

@@ -2,12 +2,15 @@
 queue, and what to say where it is too little.
 """
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import math
 import mmap
 import os
 import resource
+from collections.abc import Iterator
 
 BASE, CORE = 384 << 20, 80 << 20
 """What a process takes beside its data, bytes, and for each core: the interpreter, the libraries
@@ -22,14 +25,15 @@ where they get none.
 _SIGNS = ("memory allocation failed", "start new thread", "failed to map segment", "bad_alloc")
 
 
-def base_memory():
+def base_memory() -> int:
     """The stated base, bytes: --mem-limit and this are the most that a process may take."""
     return BASE + CORE * (os.cpu_count() or 1)
 
 
-def hold(memory):
-    """From now on this process gets MemoryError instead of more than `memory` bytes of data
-    and the base; only on Linux.
+def hold(memory: int) -> None:
+    """From now on this process gets MemoryError instead of more than it is granted; only on Linux.
+
+    memory: bytes of data, beside base_memory().
     """
     table = "/proc/self/status"
     if os.path.exists(table):
@@ -44,7 +48,7 @@ def hold(memory):
 
 
 @contextlib.contextmanager
-def limits_restored():
+def limits_restored() -> Iterator[None]:
     """What `hold` sets ends with the block."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
     try:
@@ -53,7 +57,7 @@ def limits_restored():
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def can_have(count):
+def can_have(count: int) -> bool:
     """Whether the system would give so many bytes; no page of them is touched."""
     try:
         mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
@@ -62,13 +66,13 @@ def can_have(count):
     return True
 
 
-def require_start():
+def require_start() -> None:
     """MemoryError where the limits of the shell or of a queue leave less than ROOM."""
     if not can_have(ROOM):
         raise MemoryError(f"less than {size_text(ROOM)} can be had")
 
 
-def is_lack_of_memory(error):
+def is_lack_of_memory(error: BaseException) -> bool:
     """Whether an error means that there is no memory: of ours, of a library, of a thread or process
     that cannot start, or one that came of such an error, as where a library takes it for
     another and goes on.
@@ -76,7 +80,7 @@ def is_lack_of_memory(error):
     return _lack_behind(error) is not None
 
 
-def _lack_behind(error):
+def _lack_behind(error: BaseException | None) -> BaseException | None:
     while error is not None:
         if (
             isinstance(error, MemoryError)
@@ -88,8 +92,8 @@ def _lack_behind(error):
     return None
 
 
-def lack_of_memory(error):
-    """What to say of it."""
+def lack_of_memory(error: BaseException) -> str:
+    """The message for a person of an error that is_lack_of_memory."""
     said = str(_lack_behind(error) or "")
     return (
         f"not enough memory{said and f' ({said})'}; use fewer points, lenslets or wavelengths, "
@@ -97,7 +101,7 @@ def lack_of_memory(error):
     )
 
 
-def size_text(count):
+def size_text(count: float) -> str:
     """Bytes as options take them, rounded up to three digits: 34.8MiB."""
     unit, power = next(
         (u, p)

@@ -1,19 +1,31 @@
 """Progress on stderr, only where a person watches, and notes that are always worth a line."""
 
+from __future__ import annotations
+
 import contextlib
 import contextvars
 import sys
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 quiet = False
 """Whether the person asked for silence: no bars, no notes."""
-_EAR = contextvars.ContextVar("ear", default=None)
+_COLLECTED: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar(
+    "collected", default=None
+)
 
 
-def bar(iterable, total=None, label=""):
-    """Wrap `iterable` so that a terminal shows how far it is and how long it will take; silent
-    elsewhere, for a single step, and while `heard` listens.
+def bar(iterable: Iterable | None, total: int | None = None, label: str = "") -> Any:
+    """Wrap an iterable so that a terminal shows how far it is and how long it will take.
+
+    iterable: what is gone through; None where `update` counts.
+    total: steps.
+    label: what they are.
+
+    Returns an iterable and context manager with `n` and `update`; it is silent off a terminal, for
+    a single step, and while notes are collected.
     """
-    if quiet or total == 1 or _EAR.get() is not None:
+    if quiet or total == 1 or _COLLECTED.get() is not None:
         return _Silent(iterable)
     from tqdm import tqdm
 
@@ -26,38 +38,38 @@ class _Silent:
     that is ended would leave behind.
     """
 
-    def __init__(self, iterable):
+    def __init__(self, iterable: Iterable | None) -> None:
         self.n, self._iterable = 0, iterable
 
-    def __iter__(self):
-        return iter(self._iterable)
+    def __iter__(self) -> Iterator:
+        return iter(self._iterable or ())
 
-    def __enter__(self):
+    def __enter__(self) -> _Silent:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         return None
 
-    def update(self, count=1):
+    def update(self, count: int = 1) -> None:
         """Count on."""
         self.n += count
 
 
-def note(text):
+def note(text: str) -> None:
     """One line for the person who started the command: expectations, warnings, choices made."""
-    ear = _EAR.get()
-    if ear is not None:
-        ear.append(text)
+    collected = _COLLECTED.get()
+    if collected is not None:
+        collected.append(text)
     elif not quiet:
         print(f"plenocli: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager
-def heard():
+def collected_notes() -> Iterator[list[str]]:
     """Yield a list that takes the notes of this thread while the block lasts, instead of stderr."""
-    ear = []
-    token = _EAR.set(ear)
+    collected: list[str] = []
+    token = _COLLECTED.set(collected)
     try:
-        yield ear
+        yield collected
     finally:
-        _EAR.reset(token)
+        _COLLECTED.reset(token)

@@ -5,8 +5,11 @@ draw the same numbers.
 import numpy as np
 
 
-def stream(seed, stage, index=0):
-    """A numpy Generator for draw `index` of `stage`; the same arguments give the same
-    numbers on every machine.
+def stream(seed: int, stage: str, index: int = 0) -> np.random.Generator:
+    """The random numbers of a stage, the same on every machine.
+
+    seed: of the run.
+    stage: its name.
+    index: of the draw, where a stage has several.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, index, *stage.encode()]))

@@ -5,12 +5,14 @@ from its first corner.
 import numpy as np
 
 
-def to_blocks(plane, shape):
-    """(row, column) -> (lenslet_row, lenslet_column, sample), samples numbered row by row in blocks
-    of `shape` = (rows, columns).
+def to_blocks(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A plane as the blocks that tile it.
 
-    Both sides of the plane are whole numbers of blocks. Of several planes, (band, row, column), the
-    samples of one band follow those of the other.
+    plane: (row, column), both whole numbers of blocks, or several, (band, row, column).
+    shape: (rows, columns) of a block.
+
+    Returns (lenslet_row, lenslet_column, sample), samples numbered row by row, those of one band
+    after those of the other.
     """
     if plane.ndim == 3:
         return np.concatenate([to_blocks(one, shape) for one in plane], axis=2)
@@ -22,11 +24,14 @@ def to_blocks(plane, shape):
     )
 
 
-def to_plane(blocks, shape):
-    """(lenslet_row, lenslet_column, sample) -> (row, column), the inverse of `to_blocks`.
+def to_plane(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The plane of blocks, the inverse of `to_blocks`.
 
-    Of one axis of samples or of two that stand for it, (..., rows, columns). More samples than a
-    block holds are several bands, and give (band, row, column).
+    blocks: (lenslet_row, lenslet_column, sample), or two axes (rows, columns) for the samples.
+    shape: (rows, columns) of a block.
+
+    Returns (row, column); more samples than a block holds are several bands, and give
+    (band, row, column).
     """
     rows, columns = blocks.shape[:2]
     if blocks.ndim == 3 and blocks.shape[2] > shape[0] * shape[1]:

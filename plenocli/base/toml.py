@@ -5,6 +5,7 @@ nearest known key.
 import difflib
 import re
 import tomllib
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -18,10 +19,17 @@ _DEEP_KEY = re.compile(rf"^\s*\[{{0,2}}\s*{_NAME}(?:\s*\.\s*{_NAME}){{20}}", re.
 
 _MOST_LINES = 40
 
+Model = TypeVar("Model", bound=BaseModel)
 
-def parse_toml(text, where, model):
-    """What the pydantic class `model` makes of TOML text; ConfigError lists every
-    violation with its path.
+
+def parse_toml(text: str, where: object, model: type[Model]) -> Model:
+    """What a pydantic class makes of TOML text.
+
+    text: TOML.
+    where: the file, for messages.
+    model: the class.
+
+    Raises ConfigError that lists every violation with its path.
     """
     if _DEEP_KEY.search(text):  # the standard parser takes time as the square of the depth
         raise ConfigError("is nested too deep", where, "mend the line")
@@ -37,7 +45,7 @@ def parse_toml(text, where, model):
         raise violations(error, where, model) from None
 
 
-def violations(error, where, model):
+def violations(error: ValidationError, where: object, model: type[BaseModel]) -> ConfigError:
     """The ConfigError that lists everything a pydantic ValidationError found."""
     lines = [_short(_sentence(e, model)) for e in error.errors()]
     count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
@@ -46,12 +54,12 @@ def violations(error, where, model):
     return ConfigError(f"{count}\n  " + "\n  ".join(lines), where)
 
 
-def _short(text):
+def _short(text: str) -> str:
     """A message that quotes what may be a megabyte, in a few lines."""
     return text if len(text) <= 400 else f"{text[:200]} ... {text[-150:]}"
 
 
-def _sentence(error, model):
+def _sentence(error: Any, model: type[BaseModel]) -> str:
     """One violation in words: path, what is wrong, and the nearest known key
     where a key is unknown.
     """
@@ -67,7 +75,7 @@ def _sentence(error, model):
     return f"{'.'.join(path) or model.__name__.lower()}: {message}"
 
 
-def known_keys(path, model):
+def known_keys(path: list[str], model: type[BaseModel]) -> list[str]:
     """Names that a section knows; `path` as in a pydantic error location."""
     for name in path:
         if name.isdigit() or name not in model.model_fields:
@@ -81,6 +89,6 @@ def known_keys(path, model):
     return list(model.model_fields)
 
 
-def _leaves(annotation):
+def _leaves(annotation: Any) -> list[Any]:
     arguments = getattr(annotation, "__args__", ())
     return [leaf for a in arguments for leaf in _leaves(a)] if arguments else [annotation]

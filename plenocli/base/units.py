@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Callable, Mapping
 
 LENGTHS = {
     "pm": 1e-12,
@@ -34,7 +35,7 @@ class UnitError(ValueError):
     """Text that is not a number with a known unit."""
 
 
-def _parse(text, units, what, example):
+def _parse(text: str, units: Mapping[str, float], what: str, example: str) -> float:
     match = _NUMBER.fullmatch(text) if isinstance(text, str) else None
     if match is None:
         raise UnitError(f"{text!r} is no {what}; write a number and a unit, such as {example!r}")
@@ -60,12 +61,12 @@ def _parse(text, units, what, example):
     return value
 
 
-def parse_length(text):
+def parse_length(text: str) -> float:
     """Metres from text such as "250 um" or "550nm"; a bare number is refused (UnitError)."""
     return _parse(text, LENGTHS, "length", "250 um")
 
 
-def parse_wavelength(text):
+def parse_wavelength(text: str) -> float:
     """Metres from text such as "550nm", from 100 nm to 100 um (UnitError otherwise)."""
     value = parse_length(text)
     if value <= 0:
@@ -77,22 +78,22 @@ def parse_wavelength(text):
     return value
 
 
-def parse_duration(text):
+def parse_duration(text: str) -> float:
     """Seconds from text such as "10 ms"; a bare number is refused (UnitError)."""
     return _parse(text, DURATIONS, "duration", "10 ms")
 
 
-def parse_bytes(text):
+def parse_bytes(text: str) -> int:
     """Bytes from text such as "4GiB"; a bare number is refused (UnitError)."""
     return int(_parse(text, BYTES, "memory size", "4GiB"))
 
 
-def parse_decibel(text):
+def parse_decibel(text: str) -> float:
     """Decibels from text such as "60dB"; "none" and bare numbers are refused (UnitError)."""
     return _parse(text, {"dB": 1.0, "db": 1.0}, "ratio", "60dB")
 
 
-def parse_number(text):
+def parse_number(text: str) -> float:
     """A finite number without a unit (UnitError otherwise)."""
     try:
         value = float(text)
@@ -103,19 +104,25 @@ def parse_number(text):
     return value
 
 
-def format_length(metres):
+def format_length(metres: float) -> str:
     """The shortest text that parse_length reads back to the same double, in a handy unit:
     5.5e-7 -> "550 nm".
     """
     return _format(metres, LENGTHS, ("nm", "um", "mm"), "m", parse_length)
 
 
-def format_duration(seconds):
+def format_duration(seconds: float) -> str:
     """The shortest text that parse_duration reads back to the same double: 0.01 -> "10 ms"."""
     return _format(seconds, DURATIONS, ("us", "ms"), "s", parse_duration)
 
 
-def _format(value, units, small, base, parse):
+def _format(
+    value: float,
+    units: Mapping[str, float],
+    small: tuple[str, ...],
+    base: str,
+    parse: Callable[[str], float],
+) -> str:
     unit = next((u for u in small if abs(value) / units[u] < 999.9995), base)
     for digits in (6, 9, 12, 15, 17):
         text = f"{value / units[unit]:.{digits}g} {unit}"

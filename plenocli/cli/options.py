@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 from plenocli.base.units import (
     UnitError,
     format_duration,
@@ -392,6 +392,6 @@ def _word(value: Any, kind: click.ParamType | None) -> str:
 def summary(report: dict[str, Any], as_json: bool, line: str) -> None:
     """Print what a command did: `report` as JSON on request, else the one `line`."""
     if as_json:
-        click.echo(json.dumps(plain(report), allow_nan=False, sort_keys=True))
+        click.echo(json.dumps(json_value(report), allow_nan=False, sort_keys=True))
     else:
         click.echo(line)

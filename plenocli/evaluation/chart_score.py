@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 from plenocli.evaluation.metrics.chart import (
     ChartScore,
     against_white,
@@ -118,7 +118,7 @@ class ChartMethod:
                 "nominal_rmse_six": self.nominal.rmse_six,
                 "nominal_spectral_angle_deg": self.nominal.spectral_angle_deg,
             }
-        return told | {"reflectance": plain(self.reflectance)}
+        return told | {"reflectance": json_value(self.reflectance)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ class ChartDocument:
     def as_json(self) -> dict[str, Any]:
         """The document as it is written."""
         measures = self.measures
-        return plain(
+        return json_value(
             {
                 "bands_nm": measures.bands_nm,
                 "patch_names": measures.patch_names,

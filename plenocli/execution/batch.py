@@ -3,39 +3,58 @@ happens when some fail.
 """
 
 import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.progress import bar, note
-from plenocli.execution.pool import absolute, attempt, run_all
+from plenocli.execution.pool import Pool, absolute, attempt, run_all
 
 
 @dataclass(frozen=True)
 class Batch:
-    """jobs, todo: (capture, target) pairs, all of them and those not finished before;
-    several: whether `output` is a folder.
+    """What becomes of several captures.
+
+    output: a file, or a folder.
+    several: whether it is a folder.
+    jobs: (capture, target), all of them.
+    todo: those that were not finished before.
     """
 
     output: Path
     several: bool
-    jobs: list
-    todo: list
+    jobs: list[tuple[Path, Path]]
+    todo: list[tuple[Path, Path]]
 
 
-def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
-    """Batch of `captures` (paths): one goes to the file `output`, several, or one to a name without
-    a suffix, to a folder, each to its own name with `suffix`.
+def plan_batch(
+    captures: Iterable[str | Path],
+    output: str | Path,
+    suffix: str,
+    what: str,
+    *,
+    overwrite: bool,
+    inputs: Sequence[str | Path | None],
+) -> Batch:
+    """Where the result of each capture goes.
 
-    The folder is made; in it finished results are skipped unless overwrite.
+    captures: one goes to the file `output`, several, or one to a name without a suffix, to a
+        folder, which is made.
+    output: that file or folder.
+    suffix: of results in a folder; they have the names of their captures.
     what: the result in words, for messages, such as "spectra are".
-    inputs: all files that are read, which no result may replace. Errors: UsageError, OutputError.
+    overwrite: results that are there already are made again, not skipped.
+    inputs: all files that are read, which no result may replace.
+
+    Raises UsageError, OutputError.
     """
     from plenocli.files.atomic import check_output
 
-    captures, output = [Path(c) for c in captures], Path(output)
+    shots, output = [Path(c) for c in captures], Path(output)
     # Path.is_dir raises where a name is too long
-    if len(captures) == 1 and output.suffix and not os.path.isdir(output):
+    if len(shots) == 1 and output.suffix and not os.path.isdir(output):
         if output.suffix not in (".exr", ".h5"):
             raise UsageError(
                 f"{what} written as .exr or .h5, not {output.suffix}",
@@ -43,16 +62,16 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
                 "change the suffix of OUT",
             )
         check_output(output, overwrite=overwrite, inputs=inputs)
-        jobs = [(captures[0], output)]
+        jobs = [(shots[0], output)]
         return Batch(output, False, jobs, jobs)
     if os.path.exists(output) and not os.path.isdir(output):
         raise OutputError("is a file; several captures go to a folder", output, "name a folder")
-    targets = [output / (capture.stem + suffix) for capture in captures]
+    targets = [output / (capture.stem + suffix) for capture in shots]
     read = [i for i in inputs if i is not None and os.path.exists(i)]
     for target in targets:
         if os.path.exists(target) and any(os.path.samefile(target, i) for i in read):
             raise OutputError("is also an input of this command", target, "give another folder")
-        same = [c for c, t in zip(captures, targets) if t == target]
+        same = [c for c, t in zip(shots, targets) if t == target]
         if len(same) > 1:
             raise UsageError(
                 f"captures {', '.join(str(c) for c in same)} would all become {target.name}",
@@ -64,16 +83,23 @@ def plan_batch(captures, output, suffix, what, *, overwrite, inputs):
         raise OutputError(
             f"the folder cannot be made ({error.strerror})", output, "make its parent folder first"
         ) from None
-    jobs = list(zip(captures, targets))
+    jobs = list(zip(shots, targets))
     return Batch(output, True, jobs, [job for job in jobs if overwrite or not job[1].exists()])
 
 
-def outcomes(batch, pool, work, write):
-    """(capture, report or PlenoError) of every job to do, as they end.
+def outcomes(
+    batch: Batch,
+    pool: Pool,
+    work: Callable[[Path], Any],
+    write: Callable[[Any, Path, Path], Any],
+) -> Iterator[tuple[Path, Any]]:
+    """Do what a batch has to do; not many more results than workers are held.
 
-    work(capture) runs in `pool` (stages.scheduler), write(what it returned, capture, target) in
-    this process, so that there is one writer, at once, so that a run that is killed loses no
-    finished result. Not many more results than workers are held.
+    pool: where work(capture) runs.
+    write: (what work returned, capture, target) -> report; runs in this process, so that there is
+        one writer, and at once, so that a run that is killed loses no finished result.
+
+    Yields (capture, report or PlenoError) as they end.
     """
     with bar(None, len(batch.todo), "captures") as progress:
         for (capture, target), done in run_all(
@@ -86,16 +112,33 @@ def outcomes(batch, pool, work, write):
             progress.update()
 
 
-def summarise(batch, outcomes):
-    """Summary dict of (capture, report or PlenoError) pairs, which may come in any order; its lists
-    follow that of the captures.
+@dataclass(frozen=True)
+class BatchSummary:
+    """What a batch did.
 
-    A capture that fails does not stop the others: its message is printed at once, and an error with
-    the exit code of the worst is raised at the end. The error of a single capture
-    is raised as it is.
+    output: file or folder.
+    skipped: captures that were finished before.
+    reports: what `write` returned of each of the others, in the order of the captures.
     """
-    reports, errors = [], []
-    for capture, outcome in outcomes:
+
+    output: str
+    skipped: int
+    reports: tuple[Any, ...]
+
+
+def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
+    """The summary of a batch whose captures have ended, in any order.
+
+    A capture that fails does not stop the others: its message is printed at once.
+
+    batch: what was to be done.
+    ended: (capture, report or PlenoError), as `outcomes` yields them.
+
+    Raises at the end an error with the exit code of the worst; that of a single capture as it is.
+    """
+    reports: list[tuple[Path, Any]] = []
+    errors: list[tuple[Path, PlenoError]] = []
+    for capture, outcome in ended:
         if not isinstance(outcome, PlenoError):
             reports.append((capture, outcome))
         elif not batch.several:
@@ -104,7 +147,8 @@ def summarise(batch, outcomes):
             note(f"error: {outcome}")
             errors.append((capture, outcome))
     order = {capture: number for number, (capture, _) in enumerate(batch.jobs)}
-    reports, errors = (sorted(part, key=lambda pair: order[pair[0]]) for part in (reports, errors))
+    reports.sort(key=lambda pair: order[pair[0]])
+    errors.sort(key=lambda pair: order[pair[0]])
     if errors:
         raise failed_together(
             errors,
@@ -113,17 +157,26 @@ def summarise(batch, outcomes):
             batch.output,
             f"{len(batch.jobs) - len(errors)} are done; see the messages above",
         )
-    return {
-        "output": str(batch.output),
-        "done": len(reports),
-        "skipped": len(batch.jobs) - len(batch.todo),
-        "captures": [report for _, report in reports],
-    }
+    return BatchSummary(
+        str(batch.output),
+        len(batch.jobs) - len(batch.todo),
+        tuple(report for _, report in reports),
+    )
 
 
-def failed_together(errors, total, things, where, fix):
-    """One error for the (path, PlenoError) pairs of the `things` that failed, each told already;
-    its exit code is that of the worst.
+def failed_together(
+    errors: Sequence[tuple[str | Path, PlenoError]],
+    total: int,
+    things: str,
+    where: object,
+    fix: str,
+) -> PlenoError:
+    """One error for several that were told already; its exit code is that of the worst.
+
+    errors: (path, error).
+    total: how many things there were, failed or not.
+    things: what they are, such as "captures".
+    where, fix: as in PlenoError.
     """
     worst = max((error for _, error in errors), key=lambda error: error.exit_code)
     return type(worst)(

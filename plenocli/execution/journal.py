@@ -10,19 +10,25 @@ import hashlib
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.errors import OutputError
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 
 
 class Journal:
-    """Records by key in the file at `path`, which one run at a time holds.
+    """Records by key in a file, which one run at a time holds.
 
-    OutputError where that cannot be.
+    records: key -> what was kept, as JSON knows it.
     """
 
-    def __init__(self, path):
-        self.path, self.records = Path(path), {}
+    def __init__(self, path: str | Path) -> None:
+        """Open or make the file at `path`.
+
+        Raises OutputError where it cannot be written, or another run holds it.
+        """
+        self.path = Path(path)
+        self.records: dict[str, Any] = {}
         try:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
@@ -47,15 +53,15 @@ class Journal:
         if content and not content.endswith(b"\n"):
             self._write(b"\n")  # ends the torn line
 
-    def add(self, key, record):
+    def add(self, key: str, record: Any) -> None:
         """Keep a record (JSON-able) for good before this returns."""
         text = json.dumps(
-            [key, plain(record)], sort_keys=True, ensure_ascii=True, allow_nan=False
+            [key, json_value(record)], sort_keys=True, ensure_ascii=True, allow_nan=False
         ).encode()
         self._write(_checksum(text) + b" " + text + b"\n")
         self.records[key] = json.loads(text)[1]
 
-    def _write(self, data):
+    def _write(self, data: bytes) -> None:
         try:
             while data:
                 data = data[os.write(self._file.fileno(), data) :]
@@ -67,16 +73,16 @@ class Journal:
                 "free some space, then run again: what is finished is kept",
             ) from None
 
-    def close(self):
+    def close(self) -> None:
         """Let go of the file."""
         self._file.close()
 
 
-def _checksum(text):
+def _checksum(text: bytes) -> bytes:
     return hashlib.sha256(text).hexdigest()[:16].encode()
 
 
-def _read(line):
+def _read(line: bytes) -> tuple[str, Any] | None:
     """(key, record) of a whole and undamaged line, else None."""
     checksum, _, text = line.partition(b" ")
     if checksum != _checksum(text):

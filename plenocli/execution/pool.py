@@ -8,27 +8,35 @@ takes results as they come, in any order. Linear algebra runs in one thread ever
 last digits of its results depend on how many there are.
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
 import signal
 import threading
 from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    Executor,
+    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from plenocli import __version__
-from plenocli.base.budget import budget, set_budget
+from plenocli.base.budget import Budget, budget, set_budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
-from plenocli.base.progress import heard, note
+from plenocli.base.progress import collected_notes, note
 
+Job = tuple[Any, Callable[[Any], Any], Any]
+"""(token, function, task): the result of function(task) comes back with its token."""
 ATTEMPTS = 2
 """Times that a task may take its process along before it is given up."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -41,14 +49,17 @@ class Lost(OutputError):
 
 
 @contextlib.contextmanager
-def open_pool(workers=1, scheduler=None, *, threads=False):
-    """A pool for tasks while the block lasts: `submit(token, function, task)`, `next()` -> (token,
-    result or PlenoError), `room`.
+def open_pool(
+    workers: int = 1, scheduler: str | None = None, *, threads: bool = False
+) -> Iterator[Pool]:
+    """A pool for tasks while the block lasts.
 
-    workers: processes (threads, where asked for) beside this one; 1 runs every task here.
+    workers: processes beside this one; 1 runs every task here.
     scheduler: address of a Dask scheduler, or the file that it wrote; then its workers serve,
         however many they are.
-    UsageError where there is none.
+    threads: workers are threads of this process.
+
+    Raises UsageError where there is no such scheduler.
     """
     if scheduler is not None:
         with (
@@ -59,7 +70,7 @@ def open_pool(workers=1, scheduler=None, *, threads=False):
             yield pool
     elif workers == 1:
         with _one_thread():
-            yield Here()
+            yield InProcess()
     elif threads:
         with (
             _one_thread(),
@@ -79,9 +90,13 @@ def open_pool(workers=1, scheduler=None, *, threads=False):
             yield pool
 
 
-def run_all(pool, jobs):
-    """(token, result or PlenoError) of every (token, function, task) of `jobs`, as they
-    end; few results wait.
+def run_all(pool: Pool, jobs: Iterable[Job]) -> Iterator[tuple[Any, Any]]:
+    """Run jobs, each handed in when there is room for it, so that few results wait.
+
+    pool: where they run.
+    jobs: (token, function, task).
+
+    Yields (token, result or PlenoError) as they end.
     """
     jobs, left = iter(jobs), 0
     more = True
@@ -99,7 +114,7 @@ def run_all(pool, jobs):
 
 
 @contextlib.contextmanager
-def _one_thread():
+def _one_thread() -> Iterator[None]:
     # a library of its own, which the limit below reaches only once it is loaded
     import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
@@ -108,14 +123,14 @@ def _one_thread():
         yield
 
 
-def absolute(name):
+def absolute(name: Any) -> Any:
     """A file name that means the same to a process elsewhere; None, and what is no file
     here, as they are.
     """
     return name if name is None or not os.path.exists(name) else type(name)(os.path.abspath(name))
 
 
-def attempt(function, *task):
+def attempt(function: Callable[..., Any], *task: Any) -> Any:
     """What function(*task) returns, or the PlenoError that it raises."""
     try:
         return function(*task)
@@ -123,7 +138,9 @@ def attempt(function, *task):
         return error
 
 
-def _remotely(version, granted, function, task):
+def _remotely(
+    version: str, granted: Budget, function: Callable[[Any], Any], task: Any
+) -> tuple[Any, list[str]]:
     """(result or PlenoError, what it said) of a task in a process that runs nothing but tasks,
     within the Budget `granted`.
     """
@@ -138,11 +155,11 @@ def _remotely(version, granted, function, task):
     # both for good: other tasks may run beside this one
     threadpool_limits(1, "blas")
     set_budget(replace(granted, threads=1))
-    with heard() as said:
+    with collected_notes() as said:
         return attempt(function, task), said
 
 
-def _tell(answer):
+def _tell(answer: tuple[Any, list[str]]) -> Any:
     """The result of `_remotely`; what the task said is said here."""
     result, said = answer
     for text in said:
@@ -150,68 +167,104 @@ def _tell(answer):
     return result
 
 
-class Here:
-    """Tasks in this process, each when its result is asked for.
+class Pool(Protocol):
+    """Where tasks run.
 
-    far: whether tasks run where relative file names mean nothing.
+    far: whether they run where relative file names mean nothing.
     """
+
+    far: bool
+
+    @property
+    def room(self) -> bool:
+        """Whether another task may be handed in now."""
+        ...
+
+    def submit(self, token: Any, function: Callable[[Any], Any], task: Any) -> None:
+        """Hand in a task.
+
+        token: what its result is told with.
+        function: of one argument, found by its name in a module.
+        task: the argument.
+        """
+        ...
+
+    def next(self) -> tuple[Any, Any]:
+        """(token, result or PlenoError) of a task that has ended."""
+        ...
+
+
+class InProcess:
+    """A Pool of this process: each task runs when its result is asked for."""
 
     far = False
 
-    def __init__(self):
-        self._waiting = deque()
+    def __init__(self) -> None:
+        self._waiting: deque[Job] = deque()
 
     @property
-    def room(self):
+    def room(self) -> bool:
         """Whether another task may be handed in now."""
         return not self._waiting
 
-    def submit(self, token, function, task):
+    def submit(self, token: Any, function: Callable[[Any], Any], task: Any) -> None:
         """Hand in a task."""
         self._waiting.append((token, function, task))
 
-    def next(self):
+    def next(self) -> tuple[Any, Any]:
         """(token, result or PlenoError) of a task."""
         token, function, task = self._waiting.popleft()
         return token, attempt(function, task)
 
 
 class _Executing:
-    """Tasks through an executor of concurrent.futures.
+    """A Pool of tasks through an executor of concurrent.futures.
 
     Where a process dies, the tasks under way run again one at a time, so that the one that kills
     its worker is found: only that one is lost.
     """
 
-    def __init__(self, start, limit, call=None, explain=None, far=False):
-        self._start, self._limit, self._call, self._explain, self.far = (
-            start,
-            limit,
-            call,
-            explain,
-            far,
-        )
-        self._executor, self._running, self._suspects, self._deaths = start(), {}, deque(), 0
+    def __init__(
+        self,
+        start: Callable[[], Executor],
+        limit: Callable[[], int],
+        call: Callable[..., Any] | None = None,
+        explain: Callable[[Exception], PlenoError | None] | None = None,
+        far: bool = False,
+    ) -> None:
+        """start: makes an executor, another one after a death.
+        limit: how many tasks may be under way.
+        call: what runs function(task) there; by default `_remotely`.
+        explain: the PlenoError that an error of the executor stands for, None for a fault of ours.
+        far: see Pool.
+        """
+        self._start, self._limit, self._call, self._explain = start, limit, call, explain
+        self.far = far
+        self._executor: Executor | None = start()
+        self._running: dict[Future, Job] = {}
+        self._suspects: deque[Job] = deque()
+        self._deaths = 0
 
     @property
-    def room(self):
+    def room(self) -> bool:
         """Whether another task may be handed in now."""
         return not self._suspects and not self._deaths and len(self._running) < self._limit()
 
-    def submit(self, token, function, task):
+    def submit(self, token: Any, function: Callable[[Any], Any], task: Any) -> None:
         """Hand in a task."""
         call = (
             (self._call, function, task)
             if self._call
             else (_remotely, __version__, budget(), function, task)
         )
+        assert self._executor is not None, "the pool is closed"
         try:
             self._running[self._executor.submit(*call)] = (token, function, task)
         except BrokenExecutor:  # a process died since we looked
             self._suspects.append((token, function, task))
             self._renew()
 
-    def next(self):
+    def next(self) -> tuple[Any, Any]:
         """(token, result or PlenoError) of a task that has ended."""
         while True:
             if not self._running:
@@ -230,7 +283,7 @@ class _Executing:
                 self._deaths = 0
                 return job[0], answer if self._call else _tell(answer)
 
-    def _explained(self, error):
+    def _explained(self, error: Exception) -> PlenoError:
         """The PlenoError that an error of the executor stands for; a fault of
         ours goes on as it is.
         """
@@ -239,7 +292,7 @@ class _Executing:
             raise error
         return found
 
-    def _restart(self, job):
+    def _restart(self, job: Job) -> tuple[Any, Lost] | None:
         """New workers in place of those that died; (token, Lost) where `job` was alone with
         them, and not for the first time.
         """
@@ -255,7 +308,7 @@ class _Executing:
             fix="take fewer --workers, or run again",
         )
 
-    def _renew(self):
+    def _renew(self) -> None:
         """New workers; what the old ones had not finished is under suspicion."""
         broken = [
             future
@@ -266,7 +319,7 @@ class _Executing:
         _stop(self._executor, True)
         self._executor = self._start()
 
-    def close(self):
+    def close(self) -> None:
         """Give up what is under way."""
         for future in self._running:
             future.cancel()
@@ -274,20 +327,20 @@ class _Executing:
         _stop(executor, bool(self._running))
 
 
-def _stop(executor, busy):
+def _stop(executor: Executor | None, busy: bool) -> None:
     """Let an executor go; what it still does is given up."""
     if isinstance(executor, ProcessPoolExecutor):
         for worker in list((executor._processes or {}).values()) if busy else ():
             worker.terminate()
         executor.shutdown(wait=True, cancel_futures=True)
-    else:  # threads cannot be ended, they run out; a cluster forgets
+    elif executor is not None:  # threads cannot be ended, they run out; a cluster forgets
         executor.shutdown(wait=False)
 
 
 # --- processes ------------------------------------------------------------------------------------
 
 
-def _processes(workers):
+def _processes(workers: int) -> ProcessPoolExecutor:
     import multiprocessing
 
     return ProcessPoolExecutor(
@@ -295,7 +348,7 @@ def _processes(workers):
     )
 
 
-def _become_worker():
+def _become_worker() -> None:
     """In a new process: the person's Ctrl-C is for the parent, and when that is gone, killed
     even, this one goes too.
     """
@@ -303,15 +356,18 @@ def _become_worker():
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    def watch():
-        connection.wait([parent_process().sentinel])
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager
-def _environment():
+def _environment() -> Iterator[None]:
     """One thread of linear algebra for processes started meanwhile: it is read when their
     libraries are loaded.
     """
@@ -328,7 +384,7 @@ def _environment():
 
 
 @contextlib.contextmanager
-def _cluster(scheduler):
+def _cluster(scheduler: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError as error:
@@ -361,7 +417,7 @@ def _cluster(scheduler):
         yield client
 
 
-def _on_cluster(client):
+def _on_cluster(client: Any) -> _Executing:
     return _Executing(
         lambda: client.get_executor(pure=False),
         lambda: max(2, 2 * sum(client.nthreads().values())),
@@ -370,7 +426,7 @@ def _on_cluster(client):
     )
 
 
-def _trouble(error):
+def _trouble(error: Exception) -> PlenoError | None:
     """The PlenoError that stands for what a cluster reports; None for a fault of ours."""
     name, text = type(error).__name__, str(error)
     if name == "KilledWorker":

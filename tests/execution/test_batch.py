@@ -179,7 +179,7 @@ def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):
     with pytest.raises(PlenoError, match="1 of 12 captures failed: 07.x"):
         summarise(batch, ended)
     good = [pair for pair in ended if pair[0].stem != "07"]
-    assert summarise(batch, reversed(good))["captures"] == [i for i in range(12) if i != 7]
+    assert list(summarise(batch, reversed(good)).reports) == [i for i in range(12) if i != 7]
 
 
 def test_a_fault_of_ours_ends_the_batch_with_its_traceback(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, UsageError
-from plenocli.base.progress import heard, note
+from plenocli.base.progress import collected_notes, note
 from plenocli.execution.pool import Lost, open_pool, run_all
 
 HERE = "tests_scheduler_tasks"  # a module that processes find by its name
@@ -80,7 +80,7 @@ def results(pool, function, numbers):
 
 def test_results_and_what_was_said_come_back_from_everywhere(tasks):
     for options in (dict(), dict(workers=3, threads=True), dict(workers=2)):
-        with heard() as said, open_pool(**options) as pool:
+        with collected_notes() as said, open_pool(**options) as pool:
             assert results(pool, tasks.square, range(9)) == {n: n * n for n in range(9)}
             refused = results(pool, tasks.refuse, [5])[5]
         assert isinstance(refused, InputError) and str(refused) == "number 5: is odd; take another"
@@ -190,7 +190,7 @@ def test_few_results_wait(tasks):
 
 
 def test_what_is_said_is_heard_by_this_thread_only(capsys):
-    with heard() as said:
+    with collected_notes() as said:
         note("one")
     note("two")
     assert said == ["one"] and capsys.readouterr().err == "plenocli: two\n"

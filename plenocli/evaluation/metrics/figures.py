@@ -5,7 +5,7 @@ them.
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 
 Figure = float | int | str | None | list[float | None]
 """One figure as JSON knows it: None where it is infinite or does not apply, a list by band."""
@@ -23,5 +23,5 @@ def figures(score: Any) -> dict[str, Figure]:
         if is_dataclass(value):
             found |= figures(value)
         elif value is not None:
-            found[field.name] = plain(value)
+            found[field.name] = json_value(value)
     return found

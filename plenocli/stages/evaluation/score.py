@@ -14,7 +14,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
 from plenocli.evaluation.depth_score import check_depth, score_lightfield
 from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
@@ -366,7 +366,7 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             figures={
                 **figures(own),
                 **figures(result.told),
-                **({} if sensor is None else {"snr_sensor_db": plain(sensor)}),
+                **({} if sensor is None else {"snr_sensor_db": json_value(sensor)}),
             },
             patches=patches,
         ),

@@ -22,7 +22,7 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
 
 if TYPE_CHECKING:
-    from plenocli.execution.batch import Batch
+    from plenocli.execution.batch import Batch, BatchSummary
     from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
@@ -166,8 +166,10 @@ def run_demux(
             return _summary(summarise(batch, outcomes(batch, pool, work, job.write)))
 
 
-def _summary(done: dict[str, Any]) -> DemuxSummary:
-    return DemuxSummary(**done | {"captures": tuple(done["captures"])})
+def _summary(done: BatchSummary) -> DemuxSummary:
+    return DemuxSummary(
+        output=done.output, done=len(done.reports), skipped=done.skipped, captures=done.reports
+    )
 
 
 def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> None:

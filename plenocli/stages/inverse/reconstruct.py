@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
-from plenocli.base.progress import bar, heard, note
+from plenocli.base.progress import bar, collected_notes, note
 from plenocli.base.tiling import to_blocks
-from plenocli.execution.batch import outcomes, plan_batch, summarise
-from plenocli.execution.pool import Here, absolute, open_pool, run_all
+from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
+from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
 from plenocli.files.read.captures import calibrated, read_superpixels
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import read_lenslet_matrix
@@ -277,16 +277,14 @@ def run_reconstruct(
             if split and pooled:
                 _estimators(recipe).elsewhere = partial(_solve_in_pool, recipe, pool)
             work = partial(reconstruct_capture, recipe)
-            done = outcomes(batch, Here() if split else pool, work, write)
+            done = outcomes(batch, InProcess() if split else pool, work, write)
             return _summary(summarise(batch, done))
     finally:
         _estimators.cache_clear()
 
 
-def _summary(told: dict[str, Any]) -> ReconstructSummary:
-    return ReconstructSummary(
-        output=told["output"], skipped=told["skipped"], captures=tuple(told["captures"])
-    )
+def _summary(done: BatchSummary) -> ReconstructSummary:
+    return ReconstructSummary(output=done.output, skipped=done.skipped, captures=done.reports)
 
 
 def _recipe(
@@ -374,7 +372,7 @@ def _solve_batch(
 
     What there is to say, the one that sent it has said.
     """
-    with heard():
+    with collected_notes():
         return solve(_estimators(recipe), batch, *options)
 
 

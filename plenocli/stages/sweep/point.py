@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import OutputError, PlenoError
-from plenocli.base.progress import heard
+from plenocli.base.progress import collected_notes
 from plenocli.stages.sweep.task import (
     Job,
     MadeMatrix,
@@ -64,7 +64,7 @@ def run_matrix(job: Job) -> MadeMatrix:
     Raises PlenoError.
     """
     _require_files(job)
-    with _folder(job) as folder, heard() as notes:
+    with _folder(job) as folder, collected_notes() as notes:
         try:
             cost = _simulate_pif(job.task, folder)
         except PlenoError as error:
@@ -83,7 +83,7 @@ def run_point(job: Job) -> PointResult:
     """
     start = time.process_time()
     _require_files(job)
-    with _folder(job) as folder, heard() as notes:
+    with _folder(job) as folder, collected_notes() as notes:
         try:
             if job.matrix is None:
                 cost, pif = _simulate_pif(job.task, folder), folder / "pif.h5"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import ConfigError
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 from plenocli.stages.sweep.task import (
     CHAINS,
     PointResult,
@@ -91,7 +91,7 @@ class Space:
         except ConfigError as error:
             known_by = {
                 "refused": values,
-                "options": plain(options),
+                "options": json_value(options),
                 "base": self.base,
                 "chain": self.chain,
             }
@@ -101,7 +101,7 @@ class Space:
                 key=digest_of(known_by, self.files),
                 result=refused(error),
             )
-        task = task_of(self.chain, camera, plain(options), self.seed)
+        task = task_of(self.chain, camera, json_value(options), self.seed)
         return DesignPoint(
             number=number,
             values=values,

@@ -16,7 +16,7 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError, InputError, NumericsError
 from plenocli.base.progress import note
-from plenocli.base.text import plain
+from plenocli.base.text import json_value
 from plenocli.evaluation.designs import DesignTable, Metric, Parameter
 from plenocli.stages.sweep.task import DESIGN, PointResult
 
@@ -179,7 +179,7 @@ def design_table(
             for point, result in zip(points, results)
             if result.notes
         },
-        description=plain(space.sweep.model_dump(by_alias=True, exclude_none=True)),
+        description=json_value(space.sweep.model_dump(by_alias=True, exclude_none=True)),
     )
     signs = [1 if aim == "max" else -1 for aim in objectives.values()]
     merit = np.where(status[:, None] == 0, _merit(table).T, np.nan)

@@ -16,7 +16,7 @@ from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import write_exr
 from plenocli.files.images.spectral_exr import write_spectral_exr
-from plenocli.stages.evaluation.inspect import describe, run_inspect
+from plenocli.stages.evaluation.inspect import run_inspect
 
 
 def inspect(path):
@@ -137,4 +137,4 @@ def test_pictures_and_refusals(shared_data, capsys):
 def test_a_file_that_is_nothing_known_is_refused(tmp_path):
     (tmp_path / "x.bin").write_bytes(b"anything" * 100)
     with pytest.raises(InputError, match="not a RAW file that LibRaw knows"):
-        describe(run_inspect(tmp_path / "x.bin"))
+        run_inspect(tmp_path / "x.bin")

@@ -28,7 +28,7 @@ def command(
       plenocli inspect pif.h5
       plenocli inspect IMG_0001.NEF --json
     """
-    from plenocli.stages.evaluation.inspect import describe, run_inspect
+    from plenocli.stages.evaluation.inspect import run_inspect
 
     report = run_inspect(file)
-    options.summary(report, as_json, describe(report))
+    options.summary(report.as_json(), as_json, report.text())

@@ -13,7 +13,7 @@ from plenocli.report.drawing import Figures
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
-    from plenocli.inverse.spectra.calibration import Calibration, Response
+    from plenocli.inverse.calibration.calibration import Calibration, Response
 
 Place = tuple[int, int]
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
-from plenocli.inverse.spectra.calibration import Calibration, Response, Sensor, White, Windows
 from plenocli.inverse.spectra.responses import LensletResponses
 
 

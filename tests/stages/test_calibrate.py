@@ -386,7 +386,7 @@ def test_refusals_say_what_is_wrong(files, calibration, tmp_path):
 def test_a_sensor_smaller_than_a_lenslet_is_refused():
     from types import SimpleNamespace
 
-    from plenocli.inverse.spectra.calibration import windows_on
+    from plenocli.inverse.calibration.calibration import windows_on
 
     grid = SimpleNamespace(
         window_shape=lambda: (20, 20),

@@ -11,8 +11,7 @@ from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.forward.sensor.frames import Dark
-from plenocli.inverse.grid.lenslet_grid import LensletGrid
-from plenocli.inverse.spectra.calibration import (
+from plenocli.inverse.calibration.calibration import (
     Calibration,
     Quality,
     Response,
@@ -20,6 +19,7 @@ from plenocli.inverse.spectra.calibration import (
     White,
     Windows,
 )
+from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 Datasets = dict[str, np.ndarray]
 Attributes = dict[str, Any]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.errors import InputError
-from plenocli.base.text import by
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.sensor.capture import Capture
+from plenocli.inverse.calibration.measure import require_alike
 
 
 def read_series(
@@ -27,22 +26,8 @@ def read_series(
     out: list[Capture] = []
     for path in paths:
         out.append(read_capture(path, cfa=cfa))
-        _require_alike(out[-1], like or out[0])
+        require_alike(out[-1], like or out[0])
     return out
-
-
-def check_exposure_times(captures: Sequence[Capture]) -> None:
-    """InputError unless all or none of the captures know their exposure time: else their scales
-    cannot be compared.
-    """
-    known = [c for c in captures if c.exposure_s is not None]
-    if known and len(known) != len(captures):
-        lost = next(c for c in captures if c.exposure_s is None)
-        raise InputError(
-            f"does not say its exposure time, while {known[0].name} does",
-            lost.metadata.path,
-            "use files of one kind for all captures",
-        )
 
 
 def true_centres(path: str | Path) -> np.ndarray | None:
@@ -53,17 +38,3 @@ def true_centres(path: str | Path) -> np.ndarray | None:
         return None
     grid = read_capture(path).grid
     return grid.centre if grid else None
-
-
-def _require_alike(capture: Capture, like: Capture) -> None:
-    for what, ours, theirs in (
-        ("size", by(capture.shape), by(like.shape)),
-        ("colour filter array", capture.cfa, like.cfa),
-        ("unit", capture.units, like.units),
-    ):
-        if ours != theirs:
-            raise InputError(
-                f"has another {what} ({ours}) than {like.name} ({theirs})",
-                capture.metadata.path,
-                "use captures of one camera at one setting",
-            )

@@ -110,7 +110,7 @@ class Reference:
         what they have in common by the colours under their windows, and what is
         left of the variance.
         """
-        from plenocli.inverse.spectra.low_rank import common
+        from plenocli.inverse.calibration.low_rank import common
 
         kinds, known = self.kinds(self.origin), np.isfinite(response)
         variance = (

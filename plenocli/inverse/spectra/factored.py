@@ -23,7 +23,7 @@ from plenocli.inverse.spectra.demultiplex import LARGEST_CONDITION
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.noise import Noise
-    from plenocli.inverse.spectra.calibration import MadeResponses
+    from plenocli.inverse.calibration.calibration import MadeResponses
 
 BLOCK_NUMBERS = 90_000, 45_000
 """Pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache."""

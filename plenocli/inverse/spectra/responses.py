@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.inverse.spectra.calibration import Calibration, MadeResponses
+from plenocli.inverse.calibration.calibration import Calibration, MadeResponses
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.frames import Dark

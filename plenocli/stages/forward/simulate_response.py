@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         ResponsePrediction,
     )
     from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
-    from plenocli.inverse.spectra.calibration import Calibration
+    from plenocli.inverse.calibration.calibration import Calibration
 
 Name = str | os.PathLike[str]
 SAME_PITCH = 0.02
@@ -70,7 +70,7 @@ class ResponseSummary:
     array: rows and columns of lenslets.
     window: rows and columns of a superpixel, px.
     kinds: how many kinds of superpixels there are.
-    condition, angles_deg: plenocli.inverse.spectra.calibration.Quality.
+    condition, angles_deg: plenocli.inverse.calibration.calibration.Quality.
     smallest_angle_deg: between two columns of F; None: there is one band.
     notes: plenocli.forward.sensor.response_prediction.PredictionNotes.
     """
@@ -207,8 +207,8 @@ def _described(camera: Camera, prediction: ResponsePrediction, settings: Setting
     """
     from plenocli.forward.sensor.frames import Dark
     from plenocli.forward.sensor.noise import SensorModel
+    from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, Windows
     from plenocli.inverse.grid.lenslet_grid import LensletGrid
-    from plenocli.inverse.spectra.calibration import Calibration, Sensor, White, Windows
 
     sensor, array, kinds = camera.sensor, camera.lenslet_array, prediction.kinds
     signal = prediction.white_signal(_white(camera, settings), settings.exposure)
@@ -259,8 +259,8 @@ def _with_response(
     notes: PredictionNotes,
 ) -> Calibration:
     """The calibration with F = `matrix` (kind, pixel, band)."""
-    from plenocli.inverse.spectra.calibration import Response
-    from plenocli.inverse.spectra.quality import quality_of_one
+    from plenocli.inverse.calibration.calibration import Response
+    from plenocli.inverse.calibration.quality import quality_of_one
 
     # what a description leaves out is spread evenly over the superpixel: it is not
     # known where it lies

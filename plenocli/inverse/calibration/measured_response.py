@@ -11,8 +11,8 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.sensor.noise import Noise
-from plenocli.inverse.spectra.calibration import Response, Windows
-from plenocli.inverse.spectra.quality import mean_of_known, quality_of
+from plenocli.inverse.calibration.calibration import Response, Windows
+from plenocli.inverse.calibration.quality import mean_of_known, quality_of
 
 KINDS = ("auto", "shared", "own", "low-rank")
 SAME_PLACE = 0.1
@@ -20,7 +20,7 @@ SAME_PLACE = 0.1
 still share a response.
 """
 OUTLIER = 10.0
-"""Excess of a single lenslet (plenocli.inverse.spectra.sharing) that is worth a word."""
+"""Excess of a single lenslet (plenocli.inverse.calibration.sharing) that is worth a word."""
 BLOCK = 256
 
 
@@ -212,7 +212,7 @@ def _own_or_shared(
     asked: str, gathered: GatheredResponses, middle: np.ndarray, variance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Verdict]:
     """As _decided where one F for all, `middle`, is possible and the noise of each is known."""
-    from plenocli.inverse.spectra.sharing import differences
+    from plenocli.inverse.calibration.sharing import differences
 
     found, count = differences(gathered.response, middle, variance), len(gathered.response)
     verdict = Verdict(
@@ -261,7 +261,7 @@ def _whole(gathered: GatheredResponses) -> np.ndarray:
 def _low_rank(
     gathered: GatheredResponses, variance: np.ndarray | None, phase: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Verdict]:
-    from plenocli.inverse.spectra.low_rank import low_rank
+    from plenocli.inverse.calibration.low_rank import low_rank
 
     if variance is None:
         raise NumericsError(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from plenocli.inverse.calibration.low_rank import LEAST, low_rank
 from plenocli.inverse.spectra.demultiplex import demultiplex
-from plenocli.inverse.spectra.low_rank import LEAST, low_rank
 from tests.reference.prototype import superpixels
 
 PIXELS, FULL = 18, 12000.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plenocli.inverse.spectra.calibration import Quality
+from plenocli.inverse.calibration.calibration import Quality
 from plenocli.inverse.spectra.demultiplex import (
     calibration_bias,
     choose_pixels,

@@ -5,8 +5,8 @@ errors that truth shows.
 import numpy as np
 import pytest
 
+from plenocli.inverse.calibration.sharing import differences
 from plenocli.inverse.spectra.demultiplex import demultiplex
-from plenocli.inverse.spectra.sharing import differences
 from tests.reference.prototype import superpixels
 
 COUNT, PIXELS = 60, 20

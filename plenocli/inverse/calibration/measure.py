@@ -1,0 +1,292 @@
+"""A camera measured: lenslet grid, white, dark and response F from its captures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.progress import bar
+from plenocli.base.text import by
+from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
+from plenocli.forward.sensor.noise import ROUNDING, Noise, SensorModel
+from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, windows_on
+from plenocli.inverse.calibration.measured_response import GatheredResponses, measured_response
+from plenocli.inverse.calibration.quality import mean_of_known
+from plenocli.inverse.grid.detect import find_grid
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.sensor.capture import Capture
+    from plenocli.forward.sensor.frames import Dark
+    from plenocli.inverse.calibration.calibration import Response, Windows
+    from plenocli.inverse.grid.lenslet_grid import LensletGrid
+
+SATURATED = 0.05
+"""Share of the white image that may be saturated."""
+
+
+@dataclass(frozen=True)
+class KnownNoise:
+    """What is known of a sensor's noise.
+
+    gain: units per electron; None: unknown.
+    read_variance: of one dark pixel, units^2; None: unknown.
+    source: where they come from, in words.
+    """
+
+    gain: float | None
+    read_variance: float | None
+    source: str
+
+    def filled(self) -> KnownNoise:
+        """With the rounding's variance where nothing else is known, and the source of an unknown
+        gain said to be unknown.
+        """
+        return KnownNoise(
+            self.gain,
+            ROUNDING if self.read_variance is None else self.read_variance,
+            "unknown" if self.gain is None else self.source,
+        )
+
+    def known(self) -> Noise | None:
+        """The noise, with the rounding's where no read noise is known; None without a gain."""
+        if self.gain is None:
+            return None
+        read = ROUNDING if self.read_variance is None else self.read_variance
+        return Noise(gain=self.gain, read_variance=read)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What captures of a camera give.
+
+    grid: with all lenslets that the white image shows.
+    calibration: of those that can be used.
+    noise: of the sensor, and where it is known from.
+    """
+
+    grid: LensletGrid
+    calibration: Calibration
+    noise: KnownNoise
+
+
+@dataclass(frozen=True, kw_only=True)
+class NarrowBands:
+    """Captures under narrow-band light.
+
+    wavelengths: (band,) m, ascending.
+    captures: those of a wavelength (m), read when they are asked for.
+    radiances: of the sources relative to each other, by wavelength (m); 1 where not given.
+    """
+
+    wavelengths: Sequence[float]
+    captures: Callable[[float], Sequence[Capture]]
+    radiances: Mapping[float, float] = field(default_factory=dict)
+
+
+def calibrate(
+    whites: Sequence[Capture],
+    *,
+    darks: Sequence[Capture] = (),
+    bands: NarrowBands | None = None,
+    camera: Camera | None = None,
+    response: str = "auto",
+    lattice: str = "auto",
+    near: tuple[float, float] | None = None,
+) -> Measured:
+    """Grid, white, dark and (from narrow-band captures) the response F of a camera.
+
+    whites: captures of an evenly lit white, at one or several exposure times.
+    darks: captures without light.
+    bands: captures under narrow-band light; None: no response.
+    camera: description, for gain and read noise; None: as the captures tell.
+    response: "own", "shared", "low-rank" or "auto" (measured_response).
+    lattice: "auto", "square" or "hexagonal".
+    near: (row, column) px close to any superpixel's centre (plenocli.inverse.grid.detect).
+
+    Raises InputError for captures that do not go together or are saturated, NumericsError where
+    there is no lattice or no light.
+    docs/model.md, section 9.
+    """
+    check_exposure_times(whites)
+    first = whites[0]
+    for capture in (*whites[1:], *darks):
+        require_alike(capture, first)
+    dark = make_dark(
+        [e.mosaic for e in darks], [e.exposure_s for e in darks], first.levels.black, first.shape
+    )
+    del darks  # whoever read them for this may have them gone
+    noise = _told_by(whites, dark, _noise(whites, dark, camera))
+    signal, _ = merge(
+        [e.mosaic for e in whites],
+        [e.exposure_s for e in whites],
+        dark,
+        first.levels.white,
+        first.exposure_s,
+    )
+    if np.isnan(signal).mean() > SATURATED:
+        raise InputError(
+            f"{np.isnan(signal).mean():.0%} of the white image is saturated",
+            first.metadata.path,
+            "expose it for less time",
+        )
+    found = _grid(signal, first, lattice, near)
+    windows, valid = windows_on(found, first.shape)
+    step = 1 if first.cfa == "mono" else 2
+    bad = bad_pixels(signal, dark, first.levels.white, step) | np.isnan(signal)
+    reference = White.measured(np.where(bad, np.float32(np.nan), signal), windows, valid)
+    valid = valid & (reference.level > 0)
+    del signal
+    grid, measured = replace(found, valid=valid), None
+    if bands is not None:
+        light = _Light(first, dark, bad)
+        measured, noise = _response(bands, light, noise, response, grid, windows)
+        if measured.shared:
+            reference = replace(reference, superpixels=mean_of_known(reference.superpixels[valid]))
+    noise = noise.filled()
+    sensor = Sensor(
+        cfa=first.cfa,
+        units=first.units,
+        white_level=first.levels.white,
+        exposure=first.exposure_s,
+        gain_e_per_dn=1 / noise.gain if noise.gain else None,
+        read_noise=float(np.sqrt(noise.read_variance)),
+        notes=f"noise from: {noise.source}",
+    )
+    calibration = Calibration(
+        grid=grid, sensor=sensor, windows=windows, white=reference, dark=dark, response=measured
+    )
+    return Measured(grid=found, calibration=calibration, noise=noise)
+
+
+def check_exposure_times(captures: Sequence[Capture]) -> None:
+    """InputError unless all or none of the captures know their exposure time: else their scales
+    cannot be compared.
+    """
+    known = [c for c in captures if c.exposure_s is not None]
+    if known and len(known) != len(captures):
+        lost = next(c for c in captures if c.exposure_s is None)
+        raise InputError(
+            f"does not say its exposure time, while {known[0].name} does",
+            lost.metadata.path,
+            "use files of one kind for all captures",
+        )
+
+
+def require_alike(capture: Capture, like: Capture) -> None:
+    for what, ours, theirs in (
+        ("size", by(capture.shape), by(like.shape)),
+        ("colour filter array", capture.cfa, like.cfa),
+        ("unit", capture.units, like.units),
+    ):
+        if ours != theirs:
+            raise InputError(
+                f"has another {what} ({ours}) than {like.name} ({theirs})",
+                capture.metadata.path,
+                "use captures of one camera at one setting",
+            )
+
+
+def _noise(white: Sequence[Capture], dark: Dark, camera: Camera | None) -> KnownNoise:
+    """Gain and read variance as far as the camera description or the files say them."""
+    if camera is not None and white[0].units == "DN":
+        noise = SensorModel.from_camera(camera).noise
+        return KnownNoise(noise.gain, noise.read_variance, "camera")
+    known = white[0].white_noise
+    if known is not None and known.white:
+        return KnownNoise(0.0, known.white, "white noise of the simulation")
+    return KnownNoise(white[0].levels.gain, None if dark.sigma is None else dark.sigma**2, "file")
+
+
+def _told_by(group: Sequence[Capture], dark: Dark, noise: KnownNoise) -> KnownNoise:
+    """The noise, what is not known of it from two frames of one scene among the
+    exposures `group`.
+    """
+    for a, b in zip(group[::2], group[1::2]):
+        if (
+            (noise.gain is None or noise.read_variance is None)
+            and a.exposure_s == b.exposure_s
+            and a.metadata.path != b.metadata.path
+        ):
+            top, black = a.levels.white, a.levels.black
+            limit = 0.9 * (top - np.mean(black)) if np.isfinite(top) else np.inf
+            found = photon_transfer(
+                a.mosaic - dark.at(a.exposure_s), b.mosaic - dark.at(b.exposure_s), limit
+            )
+            if found:
+                return KnownNoise(
+                    found.gain if noise.gain is None else noise.gain,
+                    found.read_variance if noise.read_variance is None else noise.read_variance,
+                    "photon transfer of repeated frames",
+                )
+    return noise
+
+
+def _grid(
+    signal: np.ndarray, white: Capture, lattice: str, near: tuple[float, float] | None
+) -> LensletGrid:
+    try:
+        return find_grid(
+            np.where(np.isnan(signal), np.nanmax(signal), signal), white.cfa, None, lattice, near
+        )
+    except (NumericsError, InputError) as error:
+        raise error.at(white.metadata.path) from None
+
+
+class _Light(NamedTuple):
+    """What makes signal of band captures: the white capture, the dark, pixels to leave out."""
+
+    white: Capture
+    dark: Dark
+    bad: np.ndarray
+
+
+def _response(
+    bands: NarrowBands,
+    light: _Light,
+    noise: KnownNoise,
+    asked: str,
+    grid: LensletGrid,
+    windows: Windows,
+) -> tuple[Response, KnownNoise]:
+    """(the response: each band's signal over the radiance of its source; the noise, as the captures
+    tell it).
+    """
+    white, dark, bad = light
+    reference, wavelengths = white.exposure_s, bands.wavelengths
+    gathered = GatheredResponses(windows, grid.valid, len(wavelengths))
+    for k, wavelength in enumerate(bar(wavelengths, len(wavelengths), "bands")):
+        group = bands.captures(wavelength)
+        for capture in group:
+            require_alike(capture, white)
+        check_exposure_times([white, *group])
+        noise = _told_by(group, dark, noise)
+        shares = [
+            1.0 if e.exposure_s is None or reference is None else e.exposure_s / reference
+            for e in group
+        ]
+        signal, weight = merge(
+            [e.mosaic for e in group],
+            [e.exposure_s for e in group],
+            dark,
+            group[0].levels.white,
+            reference,
+        )
+        signal[bad] = np.nan
+        energy = next((r for w, r in bands.radiances.items() if abs(w - wavelength) < 1e-12), 1.0)
+        gathered.add(k, wavelength, signal, weight, np.mean(shares), energy)
+    known = noise.known()
+    variance = None if known is None else gathered.variance(known, dark.variance)
+    found = measured_response(
+        asked,
+        gathered,
+        variance,
+        wavelengths=np.array(wavelengths),
+        centres=grid.centres,
+        cfa=white.cfa,
+    )
+    return found, noise

@@ -97,7 +97,7 @@ def test_prediction_and_calibration_agree_pixel_by_pixel(bench):
         [folder / "predicted.h5", folder / "rays.h5"],
         folder / "agreement.json",
         truth=folder / "measured.h5",
-    )
+    ).as_json()
     waves, rays = (entry["metrics"] for entry in document["results"])
     # what is left of the waves is light from beyond the 3 x 3 superpixels that
     # the captures followed
@@ -168,7 +168,7 @@ def test_a_prediction_goes_where_the_lenslets_of_a_real_camera_are(bench):
     )
     document = run_score(
         [folder / "placed.h5"], folder / "placed.json", truth=folder / "measured.h5"
-    )
+    ).as_json()
     assert max(document["metrics"]["response_error_per_band"]) < 0.035
     bayer = camera(
         folder,
@@ -237,7 +237,7 @@ def focused(tmp_path):
 def error(folder, name):
     return run_score(
         [folder / name], folder / "agreement.json", truth=folder / "closed.h5", overwrite=True
-    )["metrics"]["response_error_per_band"][0]
+    ).as_json()["metrics"]["response_error_per_band"][0]
 
 
 def test_light_of_the_own_field_alone_is_the_block_of_the_system_matrix(focused, tmp_path):
@@ -331,7 +331,7 @@ def test_calibrations_that_cannot_be_compared_are_refused(bench, tmp_path):
         run_score([tmp_path / "large.h5"], tmp_path / "s.json", truth=folder / "measured.h5")
     document = run_score(
         [folder / "measured.h5"], tmp_path / "same.json", truth=folder / "measured.h5"
-    )
+    ).as_json()
     assert (
         max(document["metrics"]["response_error_lenslet_per_band"]) == 0
         and document["metrics"]["response_leak"] < 1e-9

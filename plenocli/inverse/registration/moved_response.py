@@ -15,8 +15,8 @@ from plenocli.inverse.registration.smooth_response import PARITIES, SmoothRespon
 
 if TYPE_CHECKING:
     from plenocli.inverse.registration.reference import Reference
-    from plenocli.inverse.spectra.calibration import MadeResponses
-    from plenocli.inverse.spectra.low_rank import Basis
+    from plenocli.inverse.calibration.calibration import MadeResponses
+    from plenocli.inverse.calibration.low_rank import Basis
 
 NODES = 1 / 16
 """px between displacements for which pictures are moved, where lenslets have many: the rest is

@@ -12,8 +12,8 @@ import numpy as np
 from plenocli.inverse.registration.smooth_response import SmoothResponses, parity
 
 if TYPE_CHECKING:
-    from plenocli.inverse.spectra.calibration import MadeResponses
-    from plenocli.inverse.spectra.low_rank import Basis
+    from plenocli.inverse.calibration.calibration import MadeResponses
+    from plenocli.inverse.calibration.low_rank import Basis
 
 REACH = 4
 """px: how far the search for a whole-pixel displacement goes."""

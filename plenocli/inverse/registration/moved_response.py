@@ -14,9 +14,9 @@ import numpy as np
 from plenocli.inverse.registration.smooth_response import PARITIES, SmoothResponses, parity
 
 if TYPE_CHECKING:
-    from plenocli.inverse.registration.reference import Reference
     from plenocli.inverse.calibration.calibration import MadeResponses
     from plenocli.inverse.calibration.low_rank import Basis
+    from plenocli.inverse.registration.reference import Reference
 
 NODES = 1 / 16
 """px between displacements for which pictures are moved, where lenslets have many: the rest is

@@ -64,6 +64,21 @@ def write_dng(
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
     values = np.asarray(mosaic)
+    _check(path, values, cfa, white)
+    pixels = np.ascontiguousarray(values, dtype="<u2").tobytes()
+    levels = np.asarray(black, dtype=float)
+    notes = json.loads(xmp_json) if isinstance(xmp_json, str) else dict(xmp_json or {})
+    # in full: RAW readers round and merge them
+    notes |= {"black": levels.tolist(), "white": float(white)}
+    notes["mosaic_sha256"] = hashlib.sha256(pixels).hexdigest()
+    head = _headers(
+        values.shape, cfa, levels, int(round(white)), exposure_s, iso, notes, len(pixels)
+    )
+    publish(path, [head, pixels], overwrite=overwrite)
+
+
+def _check(path: str | os.PathLike[str], values: np.ndarray, cfa: str, white: float) -> None:
+    """ValueError or OutputError for what a DNG cannot hold."""
     if (
         values.ndim != 2
         or values.size == 0
@@ -87,28 +102,6 @@ def write_dng(
         raise ValueError(f"no colour filter array {cfa!r}")
     if not 0 < white <= 65535:
         raise ValueError(f"white level {white} is not within 1..65535")
-    pixels = np.ascontiguousarray(values, dtype="<u2").tobytes()
-    notes = json.loads(xmp_json) if isinstance(xmp_json, str) else dict(xmp_json or {})
-    # in full: RAW readers round and merge them
-    notes |= {"black": np.asarray(black, dtype=float).tolist(), "white": float(white)}
-    notes["mosaic_sha256"] = hashlib.sha256(pixels).hexdigest()
-    publish(
-        path,
-        [
-            _headers(
-                values.shape,
-                cfa,
-                np.asarray(black, dtype=float),
-                int(round(white)),
-                exposure_s,
-                iso,
-                notes,
-                len(pixels),
-            ),
-            pixels,
-        ],
-        overwrite=overwrite,
-    )
 
 
 def _headers(

@@ -143,32 +143,12 @@ def run_capture_sim(
     options, InputError for files, OutputError where one cannot be written.
     """
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import camera_files, read_camera
 
     output = Path(output)
-    if output.suffix not in (".h5", ".exr", ".dng"):
-        raise UsageError(
-            f"a capture is written as .h5, .exr or .dng, not {output.suffix or 'without a suffix'}",
-            output,
-            "change the suffix of OUT",
-        )
-    if output.suffix == ".dng" and (settings.snr_db is not None or settings.noise == "none"):
-        raise UsageError(
-            "a DNG holds whole numbers of a sensor; --snr and --noise none give real numbers",
-            output,
-            "write .h5 or .exr",
-        )
-    check_output(output, overwrite=overwrite, inputs=[camera_path, pif, scene])
-    if scene_out:
-        check_output(
-            scene_out,
-            overwrite=overwrite,
-            inputs=[camera_path, pif, scene],
-            suffixes=(".h5", ".exr"),
-        )
+    _check_outputs(output, scene_out, settings, [camera_path, pif, scene], overwrite)
     camera = read_camera(camera_path)
     options = settings.options
     require_tiling(camera, camera_path)
@@ -179,14 +159,9 @@ def run_capture_sim(
     else:
         matrices = None
         accuracy = planned_accuracy(camera, options, source.wavelengths).as_json()
+    name, band = settings.target or str(scene), _band(settings.target)
     found = simulate_capture(
-        camera,
-        source,
-        what,
-        options,
-        matrices=matrices,
-        name=settings.target or str(scene),
-        band_m=_band(settings.target),
+        camera, source, what, options, matrices=matrices, name=name, band_m=band
     )
     roles = camera_files(camera_path, camera) | {
         "pif": pif,
@@ -199,17 +174,40 @@ def run_capture_sim(
         config=to_toml(camera),
         accuracy=accuracy,
     )
+    truth, bands = found.scene, found.wavelengths
     write_capture(
-        output,
-        found.capture,
-        provenance,
-        scene=found.scene,
-        wavelengths=found.wavelengths,
-        overwrite=overwrite,
+        output, found.capture, provenance, scene=truth, wavelengths=bands, overwrite=overwrite
     )
     if scene_out:
-        _write_scene(scene_out, found.scene, found.wavelengths, provenance, overwrite)
+        _write_scene(scene_out, truth, bands, provenance, overwrite)
     return _summary(output, found, len(source.wavelengths))
+
+
+def _check_outputs(
+    output: Path,
+    scene_out: str | Path | None,
+    settings: Settings,
+    inputs: list[str | Path | None],
+    overwrite: bool,
+) -> None:
+    """UsageError or OutputError, before any work, where the files cannot be written."""
+    from plenocli.files.atomic import check_output
+
+    if output.suffix not in (".h5", ".exr", ".dng"):
+        raise UsageError(
+            f"a capture is written as .h5, .exr or .dng, not {output.suffix or 'without a suffix'}",
+            output,
+            "change the suffix of OUT",
+        )
+    if output.suffix == ".dng" and (settings.snr_db is not None or settings.noise == "none"):
+        raise UsageError(
+            "a DNG holds whole numbers of a sensor; --snr and --noise none give real numbers",
+            output,
+            "write .h5 or .exr",
+        )
+    check_output(output, overwrite=overwrite, inputs=inputs)
+    if scene_out:
+        check_output(scene_out, overwrite=overwrite, inputs=inputs, suffixes=(".h5", ".exr"))
 
 
 def _summary(output: Path, found: SimulatedCapture, wavelengths: int) -> CaptureSummary:
@@ -222,7 +220,7 @@ def _summary(output: Path, found: SimulatedCapture, wavelengths: int) -> Capture
         wavelengths=wavelengths,
         units=capture.units,
         peak=float(peak) if relative else int(peak),
-        noise_sigma=capture.noise.sigma if relative else None,
+        noise_sigma=capture.noise.sigma if capture.noise and relative else None,
         saturated=found.saturated,
         exposure_s=capture.exposure_s,
     )

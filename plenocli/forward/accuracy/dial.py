@@ -148,7 +148,9 @@ class _Request:
                 f"ask for {BEST_ACCURACY:g} to below 1",
             )
         self.camera, self.model, self.needs, self.points = camera, model, needs, points
-        self.reasons, self.left_out, self.warnings = [], [], []
+        self.reasons: list[str] = []
+        self.left_out: list[str] = []
+        self.warnings: list[str] = []
         kept, dropped = seen_wavelengths(wavelengths or camera.light.wavelengths, needs)
         if dropped:
             self.left_out.append(
@@ -217,7 +219,7 @@ class _Request:
         if asked != "auto":
             if asked == 0:
                 self.reasons.append("isolated lenslets as asked: light of neighbours is left out")
-            return (asked,)
+            return (int(asked),)
         return tuple(range(1, MAX_RING + 1))
 
     @property
@@ -337,7 +339,7 @@ def _sized(
     room = math.sqrt(max(request.accuracy**2 - rest**2, 0))
     why = None
     if room < SHARE * request.accuracy:
-        worst = max(split, key=split.get)
+        worst = max(split, key=lambda source: split[source])
         why = f"{worst} error {split[worst]:.1g}"
         room = max(rest, BEST_ACCURACY)
     sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
@@ -460,7 +462,8 @@ def _finest_served(
     between the request's, which nothing does, and `limit`; the chosen one is None where
     nothing serves any.
     """
-    asked, low, served = request.accuracy, request.accuracy, (limit, found, None)
+    asked = low = request.accuracy
+    served: tuple[float, list[Candidate], Candidate | None] = limit, found, None
     # what limits a model that could be sized is known; others may serve what is coarser
     trials = [limit] if any(math.isfinite(c.error) for c in found) else []
     high = limit

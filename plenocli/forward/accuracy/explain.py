@@ -153,16 +153,10 @@ def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str
 def _table(rows: list[Considered]) -> list[str]:
     cells = [("rung", "error", "time", "memory", "")]
     for r in rows:
-        known = r.error is not None
-        cells.append(
-            (
-                r.rung,
-                f"{r.error:.1g}" if known else "-",
-                _duration(r.seconds) if known else "-",
-                _size(r.bytes) if known else "-",
-                "chosen" if r.chosen else r.reason,
-            )
-        )
+        numbers = ("-", "-", "-")
+        if r.error is not None and r.seconds is not None and r.bytes is not None:
+            numbers = (f"{r.error:.1g}", _duration(r.seconds), _size(r.bytes))
+        cells.append((r.rung, *numbers, "chosen" if r.reason is None else r.reason))
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
     return [
         "  ".join(

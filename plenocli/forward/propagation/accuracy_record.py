@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 
@@ -51,10 +51,7 @@ class AccuracyRecord:
         """
         if not record:
             return None
-        sentences = {
-            name: tuple(record[name])
-            for name in ("reasons", "left_out")
-            if record.get(name) is not None
-        }
-        numbers = ("asked", "asked_by", "estimated", "by_source", "model", "model_error", "rung")
-        return cls(**{name: record.get(name) for name in numbers}, **sentences)
+        known: dict[str, Any] = {field.name: record.get(field.name) for field in fields(cls)}
+        for name in ("reasons", "left_out"):
+            known[name] = None if known[name] is None else tuple(known[name])
+        return cls(**known)

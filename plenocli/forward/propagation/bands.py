@@ -146,11 +146,14 @@ def node_count(geometry: Geometry, band: Band, accuracy: float, window: int | No
 class BandFields(LensletFields):
     """Fields at several wavelengths as one: pixel energies are the weighted sums of theirs."""
 
-    def __init__(self, fields: Sequence[LensletFields], weights: Sequence[float]) -> None:
+    def __init__(
+        self, fields: Sequence[LensletFields], weights: Sequence[float] | np.ndarray
+    ) -> None:
         """`fields` of one camera and plan, and the share of the photons of each."""
         self._fields, self._weights = list(fields), [float(w) for w in weights]
         self.superpixels, self.shared_axis = fields[0].superpixels, fields[0].shared_axis
-        self.symmetry = tuple(all(flags) for flags in zip(*(f.symmetry for f in fields)))
+        rows, columns, turn = (all(flags) for flags in zip(*(f.symmetry for f in fields)))
+        self.symmetry = rows, columns, turn
         self.by_superpixel = all(f.by_superpixel for f in fields)
         notes = [f.notes for f in fields]
         self.notes = replace(

@@ -69,7 +69,8 @@ class Spectrum:
     def __init__(
         self, object_shape: tuple[int, int], flips: Sequence[bool] = (False, False)
     ) -> None:
-        self._shape, self._flips, self._grams = tuple(object_shape), flips, None
+        self._shape, self._flips = tuple(object_shape), flips
+        self._grams: list[np.ndarray] = []
 
     def add(self, part: np.ndarray, times: int = 1, turned: int = 0) -> None:
         """Add rows of the matrix.
@@ -79,7 +80,7 @@ class Spectrum:
         turned: how often with rows and columns of points exchanged.
         """
         part = part.reshape(-1, *self._shape)
-        grams = None
+        grams: list[np.ndarray] = []
         for start in range(0, len(part), _ROWS):
             blocks = [part[start : start + _ROWS].astype(float)]
             for axis, flip in enumerate(self._flips, 1):
@@ -90,15 +91,13 @@ class Spectrum:
                 )
             shapes = [block.shape[1:] for block in blocks]
             blocks = [block.reshape(len(block), -1) for block in blocks]
-            grams = [0.0] * len(blocks) if grams is None else grams
-            grams = [gram + block.T @ block for gram, block in zip(grams, blocks)]
+            grams = _added(grams, [block.T @ block for block in blocks])
         # exchanging rows and columns exchanges even-odd with odd-even
         pairs = [0, 2, 1, 3] if len(grams) == 4 else range(len(grams))
-        other = [_exchanged(grams[k], shapes[k]) for k in pairs] if turned else [0.0] * len(grams)
-        total = [times * gram + turned * swapped for gram, swapped in zip(grams, other)]
-        self._grams = (
-            total if self._grams is None else [old + new for old, new in zip(self._grams, total)]
-        )
+        total = [times * gram for gram in grams]
+        if turned:
+            total = _added(total, [turned * _exchanged(grams[k], shapes[k]) for k in pairs])
+        self._grams = _added(self._grams, total)
 
     def values(self) -> np.ndarray:
         """Singular values, descending; those under 3e-8 of the largest are
@@ -106,6 +105,11 @@ class Spectrum:
         """
         values = np.sort(np.concatenate([np.linalg.eigvalsh(gram) for gram in self._grams]))[::-1]
         return np.sqrt(np.maximum(values, _RESOLUTION**2 * max(values[0], 0)))
+
+
+def _added(total: list[np.ndarray], parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Sums of arrays, where there is something to add to already."""
+    return [old + new for old, new in zip(total, parts)] if total else parts
 
 
 def _exchanged(gram: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -213,6 +217,8 @@ class PiecewiseDiagnosis:
 
 def describe(matrix: SystemMatrix) -> Diagnosis:
     """Diagnose a system matrix that is held whole."""
+    if matrix.A is None:
+        raise ValueError("a matrix in pieces is diagnosed by PiecewiseDiagnosis")
     points = matrix.A.shape[-1]
     whole = points == int(np.prod(matrix.object_shape))
     if whole and points > _DIRECT:

@@ -1,11 +1,19 @@
 """What every model makes: the fields behind the lenslets, asked for as pixel energies."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import BandPlan, PifPlan
 
 Flips = tuple[bool, bool, bool]
 """Symmetry: (flip rows, flip columns, transpose)."""
@@ -48,6 +56,10 @@ class LensletFields(ABC):
     superpixels: tuple[int, int]
     by_superpixel: bool = True
     shared_axis: int = 1
+
+    @abstractmethod
+    def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan) -> None:
+        """Set up the fields at the wavelength of `geometry`, with the node counts of `band`."""
 
     @abstractmethod
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

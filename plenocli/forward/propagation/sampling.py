@@ -71,12 +71,13 @@ def window_error(geometry: Geometry, superpixels: tuple[int, int], ring: int) ->
     diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md); 0 where ring
     is 0 by choice.
     """
-    if ring == 0:
+    window = coherent_window(geometry, superpixels, ring)
+    if window is None:
         return 0.0
     blur = blur_ring(geometry)
     # light spread over several lenslets has no sharp peak at a border, whose
     # interference reaches furthest
-    window = coherent_window(geometry, superpixels, ring) - blur + (blur > 0)
+    window = window - blur + (blur > 0)
     fringes = (
         geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3) * (window + 1)
     )

@@ -18,7 +18,8 @@ def superpixel_orbits(
 
     Returns [(first, [(superpixel, the Turn that leads there from the first)])].
     """
-    place, found = {tuple(o): i for i, o in enumerate(np.asarray(offsets).tolist())}, {}
+    place = {tuple(o): i for i, o in enumerate(np.asarray(offsets).tolist())}
+    found: dict[int, list[tuple[int, Turn]]] = {}
     turns = symmetry[2] and symmetry[0] == symmetry[1]
     for (r, c), index in place.items():
         flips = bool(r < 0 and symmetry[0]), bool(c < 0 and symmetry[1])

@@ -30,7 +30,7 @@ from plenocli.forward.propagation.symmetry import (
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.propagation.lenslet_fields import FieldNotes
+    from plenocli.forward.propagation.lenslet_fields import FieldNotes, LensletFields
     from plenocli.forward.propagation.plan import PifPlan
 
 BLOCK_BYTES = 1 << 28
@@ -162,6 +162,7 @@ class PifBuilder:
             import scipy.linalg  # noqa: F401
         with one_thread():
             model = model_named(plan.rung)
+            self.lenslets: LensletFields
             if plan.band_nodes:
                 self.lenslets = band_fields(model, camera, self.geometry, plan, band)
             else:

@@ -270,15 +270,15 @@ def _provenance(
 
 
 def _explained(plan: PifPlan, memory: int) -> PlanSummary:
+    from plenocli.forward.accuracy.dial import seconds_here
     from plenocli.forward.accuracy.explain import candidates, explain
 
-    considered = candidates(plan)
     return PlanSummary(
         plan=explain(plan, memory),
         memory=memory,
         accuracy=plan.accuracy_record(),
-        considered=considered,
-        seconds=next(c.seconds for c in considered if c.chosen),
+        considered=candidates(plan),
+        seconds=seconds_here(plan.chosen),
         bytes=plan.bytes,
         superpixels=plan.superpixels,
         coherent_ring=plan.coherent_ring,

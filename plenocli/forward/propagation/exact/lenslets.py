@@ -52,6 +52,7 @@ from plenocli.forward.propagation.sampling import size_band
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.exact.low_rank_product import Matrix
     from plenocli.forward.propagation.plan import PifPlan
 
 CUT, CUT_EFFECT = 0.42, 1.3
@@ -182,8 +183,10 @@ class ExactSquareLenslets(LensletFields):
             [_extent(geometry, n) for n in geometry.pixel_shape],
             _bandwidth(geometry, plan.superpixels),
         )
-        self._sensor_sides, self._intervals = {}, {}
-        self._tables, counts = {}, []
+        self._sensor_sides: dict[tuple[int, int], SensorSide] = {}
+        self._intervals: dict[tuple[int, int, int], Interval] = {}
+        self._tables: dict[tuple[int, int], Factors] = {}
+        counts = []
         for sy, sx in self._pairs():
             self._tables[sy, sx], products = self._compressed(sy, sx)
             counts.append(products)
@@ -203,9 +206,10 @@ class ExactSquareLenslets(LensletFields):
         alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         while True:
             self._field = separable_field(camera, g, self.band.half, tolerance, spherical_field)
-            self.symmetry = tuple(
+            flip_rows, flip_columns, turn = (
                 a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels))
             )
+            self.symmetry = flip_rows, flip_columns, turn
             self._turn = alike and self.symmetry[2]
             self._entering = self._light()
             brightest = self._entering.max()
@@ -297,8 +301,11 @@ class ExactSquareLenslets(LensletFields):
         the neighbourhood.
         """
         rows, signs = self._gram(0), self._field.signs
-        alike = self._turn and signs is not None and self.superpixels[0] == self.superpixels[1]
-        columns = rows * np.outer(signs, signs) if alike else self._gram(1)
+        alike = self._turn and self.superpixels[0] == self.superpixels[1]
+        if alike and signs is not None:
+            columns = rows * np.outer(signs, signs)
+        else:
+            columns = self._gram(1)
         return (rows.reshape(len(rows), -1) @ columns.reshape(len(columns), -1).T).real
 
     def _gram(self, axis: int) -> np.ndarray:
@@ -331,12 +338,10 @@ class ExactSquareLenslets(LensletFields):
             [pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order]
         )
         kept = [key for key, power in zip(order, total) if power > (cut / 4) ** 2] or order[-1:]
-        left, right, couplings, guess = (
-            [],
-            [],
-            {},
-            int(sketch_size(self._expected_rank(sy, sx))),
-        )
+        guess = int(sketch_size(self._expected_rank(sy, sx)))
+        left: list[np.ndarray] = []
+        right: list[np.ndarray] = []
+        couplings: dict[tuple[int, int], Matrix] = {}
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         for m, n in kept:
             pair, first = pairs[m, n], len(left)
@@ -402,8 +407,8 @@ class ExactSquareLenslets(LensletFields):
         images.
         """
         sy, sx = sy - self._reach(0), sx - self._reach(1)
-        *table, turned = self._canonical(sy, sx)
-        table, shape = self._tables[*table], self.geometry.object_shape
+        row, column, turned = self._canonical(sy, sx)
+        table, shape = self._tables[row, column], self.geometry.object_shape
         if turned:
             table = Factors(
                 table.wide, table.high, self.geometry.pixel_shape, self.band.pixel_nodes

@@ -10,7 +10,7 @@ combinations of both rows and columns show first how many of them it takes, and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from plenocli.forward.propagation.fresnel.spread_function import terms_within
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-    Matrix = np.ndarray | csr_array
+    Matrix: TypeAlias = np.ndarray | csr_array
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""

@@ -127,7 +127,8 @@ class Residual:
             )
             for slope in slopes
         ]
-        products, roots = [], []
+        products: list[np.ndarray] = []
+        roots: list[np.ndarray] = []
         for axis, (nodes, basis, lens) in enumerate(((t, left, lens_left), (s, right, lens_right))):
             if axis and symmetric:
                 products, roots = products * 2, roots * 2

@@ -77,16 +77,16 @@ class Factors:
             right = self._right(self.wide[sx, columns[group[0]]])
             for start in range(0, len(group), step):
                 part = group[start : start + step]
-                chosen = rows[part]
+                at = rows[part]
                 # neighbours in order lie together: no copy
-                if len(chosen) == 1 or (np.diff(chosen) == 1).all():
-                    chosen = slice(chosen[0], chosen[-1] + 1)
+                together = len(at) == 1 or (np.diff(at) == 1).all()
+                chosen = slice(at[0], at[-1] + 1) if together else at
                 left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
                 product = np.matmul(left, right, out=work[: len(left)])
                 # (point, node, pixel row x (part, node, pixel column)): |U|^2, summed over nodes
                 parts = product.reshape(len(part), nodes, -1)
-                lines = np.einsum("nqk,nqk->nk", parts, parts)
-                out[part] = np.einsum("nyqx->nyx", lines.reshape(len(part), py, 2 * nodes, px))
+                energy = np.einsum("nqk,nqk->nk", parts, parts)
+                out[part] = np.einsum("nyqx->nyx", energy.reshape(len(part), py, 2 * nodes, px))
 
     def _right(self, factor: np.ndarray) -> np.ndarray:
         """(node, term) complex as the right-hand side of a real product: (term x (real,

@@ -148,10 +148,13 @@ class ShapedLenslets(LensletFields):
         )
         self.shared_axis = 1 - self.cut.axis
         self._sites = geometry.places(plan.superpixels)
-        self._products = {} if self.window is None else {None: geometry.neighbourhood(self.window)}
-        if self.window is None:
-            self._products = {site: [([site[0]], [site[1]])] for site in self._sites}
-        self._kept, self._hops = {}, {}
+        self._products: dict[Hashable, Products] = (
+            {site: [([site[0]], [site[1]])] for site in self._sites}
+            if self.window is None
+            else {None: geometry.neighbourhood(self.window)}
+        )
+        self._kept: dict[Hashable, list[np.ndarray]] = {}
+        self._hops: dict[Hashable, tuple[Any, int]] = {}
         self._heights = {
             key: [self._rows(product[self.cut.axis]) for product in products]
             for key, products in self._products.items()
@@ -294,7 +297,7 @@ class ShapedLenslets(LensletFields):
         """Superpixels that share their place along the chords: (key of the products, place,
         [(index in out, scan place)]).
         """
-        tasks = {}
+        tasks: dict[tuple[Hashable, float], list] = {}
         for site, index in self._sites.items():
             key = site if self.window is None else None
             tasks.setdefault((key, site[1 - self.cut.axis]), []).append(
@@ -445,7 +448,7 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """As Model.valid_for; None: every lenslet shape and lattice of a camera description, and every
     pupil, can be cut into chords.
     """
-    return
+    return None
 
 
 def _chord_counts(

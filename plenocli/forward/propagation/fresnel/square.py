@@ -60,7 +60,7 @@ class SquareLenslets(LensletFields):
         self.symmetry = field.symmetry
         self.notes = FieldNotes(separable_terms=field.terms, field_tail=field.tail)
         self._x, self._w, self._basis = self._lenslet_nodes()
-        self._kernels = {}
+        self._kernels: dict[tuple, np.ndarray] = {}
         self._cut = (
             plan.tolerance if narrows(geometry, band, plan.superpixels, plan.double) else None
         )
@@ -83,7 +83,8 @@ class SquareLenslets(LensletFields):
             if len(rules) > 1
             else None
         )
-        self._roots, self._least = {}, None
+        self._roots: dict[tuple[int, int], np.ndarray] = {}
+        self._least: float | None = None
 
     def _rules(self) -> list[tuple[bool, tuple[int, int]]]:
         """[(whether all superpixels or the object's own only, (nodes of a pixel per axis,
@@ -102,16 +103,16 @@ class SquareLenslets(LensletFields):
         """
         if self._cut is None:
             return partial(self.factors.superpixel, sy, sx)
-        return partial(self._narrowed(sy, sx).superpixel, 0, 0)
-
-    def _narrowed(self, sy: int, sx: int) -> Factors:
-        """Factors of one superpixel, without the terms that its light does not need."""
         if self._least is None:
-            self._least = self._least_term()
+            self._least = self._least_term(self._cut)
+        return partial(self._narrowed(sy, sx, self._least).superpixel, 0, 0)
+
+    def _narrowed(self, sy: int, sx: int, least: float) -> Factors:
+        """Factors of one superpixel, without the terms smaller than `least`."""
         own, source = (2 * sy + 1, 2 * sx + 1) == self.superpixels, self.factors
         left, right, signs = self._roots_of(sy, sx)
         u, s, vh = np.linalg.svd(left @ right.T)
-        terms = max(1, int(np.count_nonzero(s > self._least)))
+        terms = max(1, int(np.count_nonzero(s > least)))
         scale = 1 / np.sqrt(s[:terms])
         if own and self._own:
             source, sy, sx = self._own, 0, 0
@@ -123,17 +124,17 @@ class SquareLenslets(LensletFields):
         )
         return Factors(high[None], wide[None], source.pixel_shape, source.pixel_nodes)
 
-    def _least_term(self) -> float:
+    def _least_term(self, cut: float) -> float:
         """The terms up to which size (root energy of a mean point, points at the lenslet's edge
-        weighing more) all superpixels together lose NARROWING_LOSS self._cut without.
+        weighing more) all superpixels together lose NARROWING_LOSS `cut` without.
         """
-        sizes = []
-        for place in np.ndindex(*self.superpixels):
-            left, right, _ = self._roots_of(*place)
-            sizes.append(np.linalg.svd(left @ right.T, compute_uv=False))
-        sizes = np.sort(np.concatenate(sizes))
-        lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROWING_LOSS * self._cut) ** 2))
-        return sizes[lost - 1] if lost else 0.0
+        found = []
+        for sy, sx in np.ndindex(*self.superpixels):
+            left, right, _ = self._roots_of(sy, sx)
+            found.append(np.linalg.svd(left @ right.T, compute_uv=False))
+        sizes = np.sort(np.concatenate(found))
+        lost = int(np.searchsorted(np.cumsum(sizes**2), (NARROWING_LOSS * cut) ** 2))
+        return float(sizes[lost - 1]) if lost else 0.0
 
     def _roots_of(self, sy: int, sx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(_root of superpixel row sy, of column sx with the signs of the terms, these signs)."""

@@ -13,6 +13,8 @@ import numpy as np
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
+from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
+from plenocli.evaluation.metrics.figures import figures
 from plenocli.files.read.dictionaries import Unfinished, read_unfinished
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training, split_by_scene
@@ -104,7 +106,7 @@ class LearnSummary:
     lmmse_psnr_db: of the LMMSE that reconstruct takes of a lenslet by itself.
     nonzeros, worst_gap, objective: of the coding (Validation).
     dead_share: of atoms replaced in the last iteration, None before the first.
-    coherence: measures of plenocli.evaluation.metrics.coherence by name.
+    coherence: of the dictionary with the matrix.
     output: the file.
     """
 
@@ -120,7 +122,7 @@ class LearnSummary:
     worst_gap: float
     objective: float
     dead_share: float | None
-    coherence: dict[str, Any]
+    coherence: CoherenceScore
     output: str
 
     @property
@@ -131,18 +133,19 @@ class LearnSummary:
     def as_json(self) -> dict[str, Any]:
         """Names and values of --json."""
         told = {"lambda" if k == "lam" else k: v for k, v in asdict(self).items()}
-        return told | {"beats_lmmse": self.beats_lmmse}
+        measures = figures(self.coherence)
+        return told | {"beats_lmmse": self.beats_lmmse, "coherence": measures}
 
     @property
     def line(self) -> str:
         """For a person, without the file."""
         verdict = "above" if self.beats_lmmse else "NOT above"
-        largest, mean = (self.coherence[f"coherence_effective{name}"] for name in ("", "_mean"))
         return (
             f"{self.atoms} atoms, {self.iterations} iterations, lambda {self.lam:.2e}, held out "
             f"{self.validation_psnr_db:.2f} dB, averaged over mirror images "
             f"{self.averaged_psnr_db:.2f} dB, {verdict} LMMSE {self.lmmse_psnr_db:.2f} dB; "
-            f"coherence of A Phi: largest {largest:.3f}, mean {mean:.3f}"
+            f"coherence of A Phi: largest {self.coherence.coherence_effective:.3f}, mean "
+            f"{self.coherence.coherence_effective_mean:.3f}"
         )
 
 
@@ -383,8 +386,6 @@ def _judge(
     beside the LMMSE that reconstruct takes of a lenslet by itself: statistics of the same training
     pictures, a contrast for every patch; coherence.
     """
-    from plenocli.evaluation.metrics.coherence import coherence
-    from plenocli.evaluation.metrics.figures import figures
     from plenocli.inverse.picture.solvers.lmmse import prepare
     from plenocli.inverse.prior.natural_images import draw_patches, mean_covariance
     from plenocli.inverse.prior.scene_prior import PATCHES_A_POINT
@@ -428,7 +429,7 @@ def _judge(
         worst_gap=found.worst_gap,
         objective=found.objective,
         dead_share=state.history[-1].dead_share if state.history else None,
-        coherence=figures(coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms)),
+        coherence=coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms),
         output=str(output),
     )
 
@@ -483,8 +484,15 @@ def _write(
 
 def _judgement(summary: LearnSummary) -> dict[str, Any]:
     """Attributes of a dictionary that is done."""
-    measures = summary.coherence
-    return {
+    found = summary.coherence
+    measures = {
+        "coherence_effective": found.coherence_effective,
+        "coherence_average": found.coherence_effective_mean,
+        "coherence_raw": found.coherence_raw,
+        "coherence_mutual": found.coherence_candes_romberg / np.sqrt(found.points),
+        "coherence_welch": found.welch_bound,
+    }
+    return {k: v for k, v in measures.items() if math.isfinite(v)} | {
         "notes": {
             "validation_psnr_db": summary.validation_psnr_db,
             "averaged_psnr_db": summary.averaged_psnr_db,
@@ -492,10 +500,5 @@ def _judgement(summary: LearnSummary) -> dict[str, Any]:
             "beats_lmmse": summary.beats_lmmse,
             "worst_gap": summary.worst_gap,
         },
-        "coherence_effective": measures["coherence_effective"],
-        "coherence_average": measures["coherence_effective_mean"],
-        "coherence_raw": measures["coherence_raw"],
-        "coherence_mutual": measures["coherence_candes_romberg"] / np.sqrt(measures["points"]),
-        "coherence_welch": measures["welch_bound"],
-        "coherence": measures,
+        "coherence": figures(found),
     }

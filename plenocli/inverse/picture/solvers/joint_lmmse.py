@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.inverse.picture.solvers.least_squares import Svd
+from plenocli.inverse.picture.solvers.lmmse import require_noise
 
 RING = 1
 MOST = 256
@@ -115,13 +116,7 @@ def prepare_joint(
     Raises NumericsError where sigma is not positive.
     docs/model.md, "Spatial reconstruction".
     """
-    from plenocli.base.errors import NumericsError
-
-    if not sigma > 0:
-        raise NumericsError(
-            f"LMMSE needs a positive noise level, not {sigma}",
-            fix="give --noise-sigma, or use --method tikhonov",
-        )
+    require_noise(sigma)
     offsets, bands = np.asarray(offsets, int), np.asarray(bands, float)
     (rows, columns), count = object_shape, len(bands)
     brightest = np.linalg.eigvalsh(bands)[-1]
@@ -137,18 +132,9 @@ def prepare_joint(
             "ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])
         ).reshape(filtered.shape)
 
-    flat, ring = footprint.reshape(used, -1), _ring(RING)
     data, cross = _covariances(footprint, filtered, used, object_shape)
-    # what rounding may have taken away, in proportion to each coordinate's light: almost without
-    # noise data would be no covariance
-    rounding = (
-        len(data)
-        * np.finfo(float).eps
-        * np.abs(autocovariance).sum()
-        * brightest
-        * np.einsum("ij,ij->i", flat, flat)
-    )
-    data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(ring))
+    rounding = _rounding(footprint.reshape(used, -1), np.abs(autocovariance).sum(), brightest)
+    data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(data) // used)
     middle = autocovariance.shape[0] // 2
     return JointLmmse(
         mean=mean,
@@ -186,6 +172,18 @@ def _covariances(
     own = np.s_[:, r : r + rows, c : c + columns]
     cross = np.concatenate([shifted(-dr, -dc)[own].reshape(used, -1) for dr, dc in ring]).T
     return (data + data.T) / 2, cross
+
+
+def _rounding(footprint: np.ndarray, strength: float, brightest: float) -> np.ndarray:
+    """(coordinate,) variance that rounding may have taken away, in proportion to each coordinate's
+    light: almost without noise the covariance of the data would be none.
+
+    footprint: (coordinate, point).
+    strength, brightest: magnitudes of the scene's covariance, summed, and of the bands'.
+    """
+    size = len(_ring(RING)) * len(footprint)
+    light = np.einsum("ij,ij->i", footprint, footprint)
+    return size * np.finfo(float).eps * strength * brightest * light
 
 
 def _ring(reach: int) -> list[tuple[int, int]]:

@@ -141,6 +141,17 @@ class Lmmse:
         return np.exp(logs @ posterior)
 
 
+def require_noise(sigma: float) -> None:
+    """NumericsError unless the noise of a pixel is positive."""
+    from plenocli.base.errors import NumericsError
+
+    if not sigma > 0:
+        raise NumericsError(
+            f"LMMSE needs a positive noise level, not {sigma}",
+            fix="give --noise-sigma, or use --method tikhonov",
+        )
+
+
 def prepare(
     svd: Svd,
     mean: np.ndarray,
@@ -168,13 +179,7 @@ def prepare(
     Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md, "Spatial
     reconstruction".
     """
-    from plenocli.base.errors import NumericsError
-
-    if not sigma > 0:
-        raise NumericsError(
-            f"LMMSE needs a positive noise level, not {sigma}",
-            fix="give --noise-sigma, or use --method tikhonov",
-        )
+    require_noise(sigma)
     bands = np.asarray(bands, float)
     levels, even = _levels(svd, bands, float(np.mean(np.diag(covariance))), sigma)
     left = levels / np.linalg.norm(levels, axis=1)[:, None]

@@ -11,7 +11,6 @@ only on an idle machine. Run from the project's root: python pipelines/benchmark
 
 import argparse
 import copy
-import dataclasses
 import json
 import os
 import resource
@@ -218,7 +217,7 @@ def measure(run, kind, rounds):
 
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.images.mosaic import read_capture
-    from plenocli.stages.inverse.demux import Demultiplexer, Settings
+    from plenocli.stages.inverse.demux import CaptureDemultiplexer, Settings
 
     clock, shot = Clock(), run / "shot.dng"
 
@@ -226,15 +225,17 @@ def measure(run, kind, rounds):
         with rawpy.imread(str(shot)) as raw:
             return raw.raw_image_visible.copy()
 
-    worker = clock.time("prepare", lambda: Demultiplexer(run / f"{kind}.h5", Settings(), True, ""))
-    exposure = read_capture(shot, cfa=worker.responses.cfa)
+    worker = clock.time(
+        "prepare", lambda: CaptureDemultiplexer(run / f"{kind}.h5", Settings(), True, "")
+    )
+    exposure = read_capture(shot, cfa=worker.solver.responses.cfa)
     # and what it leaves for the others
-    clock.time("first", lambda: worker.estimate(exposure, shot))
-    plain = replace(worker, "register", "off")
+    clock.time("first", lambda: worker.solver.estimate(exposure, shot))
+    plain = unregistered(worker.solver)
     for _ in range(rounds):
         clock.time("decode", decode)
-        exposure = clock.time("read", lambda: read_capture(shot, cfa=worker.responses.cfa))
-        found = clock.time("demux", lambda: worker.estimate(exposure, shot))
+        exposure = clock.time("read", lambda: read_capture(shot, cfa=worker.solver.responses.cfa))
+        found = clock.time("demux", lambda: worker.solver.estimate(exposure, shot))
         clock.time("demux, not registered", lambda: plain.estimate(exposure, shot))
         clock.time(
             "write",
@@ -242,9 +243,11 @@ def measure(run, kind, rounds):
                 (found, describe_inputs({"capture": shot})), shot, run / "shot.exr"
             ),
         )
-    elsewhere = read_capture(run / "moved.dng", cfa=worker.responses.cfa)
+    elsewhere = read_capture(run / "moved.dng", cfa=worker.solver.responses.cfa)
     for _ in range(2):
-        away = clock.time("demux, moved", lambda: worker.estimate(elsewhere, run / "moved.dng"))
+        away = clock.time(
+            "demux, moved", lambda: worker.solver.estimate(elsewhere, run / "moved.dng")
+        )
     parts = clock.medians()
     ratio = sorted(d / max(e, 1e-9) for d, e in zip(clock.cpu["demux"], clock.cpu["decode"]))
     return {
@@ -259,10 +262,10 @@ def measure(run, kind, rounds):
     }
 
 
-def replace(worker, name, value):
-    """A Demultiplexer that shares everything with another but one setting."""
-    other = copy.copy(worker)
-    other.settings = dataclasses.replace(worker.settings, **{name: value})
+def unregistered(solver):
+    """A Demultiplexer that shares everything with another but does not look for motion."""
+    other = copy.copy(solver)
+    other.register = "off"
     return other
 
 

@@ -19,13 +19,10 @@ from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary
-    from plenocli.forward.sensor.capture import Capture
-    from plenocli.forward.sensor.noise import Noise
-    from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.registration.alignment import Registration
     from plenocli.inverse.spectra.spectra import Spectra
 
@@ -143,7 +140,9 @@ def run_demux(
     with threadpool_limits(1, "blas"):
         # a broken calibration ends the run here, before any capture
         job = (
-            Demultiplexer(calibration, settings, overwrite, command, min(workers, len(batch.todo)))
+            CaptureDemultiplexer(
+                calibration, settings, overwrite, command, min(workers, len(batch.todo))
+            )
             if batch.todo
             else None
         )
@@ -227,12 +226,12 @@ def _recipe_of(target: Path) -> Recipe | None:
 
 
 @lru_cache(maxsize=1)
-def _demultiplexer(recipe: tuple[Any, ...]) -> Demultiplexer:
-    return Demultiplexer(*recipe[:2], False, "")
+def _demultiplexer(recipe: tuple[Any, ...]) -> CaptureDemultiplexer:
+    return CaptureDemultiplexer(*recipe[:2], False, "")
 
 
 def demux_elsewhere(recipe: tuple[Any, ...], capture: Name) -> tuple[Spectra, dict[str, Any]]:
-    """Demultiplexer.demux of a capture in a process of its own, which reads the calibration once.
+    """CaptureDemultiplexer.demux in a process of its own, which reads the calibration once.
 
     recipe: calibration, settings, and digests that tell them from others of the same name.
     capture: its file.
@@ -240,7 +239,7 @@ def demux_elsewhere(recipe: tuple[Any, ...], capture: Name) -> tuple[Spectra, di
     return _demultiplexer(recipe).demux(capture)
 
 
-class Demultiplexer:
+class CaptureDemultiplexer:
     """What any number of captures need: calibration read and factored, white reference
     demultiplexed, once.
 
@@ -261,16 +260,19 @@ class Demultiplexer:
     ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
         from plenocli.files.read.calibrations import read_calibration
-        from plenocli.inverse.spectra.responses import LensletResponses
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
         self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
         found = read_calibration(
             calibration, needs=("response", "windows", "white", "dark"), white_image=False
         )
-        self.prior = light_prior(LensletResponses.of(found))
-        # its superpixels, one for every lenslet, have served
-        self.responses = LensletResponses.of(replace(found, white=None), threads).prepare()
+        self.solver = Demultiplexer(
+            found,
+            method=settings.method,
+            register=settings.register,
+            ratio=settings.reference is not None,
+            threads=threads,
+        )
         self.reference: Spectra | None = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._method_of_reference())[0]
@@ -289,70 +291,8 @@ class Demultiplexer:
         """
         from plenocli.files.artefacts.provenance import describe_inputs
 
-        exposure = read_capture(path, cfa=self.responses.cfa)
-        return self.estimate(exposure, path, method), describe_inputs({"capture": path})
-
-    def estimate(self, exposure: Capture, path: Name, method: str | None = None) -> Spectra:
-        """Radiances of a capture that was read already."""
-        from plenocli.inverse.registration.alignment import doubtful, warn_of_misfit
-
-        method = method or self.settings.method
-        signal, noise = readout(exposure, self.responses, path)
-        found = self._aligned(signal, noise, method, path, self.settings.register)
-        if self.settings.register == "auto" and doubtful(found.residual, found.trace.registration):
-            found = self._believed(found, signal, noise, method, path)
-        if not np.isfinite(found.value).any():
-            raise NumericsError(
-                "no lenslet could be demultiplexed", path, "check exposure and calibration"
-            )
-        warning = warn_of_misfit(found.residual, found.trace.registration, path)
-        return replace(found, trace=replace(found.trace, warning=warning))
-
-    def _believed(
-        self, found: Spectra, signal: Readout, noise: Noise | None, method: str, path: Name
-    ) -> Spectra:
-        """`found`, or the estimate with motion alone corrected, or with nothing: the first that
-        explains its residuals.
-        """
-        from plenocli.inverse.registration.alignment import believed
-
-        uncorrected = self._aligned(signal, noise, method, path, "off")
-        if believed(found.residual, uncorrected.residual):
-            return found
-        registration = found.trace.registration
-        if "motion" in registration.corrected:
-            moved = (
-                found
-                if registration.corrected == ("motion",)
-                else self._aligned(signal, noise, method, path, "auto", levels=False)
-            )
-            if believed(moved.residual, uncorrected.residual):
-                return moved
-        trace = replace(uncorrected.trace, registration=replace(registration, corrected=()))
-        return replace(uncorrected, trace=trace)
-
-    def _aligned(
-        self,
-        signal: Readout,
-        noise: Noise | None,
-        method: str,
-        path: Name,
-        mode: str,
-        levels: bool = True,
-    ) -> Spectra:
-        from plenocli.inverse.registration.alignment import align
-
-        aligned = align(self.responses, signal, noise, mode, path, levels)
-        found = estimate(
-            aligned.responses,
-            aligned.signal,
-            noise,
-            method,
-            self.prior,
-            self.settings.reference is not None,
-            aligned.stray,
-        )
-        return replace(found, trace=replace(found.trace, registration=aligned.registration))
+        capture = read_capture(path, cfa=self.solver.responses.cfa)
+        return self.solver.estimate(capture, path, method), describe_inputs({"capture": path})
 
     def write(
         self, done: tuple[Spectra, dict[str, Any]], capture: Name, target: Name

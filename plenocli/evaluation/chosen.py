@@ -1,6 +1,7 @@
 """Which figures a score shows, and what they mean."""
 
 from collections.abc import Iterable, Mapping
+from types import ModuleType
 
 from plenocli.base.errors import UsageError
 from plenocli.evaluation.metrics import (
@@ -125,7 +126,7 @@ def keep_chosen(figures: Mapping[str, Figure], groups: Iterable[str]) -> Mapping
     return {name: value for name, value in figures.items() if name in wanted}
 
 
-_HOMES = {
+_HOMES: Mapping[str, tuple[ModuleType, ...]] = {
     "dictionary": (coherence,),
     "image": (quality,),
     "spectra": (spectral,),
@@ -138,7 +139,7 @@ def definitions_of(results: Iterable[ResultScore]) -> dict[str, str]:
     """What each figure of the results means, in the order in which they appear."""
     found = {}
     for result in results:
-        home = _HOMES.get(result.kind, ())
+        home: tuple[ModuleType, ...] = _HOMES.get(result.kind, ())
         if result.wavelengths_nm and result.kind != "calibration":
             home = (spectral, quality)
         for name in result.figures:

@@ -4,16 +4,21 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics.depth import DepthScore, counted, score_depth
-from plenocli.inverse.lightfield.planes import LightField
+from plenocli.inverse.lightfield.planes import DepthMap, LightField
 
 
-def check_depth(field: LightField) -> None:
-    """Raise InputError where planes and depth map do not say at which distances they stand."""
-    if field.depth is None or field.depth.distance is None or field.distances is None:
-        raise InputError(
-            "holds no depth map" if field.depth is None else "holds no distances",
-            fix="refocus three planes or more with --camera",
-        )
+def known_depth(field: LightField) -> tuple[np.ndarray, DepthMap, np.ndarray]:
+    """What says at which distances planes and depth map stand.
+
+    Returns (distances of the planes (plane,) m, depth map, its distances (row, column) m).
+    Raises InputError where the field does not say.
+    """
+    depth, planes = field.depth, field.distances
+    if depth is None:
+        raise InputError("holds no depth map", fix="refocus three planes or more with --camera")
+    if depth.distance is None or planes is None:
+        raise InputError("holds no distances", fix="refocus three planes or more with --camera")
+    return planes, depth, depth.distance
 
 
 def score_lightfield(field: LightField, distance: float) -> DepthScore:
@@ -25,16 +30,16 @@ def score_lightfield(field: LightField, distance: float) -> DepthScore:
     Raises InputError where fewer than two planes stand at known distances.
     docs/model.md, "Refocusing and depth".
     """
-    check_depth(field)
-    depth, known = field.depth, np.isfinite(field.distances)
+    planes, depth, distances = known_depth(field)
+    known = np.isfinite(planes)
     if known.sum() < 2:
         raise InputError(
             "holds fewer than two planes at known distances", fix="refocus more of them"
         )
     # slopes are linear in 1/distance
-    gradient, rest = np.polyfit(1 / field.distances[known], field.slopes[known], 1)
+    gradient, rest = np.polyfit(1 / planes[known], field.slopes[known], 1)
     sure = counted(depth.slope, depth.confidence)
-    off = np.abs(depth.distance[sure] - distance)
+    off = np.abs(distances[sure] - distance)
     slopes = score_depth(
         depth.slope, depth.confidence, gradient / distance + rest, field.slopes, field.sharpness
     )

@@ -60,6 +60,13 @@ class Result:
         return self.path.stem
 
     @property
+    def bands(self) -> np.ndarray:
+        """(band,) m, the wavelengths of a result that has bands."""
+        if self.wavelengths is None:
+            raise ValueError(f"{self.path} is a single picture")
+        return self.wavelengths
+
+    @property
     def grid(self) -> tuple[int, int]:
         """(rows, columns) of the values."""
         rows, columns = self.values.shape[-2:]

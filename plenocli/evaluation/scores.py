@@ -76,8 +76,10 @@ class ResultScore:
         head: dict[str, Any] = {"name": self.name, "kind": self.kind}
         if self.method:
             head |= {"method": self.method}
-        bands = {"wavelengths_nm": list(self.wavelengths_nm)} if self.wavelengths_nm else {}
-        metrics = {"metrics": dict(self.figures)}
+        bands: dict[str, Any] = (
+            {"wavelengths_nm": list(self.wavelengths_nm)} if self.wavelengths_nm else {}
+        )
+        metrics: dict[str, Any] = {"metrics": dict(self.figures)}
         body = metrics | bands if self.kind == "calibration" else bands | metrics
         if self.patches is not None:
             body |= {"patches": [patch.as_json() for patch in self.patches]}

@@ -84,7 +84,7 @@ def score_spectra(
     """
     white = _white_of(result, whites or {})
     values = _reflectance(result, white, needs_reflectance)
-    cube = score_cube(values, truth, result.wavelengths, light)
+    cube = score_cube(values, truth, result.bands, light)
     if cube is None:
         raise InputError(
             "has no lenslet with values in all bands",
@@ -92,7 +92,8 @@ def score_spectra(
             "check the calibration it was made with",
         )
     picture = score_picture(values, truth) if result.kind == "image" else None
-    patches, classification, listed = None, None, ()
+    patches, classification = None, None
+    listed: tuple[PatchScore, ...] = ()
     if labels is not None:
         six = tuple(patch_index(name) + 1 for name in SIX_PATCHES)
         patches = score_patches(values, truth, labels, six)

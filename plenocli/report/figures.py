@@ -181,11 +181,11 @@ def spectra_figures(result: Result, name: str, lenslets: Sequence[Place] | None 
     quantity = result.quantity or "value"
     return [
         (
-            band_pictures(result.values, result.wavelengths, quantity),
+            band_pictures(result.values, result.bands, quantity),
             f"{name}: one value a lenslet and band.",
         ),
         (
-            lenslet_spectra(result.values, result.sigma, result.wavelengths, quantity, lenslets),
+            lenslet_spectra(result.values, result.sigma, result.bands, quantity, lenslets),
             "Spectra of single lenslets, with one standard deviation where it is known.",
         ),
     ]

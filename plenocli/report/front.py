@@ -62,7 +62,7 @@ def front_picture(table: DesignTable) -> bytes:
             "the sweep has no point with the figures of its front",
             fix="inspect says why its points were refused",
         )
-    across = names[1:3] or [None]
+    across: list[str | None] = [*names[1:3]] or [None]
     with drawing(4.0 * len(across) + 0.6, 3.6) as made:
         for axes, x in zip(np.atleast_1d(made.figure.subplots(1, len(across))), across):
             colour = next((name for name in names[1:] if name != x), None)

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from plenocli.evaluation.scores import ResultScore
 from plenocli.report.drawing import (
@@ -49,7 +48,7 @@ HISTORY = {
 
 
 def capture_picture(
-    mosaic: ArrayLike,
+    mosaic: np.ndarray,
     units: str = "",
     centres: np.ndarray | None = None,
     pitch: tuple[float, ...] | None = None,
@@ -241,7 +240,7 @@ def _root_norm(top: float) -> "Normalize":
     return PowerNorm(0.5, vmin=0, vmax=top)
 
 
-def _on_superpixels(column: np.ndarray, pixel_shape: Shape, offsets: ArrayLike) -> np.ndarray:
+def _on_superpixels(column: np.ndarray, pixel_shape: Shape, offsets: np.ndarray) -> np.ndarray:
     """One column (lenslet, pixel) as a picture of all superpixels, each at its offset."""
     offsets = np.asarray(offsets) - np.min(offsets, axis=0)
     height, width = pixel_shape
@@ -280,9 +279,9 @@ def matrix_picture(matrix: np.ndarray) -> bytes:
 def matrix_summary(
     singular_values: np.ndarray | None,
     column_energy: np.ndarray,
-    wavelengths: ArrayLike,
+    wavelengths: np.ndarray,
     object_shape: Shape,
-    ranks: ArrayLike | None = None,
+    ranks: np.ndarray | None = None,
 ) -> bytes:
     """Singular values of A relative to the largest, one line a band, and the share of light kept by
     object point.
@@ -335,7 +334,7 @@ def matrix_summary(
     return made.png
 
 
-def reconstructions(entries: Sequence[Entry], truth: ArrayLike, columns: int = 4) -> bytes:
+def reconstructions(entries: Sequence[Entry], truth: np.ndarray, columns: int = 4) -> bytes:
     """Reconstructions beside the truth, each above its error; light encoded for the screen,
     white = 1.
 
@@ -430,7 +429,7 @@ def close_ups(
     return made.png
 
 
-def picture(values: ArrayLike, title: str = "") -> bytes:
+def picture(values: np.ndarray, title: str = "") -> bytes:
     """One reconstructed picture (row, column), without truth, as PNG."""
     values = np.asarray(values, dtype=np.float64)
     top = float(np.percentile(values, 99.8))
@@ -578,7 +577,7 @@ def _mosaic_of(columns: np.ndarray, shape: Shape, per_side: int) -> np.ndarray:
     return canvas
 
 
-def learning_history(history: Mapping[str, ArrayLike]) -> bytes:
+def learning_history(history: Mapping[str, np.ndarray]) -> bytes:
     """How learning went: one small panel for each recorded value.
 
     history: name -> (iteration,).

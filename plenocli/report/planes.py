@@ -55,9 +55,10 @@ def _planes(field: LightField) -> bytes:
 def _sharpness(field: LightField) -> bytes:
     with drawing(5.6, 2.4) as made:
         axes = made.figure.subplots()
-        known = field.distances is not None and np.isfinite(field.distances).all()
+        distances = field.distances
+        known = distances is not None and np.isfinite(distances).all()
         axes.plot(
-            1e3 * field.distances if known else field.slopes,
+            1e3 * distances if distances is not None and known else field.slopes,
             field.sharpness,
             "o-",
             color=COLOURS[0],

@@ -8,6 +8,7 @@ import numpy as np
 from plenocli.base.errors import PlenoError
 from plenocli.evaluation.metrics.response import response_error
 from plenocli.evaluation.response_score import paired_responses
+from plenocli.evaluation.results import Result
 from plenocli.evaluation.scores import ScoreDocument
 from plenocli.files.results.results import read_response, read_result
 from plenocli.files.results.run_folder import RunFile, RunFolder
@@ -107,7 +108,7 @@ def _add_merged_scores(page: Page, run: RunFolder, files: Sequence[RunFile]) -> 
         },
     )
     add_table(page, merged)
-    drawn = []
+    drawn: list[tuple[str, Result]] = []
     for one, digest in found:
         file = run.by_digest(digest)
         if file is not None and len(drawn) < MOST_SPECTRA:
@@ -149,7 +150,7 @@ def _add_bands_alone(page: Page, files: Sequence[RunFile]) -> None:
     for file in files[:MOST_SPECTRA]:
         result = read_result(file.path)
         page.figure(
-            band_pictures(result.values, result.wavelengths, result.quantity or "value"),
+            band_pictures(result.values, result.bands, result.quantity or "value"),
             f"{file.name}: one value a lenslet and band; not scored.",
         )
 

@@ -114,16 +114,19 @@ def add_pictures(page: Page, document: ScoreDocument, drawn: Sequence[Compared |
 
 def add_reconstructions(page: Page, pairs: Sequence[Pair]) -> None:
     """Truth, results and errors of pictures, those on one grid together."""
-    known = [(one, compared) for one, compared in pairs if compared.truth is not None]
-    for shape in dict.fromkeys(compared.truth.shape for _, compared in known):
-        _add_one_grid(page, [pair for pair in known if pair[1].truth.shape == shape][:_MOST])
+    grids: dict[tuple[int, ...], list[tuple[Pair, np.ndarray]]] = {}
+    for pair in pairs:
+        truth = pair[1].truth
+        if truth is not None:
+            grids.setdefault(truth.shape, []).append((pair, truth))
+    for found in grids.values():
+        _add_one_grid(page, [pair for pair, _ in found][:_MOST], found[0][1])
 
 
-def _add_one_grid(page: Page, pairs: Sequence[Pair]) -> None:
+def _add_one_grid(page: Page, pairs: Sequence[Pair], truth: np.ndarray) -> None:
     """Pictures on one grid, and a close-up where the lenslets' blocks are known."""
     from plenocli.report.pictures import close_ups, reconstructions
 
-    truth = pairs[0][1].truth
     entries = [(one.label, compared.result.values, _caption(one)) for one, compared in pairs]
     page.figure(
         reconstructions(entries, truth),
@@ -188,7 +191,7 @@ def add_spectra(page: Page, document: ScoreDocument, results: Sequence[tuple[str
             )
     for label, result in results[:4]:
         page.figure(
-            band_pictures(result.values, result.wavelengths, result.quantity or "value"),
+            band_pictures(result.values, result.bands, result.quantity or "value"),
             f"{label}: one value a lenslet and band, and the colour they make together.",
         )
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from plenocli.evaluation.scores import PatchScore, ResultScore
 from plenocli.report.drawing import (
@@ -32,9 +31,9 @@ if TYPE_CHECKING:
 
 def calibration_picture(
     flat: np.ndarray | None,
-    centres: ArrayLike,
-    valid: ArrayLike,
-    residual: ArrayLike | None = None,
+    centres: np.ndarray,
+    valid: np.ndarray,
+    residual: np.ndarray | None = None,
     predicted: bool = False,
 ) -> bytes:
     """The white image with the lenslet centres found, and a close-up.
@@ -115,7 +114,7 @@ def calibration_picture(
 
 
 def response_picture(
-    response: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float] | np.ndarray
+    response: np.ndarray, window: tuple[int, ...], wavelengths: np.ndarray | np.ndarray
 ) -> bytes:
     """Which pixels of the superpixel answer to which band, each band on its own scale.
 
@@ -137,7 +136,7 @@ def response_picture(
 
 
 def response_errors(
-    error: ArrayLike, peak: ArrayLike, window: tuple[int, ...], wavelengths: Sequence[float]
+    error: np.ndarray, peak: np.ndarray, window: tuple[int, ...], wavelengths: np.ndarray
 ) -> bytes:
     """Which pixels of the superpixel differ between two responses, on one scale.
 
@@ -234,7 +233,7 @@ def filters_picture(camera: "Camera") -> bytes:
 
 
 def band_pictures(
-    cube: ArrayLike, wavelengths: np.ndarray, quantity: str = "value", light: str = "D65"
+    cube: np.ndarray, wavelengths: np.ndarray, quantity: str = "value", light: str = "D65"
 ) -> bytes:
     """Demultiplexed bands on one scale, and the colour they make together (white = 1).
 
@@ -281,9 +280,9 @@ def band_pictures(
 
 
 def lenslet_spectra(
-    cube: ArrayLike,
-    sigma: ArrayLike | None,
-    wavelengths: ArrayLike,
+    cube: np.ndarray,
+    sigma: np.ndarray | None,
+    wavelengths: np.ndarray,
     quantity: str = "value",
     lenslets: Sequence[tuple[int, int]] | None = None,
 ) -> bytes:
@@ -428,8 +427,8 @@ def _patch_panel(
 def _points(
     axes: "Axes",
     bands: np.ndarray,
-    values: ArrayLike,
-    std: ArrayLike,
+    values: Sequence[float] | np.ndarray,
+    std: Sequence[float],
     number: int,
     label: str | None,
 ) -> None:

@@ -44,18 +44,20 @@ class StoredMatrix:
         return self.blocks[0, place[0] if place.size else 0]
 
 
+def _pair(values: np.ndarray) -> tuple[int, int]:
+    rows, columns = (int(n) for n in values)
+    return rows, columns
+
+
 def matrix_of(artefact: "Artefact") -> StoredMatrix:
     """The matrix that a pif artefact holds."""
     data, attrs = artefact.data, artefact.attrs.get("pif", {})
-    pixel_shape, object_shape = (
-        tuple(int(n) for n in data[f"pif/{name}_shape"]) for name in ("pixel", "object")
-    )
     return StoredMatrix(
         blocks=data["pif/A"],
         offsets=data["pif/lenslet_offset"],
         wavelengths=data["pif/wavelength"],
-        pixel_shape=pixel_shape,
-        object_shape=object_shape,
+        pixel_shape=_pair(data["pif/pixel_shape"]),
+        object_shape=_pair(data["pif/object_shape"]),
         column_energy=data["pif/column_energy"],
         singular_values=data.get("pif/singular_values"),
         rank=attrs.get("rank"),

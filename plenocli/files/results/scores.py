@@ -70,8 +70,9 @@ def _result(entry: object) -> ResultScore:
     ):
         raise _Nonsense("a result lacks its name or metrics")
     name = entry.get("name", "")
-    bands = tuple(_numbers(entry.get("wavelengths_nm", []), "wavelengths_nm"))
-    if any(w is None for w in bands):
+    told = _numbers(entry.get("wavelengths_nm", []), "wavelengths_nm")
+    bands = tuple(w for w in told if w is not None)
+    if len(bands) < len(told):
         raise _Nonsense("wavelengths_nm are no numbers")
     patches = entry.get("patches")
     if patches is not None and not isinstance(patches, list):

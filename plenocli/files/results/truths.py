@@ -51,7 +51,7 @@ def read_truth(
             "compare bands with a spectral result",
         )
     if spectral:
-        values = _at_wavelengths(values, wavelengths, result.wavelengths, truth)
+        values = _at_wavelengths(values, wavelengths, result.bands, truth)
     _same_aspect(values.shape[-2:], (rows, cols), truth)
     values = np.array([_coarser(plane, rows, cols) for plane in values])
     return values if spectral else values[0]
@@ -78,8 +78,8 @@ def _scene_truth(
         return _coarser(scene.at(wavelength, rows * fine, cols * fine), rows, cols)
 
     if spectral and camera is not None:
-        return _through_filters(plane, camera, result.wavelengths)
-    planes = [plane(w) for w in (result.wavelengths if spectral else [550e-9])]
+        return _through_filters(plane, camera, result.bands)
+    planes = [plane(w) for w in (result.bands if spectral else [550e-9])]
     return np.array(planes) if spectral else planes[0]
 
 

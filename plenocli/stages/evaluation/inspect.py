@@ -29,6 +29,7 @@ def run_inspect(path: Path | str) -> FileReport:
 
     path = Path(path)
     size, kind = require_file(path), file_type(path)
+    content: ArtefactReport | ChannelsReport | RawReport
     if is_hdf5(path):
         content = _artefact(path)
     elif kind == "exr":

@@ -16,7 +16,7 @@ from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.text import json_value
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
-from plenocli.evaluation.depth_score import check_depth, score_lightfield
+from plenocli.evaluation.depth_score import known_depth, score_lightfield
 from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
@@ -283,7 +283,7 @@ def _score_calibration(response: ComparedResponse, comparison: _Comparison) -> _
 
 def _score_planes(path: Path | str, field: LightField, comparison: _Comparison) -> _Scored:
     try:
-        check_depth(field)
+        known_depth(field)  # before the truth is looked at
         distance = _distance(comparison.truth, path)
         score = score_lightfield(field, distance)
     except InputError as error:
@@ -340,7 +340,8 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
     truth = read_truth(comparison.truth, result, comparison.sampling, comparison.camera)
     if not np.isfinite(truth).any():
         raise InputError("holds no finite value", comparison.truth, "name a truth that has values")
-    block, patches, bands, spectra = None, None, (), None
+    block, patches, spectra = None, None, None
+    bands: tuple[float, ...] = ()
     if result.wavelengths is None:
         block = _block(result, comparison)
         own: PictureScore | SpectraScore = _score_picture(result, truth, block, comparison)

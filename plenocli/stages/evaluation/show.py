@@ -42,6 +42,12 @@ class _File:
     kind: str
     artefact: Artefact | None
 
+    def stored(self) -> Artefact:
+        """The artefact of a file that is one."""
+        if self.artefact is None:
+            raise ValueError(f"{self.path} is no artefact")
+        return self.artefact
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Choice:
@@ -148,7 +154,7 @@ def _pif(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.figures import matrix_figures
 
-    matrix = matrix_of(file.artefact)
+    matrix = matrix_of(file.stored())
     _require_inside(choice.points, matrix.object_shape, "--point", "object points")
     return matrix_figures(matrix, choice.points)
 
@@ -177,14 +183,14 @@ def _calibration(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.read.calibrations import calibration_of
     from plenocli.report.figures import calibration_figures
 
-    return calibration_figures(calibration_of(file.artefact))
+    return calibration_figures(calibration_of(file.stored()))
 
 
 def _dictionary(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.results import result_of
     from plenocli.report.figures import dictionary_figures
 
-    return dictionary_figures(result_of(file.artefact, file.path), file.path.name, choice.matrix)
+    return dictionary_figures(result_of(file.stored(), file.path), file.path.name, choice.matrix)
 
 
 def _spectra(file: _File, choice: _Choice) -> Figures:
@@ -210,14 +216,14 @@ def _sweep(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.design_tables import designs_of
     from plenocli.report.front import front_figures
 
-    return front_figures(designs_of(file.artefact))
+    return front_figures(designs_of(file.stored()))
 
 
 def _lightfield(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.lightfields import lightfield_of
     from plenocli.report.planes import lightfield_figures
 
-    return lightfield_figures(lightfield_of(file.artefact))
+    return lightfield_figures(lightfield_of(file.stored()))
 
 
 _FIGURES = {

@@ -136,7 +136,7 @@ def _refocused(
     from plenocli.inverse.lightfield.planes import LightField
 
     pictures = np.stack([focus.refocus(samples, slope, shape)[0] for slope in slopes])
-    found = depth(samples, slopes, shape) if len(slopes) >= 3 else None
+    found = depth(samples, slopes.tolist(), shape) if len(slopes) >= 3 else None
     if found is not None and optics is not None:
         found = replace(found, distance=optics.distance(found.slope))
     return LightField(

@@ -152,7 +152,7 @@ def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
     return MatrixCost(matrix_seconds=report.nominal_seconds, matrix_bytes=report.bytes)
 
 
-def _settings(kind: type, values: Options) -> Any:
+def _settings(kind: Any, values: Options) -> Any:
     """A Settings of a stage from what JSON keeps of its options."""
     values = {
         name: tuple(value) if isinstance(value, list) else value

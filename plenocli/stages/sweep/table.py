@@ -270,7 +270,7 @@ def _front(points: Sequence[DesignPoint], table: DesignTable) -> list[dict[str, 
             **{name: float(m[i]) for name, m in zip(aims, merit) if name not in keys},
             **points[i].values,
         }
-        for i in best
+        for i in map(int, best)
     ]
 
 

@@ -2,17 +2,32 @@
 fsync of the folder.
 """
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import fcntl
 import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.errors import OutputError, UsageError
 
 
-def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
+def check_output(
+    path: str | os.PathLike,
+    *,
+    overwrite: bool = False,
+    inputs: Iterable[str | os.PathLike | None] = (),
+    suffixes: tuple[str, ...] = (),
+) -> None:
     """Refuse an output path that cannot work, before any long computation.
+
+    path: file to be written.
+    overwrite: whether it may exist.
+    inputs: files that are read, which it may not replace.
+    suffixes: allowed ones; any where there are none.
 
     Raises UsageError if the file exists and `overwrite` is not set, or its suffix is none of
     `suffixes` (where given); OutputError if `path` is a folder or not an ordinary file, its name is
@@ -55,7 +70,7 @@ def check_output(path, *, overwrite=False, inputs=(), suffixes=()):
         raise OutputError(f"the folder {folder} is read-only", path, "choose another folder")
 
 
-def partial_path(path):
+def partial_path(path: str | os.PathLike) -> Path:
     """The temporary name used while `path` is written; always the same, so that the next run
     sweeps what a killed one left.
     """
@@ -63,9 +78,12 @@ def partial_path(path):
     return path.with_name(f".{path.name}.partial")
 
 
-def publish(path, data, *, overwrite=False):
-    """Put `data` (bytes, or a list of bytes-like pieces) at `path` so that a reader sees all of it
-    or the file as it was.
+def publish(path: str | os.PathLike, data: Any, *, overwrite: bool = False) -> None:
+    """Put bytes into a file so that a reader sees all of them or the file as it was.
+
+    path: file to write.
+    data: bytes, or a list of bytes-like pieces.
+    overwrite: whether the file may exist.
 
     Raises UsageError if the file exists and `overwrite` is not set, OutputError if it cannot be
     written; the target is then untouched and nothing is left beside it.
@@ -77,7 +95,7 @@ def publish(path, data, *, overwrite=False):
 
 
 @contextlib.contextmanager
-def replacement(path, *, overwrite=False):
+def replacement(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[tuple[Path, int]]:
     """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when
     the block ends well.
 
@@ -116,7 +134,7 @@ def replacement(path, *, overwrite=False):
         os.close(descriptor)
 
 
-def _open_partial(partial):
+def _open_partial(partial: Path) -> int:
     """Open and lock the temporary file, empty.
 
     The lock keeps two runs with one target from mixing their bytes.
@@ -140,7 +158,7 @@ def _open_partial(partial):
         os.close(descriptor)
 
 
-def _empty(descriptor, partial):
+def _empty(descriptor: int, partial: Path) -> None:
     try:
         os.ftruncate(descriptor, 0)
     except OSError:
@@ -148,7 +166,7 @@ def _empty(descriptor, partial):
         raise
 
 
-def _is_same_file(descriptor, path):
+def _is_same_file(descriptor: int, path: Path) -> bool:
     try:
         there = os.lstat(path)
     except OSError:
@@ -157,12 +175,12 @@ def _is_same_file(descriptor, path):
     return (here.st_dev, here.st_ino) == (there.st_dev, there.st_ino)
 
 
-def _write_all(descriptor, view):
+def _write_all(descriptor: int, view: memoryview) -> None:
     while view:
         view = view[os.write(descriptor, view[: 1 << 24]) :]
 
 
-def write_at(descriptor, offset, data):
+def write_at(descriptor: int, offset: int, data: Any) -> None:
     """Write all of `data` (bytes-like or a C-ordered array) at `offset` of an open file; short
     writes are continued.
     """
@@ -173,7 +191,7 @@ def write_at(descriptor, offset, data):
         view, offset = view[done:], offset + done
 
 
-def reserve(descriptor, size):
+def reserve(descriptor: int, size: int) -> None:
     """Make an open file `size` bytes long, with room for them on the disk where the file
     system can promise it.
     """
@@ -191,7 +209,7 @@ def reserve(descriptor, size):
             raise
 
 
-def _sync_folder(folder):
+def _sync_folder(folder: Path) -> None:
     """Make the rename survive a power cut.
 
     Some network file systems refuse this; the file is then whole all the same.

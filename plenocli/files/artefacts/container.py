@@ -7,14 +7,18 @@ written by us (`stream` writes them as they come). Reading goes the other way: a
 digest, structure, declared sizes, and only then values, parsed from those bytes.
 """
 
+from __future__ import annotations
+
 import errno
 import hashlib
 import itertools
 import json
 import os
 import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -42,20 +46,24 @@ _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 @dataclass
 class Artefact:
-    """data: dataset path ("pif/A") -> array;
+    """What a file holds.
+
+    kind: the table that it follows.
+    data: dataset path ("pif/A") -> array.
     attrs: group or dataset path -> name -> number, list, text, bool or JSON-able value.
+    provenance: where it came from.
 
     A colour filter array may be given as text ("mono", "RGGB"); it comes back as an
     array: see `cfa_text`.
     """
 
     kind: str
-    data: dict
-    attrs: dict = field(default_factory=dict)
+    data: dict[str, Any]
+    attrs: dict[str, dict[str, Any]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=lambda: Provenance(""))
 
 
-def cfa_text(value):
+def cfa_text(value: Any) -> str:
     """ "mono" or four letters from the dataset capture/cfa (0-d or 2x2 array of bytes or
     str, or already text).
     """
@@ -65,12 +73,15 @@ def cfa_text(value):
     )
 
 
-def write_artefact(path, artefact, *, overwrite=False):
-    """Check `artefact` against the table of its kind and put it at `path`, whole or not at all;
-    same input, same bytes.
+def write_artefact(path: str | os.PathLike, artefact: Artefact, *, overwrite: bool = False) -> None:
+    """Put an artefact into a file, whole or not at all; same input, same bytes.
 
-    Raises ValueError listing every broken rule of the table (a bug of the caller),
-    UsageError, OutputError.
+    path: file to write.
+    artefact: what follows the table of its kind.
+    overwrite: whether the file may exist.
+
+    Raises ValueError listing every broken rule of the table (a bug of the caller), UsageError where
+    the file exists, OutputError where it cannot be written.
     """
     frame = Frame(artefact)
     with replacement(path, overwrite=overwrite) as (_, descriptor):
@@ -80,13 +91,20 @@ def write_artefact(path, artefact, *, overwrite=False):
         seal(descriptor, frame.size)
 
 
-def read_artefact(path, kind=None, *, skip=()):
-    """Read and verify the artefact at `path`.
+def read_artefact(
+    path: str | os.PathLike,
+    kind: str | tuple[str, ...] | None = None,
+    *,
+    skip: Collection[str] = (),
+) -> Artefact:
+    """Read and verify an artefact.
 
+    path: its file.
     kind: the kind due, or a tuple of kinds, or None for any.
     skip: datasets that are not wanted; their bytes are verified, their values are not looked at.
-    Raises InputError for a file that is missing, not an artefact, damaged, too large, of another
-    kind, or breaks its table.
+
+    Raises InputError for a file that is missing, not an artefact, damaged, of another kind, or
+    breaks its table; NumericsError for one that the memory of this process does not hold.
     """
     path = Path(path)
     try:
@@ -117,7 +135,7 @@ class Frame:
     ValueError listing every broken rule of the table.
     """
 
-    def __init__(self, artefact, streamed=None):
+    def __init__(self, artefact: Artefact, streamed: tables.Declared | None = None) -> None:
         schema, data, declared, attrs = _checked(artefact, streamed or {})
         stored = _stored_attributes(schema, artefact, declared, attrs)
         apart = [path for path, (shape, dtype) in declared.items() if is_raw(schema, path, shape)]
@@ -131,11 +149,11 @@ class Frame:
         }
         self.size = self._file.size
 
-    def offset(self, name):
+    def offset(self, name: str) -> int:
         """Where the values of a raw dataset begin in the finished file, bytes."""
         return HEADER_BYTES + self._offsets[name]
 
-    def write(self, descriptor):
+    def write(self, descriptor: int) -> None:
         """Put the frame into an open file, around the values of the raw datasets, which
         may be there already.
         """
@@ -144,7 +162,7 @@ class Frame:
             for first, last in self._around(offset, offset + len(content)):
                 write_at(descriptor, HEADER_BYTES + first, content[first - offset : last - offset])
 
-    def _around(self, first, last):
+    def _around(self, first: int, last: int) -> Iterator[tuple[int, int]]:
         """The parts of a range that no raw dataset takes."""
         for start, size in sorted(self._taken.values()):
             if start < last and start + size > first:
@@ -155,7 +173,7 @@ class Frame:
             yield first, last
 
 
-def build_image(artefact):
+def build_image(artefact: Artefact) -> bytes:
     """The HDF5 file as bytes. Raises ValueError listing every broken rule of the table."""
     frame = Frame(artefact)
     image = bytearray(frame.size)
@@ -167,7 +185,7 @@ def build_image(artefact):
     return bytes(image)
 
 
-def is_raw(schema, path, shape):
+def is_raw(schema: tables.Schema, path: str, shape: tuple[int, ...]) -> bool:
     """Whether a dataset is stored as one run of numbers: what the table does not
     compress, and is not empty.
     """
@@ -175,7 +193,7 @@ def is_raw(schema, path, shape):
     return entry is not None and not entry.compress and len(shape) > 0 and 0 not in shape
 
 
-def seal(descriptor, size):
+def seal(descriptor: int, size: int) -> None:
     """Write the digest block of the HDF5 file of `size` bytes that follows it in the open file."""
     digest = hashlib.sha256()
     for start in range(0, size, _READ_BYTES):
@@ -224,7 +242,7 @@ def _checked(artefact, streamed):
     return schema, data, declared, attrs
 
 
-def _plain_array(path, value):
+def _plain_array(path: str, value: Any) -> np.ndarray:
     """Native byte order, C order; text as fixed-length ASCII."""
     if isinstance(value, str) and path.endswith("/cfa"):
         value = value if len(value) != 4 or value == "mono" else np.array(list(value)).reshape(2, 2)
@@ -259,7 +277,7 @@ def _stored_attributes(schema, artefact, declared, attrs):
     }
 
 
-def _json(value):
+def _json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, ensure_ascii=False, allow_nan=False)
 
 
@@ -344,14 +362,15 @@ def _put_attribute(target, name, value):
         target.attrs.create(name, value)
 
 
-def _storage(values):
+def _storage(values: np.ndarray) -> dict[str, Any]:
     """Storage options: 1 MiB chunks with a checksum each, gzip."""
     if values.ndim == 0 or values.size == 0:
         return {"track_times": False}
-    chunks, budget = [], max(_CHUNK_BYTES // values.itemsize, 1)
+    chunks: list[int] = []
+    room = max(_CHUNK_BYTES // values.itemsize, 1)
     for size in reversed(values.shape):
-        chunks.insert(0, max(min(size, budget), 1))
-        budget //= chunks[0]
+        chunks.insert(0, max(min(size, room), 1))
+        room //= chunks[0]
     return {
         "chunks": tuple(chunks),
         "fletcher32": True,
@@ -371,7 +390,7 @@ of them while it opens, then the values.
 # --- reading --------------------------------------------------------------------------------------
 
 
-def _verified_bytes(path):
+def _verified_bytes(path: Path) -> memoryview:
     """The HDF5 part of the file at `path`, read once, its digest and length verified."""
     size = require_file(path)
     if READING * size > budget().memory:
@@ -392,7 +411,7 @@ def _verified_bytes(path):
     return image
 
 
-def _require_whole(path, head, size):
+def _require_whole(path: Path, head: bytes, size: int) -> str:
     """The digest that an artefact was written with; InputError where the first bytes of the file,
     or its size, are not those of one.
 
@@ -420,7 +439,7 @@ def _require_whole(path, head, size):
     return header[1].decode()
 
 
-def _open_image(image):
+def _open_image(image: bytes | memoryview) -> Any:
     """Open the bytes of an HDF5 file; the block size saves the reallocations that
     the default causes.
     """
@@ -432,7 +451,9 @@ def _open_image(image):
     return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
-def _parse(path, file, kind, skip):
+def _parse(
+    path: Path, file: h5py.File, kind: str | tuple[str, ...] | None, skip: Collection[str]
+) -> Artefact:
     declared = survey(path, file)
     root = {
         name: read_attribute(path, file, name)
@@ -470,7 +491,9 @@ def _parse(path, file, kind, skip):
     return Artefact(schema.kind, data, attrs, provenance)
 
 
-def _schema_of(path, root, kind):
+def _schema_of(
+    path: Path, root: dict[str, Any], kind: str | tuple[str, ...] | None
+) -> tables.Schema:
     found, version = root["plenocli_kind"], root["schema_version"]
     wanted = (kind,) if isinstance(kind, str) else kind
     if found not in SCHEMAS:

@@ -5,13 +5,13 @@ Pixels, points and lenslets are numbered row by row, rows downwards; positions a
 pixel centres at integers.
 """
 
-from plenocli.files.artefacts.schema import Attr, Field, Schema
+from plenocli.files.artefacts.schema import Schema, attribute, dataset
 
-_NOTES = Attr("notes", "json", "", "anything else worth keeping")
+_NOTES = attribute("notes", "json", "", "anything else worth keeping")
 
 _PIF_FIELDS = (
-    Field("pif/wavelength", "band", "f", "m", "centre wavelength", minimum=0, ascending=True),
-    Field(
+    dataset("pif/wavelength", "band", "f", "m", "centre wavelength", minimum=0, ascending=True),
+    dataset(
         "pif/lenslet_offset",
         "lenslet 2",
         "i",
@@ -21,8 +21,8 @@ _PIF_FIELDS = (
             "on a hexagonal lattice"
         ),
     ),
-    Field("pif/pixel_shape", "2", "i", "1", "pixels of a superpixel (rows, columns)", minimum=1),
-    Field(
+    dataset("pif/pixel_shape", "2", "i", "1", "pixels of a superpixel (rows, columns)", minimum=1),
+    dataset(
         "pif/object_shape",
         "2",
         "i",
@@ -30,7 +30,7 @@ _PIF_FIELDS = (
         "object points over one lenslet's field (rows, columns)",
         minimum=1,
     ),
-    Field(
+    dataset(
         "pif/column_energy",
         "band point",
         "f",
@@ -38,7 +38,7 @@ _PIF_FIELDS = (
         "share of a point's light that lands on the superpixels kept",
         minimum=0,
     ),
-    Field(
+    dataset(
         "pif/singular_values",
         "band value | value",
         "f",
@@ -49,11 +49,11 @@ _PIF_FIELDS = (
     ),
 )
 _PIF_ATTRS = (
-    Attr("rank", "number", "1", "numerical rank, one a band"),
-    Attr(
+    attribute("rank", "number", "1", "numerical rank, one a band"),
+    attribute(
         "condition", "number", "1", "largest over smallest singular value, one a band", finite=False
     ),
-    Attr(
+    attribute(
         "symmetry_defect",
         "number",
         "1",
@@ -62,31 +62,31 @@ _PIF_ATTRS = (
             "half of it is invisible"
         ),
     ),
-    Attr(
+    attribute(
         "coherent_ring",
         "number",
         "1",
         "rings of neighbour lenslets whose fields are summed; 0: isolated lenslet",
     ),
-    Attr(
+    attribute(
         "kappa",
         "number",
         "1/m",
         "quadratic phase left on the lenslet after sensor distance and lenslet focal length",
     ),
-    Attr("eps", "number", "1/m", "defocus of the main lens"),
-    Attr("superpixel_pitch", "number", "m", "spacing of superpixel centres on the sensor"),
-    Attr("model", "text", "", "propagation model"),
-    Attr("lattice", "text", "", "of the lenslets: square (if left out) or hexagonal"),
+    attribute("eps", "number", "1/m", "defocus of the main lens"),
+    attribute("superpixel_pitch", "number", "m", "spacing of superpixel centres on the sensor"),
+    attribute("model", "text", "", "propagation model"),
+    attribute("lattice", "text", "", "of the lenslets: square (if left out) or hexagonal"),
     _NOTES,
 )
 
 PIF = Schema(
-    "pif",
-    1,
-    "Pupil image functions: the system matrix A of a camera, one matrix a band and superpixel.",
-    (
-        Field(
+    kind="pif",
+    version=1,
+    doc="Pupil image functions: the system matrix A of a camera, one matrix a band and superpixel.",
+    fields=(
+        dataset(
             "pif/A",
             "band lenslet pixel point",
             "f",
@@ -106,15 +106,15 @@ PIF = Schema(
 )
 
 PIF_INDEX = Schema(
-    "pif-index",
-    1,
-    (
+    kind="pif-index",
+    version=1,
+    doc=(
         "A system matrix too large for one file: what `pif` holds but for A, which is in numbered "
         "files of kind pif beside it."
     ),
-    (
+    fields=(
         *_PIF_FIELDS,
-        Field(
+        dataset(
             "pif/shard",
             "lenslet",
             "i",
@@ -123,17 +123,17 @@ PIF_INDEX = Schema(
             minimum=0,
         ),
     ),
-    attrs={"pif": (*_PIF_ATTRS, Attr("shards", "json", "", "name and SHA-256 of each file"))},
+    attrs={"pif": (*_PIF_ATTRS, attribute("shards", "json", "", "name and SHA-256 of each file"))},
     plots={"pif": ("column_energy", ())},
     default=("pif",),
 )
 
 CAPTURE = Schema(
-    "capture",
-    1,
-    "One exposure of a plenoptic camera, simulated or measured.",
-    (
-        Field(
+    kind="capture",
+    version=1,
+    doc="One exposure of a plenoptic camera, simulated or measured.",
+    fields=(
+        dataset(
             "capture/mosaic",
             "row column",
             "i f",
@@ -141,14 +141,14 @@ CAPTURE = Schema(
             "sensor values as read out",
             maskable=False,
         ),
-        Field(
+        dataset(
             "capture/cfa",
             "2 2 |",
             "S",
             "",
             "2x2 letters of the colour filter array, or the text mono",
         ),
-        Field(
+        dataset(
             "capture/lenslet_centre",
             "lenslet_row lenslet_column 2",
             "f",
@@ -156,7 +156,7 @@ CAPTURE = Schema(
             "true superpixel centres",
             optional=True,
         ),
-        Field(
+        dataset(
             "capture/scene",
             "band scene_row scene_column",
             "f",
@@ -164,7 +164,7 @@ CAPTURE = Schema(
             "the object as sampled",
             optional=True,
         ),
-        Field(
+        dataset(
             "capture/wavelength",
             "band",
             "f",
@@ -177,7 +177,7 @@ CAPTURE = Schema(
     ),
     attrs={
         "capture": (
-            Attr(
+            attribute(
                 "units",
                 "text",
                 "",
@@ -186,24 +186,26 @@ CAPTURE = Schema(
                     "through the clear pupil"
                 ),
             ),
-            Attr("electrons_per_unit", "number", "e", "electrons for one unit of A x"),
-            Attr("black", "number", "units", "level of no light: one number, or 2x2 by position"),
-            Attr("white", "number", "units", "saturation level", finite=False),
-            Attr("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            Attr("exposure_s", "number", "s", "exposure time"),
-            Attr("band_m", "number", "m", "centre of the narrow band that lit the scene"),
-            Attr("snr_db", "number", "dB", "signal-to-noise ratio asked for", finite=False),
-            Attr("noise_sigma", "number", "units", "standard deviation of the added noise"),
-            Attr("lenslet_count", "number", "1", "lenslets (rows, columns)"),
-            Attr("superpixel_shape", "number", "px", "pixels of a superpixel (rows, columns)"),
-            Attr(
+            attribute("electrons_per_unit", "number", "e", "electrons for one unit of A x"),
+            attribute(
+                "black", "number", "units", "level of no light: one number, or 2x2 by position"
+            ),
+            attribute("white", "number", "units", "saturation level", finite=False),
+            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
+            attribute("exposure_s", "number", "s", "exposure time"),
+            attribute("band_m", "number", "m", "centre of the narrow band that lit the scene"),
+            attribute("snr_db", "number", "dB", "signal-to-noise ratio asked for", finite=False),
+            attribute("noise_sigma", "number", "units", "standard deviation of the added noise"),
+            attribute("lenslet_count", "number", "1", "lenslets (rows, columns)"),
+            attribute("superpixel_shape", "number", "px", "pixels of a superpixel (rows, columns)"),
+            attribute(
                 "superpixel_pitch", "number", "px", "spacing of superpixel centres (rows, columns)"
             ),
-            Attr("pixel_phase", "number", "px", "position of the first superpixel centre"),
-            Attr("scene_shape", "number", "1", "object points (rows, columns)"),
-            Attr("target", "text", "", "what was in front of the camera"),
-            Attr("illuminant", "text", "", "name of the light"),
-            Attr("camera", "text", "", "camera make and model"),
+            attribute("pixel_phase", "number", "px", "position of the first superpixel centre"),
+            attribute("scene_shape", "number", "1", "object points (rows, columns)"),
+            attribute("target", "text", "", "what was in front of the camera"),
+            attribute("illuminant", "text", "", "name of the light"),
+            attribute("camera", "text", "", "camera make and model"),
             _NOTES,
         )
     },
@@ -212,11 +214,11 @@ CAPTURE = Schema(
 )
 
 CALIBRATION = Schema(
-    "calibration",
-    1,
-    "Lenslet grid, white and dark levels and response of a camera, measured or predicted.",
-    (
-        Field(
+    kind="calibration",
+    version=1,
+    doc="Lenslet grid, white and dark levels and response of a camera, measured or predicted.",
+    fields=(
+        dataset(
             "grid/centre",
             "lenslet_row lenslet_column 2",
             "f",
@@ -224,14 +226,14 @@ CALIBRATION = Schema(
             "centre of each superpixel, row then column",
             maskable=True,
         ),
-        Field(
+        dataset(
             "grid/valid",
             "lenslet_row lenslet_column",
             "b",
             "1",
             "superpixel lies wholly on the sensor and is lit",
         ),
-        Field(
+        dataset(
             "grid/residual",
             "lenslet_row lenslet_column",
             "f",
@@ -240,7 +242,7 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "white/flat",
             "row column",
             "f",
@@ -249,7 +251,7 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "white/level",
             "lenslet_row lenslet_column",
             "f",
@@ -258,7 +260,7 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "dark/mean",
             "dark_row dark_column |",
             "f",
@@ -267,7 +269,7 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "response/F",
             "lenslet_row lenslet_column pixel band | pixel band",
             "f",
@@ -279,7 +281,7 @@ CALIBRATION = Schema(
                 "where two-dimensional"
             ),
         ),
-        Field(
+        dataset(
             "response/origin",
             "lenslet_row lenslet_column 2",
             "i",
@@ -287,7 +289,7 @@ CALIBRATION = Schema(
             "first pixel (row, column) of each superpixel window",
             optional=True,
         ),
-        Field(
+        dataset(
             "response/window",
             "2",
             "i",
@@ -296,7 +298,7 @@ CALIBRATION = Schema(
             optional=True,
             minimum=1,
         ),
-        Field(
+        dataset(
             "response/covariance",
             "pixel band | band | lenslet_row lenslet_column pixel band",
             "f",
@@ -306,7 +308,7 @@ CALIBRATION = Schema(
             maskable=True,
             minimum=0,
         ),
-        Field(
+        dataset(
             "response/wavelength",
             "band",
             "f",
@@ -316,7 +318,7 @@ CALIBRATION = Schema(
             minimum=0,
             ascending=True,
         ),
-        Field(
+        dataset(
             "response/white",
             "lenslet_row lenslet_column pixel | pixel",
             "f",
@@ -325,7 +327,7 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "response/energy",
             "band",
             "f",
@@ -337,44 +339,44 @@ CALIBRATION = Schema(
     ),
     attrs={
         "grid": (
-            Attr("lattice", "text", "", "square or hexagonal"),
-            Attr(
+            attribute("lattice", "text", "", "square or hexagonal"),
+            attribute(
                 "pitch",
                 "number",
                 "px",
                 "lenslet spacing along rows of the lattice and across them (row, column)",
             ),
-            Attr("angle", "number", "deg", "rotation of the lattice"),
-            Attr("offset", "number", "px", "centre of lenslet (0, 0)"),
-            Attr("rms", "number", "px", "root mean square of the residuals"),
-            Attr("lenslets", "number", "1", "valid lenslets"),
-            Attr("model", "json", "", "coefficients of the lattice fit"),
+            attribute("angle", "number", "deg", "rotation of the lattice"),
+            attribute("offset", "number", "px", "centre of lenslet (0, 0)"),
+            attribute("rms", "number", "px", "root mean square of the residuals"),
+            attribute("lenslets", "number", "1", "valid lenslets"),
+            attribute("model", "json", "", "coefficients of the lattice fit"),
             _NOTES,
         ),
         "white": (
-            Attr("exposure", "number", "s", "exposure time of the white image"),
-            Attr("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            Attr("read_noise", "number", "DN", "noise of a dark pixel"),
-            Attr("cfa", "text", "", "mono or four letters"),
-            Attr("black", "number", "DN", "level of no light: one number, or 2x2 by position"),
-            Attr("white", "number", "DN", "saturation level", finite=False),
+            attribute("exposure", "number", "s", "exposure time of the white image"),
+            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
+            attribute("read_noise", "number", "DN", "noise of a dark pixel"),
+            attribute("cfa", "text", "", "mono or four letters"),
+            attribute("black", "number", "DN", "level of no light: one number, or 2x2 by position"),
+            attribute("white", "number", "DN", "saturation level", finite=False),
             _NOTES,
         ),
         "dark": (
-            Attr("exposure", "number", "s", "exposure time of the dark image"),
-            Attr("sigma", "number", "DN", "noise of a dark pixel"),
+            attribute("exposure", "number", "s", "exposure time of the dark image"),
+            attribute("sigma", "number", "DN", "noise of a dark pixel"),
             _NOTES,
         ),
         "response": (
-            Attr("single_pixel", "number", "1", "pixel of the window chosen for each band"),
-            Attr("condition", "number", "1", "median condition number of F", finite=False),
-            Attr(
+            attribute("single_pixel", "number", "1", "pixel of the window chosen for each band"),
+            attribute("condition", "number", "1", "median condition number of F", finite=False),
+            attribute(
                 "angles",
                 "json",
                 "deg",
                 "median angles between the columns of F, (band, band); 90 is perfect separation",
             ),
-            Attr(
+            attribute(
                 "bias",
                 "number",
                 "1",
@@ -383,11 +385,11 @@ CALIBRATION = Schema(
                     "(errors in variables)"
                 ),
             ),
-            Attr("read_noise", "number", "DN", "noise of a dark pixel"),
-            Attr("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            Attr("cfa", "text", "", "mono or four letters"),
-            Attr("units", "text", "", "DN or electron"),
-            Attr("exposure_s", "number", "s", "exposure to which F refers"),
+            attribute("read_noise", "number", "DN", "noise of a dark pixel"),
+            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
+            attribute("cfa", "text", "", "mono or four letters"),
+            attribute("units", "text", "", "DN or electron"),
+            attribute("exposure_s", "number", "s", "exposure to which F refers"),
             _NOTES,
         ),
     },
@@ -401,11 +403,11 @@ CALIBRATION = Schema(
 )
 
 SPECTRA = Schema(
-    "spectra",
-    1,
-    "Spectrum behind each lenslet.",
-    (
-        Field(
+    kind="spectra",
+    version=1,
+    doc="Spectrum behind each lenslet.",
+    fields=(
+        dataset(
             "spectra/value",
             "band lenslet_row lenslet_column",
             "f",
@@ -413,7 +415,7 @@ SPECTRA = Schema(
             "recovered radiance or reflectance",
             maskable=True,
         ),
-        Field(
+        dataset(
             "spectra/sigma",
             "band lenslet_row lenslet_column",
             "f",
@@ -423,7 +425,7 @@ SPECTRA = Schema(
             maskable=True,
             minimum=0,
         ),
-        Field(
+        dataset(
             "spectra/residual",
             "lenslet_row lenslet_column",
             "f",
@@ -433,14 +435,14 @@ SPECTRA = Schema(
             maskable=True,
             minimum=0,
         ),
-        Field("spectra/wavelength", "band", "f", "m", "band centres", minimum=0, ascending=True),
+        dataset("spectra/wavelength", "band", "f", "m", "band centres", minimum=0, ascending=True),
     ),
     attrs={
         "spectra": (
-            Attr("quantity", "text", "", "radiance or reflectance"),
-            Attr("method", "text", "", "how it was computed"),
-            Attr("reference", "text", "", "white reference, file name"),
-            Attr("parameters", "json", "", "settings of the method"),
+            attribute("quantity", "text", "", "radiance or reflectance"),
+            attribute("method", "text", "", "how it was computed"),
+            attribute("reference", "text", "", "white reference, file name"),
+            attribute("parameters", "json", "", "settings of the method"),
             _NOTES,
         )
     },
@@ -449,12 +451,12 @@ SPECTRA = Schema(
 )
 
 DICTIONARY = Schema(
-    "dictionary",
-    1,
-    "Dictionary of object patches learnt for one system matrix.",
-    (
-        Field("dictionary/atoms", "point atom", "f", "1", "patches, unit norm, one a column"),
-        Field(
+    kind="dictionary",
+    version=1,
+    doc="Dictionary of object patches learnt for one system matrix.",
+    fields=(
+        dataset("dictionary/atoms", "point atom", "f", "1", "patches, unit norm, one a column"),
+        dataset(
             "dictionary/synthesis",
             "point atom",
             "f",
@@ -462,7 +464,7 @@ DICTIONARY = Schema(
             "what paints the coefficients found with the atoms, if not the atoms",
             optional=True,
         ),
-        Field(
+        dataset(
             "dictionary/history/*",
             None,
             "f i b",
@@ -470,7 +472,7 @@ DICTIONARY = Schema(
             "value after each iteration",
             maskable=True,
         ),
-        Field(
+        dataset(
             "dictionary/state/*",
             None,
             "f i b",
@@ -481,36 +483,38 @@ DICTIONARY = Schema(
     ),
     attrs={
         "dictionary": (
-            Attr("delta", "number", "1", "weight of the term that keeps A times the atoms small"),
-            Attr("lambda", "number", "1", "weight of the l1 term"),
-            Attr(
+            attribute(
+                "delta", "number", "1", "weight of the term that keeps A times the atoms small"
+            ),
+            attribute("lambda", "number", "1", "weight of the l1 term"),
+            attribute(
                 "coherence_mutual", "number", "1", "largest |cosine| between a row of A and an atom"
             ),
-            Attr(
+            attribute(
                 "coherence_effective",
                 "number",
                 "1",
                 "largest |cosine| between two columns of A times the atoms",
             ),
-            Attr(
+            attribute(
                 "coherence_average",
                 "number",
                 "1",
                 "mean |cosine| between columns of A times the atoms",
             ),
-            Attr(
+            attribute(
                 "coherence_raw",
                 "number",
                 "1",
                 "largest |inner product| of a row of A and an atom, not normalised",
             ),
-            Attr("coherence_welch", "number", "1", "lower bound of the effective coherence"),
-            Attr("coherence", "json", "", "all coherence measures"),
-            Attr("object_shape", "number", "1", "points of an atom (rows, columns)"),
-            Attr("iterations", "number", "1", "iterations done"),
-            Attr("scale", "number", "1", "factor by which A was divided before learning"),
-            Attr("parameters", "json", "", "settings of the method"),
-            Attr("random_state", "json", "", "state of the random numbers for a resumed run"),
+            attribute("coherence_welch", "number", "1", "lower bound of the effective coherence"),
+            attribute("coherence", "json", "", "all coherence measures"),
+            attribute("object_shape", "number", "1", "points of an atom (rows, columns)"),
+            attribute("iterations", "number", "1", "iterations done"),
+            attribute("scale", "number", "1", "factor by which A was divided before learning"),
+            attribute("parameters", "json", "", "settings of the method"),
+            attribute("random_state", "json", "", "state of the random numbers for a resumed run"),
             _NOTES,
         )
     },
@@ -519,12 +523,12 @@ DICTIONARY = Schema(
 )
 
 IMAGE = Schema(
-    "image",
-    1,
-    "Reconstructed picture, linear.",
-    (
-        Field("image/value", "row column | band row column", "f", "1", "relative radiance"),
-        Field(
+    kind="image",
+    version=1,
+    doc="Reconstructed picture, linear.",
+    fields=(
+        dataset("image/value", "row column | band row column", "f", "1", "relative radiance"),
+        dataset(
             "image/sigma",
             "row column | band row column",
             "f",
@@ -533,7 +537,7 @@ IMAGE = Schema(
             optional=True,
             minimum=0,
         ),
-        Field(
+        dataset(
             "image/seen",
             "object_row object_column",
             "f",
@@ -545,7 +549,7 @@ IMAGE = Schema(
             optional=True,
             minimum=0,
         ),
-        Field(
+        dataset(
             "image/wavelength",
             "band",
             "f",
@@ -558,9 +562,9 @@ IMAGE = Schema(
     ),
     attrs={
         "image": (
-            Attr("method", "text", "", "how it was computed"),
-            Attr("parameters", "json", "", "settings of the method"),
-            Attr(
+            attribute("method", "text", "", "how it was computed"),
+            attribute("parameters", "json", "", "settings of the method"),
+            attribute(
                 "clipped",
                 "number",
                 "1",
@@ -574,11 +578,11 @@ IMAGE = Schema(
 )
 
 SWEEP = Schema(
-    "sweep",
-    1,
-    "Points of a design space, what each gave, and which of them no other beats.",
-    (
-        Field(
+    kind="sweep",
+    version=1,
+    doc="Points of a design space, what each gave, and which of them no other beats.",
+    fields=(
+        dataset(
             "sweep/parameter",
             "point parameter",
             "f",
@@ -586,7 +590,7 @@ SWEEP = Schema(
             "value of each key that varies; for one with choices its place in their list",
             maskable=True,
         ),
-        Field(
+        dataset(
             "sweep/metric",
             "point metric",
             "f",
@@ -595,7 +599,7 @@ SWEEP = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "sweep/status",
             "point",
             "i",
@@ -606,34 +610,36 @@ SWEEP = Schema(
             ),
             minimum=0,
         ),
-        Field(
+        dataset(
             "sweep/front",
             "point",
             "b",
             "1",
             "no other point is at least as good in all objectives and better in one",
         ),
-        Field("sweep/key", "point", "S", "", "SHA-256 of all that a point's figures depend on"),
+        dataset("sweep/key", "point", "S", "", "SHA-256 of all that a point's figures depend on"),
     ),
     attrs={
         "sweep": (
-            Attr("chain", "text", "", "stages that each point went through: spatial or spectral"),
-            Attr(
+            attribute(
+                "chain", "text", "", "stages that each point went through: spatial or spectral"
+            ),
+            attribute(
                 "parameters",
                 "json",
                 "",
                 "columns of parameter: key, unit, and choices where it has no number",
             ),
-            Attr("metrics", "json", "", "columns of metric: name and meaning"),
-            Attr(
+            attribute("metrics", "json", "", "columns of metric: name and meaning"),
+            attribute(
                 "objectives",
                 "json",
                 "",
                 "what the front compares: pairs of a metric or key, and max or min",
             ),
-            Attr("reasons", "json", "", "point -> why a stage refused it"),
-            Attr("notes", "json", "", "point -> what the stages said beside their results"),
-            Attr("description", "json", "", "the sweep file"),
+            attribute("reasons", "json", "", "point -> why a stage refused it"),
+            attribute("notes", "json", "", "point -> what the stages said beside their results"),
+            attribute("description", "json", "", "the sweep file"),
         )
     },
     plots={"sweep": ("metric", ())},
@@ -641,11 +647,14 @@ SWEEP = Schema(
 )
 
 LIGHTFIELD = Schema(
-    "lightfield",
-    1,
-    "One capture focused on several planes, its depth, and its views through parts of the pupil.",
-    (
-        Field(
+    kind="lightfield",
+    version=1,
+    doc=(
+        "One capture focused on several planes, its depth, and its views through parts of "
+        "the pupil."
+    ),
+    fields=(
+        dataset(
             "refocus/value",
             "plane point_row point_column",
             "f",
@@ -653,7 +662,7 @@ LIGHTFIELD = Schema(
             "radiance relative to white, `step` points a lenslet pitch",
             maskable=True,
         ),
-        Field(
+        dataset(
             "refocus/slope",
             "plane",
             "f",
@@ -661,7 +670,7 @@ LIGHTFIELD = Schema(
             "px that a plane's picture moves for each px of view; 0 is focused on the lenslets",
             ascending=True,
         ),
-        Field(
+        dataset(
             "refocus/distance",
             "plane",
             "f",
@@ -670,7 +679,7 @@ LIGHTFIELD = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "refocus/sharpness",
             "plane",
             "f",
@@ -678,7 +687,7 @@ LIGHTFIELD = Schema(
             "mean square gradient of each picture",
             minimum=0,
         ),
-        Field(
+        dataset(
             "depth/slope",
             "row column",
             "f",
@@ -687,7 +696,7 @@ LIGHTFIELD = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "depth/distance",
             "row column",
             "f",
@@ -696,7 +705,7 @@ LIGHTFIELD = Schema(
             optional=True,
             maskable=True,
         ),
-        Field(
+        dataset(
             "depth/confidence",
             "row column",
             "f",
@@ -705,7 +714,7 @@ LIGHTFIELD = Schema(
             optional=True,
             minimum=0,
         ),
-        Field(
+        dataset(
             "views/value",
             "view_row view_column row column",
             "f",
@@ -717,9 +726,9 @@ LIGHTFIELD = Schema(
     ),
     attrs={
         "refocus": (
-            Attr("pitch", "number", "px", "lenslet spacing"),
-            Attr("step", "number", "1", "points of a picture per pitch"),
-            Attr("pupil", "number", "px", "width of the pupil's image"),
+            attribute("pitch", "number", "px", "lenslet spacing"),
+            attribute("step", "number", "1", "points of a picture per pitch"),
+            attribute("pupil", "number", "px", "width of the pupil's image"),
             _NOTES,
         )
     },

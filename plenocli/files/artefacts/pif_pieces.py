@@ -2,12 +2,24 @@
 split into shards.
 """
 
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.files.artefacts.container import READING
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.diagnosis import Diagnosis
+    from plenocli.forward.propagation.plan import PifPlan
+    from plenocli.forward.propagation.system_matrix import SystemMatrix
 
 WHOLE_BYTES = 1 << 27
 """A matrix up to this size is held in memory while it is computed; larger ones go to
@@ -25,7 +37,7 @@ class Layout:
     groups: tuple | None = None
 
 
-def cost(plan):
+def cost(plan: PifPlan) -> tuple[bool, int]:
     """(whether it is written in pieces, bytes of memory) of a PifPlan's matrix
     within the budget of this process.
     """
@@ -35,7 +47,7 @@ def cost(plan):
     return streamed, (5 * slab if streamed else plan.bytes) + work
 
 
-def layout(plan, where):
+def layout(plan: PifPlan, where: object) -> Layout:
     """The Layout of a PifPlan's matrix within the budget of this process.
 
     NumericsError where not even one superpixel's part fits.
@@ -59,7 +71,16 @@ def layout(plan, where):
     )
 
 
-def stream_pif(camera, plan, output, chosen, finish, *, overwrite=False, progress=None):
+def stream_pif(
+    camera: Camera,
+    plan: PifPlan,
+    output: str | os.PathLike,
+    chosen: Layout,
+    finish: Callable[[SystemMatrix, Diagnosis], Artefact],
+    *,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[SystemMatrix, Diagnosis]:
     """Compute a matrix piece by piece into `output`; returns (SystemMatrix without A, its
     Diagnosis).
 

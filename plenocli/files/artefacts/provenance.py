@@ -3,30 +3,38 @@
 No clock, host, folder or user.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from plenocli.base.errors import InputError
 
 
 @dataclass
 class Provenance:
-    """`inputs`: role -> {"name": file name without folder, "sha256": hex};
-    `config`: resolved TOML text;
-    `accuracy`: JSON-able dict.
+    """Where a result came from.
+
+    command: that made it, without folders.
+    inputs: role -> {"name": file name without folder, "sha256": hex}.
+    seed: of the random numbers, or None.
+    config: resolved TOML text.
+    accuracy: JSON-able dict.
     """
 
     command: str
-    inputs: dict = field(default_factory=dict)
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
     seed: int | None = None
     config: str = ""
-    accuracy: dict = field(default_factory=dict)
+    accuracy: dict[str, Any] = field(default_factory=dict)
 
 
-def describe_inputs(roles):
+def describe_inputs(roles: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """Name and SHA-256 of each input file, for Provenance.inputs.
 
     roles: role -> path, or role -> sequence of paths (they become "role 1", "role 2", ...); a
@@ -49,7 +57,7 @@ def describe_inputs(roles):
 _TEXT = "plenocli:{}"
 
 
-def provenance_texts(provenance):
+def provenance_texts(provenance: Provenance) -> dict[str, str]:
     """The Provenance as text attributes of an EXR, name -> text; what is empty is left out."""
     texts = {
         "command": provenance.command,
@@ -64,7 +72,7 @@ def provenance_texts(provenance):
     return {_TEXT.format(name): text for name, text in texts.items() if text}
 
 
-def read_provenance_texts(attrs):
+def read_provenance_texts(attrs: Mapping[str, str]) -> Provenance:
     """The Provenance that `provenance_texts` put into the text attributes of an EXR; empty where
     they lack it or it is broken.
     """
@@ -81,7 +89,7 @@ def read_provenance_texts(attrs):
     return Provenance(found["command"], inputs, seed, found["config"], accuracy)
 
 
-def file_digest(path):
+def file_digest(path: str | os.PathLike) -> str:
     """SHA-256 of a file's bytes, hex. Raises InputError."""
     require_file(path)
     try:
@@ -93,7 +101,7 @@ def file_digest(path):
         ) from error
 
 
-def first_bytes(path, count):
+def first_bytes(path: str | os.PathLike, count: int) -> bytes:
     """The first `count` bytes of a file, or all of a shorter one. Raises InputError."""
     require_file(path)
     try:
@@ -105,7 +113,7 @@ def first_bytes(path, count):
         ) from error
 
 
-def require_file(path):
+def require_file(path: str | os.PathLike) -> int:
     """Raise InputError, saying which, unless `path` is an existing, non-empty, ordinary file.
 
     Returns its size in bytes.

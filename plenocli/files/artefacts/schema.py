@@ -5,10 +5,17 @@ themselves stand in `kinds`.
 `python -m plenocli.files.artefacts` prints them as a Markdown page.
 """
 
+from __future__ import annotations
+
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+
+Declared = Mapping[str, tuple[tuple[int, ...], Any]]
+"""Dataset path -> (shape, dtype), before there are values."""
 
 # Root attributes of every artefact, in the order in which they are shown.
 ROOT_ATTRIBUTES = {
@@ -23,12 +30,20 @@ ROOT_ATTRIBUTES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Field:
-    """One dataset. `dims` names the axes ("band row column"; a number is a fixed length;
-    alternatives are separated by "|"; None takes any shape), `dtype` lists what it may hold: f (f4
-    or f8), i (integers), b (true/false), S (short ASCII text). A path that ends in /* stands for
-    any number of datasets below that group.
+    """One dataset.
+
+    path: in the file; one that ends in /* stands for any number of datasets below that group.
+    dims: names of the axes ("band row column"); a number is a fixed length, alternatives are
+        separated by "|", None takes any shape.
+    dtype: what it may hold: f (f4 or f8), i (integers), b (true/false), S (short ASCII text).
+    unit, doc: for the file and for people.
+    optional: whether it may be left out.
+    maskable: whether NaN marks "not measured".
+    minimum: least value, or None.
+    ascending: whether each value is above the one before.
+    compress: whether it is stored in compressed chunks, not as one run of numbers.
     """
 
     path: str
@@ -37,21 +52,23 @@ class Field:
     unit: str
     doc: str
     optional: bool = False
-    maskable: bool = False  # NaN marks "not measured"
+    maskable: bool = False
     minimum: float | None = None
     ascending: bool = False
     compress: bool = True
 
-    def alternatives(self):
+    def alternatives(self) -> list[tuple[str, ...]] | None:
         """The allowed axis-name tuples, or None where any shape will do."""
         return None if self.dims is None else [tuple(part.split()) for part in self.dims.split("|")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Attr:
     """One attribute of a group or dataset.
 
-    `type`: number (one, or a short list), text, json or flag.
+    type: number (one, or a short list), text, json or flag.
+    unit, doc: for people.
+    finite: whether a number may not be infinite.
     """
 
     name: str
@@ -61,12 +78,15 @@ class Attr:
     finite: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Schema:
     """All that an artefact of one kind may hold.
 
-    `attrs` maps a group or dataset path to its Attrs (all may be left out); `plots` maps a group to
-    (signal dataset, names of its companions); `default` lists the groups to draw first.
+    kind, version, doc: name of the kind, version of this table, what it is.
+    fields: its datasets.
+    attrs: group or dataset path -> its attributes; all may be left out.
+    plots: group -> (signal dataset, names of its companions).
+    default: the groups to draw first.
     """
 
     kind: str
@@ -77,7 +97,7 @@ class Schema:
     plots: dict[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
     default: tuple[str, ...] = ()
 
-    def field_for(self, path):
+    def field_for(self, path: str) -> Field | None:
         """The Field that describes dataset `path`, or None."""
         for entry in self.fields:
             if entry.path == path or (
@@ -86,12 +106,22 @@ class Schema:
                 return entry
         return None
 
-    def attr_for(self, where, name):
+    def attr_for(self, where: str, name: str) -> Attr | None:
         """The Attr `name` of group or dataset `where`, or None."""
         return next((attr for attr in self.attrs.get(where, ()) if attr.name == name), None)
 
 
-def _dtype_fits(dtype, spec):
+def dataset(path: str, dims: str | None, dtype: str, unit: str, doc: str, **options: Any) -> Field:
+    """A Field, as the tables write it: its columns in this order, what is rare by name."""
+    return Field(path=path, dims=dims, dtype=dtype, unit=unit, doc=doc, **options)
+
+
+def attribute(name: str, type: str, unit: str, doc: str, *, finite: bool = True) -> Attr:
+    """An Attr, as the tables write it."""
+    return Attr(name=name, type=type, unit=unit, doc=doc, finite=finite)
+
+
+def _dtype_fits(dtype: Any, spec: str) -> bool:
     dtype = np.dtype(dtype)
     for code in spec.split():
         if code == "f" and dtype.kind == "f" and dtype.itemsize in (4, 8):
@@ -105,7 +135,9 @@ def _dtype_fits(dtype, spec):
     return False
 
 
-def _shape_problem(entry, shape, lengths):
+def _shape_problem(
+    entry: Field, shape: tuple[int, ...], lengths: dict[str, tuple[int, str]]
+) -> str | None:
     """Why `shape` does not fit the axes of `entry`, or None; `lengths` collects the length
     of each named axis.
     """
@@ -128,11 +160,12 @@ def _shape_problem(entry, shape, lengths):
     return None
 
 
-def declared_problems(schema, declared):
+def declared_problems(schema: Schema, declared: Declared) -> list[str]:
     """Every way in which `declared` (path -> (shape, dtype)) breaks the table, as a
     list of sentences.
     """
-    problems, lengths = [], {}
+    problems: list[str] = []
+    lengths: dict[str, tuple[int, str]] = {}
     for entry in schema.fields:
         if not entry.path.endswith("/*") and not entry.optional and entry.path not in declared:
             problems.append(f"dataset '{entry.path}' is missing ({entry.doc})")
@@ -154,11 +187,11 @@ def declared_problems(schema, declared):
     return problems
 
 
-def _known(schema):
+def _known(schema: Schema) -> str:
     return ", ".join(entry.path for entry in schema.fields)
 
 
-def value_problems(schema, data):
+def value_problems(schema: Schema, data: Mapping[str, np.ndarray]) -> list[str]:
     """Every way in which the values of `data` (path -> array) break the table: NaN, infinities,
     below minimum, order.
     """
@@ -183,7 +216,7 @@ def value_problems(schema, data):
     return problems
 
 
-def attribute_problems(schema, attrs):
+def attribute_problems(schema: Schema, attrs: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Every way in which `attrs` (path -> name -> value) breaks the table."""
     problems = []
     for where, named in attrs.items():
@@ -202,7 +235,7 @@ def attribute_problems(schema, attrs):
     return problems
 
 
-def _attribute_fits(attr, value):
+def _attribute_fits(attr: Attr, value: Any) -> bool:
     if attr.type == "text":
         return isinstance(value, str) and "\0" not in value
     if attr.type == "flag":
@@ -219,7 +252,7 @@ def _attribute_fits(attr, value):
     return bool(np.isfinite(values).all()) if attr.finite else not np.isnan(values).any()
 
 
-def plot_attributes(schema, declared):
+def plot_attributes(schema: Schema, declared: Declared) -> dict[str, dict[str, Any]]:
     """NXdata attributes for a file that holds `declared` (path -> (shape, dtype)): path -> name ->
     text, list or int.
 
@@ -248,7 +281,13 @@ def plot_attributes(schema, declared):
     return found
 
 
-def _plot_group(schema, group, signal, companions, declared):
+def _plot_group(
+    schema: Schema,
+    group: str,
+    signal: str,
+    companions: tuple[str, ...],
+    declared: Declared,
+) -> dict[str, Any]:
     """NXdata attributes of one group: axes are the datasets of the group whose single dimension
     names an axis of the signal.
     """
@@ -263,7 +302,7 @@ def _plot_group(schema, group, signal, companions, declared):
         for e in schema.fields
         if e.ascending and e.path in declared and e.path.rsplit("/", 1)[0] == group
     }
-    attrs = {"NX_class": "NXdata", "signal": signal}
+    attrs: dict[str, Any] = {"NX_class": "NXdata", "signal": signal}
     if shape:
         attrs["axes"] = [scales.get(dim, ".") for dim in dims]
     attrs |= {
@@ -275,7 +314,7 @@ def _plot_group(schema, group, signal, companions, declared):
     return attrs
 
 
-def axis_names(schema: Schema, declared: dict) -> dict[str, tuple[str, ...]]:
+def axis_names(schema: Schema, declared: Declared) -> dict[str, tuple[str, ...]]:
     """Name of the dimension scale of each axis: dataset path -> names in the dataset's group.
 
     schema: table of the kind.
@@ -298,7 +337,7 @@ def axis_names(schema: Schema, declared: dict) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _scale_of(schema, declared, group, dim):
+def _scale_of(schema: Schema, declared: Declared, group: str, dim: str) -> str:
     if dim.isdigit():
         return f"length_{dim}"
     own = (e.path for e in schema.fields if e.ascending and e.dims == dim and e.path in declared)
@@ -308,12 +347,12 @@ def _scale_of(schema, declared, group, dim):
     return f"{dim}_axis" if f"{group}/{dim}" in declared else dim
 
 
-def _long_name(path, entry):
+def _long_name(path: str, entry: Field) -> str:
     name = path.rsplit("/", 1)[1].replace("_", " ")
     return name if entry.unit in ("", "1") else f"{name} ({entry.unit})"
 
 
-def markdown(schemas):
+def markdown(schemas: Mapping[str, Schema]) -> str:
     """The tables of `schemas` (kind -> Schema) as one Markdown page."""
     lines = [
         "# Artefacts",

@@ -2,9 +2,14 @@
 superpixels, and an index of kind pif-index.
 """
 
+from __future__ import annotations
+
 import contextlib
+import os
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +21,7 @@ from plenocli.files.artefacts.stream import streamed_artefact
 from plenocli.files.atomic import check_output
 
 
-def shard_path(index, number):
+def shard_path(index: str | os.PathLike, number: int) -> Path:
     """Where shard `number` of the product at `index` stands: pif.h5 -> pif.000.h5."""
     index = Path(index)
     return index.with_name(f"{index.stem}.{number:03d}{index.suffix}")
@@ -29,7 +34,15 @@ class PifWriter:
     groups: the lenslets of each shard, or None for one file. Use `writing_pif`.
     """
 
-    def __init__(self, path, shape, dtype, groups, stack, overwrite):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        shape: tuple[int, ...],
+        dtype: Any,
+        groups: Sequence[Sequence[int]] | None,
+        stack: contextlib.ExitStack,
+        overwrite: bool,
+    ) -> None:
         self.path, self._groups, self._overwrite = Path(path), groups, overwrite
         self.files = (
             [self.path] if groups is None else [shard_path(path, n) for n in range(len(groups))]
@@ -56,18 +69,18 @@ class PifWriter:
             )
         self._energy = np.zeros((len(self.files), shape[0], shape[3]))
 
-    def put(self, band, lenslet, slab):
+    def put(self, band: int, lenslet: int, slab: np.ndarray) -> None:
         """Write A (pixel, point) of one band and superpixel."""
         file, place = self._home[lenslet]
         self._streams[file].put((band, place), slab)
         self._energy[file, band] += slab.sum(axis=0, dtype=float)
 
     @property
-    def energy(self):
+    def energy(self) -> np.ndarray:
         """Column energies (band, point) of all that was put."""
         return self._energy.sum(axis=0)
 
-    def close(self, artefact):
+    def close(self, artefact: Artefact) -> None:
         """Seal all files with what `artefact`, of kind pif, holds beside A."""
         if self._groups is None:
             self._streams[0].close(artefact)
@@ -90,7 +103,7 @@ class PifWriter:
             stream.close(Artefact("pif", data, {"pif": attrs}, artefact.provenance))
         self._index = artefact
 
-    def index(self):
+    def index(self) -> None:
         """Write the index, once the shards stand under their names."""
         if self._groups is None:
             return
@@ -110,7 +123,14 @@ class PifWriter:
 
 
 @contextlib.contextmanager
-def writing_pif(path, shape, dtype, *, groups=None, overwrite=False):
+def writing_pif(
+    path: str | os.PathLike,
+    shape: tuple[int, ...],
+    dtype: Any,
+    *,
+    groups: Sequence[Sequence[int]] | None = None,
+    overwrite: bool = False,
+) -> Iterator[PifWriter]:
     """Yield a PifWriter; all files appear when the block ends well, the index last.
 
     After a failure no new file is left.
@@ -132,7 +152,7 @@ def writing_pif(path, shape, dtype, *, groups=None, overwrite=False):
         raise
 
 
-def read_pif(path):
+def read_pif(path: str | os.PathLike) -> Artefact:
     """The Artefact of kind pif at `path`; that of an index with its shards put together.
 
     Errors as read_artefact.
@@ -153,7 +173,9 @@ def read_pif(path):
     return Artefact("pif", data | {"pif/A": A}, {"pif": attrs}, artefact.provenance)
 
 
-def pif_parts(path, artefact=None):
+def pif_parts(
+    path: str | os.PathLike, artefact: Artefact | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The matrix of a pif or pif-index shard by shard: yields (lenslet numbers, A of these (band,
     lenslet, pixel, point)).
 

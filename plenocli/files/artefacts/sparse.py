@@ -2,8 +2,12 @@
 datasets go to the disk by themselves.
 """
 
+from __future__ import annotations
+
 import io
 import os
+from collections.abc import Iterator
+from typing import Any
 
 PAGE = 1 << 12
 
@@ -11,28 +15,29 @@ PAGE = 1 << 12
 class SparseFile(io.RawIOBase):
     """A seekable file of any size; pages never written read as zeros and cost nothing."""
 
-    def __init__(self):
-        self.pages, self.size, self._place = {}, 0, 0
+    def __init__(self) -> None:
+        self.pages: dict[int, bytearray] = {}
+        self.size, self._place = 0, 0
 
-    def readable(self):
+    def readable(self) -> bool:
         return True
 
     writable = seekable = readable
 
-    def tell(self):
+    def tell(self) -> int:
         return self._place
 
-    def seek(self, offset, whence=os.SEEK_SET):
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         self._place = (
             offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
         )
         return self._place
 
-    def truncate(self, size=None):
+    def truncate(self, size: int | None = None) -> int:
         self.size = self._place if size is None else size
         return self.size
 
-    def write(self, data):
+    def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
         for page, inside, part in self._parts(len(view)):
             self.pages.setdefault(page, bytearray(PAGE))[inside : inside + len(view[part])] = view[
@@ -42,7 +47,7 @@ class SparseFile(io.RawIOBase):
         self.size = max(self.size, self._place)
         return len(view)
 
-    def readinto(self, buffer):
+    def readinto(self, buffer: Any) -> int:
         view = memoryview(buffer).cast("B")
         view = view[: max(0, min(len(view), self.size - self._place))]
         for page, inside, part in self._parts(len(view)):
@@ -53,7 +58,7 @@ class SparseFile(io.RawIOBase):
         self._place += len(view)
         return len(view)
 
-    def _parts(self, length):
+    def _parts(self, length: int) -> Iterator[tuple[int, int, slice]]:
         """(page, place in it, slice of the data) of `length` bytes from the current place."""
         done = 0
         while done < length:
@@ -62,7 +67,7 @@ class SparseFile(io.RawIOBase):
             yield page, inside, slice(done, done + step)
             done += step
 
-    def extents(self):
+    def extents(self) -> Iterator[tuple[int, memoryview]]:
         """(offset, bytes) of all that was written, ascending, cut at the size."""
         for page in sorted(self.pages):
             yield page * PAGE, memoryview(self.pages[page])[: max(0, self.size - page * PAGE)]

@@ -2,11 +2,16 @@
 been held in memory.
 """
 
+from __future__ import annotations
+
 import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from plenocli.files.artefacts.container import HEADER_BYTES, Frame, _frame, seal
+from plenocli.files.artefacts.container import HEADER_BYTES, Artefact, Frame, _frame, seal
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.atomic import replacement, write_at
 
@@ -16,7 +21,9 @@ class Stream:
     that comes in pieces.
     """
 
-    def __init__(self, descriptor, kind, name, shape, dtype):
+    def __init__(
+        self, descriptor: int, kind: str, name: str, shape: tuple[int, ...], dtype: Any
+    ) -> None:
         self.name, self.shape, self.dtype = name, tuple(shape), np.dtype(dtype)
         self._descriptor, self._entry = descriptor, SCHEMAS[kind].field_for(name)
         # the frame is known only at the end, but raw datasets come first in it
@@ -26,7 +33,7 @@ class Stream:
         self._missing = int(np.prod(self.shape))
         self._closed = False
 
-    def put(self, index, values):
+    def put(self, index: tuple[int, ...], values: np.ndarray) -> None:
         """Write the part of the dataset at `index`, whole numbers for its leading axes.
 
         ValueError where the table forbids the values.
@@ -46,7 +53,7 @@ class Stream:
         write_at(self._descriptor, self._offset + start * self.dtype.itemsize, values)
         self._missing -= values.size
 
-    def close(self, artefact):
+    def close(self, artefact: Artefact) -> None:
         """Add everything else, an Artefact without the streamed dataset, and seal the file.
 
         ValueError as write_artefact.
@@ -66,7 +73,15 @@ class Stream:
 
 
 @contextlib.contextmanager
-def streamed_artefact(path, kind, name, shape, dtype, *, overwrite=False):
+def streamed_artefact(
+    path: str | os.PathLike,
+    kind: str,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: Any,
+    *,
+    overwrite: bool = False,
+) -> Iterator[Stream]:
     """Yield a Stream into an artefact that appears at `path` when the block ends well, after
     `close`; errors as write_artefact.
     """

@@ -2,6 +2,11 @@
 the rest declares.
 """
 
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
 import h5py
 import numpy as np
 from h5py import h5d, h5ds, h5l, h5t, h5z
@@ -24,7 +29,7 @@ _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
 
 
-def survey(path, file):
+def survey(path: Path, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
     Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
@@ -32,7 +37,9 @@ def survey(path, file):
     floats, true/false and fixed-length text, and what does not fit the
     memory of this process, as Budget.require_declared. Reads no dataset.
     """
-    declared, seen, total = {}, set(), 0
+    declared: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    seen: set[int] = set()
+    total = 0
     stack = [
         ("", file.id if isinstance(file.id, h5py.h5g.GroupID) else h5py.h5g.open(file.id, b"/"), 0)
     ]
@@ -66,7 +73,7 @@ def survey(path, file):
     return dict(sorted(declared.items()))
 
 
-def _text(path, name):
+def _text(path: Path, name: bytes) -> str:
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -77,13 +84,13 @@ def _text(path, name):
         ) from error
 
 
-def _check_link(path, group, link, child):
+def _check_link(path: Path, group: Any, link: bytes, child: str) -> None:
     kind = group.links.get_info(link).type
     if kind != h5l.TYPE_HARD:
         raise InputError(f"'/{child}' is {_LINKS.get(kind, 'a user-defined')} link", path, _FIX)
 
 
-def _declaration(path, dataset, name):
+def _declaration(path: Path, dataset: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
     properties = dataset.get_create_plist()
     if properties.get_external_count() > 0:
         raise InputError(f"'/{name}' keeps its data in another file (external storage)", path, _FIX)
@@ -105,7 +112,7 @@ def _declaration(path, dataset, name):
     return tuple(dataset.shape), np.dtype(dataset.dtype)
 
 
-def _check_type(path, kind, where):
+def _check_type(path: Path, kind: Any, where: str) -> None:
     allowed = (
         kind.get_class() in (h5t.INTEGER, h5t.FLOAT)
         or (kind.get_class() == h5t.STRING and not kind.is_variable_str())
@@ -117,7 +124,7 @@ def _check_type(path, kind, where):
         )
 
 
-def _check_attributes(path, target, where):
+def _check_attributes(path: Path, target: Any, where: str) -> None:
     for position in range(h5py.h5a.get_num_attrs(target)):
         attribute = h5py.h5a.open(target, index=position)
         label = f"{where}@{_text(path, attribute.name)}"
@@ -148,12 +155,12 @@ def _is_empty_axis(dataset):
     return h5ds.get_scale_name(dataset).startswith(EMPTY_AXIS.encode())
 
 
-def attribute_names(target):
+def attribute_names(target: Any) -> list[str]:
     """Names of the attributes of an h5py group or dataset but those of dimension scales, sorted."""
     return sorted(set(target.attrs) - _AXIS_ATTRIBUTES)
 
 
-def read_attribute(path, target, name):
+def read_attribute(path: Path, target: Any, name: str) -> Any:
     """One attribute as text, list of texts, Python number, bool or numpy array."""
     value = target.attrs[name]
     if isinstance(value, np.ndarray) and value.ndim == 0:

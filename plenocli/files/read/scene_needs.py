@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.files.read.scenes import read_scene
-from plenocli.forward.accuracy.needs import Needs
+from plenocli.forward.accuracy.scene_needs import SceneNeeds
 from plenocli.forward.scene.scenes import Cube
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ DARK = 1e-6
 """Lenslets whose part of the picture is below this share of its peak see no light."""
 
 
-def read_needs(name: str | Path, camera: Camera) -> Needs:
+def read_needs(name: str | Path, camera: Camera) -> SceneNeeds:
     """What a scene requires of the camera model.
 
     name: of a scene .toml, or whatever read_scene takes, whose bands and extent then count.
@@ -31,8 +31,10 @@ def read_needs(name: str | Path, camera: Camera) -> Needs:
     from plenocli.files.config.scene_file import load_scene
 
     scene = load_scene(name)
-    found = _from_picture(Path(name).parent / scene.picture, camera) if scene.picture else Needs()
-    return Needs(
+    found = (
+        _from_picture(Path(name).parent / scene.picture, camera) if scene.picture else SceneNeeds()
+    )
+    return SceneNeeds(
         depth=scene.depth,
         spectrum=found.spectrum if scene.spectrum is None else scene.spectrum,
         lenslets=found.lenslets if scene.lenslets is None else scene.lenslets,
@@ -41,7 +43,7 @@ def read_needs(name: str | Path, camera: Camera) -> Needs:
     )
 
 
-def _from_picture(name: str | Path, camera: Camera) -> Needs:
+def _from_picture(name: str | Path, camera: Camera) -> SceneNeeds:
     """Extent in lenslets and, of a spectral picture, the wavelengths between which it has light."""
     scene = read_scene(str(name), spectral=True)
     count = camera.lenslet_array.count
@@ -57,10 +59,10 @@ def _from_picture(name: str | Path, camera: Camera) -> Needs:
     )
     peak = planes.max()
     if peak <= 0:
-        return Needs(lenslets=(1, 1))
+        return SceneNeeds(lenslets=(1, 1))
     lit = (planes > DARK * peak).any(axis=0)
     rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
-    found = Needs(lenslets=(int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1)))
+    found = SceneNeeds(lenslets=(int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1)))
     if isinstance(scene, Cube):
         with_light = np.asarray(wavelengths)[planes.max(axis=(1, 2)) > DARK * peak]
         step = np.diff(wavelengths).max() / 2 if len(wavelengths) > 1 else 0.0

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import NumericsError, UsageError
-from plenocli.forward.accuracy.needs import seen_wavelengths, sensor_noise, visible_accuracy
-from plenocli.forward.accuracy.rates import product_rate
+from plenocli.forward.accuracy.machine_rate import product_rate
+from plenocli.forward.accuracy.scene_needs import seen_wavelengths, sensor_noise, visible_accuracy
 from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.camera.geometry import lenslet_shift
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
@@ -28,7 +28,7 @@ from plenocli.forward.propagation.sampling import (
 from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
 
 if TYPE_CHECKING:
-    from plenocli.forward.accuracy.needs import Needs
+    from plenocli.forward.accuracy.scene_needs import SceneNeeds
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.models import Model
@@ -76,7 +76,7 @@ def plan_pif(
     model: str = "auto",
     dtype: np.typing.DTypeLike = "auto",
     points: slice | None = None,
-    needs: Needs | None = None,
+    needs: SceneNeeds | None = None,
     lenslet: tuple[int, int] | None = None,
 ) -> PifPlan:
     """Choose how to compute a system matrix; no optics is computed.
@@ -129,7 +129,7 @@ class _Request:
         model: str,
         dtype: np.typing.DTypeLike,
         points: slice | None,
-        needs: Needs | None,
+        needs: SceneNeeds | None,
         lenslet: tuple[int, int] | None,
     ) -> None:
         if model not in KINDS:

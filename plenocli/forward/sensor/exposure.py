@@ -217,12 +217,12 @@ def _request(options: ExposureOptions) -> dict[str, Any]:
     """What the dial is asked: with --snr its noise stands in for the sensor's where no
     accuracy is named.
     """
-    from plenocli.forward.accuracy.needs import Needs
+    from plenocli.forward.accuracy.scene_needs import SceneNeeds
 
     needs = (
         None
         if options.snr_db is None or options.accuracy is not None
-        else Needs(noise=10 ** (-options.snr_db / 20), source="--snr")
+        else SceneNeeds(noise=10 ** (-options.snr_db / 20), source="--snr")
     )
     return dict(
         superpixels=options.superpixels,

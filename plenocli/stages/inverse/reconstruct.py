@@ -30,7 +30,7 @@ from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruct
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
-    from plenocli.forward.accuracy.limits import Limits
+    from plenocli.forward.accuracy.limiting_error import Limits
     from plenocli.inverse.prior.natural_images import TrainingPicture
 
 
@@ -466,7 +466,7 @@ def _limits(
     is expected to cost; None where that is not known.
     """
     from plenocli.files.artefacts.provenance import file_digest
-    from plenocli.forward.accuracy.limits import what_limits
+    from plenocli.forward.accuracy.limiting_error import what_limits
 
     system = estimators.system
     signal = float(np.sqrt(np.mean(np.square(data.y))))

@@ -12,7 +12,7 @@ from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy import dial
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.accuracy.explain import _duration, candidates, expectation, explain
-from plenocli.forward.accuracy.needs import Needs, sensor_noise
+from plenocli.forward.accuracy.scene_needs import SceneNeeds, sensor_noise
 from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.sampling import size_band
 from tests.forward.propagation.cameras import small_camera
@@ -108,10 +108,10 @@ def test_default_accuracy_is_what_noise_lets_be_seen(ladder):
     camera = small_camera()
     assert plan_pif(camera).accuracy == pytest.approx(0.3 * sensor_noise(camera))
     assert sensor_noise(camera) == pytest.approx(math.sqrt(15000 + 16) / 15000)
-    quiet = plan_pif(camera, needs=Needs(noise=1e-2, source="night.toml"))
+    quiet = plan_pif(camera, needs=SceneNeeds(noise=1e-2, source="night.toml"))
     assert quiet.accuracy == pytest.approx(3e-3) and "night.toml" in quiet.asked_by
     # a finer accuracy asked for is not computed where noise hides it, and the plan says so
-    hidden = plan_pif(camera, accuracy=1e-4, needs=Needs(noise=0.1, source="night.toml"))
+    hidden = plan_pif(camera, accuracy=1e-4, needs=SceneNeeds(noise=0.1, source="night.toml"))
     assert hidden.accuracy == pytest.approx(0.03) and any(
         "hides" in text for text in hidden.left_out
     )
@@ -178,12 +178,14 @@ def test_what_too_many_terms_refuse_may_be_had_coarser(monkeypatch):
 
 def test_a_scene_narrows_the_model(ladder):
     camera = small_camera(light__wavelengths=(450e-9, 550e-9, 650e-9))
-    plan = plan_pif(camera, accuracy=1e-2, needs=Needs(spectrum=(500e-9, 700e-9), lenslets=(1, 2)))
+    plan = plan_pif(
+        camera, accuracy=1e-2, needs=SceneNeeds(spectrum=(500e-9, 700e-9), lenslets=(1, 2))
+    )
     assert [b.wavelength for b in plan.bands] == [550e-9, 650e-9]
     assert any("1 wavelength" in text for text in plan.left_out) and any(
         "7 of 9 lenslets" in text for text in plan.left_out
     )
-    near = plan_pif(camera, accuracy=1e-2, needs=Needs(depth=(0.45, 0.55)))
+    near = plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(depth=(0.45, 0.55)))
     assert (
         near.superpixels
         == plan_pif(camera.replace(**{"object.distance": 0.45}), accuracy=1e-2).superpixels
@@ -191,7 +193,9 @@ def test_a_scene_narrows_the_model(ladder):
     )
     assert near.bands[0].window >= max(near.superpixels) // 2 + 1
     # light outside the camera's wavelengths changes nothing
-    assert len(plan_pif(camera, accuracy=1e-2, needs=Needs(spectrum=(900e-9, 1e-6))).bands) == 3
+    assert (
+        len(plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(spectrum=(900e-9, 1e-6))).bands) == 3
+    )
 
 
 def test_double_precision_and_storage_follow_the_accuracy(ladder):

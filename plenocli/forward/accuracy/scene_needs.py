@@ -20,7 +20,7 @@ total: it cannot be seen.
 
 
 @dataclass(frozen=True, kw_only=True)
-class Needs:
+class SceneNeeds:
     """What is known of a scene; None where it is not.
 
     depth: nearest and farthest distance (m) to the main lens;
@@ -55,7 +55,7 @@ def visible_accuracy(noise: float) -> float:
 
 
 def seen_wavelengths(
-    wavelengths: Sequence[float], needs: Needs | None
+    wavelengths: Sequence[float], needs: SceneNeeds | None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Part wavelengths into those that the scene has light at and others.
 

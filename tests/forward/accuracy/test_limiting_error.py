@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from plenocli.forward.accuracy.dial import plan_pif
-from plenocli.forward.accuracy.limits import what_limits
+from plenocli.forward.accuracy.limiting_error import what_limits
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from tests.forward.propagation.cameras import small_camera
 

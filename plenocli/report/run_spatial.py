@@ -141,6 +141,7 @@ def add_capture(page: Page, run: RunFolder, file: RunFile) -> None:
     made with.
     """
     from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.read.calibrations import calibration_of
     from plenocli.report.figures import capture_figures
 
     try:
@@ -156,7 +157,7 @@ def add_capture(page: Page, run: RunFolder, file: RunFile) -> None:
     beside = (run.source_of_kind(user, "calibration") for user in users)
     calibration = next(made, None) or next((one for one in beside if one), None)
     if centres is None and calibration is not None:
-        centres = calibration.artefact().data.get("grid/centre")
+        centres = calibration_of(calibration.artefact()).grid.centres
     page.figures(capture_figures(capture, file.name, centres))
 
 

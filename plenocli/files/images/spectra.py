@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,11 @@ from plenocli.inverse.spectra.spectra import Spectra
 
 
 def write_spectra(
-    path: str | os.PathLike[str],
+    path: str | Path,
     spectra: Spectra,
     provenance: Provenance,
     *,
-    reference: str | os.PathLike[str] | None = None,
+    reference: str | Path | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write spectra: an artefact where `path` ends in .h5, else a spectral EXR.
@@ -52,10 +51,10 @@ def _parameters(spectra: Spectra) -> dict[str, Any]:
 
 
 def _write_artefact(
-    path: str | os.PathLike[str],
+    path: str | Path,
     spectra: Spectra,
     provenance: Provenance,
-    reference: str | os.PathLike[str] | None,
+    reference: str | Path | None,
     overwrite: bool,
 ) -> None:
     attrs = {
@@ -75,9 +74,7 @@ def _write_artefact(
     )
 
 
-def _write_exr(
-    path: str | os.PathLike[str], spectra: Spectra, provenance: Provenance, overwrite: bool
-) -> None:
+def _write_exr(path: str | Path, spectra: Spectra, provenance: Provenance, overwrite: bool) -> None:
     from plenocli.forward.scene.colour import preview_rgb
 
     value, sigma = spectra.value.astype(np.float32), spectra.sigma.astype(np.float32)
@@ -117,7 +114,7 @@ class Origin:
     registered: bool
 
 
-def read_origin(path: str | os.PathLike[str]) -> Origin:
+def read_origin(path: str | Path) -> Origin:
     """How the spectra of a file came about.
 
     Raises InputError, KeyError, TypeError or ValueError where the file does not say it.

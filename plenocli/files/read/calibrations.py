@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ WHITE_IMAGE = ("white/flat", "white/level")
 
 
 def read_calibration(
-    path: str | os.PathLike[str],
+    path: str | Path,
     *,
     needs: tuple[str, ...] = (),
     response: bool = True,
@@ -85,7 +85,7 @@ def calibration_of(artefact: Artefact, *, response: bool = True) -> Calibration:
 
 
 def write_calibration(
-    path: str | os.PathLike[str],
+    path: str | Path,
     calibration: Calibration,
     provenance: Provenance,
     *,
@@ -126,7 +126,7 @@ def write_calibration(
 # --- reading --------------------------------------------------------------------------------------
 
 
-def _lacks(name: str, path: str | os.PathLike[str]) -> InputError:
+def _lacks(name: str, path: str | Path) -> InputError:
     if name == "response/F":
         return InputError(
             "holds no response F, only the lenslet grid", path, "calibrate with --band captures"

@@ -4,8 +4,8 @@ an even object in each band. docs/model.md, "The response predicted".
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE, WHITE_
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.propagation.sampling import PifPlan
+    from plenocli.forward.propagation.plan import PifPlan
     from plenocli.forward.scene.light import Quadrature
     from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
 
@@ -99,7 +99,7 @@ class ResponsePrediction:
         camera: Camera,
         options: PredictionOptions,
         kinds: SuperpixelKinds,
-        where: str | os.PathLike[str],
+        where: str | Path,
     ) -> None:
         self.camera, self.options, self.kinds = camera, options, kinds
         asked = "fresnel" if options.model == "auto" else options.model
@@ -183,7 +183,7 @@ class ResponsePrediction:
 
         camera, kinds = self.camera, self.kinds
         letters, efficiency = sensitivity(camera, source.wavelengths)
-        light = 0.0
+        light: Any = 0.0
         for index, wavelength in enumerate(source.wavelengths):
             photons = source.photons[index] * efficiency[:, index]
             light = light + photons[:, None, None] * self.at(wavelength)[None]
@@ -214,7 +214,7 @@ class ResponsePrediction:
         """What is recorded of F in `bands` (m), once it was computed."""
         against = self._rays_against_waves(bands)
         model = self.model if self.plan is None else self.plan.model
-        apart = np.zeros(len(bands))
+        apart = [0.0] * len(bands)
         if model == "ray":
             apart = [RAYS_ERR] * len(bands) if against is None else against
         return PredictionNotes(

@@ -5,7 +5,7 @@ description.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from plenocli.forward.sensor import superpixel
 from plenocli.forward.sensor.frames import Dark
 from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,16 @@ class Calibration:
     response: Response | None = None
 
 
+def there(part: T | None) -> T:
+    """A part of a calibration that its reader made sure of.
+
+    Raises ValueError where it is missing, which is a mistake of the caller.
+    """
+    if part is None:
+        raise ValueError("the calibration lacks a part that is needed")
+    return part
+
+
 class MadeResponses(Protocol):
     """Responses (lenslet_row, lenslet_column, pixel, band) that are made lenslet by lenslet, and
     never held whole: plenocli.inverse.registration.moved_response.
@@ -205,4 +217,4 @@ class MadeResponses(Protocol):
     shape: tuple[int, ...]
     ndim: int
 
-    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray: ...
+    def __getitem__(self, places: Any) -> np.ndarray: ...

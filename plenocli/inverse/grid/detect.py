@@ -24,6 +24,10 @@ STRUCTURED = 0.2
 """Correlation half a step away, over that of a whole step, above which superpixels hold several
 bright parts.
 """
+LONGEST_SIDE = 1.3
+"""Of a cell's shorter side, that its longer one may be."""
+SCATTER = 0.07
+"""Of the pitch, by which spots may scatter (rms) about the best grid."""
 BORDER_WEIGHT = 0.1
 """Of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it."""
 FRAME_TOLERANCE = 0.4
@@ -61,14 +65,35 @@ def find_grid(
     mosaic = prepare(white, cfa, dark)
     # what is left of the 2x2 pattern goes
     image = mosaic if cfa == "mono" else template.smoothed(mosaic)
-    found = lattice.find_basis(_brightest_crop(image, crop))
+    basis, kind, structured = _basis(_brightest_crop(image, crop), lattice_kind)
+    pitch = float(np.hypot(*basis.T).min())
+    index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
+    inside = _whole(position, image.shape, 0.5 * pitch) & clean
+    model, weight = _first_model(index, position, inside, kind, pitch)
+    position[inside], _ = template.register(
+        mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured
+    )
+    model, _ = distortion.choose_model(index[inside], position[inside], weight)
+    lit = None
+    if structured and kind == "square":
+        moved = _to_dark_borders(image, model, index[inside], pitch, near)
+        position = position + moved.at(index) - model.at(index)
+        model, lit = moved, _lit_cells(image, moved)
+    miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
+    return _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
+
+
+def _basis(image: np.ndarray, lattice_kind: str) -> tuple[np.ndarray, str, bool]:
+    """(lattice vectors [down, right], kind of lattice, whether superpixels hold several bright
+    parts).
+    """
+    found = lattice.find_basis(image)
     if found.basis is None:
         raise NumericsError(f"no lenslet lattice in the image: {found.reason}", fix=FIX)
-    basis, structured = found.basis, found.structure > STRUCTURED
-    kind = lattice.kind_of(basis) if lattice_kind == "auto" else lattice_kind
-    basis = lattice.oriented(basis, kind)
+    kind = lattice.kind_of(found.basis) if lattice_kind == "auto" else lattice_kind
+    basis = lattice.oriented(found.basis, kind)
     sides = np.hypot(*basis.T)
-    if sides.max() > 1.3 * sides.min():
+    if sides.max() > LONGEST_SIDE * sides.min():
         raise NumericsError(
             (
                 f"no lenslet lattice in the image: it repeats every {sides[0]:.1f} by "
@@ -76,9 +101,13 @@ def find_grid(
             ),
             fix=FIX,
         )
-    pitch = float(np.hypot(*basis.T).min())
-    index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
-    inside = _whole(position, image.shape, 0.5 * pitch) & clean
+    return basis, kind, found.structure > STRUCTURED
+
+
+def _first_model(
+    index: np.ndarray, position: np.ndarray, inside: np.ndarray, kind: str, pitch: float
+) -> tuple[GridModel, np.ndarray]:
+    """(map through the centroids of the sites inside the frame, weights of those sites)."""
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
             (
@@ -91,7 +120,7 @@ def find_grid(
     few = slice(None, None, -(-int(inside.sum()) // distortion.ENOUGH))
     model, _ = distortion.choose_model(index[inside][few], position[inside][few], weight[few])
     miss = np.hypot(*(position - model.at(index)).T)
-    if np.sqrt(np.mean(miss[inside] ** 2)) > 0.07 * pitch:
+    if np.sqrt(np.mean(miss[inside] ** 2)) > SCATTER * pitch:
         raise NumericsError(
             (
                 f"no lenslet lattice in the image: spots {pitch:.1f} px apart scatter by "
@@ -99,17 +128,7 @@ def find_grid(
             ),
             fix=FIX,
         )
-    position[inside], _ = template.register(
-        mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured
-    )
-    model, _ = distortion.choose_model(index[inside], position[inside], weight)
-    lit = None
-    if structured and kind == "square":
-        moved = _to_dark_borders(image, model, index[inside], pitch, near)
-        position = position + moved.at(index) - model.at(index)
-        model, lit = moved, _lit_cells(image, moved)
-    miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
-    return _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
+    return model, weight
 
 
 def prepare(

@@ -146,8 +146,8 @@ def oriented(basis: np.ndarray, kind: str) -> np.ndarray:
     kind: "square" or "hexagonal".
     """
     a, b = reduced(basis)
-    short = [a, b, a - b] if kind == "hexagonal" else [a, b]
-    short = np.array(short + [-v for v in short])
+    shortest = [a, b, a - b] if kind == "hexagonal" else [a, b]
+    short = np.array(shortest + [-v for v in shortest])
     right = short[np.argmax(short[:, 1] / np.hypot(*short.T))]
     turn = np.degrees(np.arctan2(short[:, 0], short[:, 1]) - np.arctan2(*right))
     wanted = 60.0 if kind == "hexagonal" else 90.0

@@ -4,8 +4,8 @@ calibration does not know.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,7 +90,7 @@ def align(
     signal: Readout | np.ndarray,
     noise: Noise | None,
     mode: str,
-    path: str | os.PathLike[str],
+    path: str | Path,
     levels: bool = True,
 ) -> Aligned:
     """The responses moved to where the lenslets of a capture are.
@@ -132,21 +132,28 @@ def align(
             path,
             "calibrate again, or use --register off",
         )
-    corrected = []
-    if motion.after < motion.before and (mode == "on" or motion.moved):
-        corrected.append("motion")
-    dark = noise.sigma if noise is not None else 0.0
-    levels = levels and not lost and not c.calibration.response.predicted
-    if levels and motion.lifted and (mode == "on" or abs(motion.offset) > LEAST_OFFSET * dark):
-        corrected.append("offset")
-    if levels and motion.strayed:
-        corrected.append("stray light")
+    levels = levels and not lost and not c.predicted
+    corrected = _what_to_correct(motion, noise, mode == "on", levels)
     if "motion" in corrected:
         c = moved_with(c, motion)
     if "offset" in corrected:
         signal = signal - float(np.float32(motion.offset))
     stray = even_light(c.window, c.cfa) if "stray light" in corrected else None
-    return Aligned(c, signal, stray, Registration(tuple(corrected), motion))
+    return Aligned(c, signal, stray, Registration(corrected, motion))
+
+
+def _what_to_correct(
+    motion: Motion, noise: Noise | None, asked: bool, levels: bool
+) -> tuple[str, ...]:
+    """What deserves a correction; asked: even by no more than chance."""
+    dark = noise.sigma if noise is not None else 0.0
+    large = abs(motion.offset) > LEAST_OFFSET * dark
+    deserves = {
+        "motion": motion.after < motion.before and (asked or motion.moved),
+        "offset": levels and motion.lifted and (asked or large),
+        "stray light": levels and motion.strayed,
+    }
+    return tuple(name for name, wanted in deserves.items() if wanted)
 
 
 def moved_with(c: LensletResponses, motion: Motion) -> LensletResponses:
@@ -232,7 +239,7 @@ def believed(residual: np.ndarray | None, plain: np.ndarray | None) -> bool:
 
 
 def warn_of_misfit(
-    residual: np.ndarray | None, registration: Registration | None, path: str | os.PathLike[str]
+    residual: np.ndarray | None, registration: Registration | None, path: str | Path
 ) -> str | None:
     """Warn where the calibration does not describe the capture.
 

@@ -102,7 +102,8 @@ class Reference:
                 ]
             ),
         )
-        self._smooth, self._still = {}, {}
+        self._smooth: dict[Any, np.ndarray] = {}
+        self._still: dict[Any, np.ndarray] = {}
         self._lock = threading.Lock()
 
     def _clean(self, response: np.ndarray) -> np.ndarray:

@@ -136,15 +136,7 @@ def demultiplex(
     condition number above 1e10.
     Raises NumericsError where wls or lmmse lack the variance, or lmmse the prior.
     """
-    if method not in METHODS:
-        raise ValueError(f"unknown method {method!r}")
-    if variance is None and method in ("wls", "lmmse"):
-        raise NumericsError(
-            f"{method} weighs pixels by their noise, which is not known",
-            fix="give the sensor's gain and read noise (--camera) or use pinv",
-        )
-    if method == "lmmse" and prior is None:
-        raise NumericsError("lmmse needs the mean and covariance of the radiances", fix="use wls")
+    _check(method, variance is not None, prior is not None)
     if method == "single-pixel" and pixels is None:
         pixels = choose_pixels(response)
     values = np.asarray(values)
@@ -169,6 +161,19 @@ def demultiplex(
         else:
             out[:, part] = _least_squares(f, flat[part], method, one, prior)
     return out[0].reshape(*lead, bands), out[1].reshape(*lead, bands)
+
+
+def _check(method: str, with_variance: bool, with_prior: bool) -> None:
+    """Refuse a method that is unknown or lacks what it needs."""
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}")
+    if not with_variance and method in ("wls", "lmmse"):
+        raise NumericsError(
+            f"{method} weighs pixels by their noise, which is not known",
+            fix="give the sensor's gain and read noise (--camera) or use pinv",
+        )
+    if not with_prior and method == "lmmse":
+        raise NumericsError("lmmse needs the mean and covariance of the radiances", fix="use wls")
 
 
 def _masked(response: np.ndarray) -> np.ndarray:

@@ -124,6 +124,21 @@ class NormalEquations:
     count: np.ndarray
     hard: np.ndarray
 
+    @classmethod
+    def unfilled(cls, total: int, bands: int, pixels: int, sandwich: bool) -> NormalEquations:
+        """Of `total` superpixels, to be filled in; sandwich: with `spread`."""
+        square = (total, bands, bands)
+        return cls(
+            unweighted=np.zeros((total, bands)),
+            unweighted_normal=np.broadcast_to(np.eye(bands), square).copy(),
+            normal=np.empty(square),
+            right=np.zeros((total, bands)),
+            spread=np.empty(square) if sandwich else None,
+            chi=np.zeros(total),
+            count=np.full(total, pixels),
+            hard=np.zeros(total, bool),
+        )
+
 
 def factor(
     response: np.ndarray | MadeResponses,
@@ -222,17 +237,7 @@ def normal_equations(
     bands = factored.r.shape[-1]
     basis = (_SharedBasis if factored.shared else _OwnBases)(factored.q)
     variance = None if noise is None else _PixelVariance(factored, noise, response_variance, doubt)
-    square = (total, bands, bands)
-    out = NormalEquations(
-        unweighted=np.zeros((total, bands)),
-        unweighted_normal=np.broadcast_to(np.eye(bands), square).copy(),
-        normal=np.empty(square),
-        right=np.zeros((total, bands)),
-        spread=np.empty(square) if sandwich else None,
-        chi=np.zeros(total),
-        count=np.full(total, factored.q.shape[-1]),
-        hard=np.zeros(total, bool),
-    )
+    out = NormalEquations.unfilled(total, bands, factored.q.shape[-1], sandwich)
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
     kernel = (

@@ -4,10 +4,10 @@ method asked for or the best one.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +35,7 @@ Prior = tuple[np.ndarray, np.ndarray]
 
 
 def readout(
-    exposure: Capture, c: LensletResponses, path: str | os.PathLike[str]
+    exposure: Capture, c: LensletResponses, path: str | Path
 ) -> tuple[Readout, Noise | None]:
     """A capture as light at the calibration's exposure time, and the noise of it.
 

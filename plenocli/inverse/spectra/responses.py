@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.inverse.calibration.calibration import Calibration, MadeResponses
+from plenocli.inverse.calibration.calibration import Calibration, MadeResponses, there
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.frames import Dark
@@ -44,23 +44,24 @@ class LensletResponses:
     @classmethod
     def of(cls, calibration: Calibration, threads: int = 1) -> LensletResponses:
         """The responses as they were calibrated."""
+        response = there(calibration.response)
         return cls(
             calibration=calibration,
-            response=calibration.response.matrix,
-            variance=calibration.response.variance,
-            origin=calibration.windows.origin,
+            response=response.matrix,
+            variance=response.variance,
+            origin=there(calibration.windows).origin,
             threads=threads,
         )
 
     @property
     def wavelengths(self) -> np.ndarray:
         """Of the bands, (band,) m."""
-        return self.calibration.response.wavelengths
+        return there(self.calibration.response).wavelengths
 
     @property
     def window(self) -> tuple[int, int]:
         """Rows and columns of a superpixel, px."""
-        return self.calibration.windows.shape
+        return there(self.calibration.windows).shape
 
     @property
     def centres(self) -> np.ndarray:
@@ -75,12 +76,17 @@ class LensletResponses:
     @property
     def dark(self) -> Dark:
         """What the sensor reports without light."""
-        return self.calibration.dark
+        return there(self.calibration.dark)
 
     @property
     def cfa(self) -> str:
         """ "mono" or the four letters of the colour filter array."""
         return self.calibration.sensor.cfa
+
+    @property
+    def predicted(self) -> bool:
+        """Whether F comes from a description of the camera, not from captures."""
+        return there(self.calibration.response).predicted
 
     @property
     def shared(self) -> bool:

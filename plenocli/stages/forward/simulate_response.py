@@ -4,8 +4,8 @@ description of the camera.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.superpixel_kinds import SuperpixelKinds
     from plenocli.inverse.calibration.calibration import Calibration
 
-Name = str | os.PathLike[str]
+Name = str | Path
 SAME_PITCH = 0.02
 """Share by which the pitch of a grid may differ from the description's without a word."""
 
@@ -123,7 +123,9 @@ def run_simulate_response(
     camera = read_camera(camera_path)
     measured = read_calibration(grid, response=False) if grid else None
     kinds = (
-        _measured_kinds(measured, camera, grid) if measured else SuperpixelKinds.of_camera(camera)
+        _measured_kinds(measured, camera, grid)
+        if grid and measured
+        else SuperpixelKinds.of_camera(camera)
     )
     prediction = ResponsePrediction(camera, settings.options(), kinds, camera_path)
     bands = tuple(sorted(set(settings.wavelengths))) or camera.light.wavelengths
@@ -278,8 +280,10 @@ def _with_response(
 def _summary(
     output: Name, calibration: Calibration, kinds: SuperpixelKinds, notes: PredictionNotes
 ) -> ResponseSummary:
-    response, valid = calibration.response, calibration.grid.valid
-    bands, quality = len(response.wavelengths), response.quality
+    from plenocli.inverse.calibration.calibration import there
+
+    response, valid = there(calibration.response), calibration.grid.valid
+    bands, quality = len(response.wavelengths), there(response.quality)
     between = np.array(quality.angles)[np.triu_indices(bands, 1)]
     return ResponseSummary(
         output=str(output),

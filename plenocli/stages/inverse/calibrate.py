@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plenocli.inverse.calibration.calibration import Response
     from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
-Name = str | os.PathLike[str]
+Name = str | Path
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,6 @@ standard deviations.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from plenocli.inverse.registration.alignment import Registration
     from plenocli.inverse.spectra.spectra import Spectra
 
-Name = str | os.PathLike[str]
+Name = str | Path
 
 
 @dataclass(frozen=True)
@@ -154,7 +153,7 @@ def run_demux(
             if scheduler is None
             else partial(
                 demux_elsewhere,
-                (
+                Setup(
                     absolute(calibration),
                     replace(settings, reference=absolute(settings.reference)),
                     tuple(i["sha256"] for i in job.inputs.values()),
@@ -225,18 +224,28 @@ def _recipe_of(target: Path) -> Recipe | None:
         return None
 
 
+@dataclass(frozen=True)
+class Setup:
+    """What another process needs to demultiplex captures: calibration, settings, and digests that
+    tell their files from others of the same name.
+    """
+
+    calibration: Name
+    settings: Settings
+    digests: tuple[str, ...]
+
+
 @lru_cache(maxsize=1)
-def _demultiplexer(recipe: tuple[Any, ...]) -> CaptureDemultiplexer:
-    return CaptureDemultiplexer(*recipe[:2], False, "")
+def _demultiplexer(setup: Setup) -> CaptureDemultiplexer:
+    return CaptureDemultiplexer(setup.calibration, setup.settings, False, "")
 
 
-def demux_elsewhere(recipe: tuple[Any, ...], capture: Name) -> tuple[Spectra, dict[str, Any]]:
+def demux_elsewhere(setup: Setup, capture: Name) -> tuple[Spectra, dict[str, Any]]:
     """CaptureDemultiplexer.demux in a process of its own, which reads the calibration once.
 
-    recipe: calibration, settings, and digests that tell them from others of the same name.
     capture: its file.
     """
-    return _demultiplexer(recipe).demux(capture)
+    return _demultiplexer(setup).demux(capture)
 
 
 class CaptureDemultiplexer:

@@ -128,12 +128,7 @@ def calibrate(
         first.levels.white,
         first.exposure_s,
     )
-    if np.isnan(signal).mean() > SATURATED:
-        raise InputError(
-            f"{np.isnan(signal).mean():.0%} of the white image is saturated",
-            first.metadata.path,
-            "expose it for less time",
-        )
+    _check_saturation(signal, first)
     found = _grid(signal, first, lattice, near)
     windows, valid = windows_on(found, first.shape)
     step = 1 if first.cfa == "mono" else 2
@@ -148,19 +143,39 @@ def calibrate(
         if measured.shared:
             reference = replace(reference, superpixels=mean_of_known(reference.superpixels[valid]))
     noise = noise.filled()
-    sensor = Sensor(
-        cfa=first.cfa,
-        units=first.units,
-        white_level=first.levels.white,
-        exposure=first.exposure_s,
+    calibration = Calibration(
+        grid=grid,
+        sensor=_sensor(first, noise),
+        windows=windows,
+        white=reference,
+        dark=dark,
+        response=measured,
+    )
+    return Measured(grid=found, calibration=calibration, noise=noise)
+
+
+def _check_saturation(signal: np.ndarray, white: Capture) -> None:
+    """Refuse a white image that lost too many pixels."""
+    lost = np.isnan(signal).mean()
+    if lost > SATURATED:
+        raise InputError(
+            f"{lost:.0%} of the white image is saturated",
+            white.metadata.path,
+            "expose it for less time",
+        )
+
+
+def _sensor(white: Capture, noise: KnownNoise) -> Sensor:
+    """What the numbers mean; noise: with a read variance."""
+    return Sensor(
+        cfa=white.cfa,
+        units=white.units,
+        white_level=white.levels.white,
+        exposure=white.exposure_s,
         gain_e_per_dn=1 / noise.gain if noise.gain else None,
         read_noise=float(np.sqrt(noise.read_variance)),
         notes=f"noise from: {noise.source}",
     )
-    calibration = Calibration(
-        grid=grid, sensor=sensor, windows=windows, white=reference, dark=dark, response=measured
-    )
-    return Measured(grid=found, calibration=calibration, noise=noise)
 
 
 def check_exposure_times(captures: Sequence[Capture]) -> None:

@@ -117,10 +117,7 @@ def run_calibrate(
     from plenocli.files.read.cameras import camera_files, read_camera
 
     bands = sorted(bands, key=lambda pair: pair[0])
-    if unknown := [w for w, _ in radiances if not any(abs(w - band) < 1e-12 for band, _ in bands)]:
-        raise UsageError(
-            f"--band-radiance names {unknown[0] * 1e9:g} nm, of which there is no --band"
-        )
+    _check_radiances(radiances, bands)
     roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
     check_output(
         output,
@@ -152,15 +149,20 @@ def run_calibrate(
         near=near,
     )
     summary = _summary(output, found, whites[0])
-    write_calibration(
-        output,
-        found.calibration,
-        Provenance(
-            command, describe_inputs(roles), None, to_toml(description) if description else ""
-        ),
-        overwrite=overwrite,
-    )
+    config = to_toml(description) if description else ""
+    provenance = Provenance(command, describe_inputs(roles), None, config)
+    write_calibration(output, found.calibration, provenance, overwrite=overwrite)
     return summary
+
+
+def _check_radiances(
+    radiances: Sequence[tuple[float, float]], bands: Sequence[tuple[float, Name]]
+) -> None:
+    """Refuse the radiance of a band that there is none of."""
+    if unknown := [w for w, _ in radiances if not any(abs(w - band) < 1e-12 for band, _ in bands)]:
+        raise UsageError(
+            f"--band-radiance names {unknown[0] * 1e9:g} nm, of which there is no --band"
+        )
 
 
 def _band_roles(bands: Sequence[tuple[float, Name]]) -> dict[str, list[Name]]:

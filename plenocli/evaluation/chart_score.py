@@ -256,6 +256,22 @@ def measure_chart(
             )
         )
     level = truth[WHITE] / values[WHITE]
+    return ChartMeasures(
+        bands_nm=np.round(bands * 1e9, 6).tolist(),
+        patch_names=colorchecker()[0],
+        six=six,
+        truth=truth,
+        target="nominal" if lobe is None else "lobe",
+        paper_blocks=blocks,
+        methods=methods,
+        cube=_upright_cube(found, light, level, chart, grid),
+    )
+
+
+def _upright_cube(
+    found: ChartRates, light: np.ndarray, level: np.ndarray, chart: Any, grid: tuple[int, int]
+) -> np.ndarray:
+    """The chart as a scene (band, row, column); `level`: reflectance of a unit of rate, by band."""
     cube = np.stack(
         [
             k * upright(rate / f, site, chart, grid)
@@ -266,16 +282,7 @@ def measure_chart(
         raise NumericsError(
             "parts of the chart saturate in every exposure", fix="add shorter exposures"
         )
-    return ChartMeasures(
-        bands_nm=np.round(bands * 1e9, 6).tolist(),
-        patch_names=colorchecker()[0],
-        six=six,
-        truth=truth,
-        target="nominal" if lobe is None else "lobe",
-        paper_blocks=blocks,
-        methods=methods,
-        cube=np.clip(cube, 0, None),
-    )
+    return np.clip(cube, 0, None)
 
 
 def _patch_values(found: ChartRates, field: np.ndarray, cores: np.ndarray) -> np.ndarray:

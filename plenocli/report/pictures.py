@@ -27,6 +27,7 @@ from plenocli.report.drawing import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
+    from matplotlib.image import AxesImage
     from matplotlib.patches import Rectangle
 
 Shape = tuple[int, ...]
@@ -88,14 +89,7 @@ def capture_picture(
             + ("" if step == 1 else f", shown {step} times smaller"),
         )
         box = _middle(mosaic.shape, centres)
-        image = close.imshow(
-            mosaic[box[0] : box[1], box[2] : box[3]],
-            cmap=LIGHT_MAP,
-            vmin=0,
-            vmax=top,
-            interpolation="nearest",
-            extent=(box[2] - 0.5, box[3] - 0.5, box[1] - 0.5, box[0] - 0.5),
-        )
+        image = _close_up(close, mosaic, box, top)
         close.set(
             xlabel="column [px]",
             title="close-up"
@@ -109,6 +103,20 @@ def capture_picture(
         whole.add_patch(_outline(box))
         colour_bar(close, image, f"signal [{units}]" if units else "signal")
     return made.png
+
+
+def _close_up(
+    axes: "Axes", mosaic: np.ndarray, box: tuple[int, int, int, int], top: float
+) -> "AxesImage":
+    """A part of a capture, rows and columns from and to, white at `top`."""
+    return axes.imshow(
+        mosaic[box[0] : box[1], box[2] : box[3]],
+        cmap=LIGHT_MAP,
+        vmin=0,
+        vmax=top,
+        interpolation="nearest",
+        extent=(box[2] - 0.5, box[3] - 0.5, box[1] - 0.5, box[0] - 0.5),
+    )
 
 
 def _tiling(shape: Shape, pitch: tuple[float, ...]) -> np.ndarray:

@@ -52,20 +52,10 @@ def calibration_picture(
         whole, close = made.figure.subplots(1, 2)
         if flat is not None:
             shown, step = thumbnail(np.nan_to_num(np.asarray(flat, dtype=np.float64)))
-            extent = (-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5)
-            for axes, picture, where in (
-                (whole, shown, extent),
-                (close, np.nan_to_num(flat), None),
-            ):
-                axes.imshow(
-                    picture,
-                    cmap="gray",
-                    vmin=0,
-                    vmax=1,
-                    interpolation="nearest",
-                    **({"extent": where} if where else {}),
-                )
-            limits = extent
+            limits = (-0.5, step * shown.shape[1] - 0.5, step * shown.shape[0] - 0.5, -0.5)
+            look = {"cmap": "gray", "vmin": 0, "vmax": 1, "interpolation": "nearest"}
+            whole.imshow(shown, extent=limits, **look)
+            close.imshow(np.nan_to_num(flat), **look)
         else:
             limits = (
                 found[:, 1].min() - 5,
@@ -97,20 +87,23 @@ def calibration_picture(
         )
         if residual is not None and not predicted:
             colour_bar(whole, dots, "distance from the lattice [px]")
-        middle = found[np.argmin(((found - found.mean(axis=0)) ** 2).sum(axis=1))]
-        nearest = np.sort(np.hypot(*(found - middle).T))
-        half = 2.2 * (nearest[1] if len(nearest) > 1 else 20)
-        close.plot(
-            found[:, 1], found[:, 0], "+", color=COLOURS[1], markersize=9, markeredgewidth=1.4
-        )
-        close.set(
-            xlim=(middle[1] - half, middle[1] + half),
-            ylim=(middle[0] + half, middle[0] - half),
-            aspect="equal",
-            xlabel="column [px]",
-            title="centres in the middle of the sensor",
-        )
+        _middle_centres(close, found)
     return made.png
+
+
+def _middle_centres(axes: "Axes", found: np.ndarray) -> None:
+    """The centres (lenslet, 2) px about the middle one."""
+    middle = found[np.argmin(((found - found.mean(axis=0)) ** 2).sum(axis=1))]
+    nearest = np.sort(np.hypot(*(found - middle).T))
+    half = 2.2 * (nearest[1] if len(nearest) > 1 else 20)
+    axes.plot(found[:, 1], found[:, 0], "+", color=COLOURS[1], markersize=9, markeredgewidth=1.4)
+    axes.set(
+        xlim=(middle[1] - half, middle[1] + half),
+        ylim=(middle[0] + half, middle[0] - half),
+        aspect="equal",
+        xlabel="column [px]",
+        title="centres in the middle of the sensor",
+    )
 
 
 def response_picture(
@@ -213,15 +206,8 @@ def filters_picture(camera: "Camera") -> bytes:
             title="filters [nm]",
         )
         for letter, curve in zip(letters, curves, strict=True):
-            through.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
-            top = np.argmax(curve) if np.ptp(curve) else len(curve) * 14 // 15
-            through.annotate(
-                "sensor" if len(letters) == 1 else letter,
-                (wavelengths[top] * 1e9, curve[top]),
-                ha="center",
-                va="bottom",
-                fontsize=7.5,
-            )
+            name = "sensor" if len(letters) == 1 else letter
+            _sensitivity_curve(through, wavelengths, curve, name)
         through.set(
             xlim=(400, 700),
             ylim=(0, 1.05),
@@ -230,6 +216,15 @@ def filters_picture(camera: "Camera") -> bytes:
         )
         through.grid(True)
     return made.png
+
+
+def _sensitivity_curve(axes: "Axes", wavelengths: np.ndarray, curve: np.ndarray, name: str) -> None:
+    """The quantum efficiency (n,) of one colour over wavelengths (n,) m, named where it peaks."""
+    axes.plot(wavelengths * 1e9, curve, color=TRUTH, linestyle="--", linewidth=0.9)
+    top = np.argmax(curve) if np.ptp(curve) else len(curve) * 14 // 15
+    axes.annotate(
+        name, (wavelengths[top] * 1e9, curve[top]), ha="center", va="bottom", fontsize=7.5
+    )
 
 
 def band_pictures(

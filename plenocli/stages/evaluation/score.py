@@ -124,7 +124,7 @@ def run_score(
     from plenocli.files.atomic import check_output, publish
 
     inputs = [*results, truth, *whites, patches, pif, capture, camera]
-    files = [path for path in inputs if path is not None and Path(path).is_file()]
+    files = [path for path in inputs if _is_file(path)]
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
@@ -135,35 +135,53 @@ def run_score(
         raise failed_together(
             errors, len(results), "results", None, "nothing is written; see the messages above"
         )
-    labels = _labels(results)
-    named = [replace(one.score, label=label) for one, label in zip(scored, labels, strict=True)]
     roles = {
         "result": list(results),
-        "truth": truth if truth and Path(truth).is_file() else None,
+        "truth": truth if _is_file(truth) else None,
         "white": list(whites),
         "camera": camera,
-        "patches": patches if patches and Path(patches).is_file() else None,
+        "patches": patches if _is_file(patches) else None,
         "pif": pif,
         "capture": capture,
     }
-    document = ScoreDocument(
-        results=tuple(named),
-        definitions=definitions_of(named),
-        command=command,
-        inputs={role: InputFile(**about) for role, about in describe_inputs(roles).items()},
-    )
+    document = _document(results, scored, describe_inputs(roles), command)
     text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
     publish(output, text.encode(), overwrite=overwrite)
     if report is not None:
-        from plenocli.report.score_page import score_page
-
-        page = score_page(document, [one.drawn for one in scored])
-        publish(report, page.encode(), overwrite=overwrite)
+        publish(report, _page(document, scored), overwrite=overwrite)
     if errors:
         raise failed_together(
             errors, len(results), "results", output, "the others are scored; see the messages above"
         )
     return document
+
+
+def _is_file(name: Path | str | None) -> bool:
+    """Whether a truth or a label map is a file and not a name."""
+    return name is not None and Path(name).is_file()
+
+
+def _page(document: ScoreDocument, scored: Sequence[_Scored]) -> bytes:
+    from plenocli.report.score_page import score_page
+
+    return score_page(document, [one.drawn for one in scored]).encode()
+
+
+def _document(
+    results: Sequence[Path | str],
+    scored: Sequence[_Scored],
+    inputs: Mapping[str, dict[str, str]],
+    command: str,
+) -> ScoreDocument:
+    """What is written: every result by a label of its own; `inputs`: as a provenance has them."""
+    labels = _labels(results)
+    named = [replace(one.score, label=label) for one, label in zip(scored, labels, strict=True)]
+    return ScoreDocument(
+        results=tuple(named),
+        definitions=definitions_of(named),
+        command=command,
+        inputs={role: InputFile(**about) for role, about in inputs.items()},
+    )
 
 
 def _comparison(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.budget import Budget, within
-from plenocli.base.errors import InputError, OutputError
+from plenocli.base.errors import InputError, NumericsError, OutputError
 from plenocli.files.images import raw as raw_module
 from plenocli.files.images.dng import read_notes, write_dng
 from plenocli.files.images.mosaic import read_capture
@@ -199,6 +199,16 @@ def test_no_mutant_of_a_dng_ends_otherwise_than_whole_or_refused(tmp_path):
             np.testing.assert_array_equal(read_capture(tmp_path / "x.dng").mosaic, values)
         except InputError:
             pass
+
+
+def test_a_mosaic_that_does_not_fit_is_told_what_it_needs_before_it_is_unpacked(tmp_path):
+    values = mosaic((300, 400))
+    write_dng(tmp_path / "x.dng", values, cfa="RGGB", black=0, white=16383)
+    with within(Budget(3 * values.nbytes)):
+        with pytest.raises(NumericsError, match="needs about 938KiB to be read, more than"):
+            read_capture(tmp_path / "x.dng")
+    with within(Budget(5 * values.nbytes)):
+        np.testing.assert_array_equal(read_capture(tmp_path / "x.dng").mosaic, values)
 
 
 def test_too_little_time_or_memory_becomes_an_input_error(tmp_path, monkeypatch):

@@ -29,12 +29,14 @@ the disk in pieces.
 
 @dataclass(frozen=True)
 class Layout:
-    """streamed: written in pieces;
+    """How a matrix is written.
+
+    streamed: in pieces.
     groups: the superpixels of each shard, or None for one file.
     """
 
     streamed: bool
-    groups: tuple | None = None
+    groups: tuple[tuple[int, ...], ...] | None = None
 
 
 def cost(plan: PifPlan) -> tuple[bool, int]:
@@ -48,12 +50,14 @@ def cost(plan: PifPlan) -> tuple[bool, int]:
 
 
 def layout(plan: PifPlan, where: object) -> Layout:
-    """The Layout of a PifPlan's matrix within the budget of this process.
+    """How a matrix is written within the budget of this process.
 
-    NumericsError where not even one superpixel's part fits.
+    plan: of the matrix.
+    where: the camera's file, for the message.
 
-    Held whole up to WHOLE_BYTES and a quarter of the memory; one file where another stage can read
-    it within the same budget; else shards of an eighth of it.
+    Returns held whole up to WHOLE_BYTES and a quarter of the memory; one file where another stage
+    can read it within the same budget; else shards of an eighth of it.
+    Raises NumericsError where not even one superpixel's part fits.
     """
     bands, superpixels = plan.shape[:2]
     slab = plan.bytes // (bands * superpixels)
@@ -81,10 +85,17 @@ def stream_pif(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[SystemMatrix, Diagnosis]:
-    """Compute a matrix piece by piece into `output`; returns (SystemMatrix without A, its
-    Diagnosis).
+    """Compute a matrix piece by piece into files.
 
-    finish(pif, found): the Artefact of all but A. Errors as build_pif and write_artefact.
+    camera, plan: as in build_pif.
+    output: the file, or the index of shards.
+    chosen: how it is written.
+    finish: (matrix without A, its diagnosis) -> the Artefact of all but A.
+    overwrite: whether the files may exist.
+    progress: called with columns done and columns in all.
+
+    Returns (matrix without A, its diagnosis).
+    Raises as build_pif and write_artefact.
     """
     from plenocli.files.artefacts.shards import writing_pif
     from plenocli.forward.propagation.diagnosis import PiecewiseDiagnosis

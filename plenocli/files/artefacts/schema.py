@@ -161,8 +161,10 @@ def _shape_problem(
 
 
 def declared_problems(schema: Schema, declared: Declared) -> list[str]:
-    """Every way in which `declared` (path -> (shape, dtype)) breaks the table, as a
-    list of sentences.
+    """Every way in which datasets break their table, as sentences.
+
+    schema: the table.
+    declared: the datasets, before there are values.
     """
     problems: list[str] = []
     lengths: dict[str, tuple[int, str]] = {}
@@ -173,15 +175,15 @@ def declared_problems(schema: Schema, declared: Declared) -> list[str]:
     ordered += sorted(set(declared) - set(ordered))
     for path in ordered:
         shape, dtype = declared[path]
-        entry = schema.field_for(path)
-        if entry is None:
+        found = schema.field_for(path)
+        if found is None:
             problems.append(
                 f"dataset '{path}' is unknown in kind '{schema.kind}' (known: {_known(schema)})"
             )
             continue
-        if not _dtype_fits(dtype, entry.dtype):
-            problems.append(f"dataset '{path}' holds {dtype} where {entry.dtype} is due")
-        problem = _shape_problem(entry, shape, lengths)
+        if not _dtype_fits(dtype, found.dtype):
+            problems.append(f"dataset '{path}' holds {dtype} where {found.dtype} is due")
+        problem = _shape_problem(found, shape, lengths)
         if problem:
             problems.append(f"dataset '{path}' {problem}")
     return problems
@@ -253,11 +255,14 @@ def _attribute_fits(attr: Attr, value: Any) -> bool:
 
 
 def plot_attributes(schema: Schema, declared: Declared) -> dict[str, dict[str, Any]]:
-    """NXdata attributes for a file that holds `declared` (path -> (shape, dtype)): path -> name ->
-    text, list or int.
+    """NXdata attributes of a file, from which other programs draw it.
 
-    Groups get NX_class, signal, axes and <axis>_indices; datasets get units and long_name; the root
-    gets `default` (NeXus NXdata; silx, h5web and HDFView draw such a group at once).
+    schema: the table.
+    declared: the datasets of the file.
+
+    Returns path -> name -> text, list or int. Groups get NX_class, signal, axes and
+    <axis>_indices; datasets get units and long_name; the root gets `default` (NeXus NXdata; silx,
+    h5web and HDFView draw such a group at once).
     """
     found = {"": {"NX_class": "NXroot"}}
     for group in sorted(
@@ -295,7 +300,8 @@ def _plot_group(
     shape = declared[path][0]
     entry = schema.field_for(path)
     dims = next(
-        (d for d in entry.alternatives() or [] if len(d) == len(shape)), tuple("." for _ in shape)
+        (d for d in (entry and entry.alternatives()) or [] if len(d) == len(shape)),
+        tuple("." for _ in shape),
     )
     scales = {
         e.dims: e.path.rsplit("/", 1)[1]
@@ -327,7 +333,8 @@ def axis_names(schema: Schema, declared: Declared) -> dict[str, tuple[str, ...]]
     found = {}
     for path, (shape, _) in declared.items():
         entry, group = schema.field_for(path), path.rpartition("/")[0]
-        dims = next((d for d in entry.alternatives() or () if len(d) == len(shape)), ())
+        known = (entry and entry.alternatives()) or []
+        dims = next((d for d in known if len(d) == len(shape)), ())
         names: list[str] = []
         for dim in dims:
             name = _scale_of(schema, declared, group, dim)
@@ -382,7 +389,7 @@ def markdown(schemas: Mapping[str, Schema]) -> str:
             axes = (
                 "any"
                 if e.dims is None
-                else " or ".join(f"({', '.join(a)})" for a in e.alternatives())
+                else " or ".join(f"({', '.join(a)})" for a in e.alternatives() or ())
             )
             notes = [
                 n for n, on in (("optional", e.optional), ("NaN = not measured", e.maskable)) if on

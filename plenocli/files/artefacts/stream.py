@@ -43,9 +43,8 @@ class Stream:
         if values.shape != rest:
             raise ValueError(f"'{self.name}' at {index} takes {rest}, not {values.shape}")
         low, high = values.min(), values.max()
-        if not np.isfinite(low + high) or (
-            self._entry.minimum is not None and low < self._entry.minimum
-        ):
+        least = self._entry and self._entry.minimum
+        if not np.isfinite(low + high) or (least is not None and low < least):
             raise ValueError(f"'{self.name}' at {index} holds values from {low:.6g} to {high:.6g}")
         start = (
             int(np.ravel_multi_index(index, self.shape[: len(index)])) * values.size if index else 0

@@ -1,30 +1,18 @@
-"""Captures as superpixels in the units of the system matrix, and along the grid of a
-calibration.
-"""
+"""Captures from files as superpixels in the units of the system matrix."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from plenocli.base.errors import InputError
-from plenocli.base.progress import note
-from plenocli.base.text import by
-from plenocli.base.tiling import to_blocks
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.calibrations import read_calibration
-from plenocli.forward.propagation.accuracy_record import AccuracyRecord
-from plenocli.forward.sensor.capture import Capture
-from plenocli.forward.sensor.noise import Noise
-from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.superpixels import superpixels
 
 
 def read_superpixels(
-    path: str | Path,
-    system: LensletMatrix,
-    calibration: str | Path | None = None,
+    path: str | Path, system: LensletMatrix, calibration: str | Path | None = None
 ) -> Superpixels:
     """Superpixels of a capture.
 
@@ -36,109 +24,11 @@ def read_superpixels(
     Raises InputError where sizes disagree or the scale is not known.
     """
     capture = read_capture(path)
-    if capture.cfa != "mono":
-        raise InputError(
-            f"has the colour filter array {capture.cfa}; the system matrix knows none",
-            path,
-            "use --calibration with --method block-mean, or demux",
-        )
-    if calibration is not None:
-        return _along_the_grid(capture, system, calibration)
-    light = capture.metadata.illuminant
-    if system.illuminant and light and light != system.illuminant:
-        note(
-            f"{Path(path).name} was lit by {light}, the system matrix has its bands for "
-            f"{system.illuminant}: colours will be off"
-        )
-    shape = _tiles(capture, system, path)
-    signal, unit = capture.signal(), _unit(capture, path)
-    white = capture.levels.white
-    over = float(np.mean(capture.mosaic >= white)) if np.isfinite(white) else 0.0
-    if over > 0:
-        note(
-            f"{Path(path).name}: {over:.2%} of the pixels are saturated; the "
-            "picture is too dark there"
-        )
-    noise = capture.white_noise
-    return Superpixels(
-        y=to_blocks(signal, shape) / unit,
-        noise=None if noise is None else Noise.of_sigma(noise.sigma / unit),
-        scene=capture.metadata.target,
-        accuracy=AccuracyRecord.from_json(capture.metadata.accuracy),
-        pif_digest=capture.metadata.matrix,
-    )
+    if calibration is None or capture.cfa != "mono":
+        return superpixels(capture, system)
+    return superpixels(capture, system, read_white(calibration), where=calibration)
 
 
-def calibrated(capture: Capture, calibration: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Windows of a capture and of the white reference along the grid of a calibration.
-
-    calibration: path of the artefact.
-
-    Returns (signal, white), (lenslet_row, lenslet_column, pixel) each, dark subtracted; NaN where a
-    superpixel is not wholly on the sensor.
-    Raises InputError where the two sensors differ.
-    """
-    found = read_calibration(calibration, needs=("windows", "white", "dark"), response=False)
-    dark, windows = found.dark.mean, found.windows
-    if dark.ndim == 2 and dark.shape != capture.shape:
-        raise InputError(
-            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
-            capture.metadata.path,
-            "use captures of the calibrated camera",
-        )
-    reference = found.sensor.exposure
-    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
-    signal = extract((capture.mosaic - dark) * scale, windows.origin, windows.shape)
-    signal[~found.grid.valid] = np.nan
-    return signal, np.broadcast_to(found.white.superpixels, signal.shape)
-
-
-def _along_the_grid(
-    capture: Capture, system: LensletMatrix, calibration: str | Path
-) -> Superpixels:
-    """Lit superpixels in units of A x, by the light of a white object; dark ones are zero."""
-    signal, white = calibrated(capture, calibration)
-    if signal.shape[2] != system.own.shape[0]:
-        raise InputError(
-            (f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}"),
-            calibration,
-            "simulate-pif with pixels_per_lenslet as measured",
-        )
-    lit = np.all(np.isfinite(signal), axis=2)
-    scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
-    y = np.where(lit[:, :, None], signal, 0) * scale[:, :, None]
-    return Superpixels(y=y)
-
-
-def _tiles(capture: Capture, system: LensletMatrix, path: str | Path) -> tuple[int, int]:
-    """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
-    system matrix.
-    """
-    shape = (capture.grid.shape if capture.grid else None) or system.pixel_shape
-    if shape != system.pixel_shape:
-        raise InputError(
-            (f"has superpixels of {by(shape)} pixels, the system matrix {by(system.pixel_shape)}"),
-            path,
-            "use the pif of this camera",
-        )
-    if capture.shape[0] % shape[0] or capture.shape[1] % shape[1]:
-        raise InputError(
-            f"has {by(capture.shape)} pixels, no whole number of superpixels of {by(shape)}",
-            path,
-            "give --calibration to find the lenslets",
-        )
-    return shape
-
-
-def _unit(capture: Capture, path: str | Path) -> float:
-    """What one unit of A x is in the units of the mosaic."""
-    if capture.units == "relative":
-        return 1.0
-    electrons = capture.metadata.electrons_per_unit
-    if not electrons:
-        raise InputError(
-            "does not say how many electrons white gives, so that the picture would have no scale",
-            path,
-            "give --calibration with a white reference",
-        )
-    return electrons * ((capture.levels.gain or 1.0) if capture.units == "DN" else 1.0)
+def read_white(path: str | Path) -> Calibration:
+    """What a calibration artefact knows of lenslets, white and dark."""
+    return read_calibration(path, needs=("windows", "white", "dark"), response=False)

@@ -11,7 +11,7 @@ from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
-from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -58,26 +58,14 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
             "run simulate-pif again",
         )
     bands, weights, illuminant = _bands(artefact, path) if by_band else ((), None, None)
-    if weights is None:
-        if len(matrices) > 1:
-            note(
-                f"{Path(path).name} holds {len(matrices)} wavelengths; they are averaged, as "
-                "equal shares of the light"
-            )
-        weights = np.full((1, len(matrices)), 1 / len(matrices))
-    blocks = np.concatenate(
-        [
-            sum(
-                (w * np.asarray(a, np.float64) for w, a in zip(row, matrices) if w),
-                np.zeros(matrices.shape[1:]),
-            )
-            for row in weights
-        ],
-        axis=2,
-    )
+    if weights is None and len(matrices) > 1:
+        note(
+            f"{Path(path).name} holds {len(matrices)} wavelengths; they are averaged, as "
+            "equal shares of the light"
+        )
     return LensletMatrix(
         path=Path(path),
-        blocks=blocks,
+        blocks=gathered(matrices, weights),
         offsets=offsets,
         pixel_shape=shapes[0],
         object_shape=shapes[1],

@@ -53,6 +53,28 @@ class LensletMatrix:
         return y @ np.linalg.pinv(self.even, rcond=1e-3).T
 
 
+def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """System matrices of several wavelengths as one.
+
+    matrices: (wavelength, offset, pixel, point).
+    weights: (band, wavelength) share of each wavelength in a band; None: one band, equal shares.
+
+    Returns (offset, pixel, point) float64, points of several bands one band after the other.
+    """
+    if weights is None:
+        weights = np.full((1, len(matrices)), 1 / len(matrices))
+    return np.concatenate(
+        [
+            sum(
+                (w * np.asarray(a, np.float64) for w, a in zip(row, matrices) if w),
+                np.zeros(matrices.shape[1:]),
+            )
+            for row in weights
+        ],
+        axis=2,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Superpixels:
     """A capture as the estimators take it.

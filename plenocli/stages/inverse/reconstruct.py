@@ -17,7 +17,7 @@ from plenocli.base.progress import bar, collected_notes, note
 from plenocli.base.tiling import to_blocks
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
-from plenocli.files.read.captures import calibrated, read_superpixels
+from plenocli.files.read.captures import read_superpixels, read_white
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training
@@ -27,6 +27,7 @@ from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
+from plenocli.inverse.picture.superpixels import windows_of
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -529,7 +530,7 @@ def _white_normalised(capture: Path, calibration: Path) -> np.ndarray:
     """
     from plenocli.files.images.mosaic import read_capture
 
-    signal, white = calibrated(read_capture(capture), calibration)
+    signal, white = windows_of(read_capture(capture), read_white(calibration))
     with np.errstate(divide="ignore", invalid="ignore"):
         usable = np.isfinite(signal) & np.isfinite(white)
         value = np.where(usable, signal, 0).sum(axis=2) / np.where(usable, white, 0).sum(axis=2)

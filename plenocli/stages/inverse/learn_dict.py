@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +24,7 @@ from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
 from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales
 from plenocli.inverse.sparse.dictionary import HISTORY, Learner, State
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
-
-LAMBDAS = np.logspace(-7, -4, 13)
-"""Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
-
-INDIFFERENT_DB = 0.02
-"""Differences in validation PSNR below this do not count: the larger lambda is sparser, and
-cheaper, for nothing.
-"""
+from plenocli.inverse.sparse.learning import learner_for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,7 +229,15 @@ def _begin(
         )
     require_learning(system, chosen, pif, synthesis=settings.synthesis)
     svd = decompose(system.own)
-    machine = _learner(svd, system, scenes, chosen, settings)
+    machine = learner_for(
+        svd,
+        system.object_shape,
+        chosen,
+        [p for _, p in scenes.training],
+        [p for _, p in scenes.held_out],
+        rule=settings.lam,
+        workers=settings.workers,
+    )
     state = earlier.state if earlier else machine.start()
     if state.iteration > settings.iterations:
         raise UsageError(
@@ -322,50 +323,6 @@ def _resolve(
                 ),
             )
     return earlier.settings
-
-
-def _learner(
-    svd: Svd,
-    system: LensletMatrix,
-    scenes: Scenes,
-    chosen: LearnerSettings,
-    asked: Settings,
-) -> Learner:
-    """The Learner, its lambda chosen as `asked` where it is not given."""
-
-    def learner(lam: float) -> Learner:
-        return Learner(
-            svd,
-            system.object_shape,
-            [p for _, p in scenes.training],
-            [p for _, p in scenes.held_out],
-            replace(chosen, lam=lam),
-            workers=asked.workers,
-        )
-
-    given = not math.isnan(chosen.lam)
-    return learner(chosen.lam if given else _choose_lambda(learner(1.0), asked.lam))
-
-
-def _choose_lambda(machine: Learner, rule: float | str | None) -> float:
-    """The largest lambda with the best validation PSNR for the starting dictionary, or
-    lambda by the noise.
-    """
-    from plenocli.inverse.sparse.l1.solve import noise_lambda
-
-    atoms = machine.start().atoms
-    if rule == "noise":
-        lam = noise_lambda(machine.seen @ atoms[:, 1:], machine.sigma)
-        note(f"lambda = {lam:.2e}, from the noise")
-        return lam
-    table = machine.validate_path(atoms, LAMBDAS)
-    top = max(quality for _, quality, _ in table)
-    best, quality, nonzeros = max(row for row in table if row[1] > top - INDIFFERENT_DB)
-    note(
-        f"lambda = {best:.2e}: validation {quality:.2f} dB with the starting atoms "
-        f"({nonzeros:.0f} of them a patch), out of {len(LAMBDAS)} values"
-    )
-    return best
 
 
 def _tell(state: State) -> None:

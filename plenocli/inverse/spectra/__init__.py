@@ -1,4 +1,4 @@
-"""Spectra behind lenslets: the response matrix measured, shared or cleaned, and its inverse.
+"""Spectra behind lenslets: the response matrix of a calibration and its inverse.
 
 Pictures behind lenslets are picture.
 """

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.calibration.calibration import Calibration
+    from plenocli.inverse.registration.alignment import Registration
     from plenocli.inverse.spectra.spectra import Spectra
 
-Name = str | os.PathLike[str]
+Name = str | Path
 
 
 class Demultiplexer:
@@ -65,8 +66,9 @@ class Demultiplexer:
         method = method or self.method
         signal, noise = readout(capture, self.responses, path)
         found = self._aligned(signal, noise, method, path, self.register)
-        if self.register == "auto" and doubtful(found.residual, found.trace.registration):
-            found = self._believed(found, signal, noise, method, path)
+        tried = found.trace.registration
+        if tried and self.register == "auto" and doubtful(found.residual, tried):
+            found = self._believed(found, tried, signal, noise, method, path)
         if not np.isfinite(found.value).any():
             raise NumericsError(
                 "no lenslet could be demultiplexed", path, "check exposure and calibration"
@@ -75,7 +77,13 @@ class Demultiplexer:
         return replace(found, trace=replace(found.trace, warning=warning))
 
     def _believed(
-        self, found: Spectra, signal: Readout, noise: Noise | None, method: str, path: Name
+        self,
+        found: Spectra,
+        registration: Registration,
+        signal: Readout,
+        noise: Noise | None,
+        method: str,
+        path: Name,
     ) -> Spectra:
         """`found`, or the estimate with motion alone corrected, or with nothing: the first that
         explains its residuals.
@@ -83,7 +91,6 @@ class Demultiplexer:
         uncorrected = self._aligned(signal, noise, method, path, "off")
         if believed(found.residual, uncorrected.residual):
             return found
-        registration = found.trace.registration
         if "motion" in registration.corrected:
             moved = (
                 found

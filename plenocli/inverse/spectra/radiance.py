@@ -14,6 +14,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def light_prior(c: LensletResponses) -> Prior | None:
     from plenocli.forward.scene.tables import surfaces
     from plenocli.inverse.spectra.demultiplex import demultiplex
 
-    response, white = c.response, c.calibration.white.superpixels
+    response, white = c.response, there(there(c.calibration.white).superpixels)
     if not c.shared:
         some = tuple(part[:: max(1, len(part) // LIT)] for part in c.sites)
         response, white = response[some], white[some]

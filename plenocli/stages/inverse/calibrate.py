@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
 from plenocli.files.read.series import read_series, true_centres
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.calibration.measure import Measured, NarrowBands, calibrate
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def run_calibrate(
         suffixes=(".h5",),
     )
     description = read_camera(camera) if camera else None
-    roles |= camera_files(camera, description) if camera else {}
+    roles |= camera_files(camera, description) if camera and description else {}
     cfa = cfa or (description.sensor.cfa if description else None)
     white = read_series(whites, cfa=cfa)
     wavelengths = list(dict.fromkeys(w for w, _ in bands))
@@ -174,8 +175,9 @@ def _band_roles(bands: Sequence[tuple[float, Name]]) -> dict[str, list[Name]]:
 
 def _summary(output: Name, measured: Measured, white: Name) -> CalibrateSummary:
     found, calibration, noise = measured.grid, measured.calibration, measured.noise
+    residual = there(found.residual)
     row, column = np.unravel_index(
-        np.nanargmax(np.where(found.valid, found.residual, np.nan)), found.valid.shape
+        np.nanargmax(np.where(found.valid, residual, np.nan)), found.valid.shape
     )
     grid, response = calibration.grid, calibration.response
     return CalibrateSummary(
@@ -185,12 +187,12 @@ def _summary(output: Name, measured: Measured, white: Name) -> CalibrateSummary:
         angle_deg=found.angle,
         rms_px=found.rms,
         model=found.model,
-        residual_median_px=float(np.nanmedian(found.residual[found.valid])),
-        residual_worst_px=float(found.residual[row, column]),
+        residual_median_px=float(np.nanmedian(residual[found.valid])),
+        residual_worst_px=float(residual[row, column]),
         residual_worst_lenslet=[int(row), int(column)],
         lenslets=int(grid.valid.sum()),
         array=list(grid.valid.shape),
-        window=list(calibration.windows.shape),
+        window=list(there(calibration.windows).shape),
         noise=noise.source,
         gain_dn_per_e=noise.gain,
         response=None if response is None else _response_summary(response),
@@ -199,13 +201,14 @@ def _summary(output: Name, measured: Measured, white: Name) -> CalibrateSummary:
 
 
 def _response_summary(response: Response) -> ResponseSummary:
+    quality, notes = there(response.quality), there(response.notes)
     return ResponseSummary(
         bands_nm=[float(w * 1e9) for w in response.wavelengths],
-        condition=response.quality.condition,
-        columns=response.notes["text"],
-        response=response.notes["response"],
-        angles_deg=response.quality.angles,
-        bias=response.quality.bias,
+        condition=quality.condition,
+        columns=notes["text"],
+        response=notes["response"],
+        angles_deg=quality.angles,
+        bias=quality.bias,
     )
 
 

@@ -42,7 +42,7 @@ class _Silent:
         self.n, self._iterable = 0, iterable
 
     def __iter__(self) -> Iterator:
-        return iter(self._iterable or ())
+        return iter(() if self._iterable is None else self._iterable)
 
     def __enter__(self) -> _Silent:
         return self

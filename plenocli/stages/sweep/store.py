@@ -17,7 +17,7 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
-from plenocli.execution.pool import Lost
+from plenocli.execution.pool import Lost, Pool
 from plenocli.stages.sweep.point import run_matrix, run_point
 from plenocli.stages.sweep.task import (
     Job,
@@ -116,7 +116,7 @@ class Store:
     def evaluate(
         self,
         points: Sequence[DesignPoint],
-        pool: Any,
+        pool: Pool,
         files: Sequence[str] = (),
         label: str = "points",
     ) -> int:
@@ -178,7 +178,7 @@ class _Work:
         self,
         store: Store,
         groups: Mapping[str, Sequence[DesignPoint]],
-        pool: Any,
+        pool: Pool,
         files: tuple[str, ...],
         scratch: str | None,
     ) -> None:

@@ -7,8 +7,8 @@ from plenocli.base.errors import InputError
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.files.read.training import DEFAULT, read_training, split_by_scene
-from plenocli.inverse.prior.natural_images import at_scales
+from plenocli.files.read.training import DEFAULT, read_training
+from plenocli.inverse.prior.natural_images import at_scales, split_by_scene
 
 
 def test_the_test_picture_is_never_trained_on(capsys):

@@ -94,22 +94,6 @@ def read_training(
     return pictures
 
 
-def split_by_scene(
-    pictures: list[TrainingPicture],
-) -> tuple[list[TrainingPicture], list[TrainingPicture]]:
-    """(training, held out): every fifth picture, from the third on, judges; one picture
-    alone has to do both.
-    """
-    if len(pictures) == 1:
-        note(
-            "one training picture only: the validation patches come from it too, "
-            "so the figures flatter"
-        )
-        return pictures, pictures
-    held = set(range(2, len(pictures), 5)) or {len(pictures) - 1}
-    return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
-
-
 def _expand(names: Sequence[str]) -> list[tuple[str, bool]]:
     """[(name, asked for by itself)], folders replaced by their pictures in order of their paths."""
     out = []

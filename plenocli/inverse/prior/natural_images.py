@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from plenocli.base.progress import note
 from plenocli.inverse.prior.shelf import Shelf
 
 TrainingPicture = tuple[str, np.ndarray]
@@ -13,6 +14,22 @@ TrainingPicture = tuple[str, np.ndarray]
 
 SCALES = (1, 2, 4)
 """Scenes come in all sizes: training pictures are taken at these reductions."""
+
+
+def split_by_scene(
+    pictures: list[TrainingPicture],
+) -> tuple[list[TrainingPicture], list[TrainingPicture]]:
+    """(training, held out): every fifth picture, from the third on, judges; one picture
+    alone has to do both.
+    """
+    if len(pictures) == 1:
+        note(
+            "one training picture only: the validation patches come from it too, "
+            "so the figures flatter"
+        )
+        return pictures, pictures
+    held = set(range(2, len(pictures), 5)) or {len(pictures) - 1}
+    return [p for k, p in enumerate(pictures) if k not in held], [pictures[k] for k in sorted(held)]
 
 
 def at_scales(

@@ -17,11 +17,11 @@ from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.files.read.dictionaries import Unfinished, read_unfinished
 from plenocli.files.read.system_matrices import read_lenslet_matrix
-from plenocli.files.read.training import files_of, read_training, split_by_scene
+from plenocli.files.read.training import files_of, read_training
 from plenocli.inverse.picture.footprint import require_learning
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
-from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales
+from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, split_by_scene
 from plenocli.inverse.sparse.dictionary import HISTORY, Learner, State
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 from plenocli.inverse.sparse.learning import learner_for

@@ -131,7 +131,7 @@ def test_names_inside_a_file_never_become_paths(tmp_path, name):
             "pif-index",
             data,
             {"pif": {"shards": [{"name": name, "sha256": "0" * 64}]}},
-            Provenance("t"),
+            Provenance(command="t"),
         ),
     )
     with pytest.raises(InputError, match="i.h5: does not name the files"):
@@ -147,7 +147,13 @@ def test_the_report_escapes_what_files_say(tmp_path):
             "image",
             {"image/value": np.random.default_rng(0).random((8, 8))},
             {"image": {"method": evil}},
-            Provenance(evil, {evil: {"name": evil, "sha256": "0" * 64}}, 1, evil, {evil: evil}),
+            Provenance(
+                command=evil,
+                inputs={evil: {"name": evil, "sha256": "0" * 64}},
+                seed=1,
+                config=evil,
+                accuracy={evil: evil},
+            ),
         ),
     )
     (tmp_path / "run" / "score.json").write_text(

@@ -6,7 +6,7 @@ MOST = 40
 """Files looked at."""
 
 
-def next_step(folder):
+def next_step(folder: str | Path) -> str:
     """One sentence with a command, from the newest plenocli files in `folder`."""
     found = _kinds(Path(folder))
     cameras = sorted(p.name for p in Path(folder).glob("*.toml") if _is_camera(p))
@@ -39,11 +39,11 @@ def next_step(folder):
     )
 
 
-def _kinds(folder):
+def _kinds(folder: Path) -> dict[str, list[str]]:
     """Kind -> names of artefacts in the folder, newest first; what cannot be read is left out."""
     import h5py
 
-    found = {}
+    found: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*.h5"), key=lambda p: (-p.stat().st_mtime, p.name))[:MOST]:
         try:
             with h5py.File(path, "r") as file:
@@ -54,7 +54,7 @@ def _kinds(folder):
     return found
 
 
-def _is_camera(path):
+def _is_camera(path: Path) -> bool:
     try:
         return path.stat().st_size < 1 << 20 and "[lenslet_array]" in path.read_text(
             encoding="utf-8"

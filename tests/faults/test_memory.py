@@ -301,7 +301,9 @@ def test_a_healthy_capture_is_told_what_it_needs_not_that_it_is_damaged(
     """HDF5 that gets no memory says that the file cannot be opened."""
     values = np.random.default_rng(0).random((1500, 1500))
     data = {"capture/mosaic": values, "capture/cfa": "mono"}
-    write_artefact(tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance("made up")))
+    write_artefact(
+        tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance(command="made up"))
+    )
     outcome = runner.run(
         ["reconstruct", "capture.h5", "--calibration", str(stages[0] / "calibration.h5")]
         + ["--method", "block-mean", "-o", "a.h5", "--mem-limit", f"{limit}MiB"],
@@ -315,7 +317,9 @@ def test_hdf5_without_memory_is_no_damage(tmp_path):
     """Within the budget, but what else there is has taken the memory."""
     values = np.random.default_rng(0).random((2500, 2500))
     data = {"capture/mosaic": values, "capture/cfa": "mono"}
-    write_artefact(tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance("made up")))
+    write_artefact(
+        tmp_path / "capture.h5", Artefact("capture", data, {}, Provenance(command="made up"))
+    )
     code = (
         "import resource\n"
         "from plenocli.files.artefacts.container import read_artefact\n"

@@ -45,7 +45,7 @@ def whole(kind):
                 if letter == "S"
                 else values.astype({"f": "f8", "i": "i4", "b": "?"}[letter])
             )
-    return Artefact(kind, data, {}, Provenance("plenocli test"))
+    return Artefact(kind, data, {}, Provenance(command="plenocli test"))
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)

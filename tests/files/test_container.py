@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -45,11 +46,11 @@ def spectra(seed=0, bands=3, shape=(4, 5)):
             }
         },
         Provenance(
-            "plenocli demux",
-            {"capture": {"name": "c.h5", "sha256": "0" * 64}},
-            7,
-            "# Öl, 5 µm\n[light]\n",
-            {"asked": 1e-3},
+            command="plenocli demux",
+            inputs={"capture": {"name": "c.h5", "sha256": "0" * 64}},
+            seed=7,
+            config="# Öl, 5 µm\n[light]\n",
+            accuracy={"asked": 1e-3},
         ),
     )
 
@@ -145,7 +146,8 @@ def test_same_input_gives_same_bytes_in_another_process_folder_zone_and_hash_see
 
 def test_a_config_longer_than_64_kib_survives(tmp_path):
     artefact = spectra()
-    artefact.provenance.config = "# µ\n" * 50_000
+    long = replace(artefact.provenance, config="# µ\n" * 50_000)
+    artefact = replace(artefact, provenance=long)
     write_artefact(tmp_path / "x.h5", artefact)
     assert read_artefact(tmp_path / "x.h5").provenance.config == artefact.provenance.config
 

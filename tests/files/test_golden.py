@@ -48,11 +48,11 @@ def fill(schema):
         data,
         {},
         Provenance(
-            f"plenocli makes-{schema.kind}",
-            {"camera": {"name": "camera.toml", "sha256": "0" * 64}},
-            3,
-            "[light]\n",
-            {"asked": 1e-3},
+            command=f"plenocli makes-{schema.kind}",
+            inputs={"camera": {"name": "camera.toml", "sha256": "0" * 64}},
+            seed=3,
+            config="[light]\n",
+            accuracy={"asked": 1e-3},
         ),
     )
 

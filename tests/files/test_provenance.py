@@ -8,13 +8,13 @@ from plenocli.files.artefacts.provenance import Provenance, provenance_texts, re
 @pytest.mark.parametrize(
     "provenance",
     [
-        Provenance(""),
+        Provenance(command=""),
         Provenance(
-            "plenocli demux a.h5",
-            {"capture": {"name": "a.h5", "sha256": "0" * 64}},
-            0,
-            "[sensor]\n",
-            {"asked": 1e-3},
+            command="plenocli demux a.h5",
+            inputs={"capture": {"name": "a.h5", "sha256": "0" * 64}},
+            seed=0,
+            config="[sensor]\n",
+            accuracy={"asked": 1e-3},
         ),
     ],
 )
@@ -26,6 +26,8 @@ def test_texts_bring_everything_back(provenance):
 
 def test_broken_texts_count_as_absent():
     assert read_provenance_texts({"plenocli:inputs": "{", "plenocli:command": "c"}) == Provenance(
-        "c"
+        command="c"
     )
-    assert read_provenance_texts({"plenocli:inputs": "[1]", "plenocli:seed": "x"}) == Provenance("")
+    assert read_provenance_texts({"plenocli:inputs": "[1]", "plenocli:seed": "x"}) == Provenance(
+        command=""
+    )

@@ -36,7 +36,7 @@ def pif(A, notes="short"):
             "pif/singular_values": np.ones((2, 4)),
         },
         {"pif": {"rank": [4, 4], "condition": np.inf, "kappa": -0.5, "notes": {"text": notes}}},
-        Provenance("plenocli simulate-pif", config="# µm\n"),
+        Provenance(command="plenocli simulate-pif", config="# µm\n"),
     )
 
 
@@ -223,7 +223,7 @@ def test_streaming_holds_one_piece_in_memory(tmp_path):
         "    s.close(Artefact('pif', {'pif/wavelength': [5e-7], 'pif/lenslet_offset': "
         "np.zeros((40, 2), int), 'pif/pixel_shape': [10, 100],\n"
         "        'pif/object_shape': [10, 100], 'pif/column_energy': np.ones((1, 1000))}, {}, "
-        "Provenance('test')))\n"
+        "Provenance(command='test')))\n"
         f"print({PEAK} - before)\n"
     )
     done = subprocess.run(

@@ -44,7 +44,8 @@ def camera(tmp_path):
 def scene(tmp_path):
     values = np.random.default_rng(3).uniform(size=(12, 16)).astype(np.float32)
     write_artefact(
-        tmp_path / "scene.h5", Artefact("image", {"image/value": values}, {}, Provenance("test"))
+        tmp_path / "scene.h5",
+        Artefact("image", {"image/value": values}, {}, Provenance(command="test")),
     )
     return tmp_path / "scene.h5", values
 

@@ -53,11 +53,11 @@ ARTEFACTS = {
 @pytest.mark.parametrize("kind", ARTEFACTS)
 def test_every_kind_of_artefact(tmp_path, kind):
     origin = Provenance(
-        "plenocli something",
-        {"in": {"name": "in.h5", "sha256": "ab" * 32}},
-        5,
-        "config",
-        {"asked": 1e-3},
+        command="plenocli something",
+        inputs={"in": {"name": "in.h5", "sha256": "ab" * 32}},
+        seed=5,
+        config="config",
+        accuracy={"asked": 1e-3},
     )
     write_artefact(tmp_path / "x.h5", Artefact(kind, ARTEFACTS[kind], provenance=origin))
     document, text = inspect(tmp_path / "x.h5")

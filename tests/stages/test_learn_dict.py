@@ -52,7 +52,7 @@ def pif(tmp_path):
         "pif/object_shape": np.array([3, 3]),
         "pif/column_energy": a.sum(axis=(1, 2)),
     }
-    write_artefact(tmp_path / "pif.h5", Artefact("pif", data, {}, Provenance("test")))
+    write_artefact(tmp_path / "pif.h5", Artefact("pif", data, {}, Provenance(command="test")))
     return tmp_path / "pif.h5"
 
 

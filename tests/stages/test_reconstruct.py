@@ -63,7 +63,10 @@ def make_files(folder, coupled=False, noise=60.0, stray=1.0, beyond=0, **attrs):
     write_artefact(
         folder / "pif.h5",
         Artefact(
-            "pif", data, {}, Provenance("test", accuracy={"estimated": 1e-6, "model": "fresnel"})
+            "pif",
+            data,
+            {},
+            Provenance(command="test", accuracy={"estimated": 1e-6, "model": "fresnel"}),
         ),
         overwrite=True,
     )
@@ -100,7 +103,7 @@ def make_files(folder, coupled=False, noise=60.0, stray=1.0, beyond=0, **attrs):
             "capture",
             mosaic,
             {"capture": {k: v for k, v in about.items() if v is not None}},
-            Provenance("test"),
+            Provenance(command="test"),
         ),
         overwrite=True,
     )

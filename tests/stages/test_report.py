@@ -36,11 +36,11 @@ PLAN = {
 def put(path, kind, data, attrs=None, inputs=None):
     path.parent.mkdir(parents=True, exist_ok=True)
     provenance = Provenance(
-        f"plenocli made {path.name}",
-        describe_inputs(inputs or {}),
-        1,
-        "# camera\n",
-        PLAN if kind == "pif" else {},
+        command=f"plenocli made {path.name}",
+        inputs=describe_inputs(inputs or {}),
+        seed=1,
+        config="# camera\n",
+        accuracy=PLAN if kind == "pif" else {},
     )
     write_artefact(path, Artefact(kind, data, attrs or {}, provenance), overwrite=True)
     return path
@@ -353,7 +353,12 @@ def test_responses_are_compared_and_the_filters_of_a_described_camera_drawn(tmp_
         root.mkdir(exist_ok=True)
         write_artefact(
             root / f"{name}.h5",
-            Artefact("calibration", data, attrs, Provenance("made here", {}, None, config)),
+            Artefact(
+                "calibration",
+                data,
+                attrs,
+                Provenance(command="made here", inputs={}, seed=None, config=config),
+            ),
         )
     run_score([root / "predicted.h5"], root / "score-response.json", truth=root / "measured.h5")
     run_report(root, tmp_path / "report.html")

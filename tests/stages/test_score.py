@@ -16,7 +16,7 @@ BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 def put(path, kind, data, **attrs):
     write_artefact(
         path,
-        Artefact(kind, data, {kind: attrs} if attrs else {}, Provenance("test")),
+        Artefact(kind, data, {kind: attrs} if attrs else {}, Provenance(command="test")),
         overwrite=True,
     )
     return path

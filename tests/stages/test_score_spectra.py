@@ -26,7 +26,10 @@ def put(path, value, **attrs):
     write_artefact(
         path,
         Artefact(
-            "spectra", data, {"spectra": {"quantity": "reflectance"} | attrs}, Provenance("test")
+            "spectra",
+            data,
+            {"spectra": {"quantity": "reflectance"} | attrs},
+            Provenance(command="test"),
         ),
         overwrite=True,
     )

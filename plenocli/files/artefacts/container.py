@@ -60,7 +60,7 @@ class Artefact:
     kind: str
     data: dict[str, Any]
     attrs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    provenance: Provenance = field(default_factory=lambda: Provenance(""))
+    provenance: Provenance = field(default_factory=lambda: Provenance(command=""))
 
 
 def cfa_text(value: Any) -> str:
@@ -482,11 +482,11 @@ def _parse(
             f"make it again ({root['command']})",
         )
     provenance = Provenance(
-        root["command"],
-        json.loads(root["inputs"]),
-        None if root["seed"] == "none" else int(root["seed"]),
-        root["config"],
-        json.loads(root["accuracy"]),
+        command=root["command"],
+        inputs=json.loads(root["inputs"]),
+        seed=None if root["seed"] == "none" else int(root["seed"]),
+        config=root["config"],
+        accuracy=json.loads(root["accuracy"]),
     )
     return Artefact(schema.kind, data, attrs, provenance)
 

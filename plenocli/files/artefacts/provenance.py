@@ -16,7 +16,7 @@ from typing import Any
 from plenocli.base.errors import InputError
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Provenance:
     """Where a result came from.
 
@@ -86,7 +86,13 @@ def read_provenance_texts(attrs: Mapping[str, str]) -> Provenance:
     except ValueError:
         inputs, accuracy, seed = {}, {}, None
     inputs, accuracy = (value if isinstance(value, dict) else {} for value in (inputs, accuracy))
-    return Provenance(found["command"], inputs, seed, found["config"], accuracy)
+    return Provenance(
+        command=found["command"],
+        inputs=inputs,
+        seed=seed,
+        config=found["config"],
+        accuracy=accuracy,
+    )
 
 
 def file_digest(path: str | os.PathLike) -> str:

@@ -78,7 +78,7 @@ def run_colorchecker(
             "image",
             {"image/wavelength": wavelengths, "image/value": values},
             {"image": {"method": "measured", "notes": notes}},
-            Provenance(command, described),
+            Provenance(command=command, inputs=described),
         ),
         overwrite=overwrite,
     )

@@ -261,11 +261,11 @@ def _provenance(
 
     scene = settings.scene if settings.scene and Path(settings.scene).is_file() else None
     return Provenance(
-        command,
-        describe_inputs(camera_files(camera_path, camera) | {"scene": scene}),
-        None,
-        to_toml(camera),
-        plan.accuracy_record().as_json(),
+        command=command,
+        inputs=describe_inputs(camera_files(camera_path, camera) | {"scene": scene}),
+        seed=None,
+        config=to_toml(camera),
+        accuracy=plan.accuracy_record().as_json(),
     )
 
 

@@ -137,11 +137,11 @@ def run_simulate_response(
     notes = prediction.notes(bands)
     calibration = _with_response(known, kinds, matrix, bands, notes)
     provenance = Provenance(
-        command,
-        describe_inputs(camera_files(camera_path, camera) | {"grid": grid}),
-        None,
-        to_toml(camera),
-        prediction.accuracy.as_json(),
+        command=command,
+        inputs=describe_inputs(camera_files(camera_path, camera) | {"grid": grid}),
+        seed=None,
+        config=to_toml(camera),
+        accuracy=prediction.accuracy.as_json(),
     )
     write_calibration(output, calibration, provenance, overwrite=overwrite)
     return _summary(output, calibration, kinds, notes)

@@ -151,7 +151,9 @@ def run_calibrate(
     )
     summary = _summary(output, found, whites[0])
     config = to_toml(description) if description else ""
-    provenance = Provenance(command, describe_inputs(roles), None, config)
+    provenance = Provenance(
+        command=command, inputs=describe_inputs(roles), seed=None, config=config
+    )
     write_calibration(output, found.calibration, provenance, overwrite=overwrite)
     return summary
 

@@ -322,7 +322,7 @@ class CaptureDemultiplexer:
         write_spectra(
             target,
             found,
-            Provenance(self.command, own | self.inputs),
+            Provenance(command=self.command, inputs=own | self.inputs),
             reference=self.settings.reference,
             overwrite=self.overwrite,
         )

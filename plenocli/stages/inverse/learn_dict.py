@@ -431,7 +431,9 @@ def _write(
         "notes": {},
     } | ({} if summary is None else _judgement(summary))
     provenance = Provenance(
-        origin.command, describe_inputs({"pif": origin.pif, "image": origin.images}), chosen.seed
+        command=origin.command,
+        inputs=describe_inputs({"pif": origin.pif, "image": origin.images}),
+        seed=chosen.seed,
     )
     attrs = {k: v for k, v in attrs.items() if v is not None}
     write_artefact(

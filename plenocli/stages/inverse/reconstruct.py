@@ -572,7 +572,7 @@ def _write(
     """Write one picture."""
     from plenocli.files.artefacts.provenance import Provenance
 
-    provenance = Provenance(command, inputs, settings.seed)
+    provenance = Provenance(command=command, inputs=inputs, seed=settings.seed)
     summary = solved.summary(target, clipped=settings.clip)
     write = _write_exr if target.suffix == ".exr" else _write_artefact
     write(target, solved, summary, provenance, overwrite)

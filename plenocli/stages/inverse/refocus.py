@@ -85,7 +85,7 @@ def run_refocus(
     inputs = describe_inputs({"capture": capture, "calibration": calibration, "camera": camera})
     write_artefact(
         output,
-        lightfield_artefact(field, samples, Provenance(command, inputs, seed)),
+        lightfield_artefact(field, samples, Provenance(command=command, inputs=inputs, seed=seed)),
         overwrite=overwrite,
     )
     best = int(np.argmax(field.sharpness))

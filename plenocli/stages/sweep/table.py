@@ -217,7 +217,9 @@ def finish(
 
     table = design_table(space, points, objectives)
     inputs = {"sweep": space.path, "camera": space.camera_path, "file": sorted(space.files) or None}
-    provenance = Provenance(command, describe_inputs(inputs), space.seed, _base_text(space))
+    provenance = Provenance(
+        command=command, inputs=describe_inputs(inputs), seed=space.seed, config=_base_text(space)
+    )
     publish(
         store.output.with_suffix(".csv"),
         _csv(points, table).encode(),

@@ -91,3 +91,14 @@ def test_python_in_the_documentation_runs(tmp_path, monkeypatch):
             and 0.1 < names["psf"].sum() <= 1.001
         )
     assert blocks
+
+
+def test_places_named_in_the_architecture_and_the_recipes_exist():
+    for page in (ROOT / "docs" / "architecture.md", ROOT / "CONTRIBUTING.md"):
+        for name in re.findall(r"`((?:\w+/)+[\w.]+)`", page.read_text()):
+            places = [ROOT / name, ROOT / "plenocli" / name]
+            assert any(place.exists() for place in places), (page.name, name)
+
+
+def test_the_house_is_drawn_in_forty_lines():
+    assert len((ROOT / "docs" / "architecture.md").read_text().splitlines()) <= 45

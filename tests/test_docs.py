@@ -313,7 +313,8 @@ def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
     (tmp_path / "sweeps" / "mine.toml").write_text(example)
     space = open_space(tmp_path / "sweeps" / "mine.toml", read_options, 0)
     rows = [
-        space.row(number, point) for number, point in enumerate(points(space.sweep, space.axes, 0))
+        space.point(number, point)
+        for number, point in enumerate(points(space.sweep, space.axes, 0))
     ]
     assert len(rows) == 4 * 5 * 3 * 2 and all(
         row.task is not None and row.result is None for row in rows

@@ -320,6 +320,12 @@ coherent_ring = click.option(
 )
 
 
+def model(help: str) -> Callable:
+    """--model, a kind of propagation (those of plenocli.forward.propagation.models)."""
+    kinds = click.Choice(["auto", "ray", "fresnel", "exact"])
+    return click.option("--model", type=kinds, default="auto", show_default=True, help=help)
+
+
 def superpixels(meaning: str) -> Callable:
     """--superpixels with its meaning for one command."""
     return click.option(

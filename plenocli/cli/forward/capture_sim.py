@@ -93,13 +93,7 @@ from plenocli.cli import options
     default=None,
     help="Relative error of the light on the sensor; default: what its noise lets be seen.",
 )
-@click.option(
-    "--model",
-    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
-    default="auto",
-    show_default=True,
-    help="Propagation model, as in simulate-pif.",
-)
+@options.model("Propagation model, as in simulate-pif.")
 @click.option(
     "--scene-out",
     type=options.FILE,

@@ -53,15 +53,9 @@ class _Step(click.ParamType):
         "default the one on the axis."
     ),
 )
-@click.option(
-    "--model",
-    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
-    default="auto",
-    show_default=True,
-    help=(
-        "Propagation model; auto takes the cheapest that meets the accuracy, a named one is "
-        "accurate within itself."
-    ),
+@options.model(
+    "Propagation model; auto takes the cheapest that meets the accuracy, a named one is "
+    "accurate within itself."
 )
 @click.option(
     "--accuracy",

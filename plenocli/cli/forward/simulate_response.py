@@ -33,13 +33,7 @@ from plenocli.cli import options
     default=None,
     help="Full width at half maximum of each band, such as 10nm; default one exact wavelength.",
 )
-@click.option(
-    "--model",
-    type=click.Choice(["auto", "ray", "fresnel", "exact"]),
-    default="auto",
-    show_default=True,
-    help="Rays (exact areas of the pupil), paraxial waves, or exact waves; auto is waves.",
-)
+@options.model("Rays (exact areas of the pupil), paraxial waves, or exact waves; auto is waves.")
 @click.option(
     "--own-field",
     is_flag=True,

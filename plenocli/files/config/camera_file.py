@@ -30,11 +30,6 @@ def parse_camera(text: str, where: str | Path = "camera") -> Camera:
     return parse_toml(text, where, Camera)
 
 
-def camera_schema() -> dict[str, Any]:
-    """The JSON Schema of a camera description."""
-    return Camera.model_json_schema()
-
-
 _UNITS = {"full_well": "e", "read_noise": "e", "gain": "DN/e"}
 
 

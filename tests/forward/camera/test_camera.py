@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import ConfigError, InputError
-from plenocli.files.config.camera_file import camera_schema, load_camera, parse_camera, to_toml
+from plenocli.files.config.camera_file import load_camera, parse_camera, to_toml
+from plenocli.forward.camera.model import Camera
 
 SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
 TINY = (SAMPLES / "tiny.toml").read_text()
@@ -118,7 +119,7 @@ def test_files_that_are_no_description(tmp_path):
 
 def test_schema_names_every_section():
     assert {"main_lens", "object", "lenslet_array", "sensor", "light", "filter_array"} <= set(
-        camera_schema()["properties"]
+        Camera.model_json_schema()["properties"]
     )
 
 

@@ -3,6 +3,7 @@ is --method lmmse.
 """
 
 import difflib
+from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -41,7 +42,7 @@ _OURS = {
 """What a chain of stages gives its stages by itself."""
 
 
-def read_options(stage: str, values: dict[str, Any]) -> dict[str, Any]:
+def read_options(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a command, checked and converted as on its command line.
 
     stage: the command.

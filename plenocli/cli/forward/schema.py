@@ -1,10 +1,16 @@
 """`plenocli schema`: the JSON Schema of a configuration file."""
 
+from __future__ import annotations
+
 import json
+from typing import TYPE_CHECKING
 
 import click
 
 from plenocli.cli import options
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 
 @click.command("schema", short_help="Print the JSON Schema of a camera, scene or lens description.")
@@ -23,8 +29,5 @@ def command(
     from plenocli.files.config.scene_file import Scene
     from plenocli.forward.camera.model import Camera
 
-    click.echo(
-        json.dumps(
-            {"camera": Camera, "scene": Scene, "lens": LensFile}[kind].model_json_schema(), indent=2
-        )
-    )
+    models: dict[str, type[BaseModel]] = {"camera": Camera, "scene": Scene, "lens": LensFile}
+    click.echo(json.dumps(models[kind].model_json_schema(), indent=2))

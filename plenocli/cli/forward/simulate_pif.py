@@ -1,7 +1,7 @@
 """`plenocli simulate-pif`: the system matrix of a camera."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -96,7 +96,7 @@ def command(
     *,
     output: Path | None,
     wavelengths: tuple[float, ...],
-    spectral_step: float | str | None,
+    spectral_step: float | Literal["auto"] | None,
     superpixels: tuple[int, int] | str,
     coherent_ring: int | str,
     lenslet: tuple[int, int] | None,

@@ -13,7 +13,13 @@ from plenocli.base.progress import bar
 from plenocli.base.text import by
 from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
 from plenocli.forward.sensor.noise import ROUNDING, Noise, SensorModel
-from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, windows_on
+from plenocli.inverse.calibration.calibration import (
+    Calibration,
+    Sensor,
+    White,
+    there,
+    windows_on,
+)
 from plenocli.inverse.calibration.measured_response import GatheredResponses, measured_response
 from plenocli.inverse.calibration.quality import mean_of_known
 from plenocli.inverse.grid.detect import find_grid
@@ -134,14 +140,16 @@ def calibrate(
     step = 1 if first.cfa == "mono" else 2
     bad = bad_pixels(signal, dark, first.levels.white, step) | np.isnan(signal)
     reference = White.measured(np.where(bad, np.float32(np.nan), signal), windows, valid)
-    valid = valid & (reference.level > 0)
+    valid = valid & (there(reference.level) > 0)
     del signal
     grid, measured = replace(found, valid=valid), None
     if bands is not None:
         light = _Light(first, dark, bad)
         measured, noise = _response(bands, light, noise, response, grid, windows)
         if measured.shared:
-            reference = replace(reference, superpixels=mean_of_known(reference.superpixels[valid]))
+            reference = replace(
+                reference, superpixels=mean_of_known(there(reference.superpixels)[valid])
+            )
     noise = noise.filled()
     calibration = Calibration(
         grid=grid,
@@ -173,7 +181,7 @@ def _sensor(white: Capture, noise: KnownNoise) -> Sensor:
         white_level=white.levels.white,
         exposure=white.exposure_s,
         gain_e_per_dn=1 / noise.gain if noise.gain else None,
-        read_noise=float(np.sqrt(noise.read_variance)),
+        read_noise=float(np.sqrt(there(noise.read_variance))),
         notes=f"noise from: {noise.source}",
     )
 
@@ -293,7 +301,7 @@ def _response(
         )
         signal[bad] = np.nan
         energy = next((r for w, r in bands.radiances.items() if abs(w - wavelength) < 1e-12), 1.0)
-        gathered.add(k, wavelength, signal, weight, np.mean(shares), energy)
+        gathered.add(k, wavelength, signal, weight, float(np.mean(shares)), energy)
     known = noise.known()
     variance = None if known is None else gathered.variance(known, dark.variance)
     found = measured_response(

@@ -226,6 +226,7 @@ def _measured_sites(
             best, chosen = found, index
         if best.sum() > 0.6 * len(position):
             break
+    assert chosen is not None  # a walk finds its start at least
     index, first, flux = chosen[best], position[best], flux[best]
     surface, slope = _illumination(
         first, flux, image.shape, _whole(first, image.shape, 0.45 * pitch)
@@ -425,7 +426,7 @@ def _lit_cells(image: np.ndarray, model: GridModel) -> np.ndarray:
 
 def _whole(position: np.ndarray, shape: tuple[int, ...], margin: float) -> np.ndarray:
     low = margin - 0.5 - FRAME_TOLERANCE
-    return ((position >= low) & (position <= np.array(shape) - 1 - low)).all(axis=-1)
+    return np.all((position >= low) & (position <= np.array(shape) - 1 - low), axis=-1)
 
 
 def _assemble(

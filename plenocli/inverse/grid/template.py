@@ -270,7 +270,8 @@ def _template(
         [window.shifted(sign * phase[0]), window.shifted(sign * phase[1]).transpose(0, 2, 1)]
         for sign in (1, -1)
     )
-    mean, quarter = 0.0, len(patch) // 4
+    mean: np.ndarray = np.zeros((), patch.dtype)
+    quarter = len(patch) // 4
     for turn in range(3):  # interpolation blurs: what is left of the patches, moved back, is put in
         rest = patch if turn == 0 else patch - back[0] @ mean @ back[1]
         mean = mean + np.sort(there[0] @ rest @ there[1], axis=0)[
@@ -409,7 +410,7 @@ def _share_within(
         )
         trust.append(own - np.einsum("ni,ni->n", joint[:, :4], beside))
         total.append(own)
-    value, trust, total = (np.concatenate(x) for x in (value, trust, total))
-    if trust.sum() <= DEGENERATE * total.sum():
+    values, trusts, totals = (np.concatenate(x) for x in (value, trust, total))
+    if trusts.sum() <= DEGENERATE * totals.sum():
         return 1.0
-    return float(np.clip((value.sum() + 1.0) / (trust.sum() + 1.0), 0, 1))  # 1: a prior of 1 +- 1
+    return float(np.clip((values.sum() + 1.0) / (trusts.sum() + 1.0), 0, 1))  # 1: a prior of 1 +- 1

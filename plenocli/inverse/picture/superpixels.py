@@ -16,6 +16,7 @@ from plenocli.base.tiling import to_blocks
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, 
     superpixel is not wholly on the sensor.
     Raises InputError where the two sensors differ.
     """
-    dark, windows = calibration.dark.mean, calibration.windows
+    dark, windows = there(calibration.dark).mean, there(calibration.windows)
     if dark.ndim == 2 and dark.shape != capture.shape:
         raise InputError(
             f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
@@ -92,7 +93,8 @@ def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, 
     scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
     signal = extract((capture.mosaic - dark) * scale, windows.origin, windows.shape)
     signal[~calibration.grid.valid] = np.nan
-    return signal, np.broadcast_to(calibration.white.superpixels, signal.shape)
+    white = there(there(calibration.white).superpixels)
+    return signal, np.broadcast_to(white, signal.shape)
 
 
 def _along_the_grid(

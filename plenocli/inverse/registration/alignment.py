@@ -12,6 +12,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.progress import note
+from plenocli.inverse.calibration.calibration import there
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.noise import Noise
@@ -176,17 +177,18 @@ def moved_with(c: LensletResponses, motion: Motion) -> LensletResponses:
         / period
     )
     origin, rest = c.origin + whole, shifts - whole
-    variance = _carried(
-        c, SmoothResponses.of(None, c.window, c.cfa, gains), corners[0], rest[c.sites].mean(axis=0)
-    )
+    no_pictures = np.zeros((0, len(c.wavelengths), *c.window), np.float32)
+    colours = SmoothResponses.of(no_pictures, c.window, c.cfa, gains)
+    variance = _carried(c, colours, corners[0], rest[c.sites].mean(axis=0))
     if together:
-        smooth = SmoothResponses(c.response[None], corners[:1], c.window, c.cfa, gains)
+        smooth = SmoothResponses(c.common[None], corners[:1], c.window, c.cfa, gains)
         return replace(
             c,
             response=smooth.at(origin[c.sites][:1], rest[c.sites].mean(axis=0, keepdims=True))[0],
             origin=origin,
             variance=variance,
         )
+    assert isinstance(c.response, np.ndarray)  # as calibrated
     return replace(
         c,
         response=MovedResponses(c.response, c.origin, origin, rest, c.reference),
@@ -205,7 +207,7 @@ def _carried(
         return None
     if c.shared:
         return smooth.moved_variance(c.variance, corner, corner, shift)
-    return c.variance + smooth.moved_variance(c.reference.variance, corner, corner, shift)
+    return c.variance + smooth.moved_variance(there(c.reference.variance), corner, corner, shift)
 
 
 def _or_none(value: float) -> float | None:

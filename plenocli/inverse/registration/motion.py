@@ -215,11 +215,11 @@ class _LensletSample:
         )
         q = np.zeros((2, arms.shape[1]))
         q[:, 0] = start
-        before = after = None
-        for _ in range(ITERATIONS):
+        for turn in range(ITERATIONS):
             shifts = arms @ q.T
             normal, right, chi, product = self._equations(shifts, arms)
-            before = chi if before is None else before
+            if turn == 0:
+                before = chi
             solved, spread = _solve(normal, right)
             step = solved[: q.size].reshape(q.shape)
             length = np.abs(arms @ step.T).max()

@@ -140,9 +140,9 @@ class WidenedResponses:
     def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
         more = self._patterns[parity(self._origin[places])]
         own = (
-            self._response[places]
-            if self._response.ndim > 2
-            else np.broadcast_to(self._response, (len(more), *self._response.shape))
+            np.broadcast_to(self._response, (len(more), *self._response.shape))
+            if isinstance(self._response, np.ndarray) and self._response.ndim == 2
+            else self._response[places]
         )
         return np.concatenate([own, more], axis=-1)
 

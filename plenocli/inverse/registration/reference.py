@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.registration.smooth_response import SmoothResponses, parity
 
 if TYPE_CHECKING:
@@ -78,17 +79,17 @@ class Reference:
         from plenocli.forward.sensor.superpixel import inside
 
         self.window, self.cfa, self.sample = window, cfa, sample
-        whole = inside(origin - REACH, np.asarray(window) + 2 * REACH, shape)
+        whole = inside(origin - REACH, (window[0] + 2 * REACH, window[1] + 2 * REACH), shape)
         place = np.argwhere(whole)
         place = place[evenly(len(place), 4 * sample)]
         if response.ndim > 2 and len(place):
             place = place[np.isfinite(response[tuple(place.T)]).all(axis=-1).mean(axis=-1) > 0.5]
-        place = tuple(place.T)
-        self.origin, self.centres = origin[place], centres[place]
+        places = tuple(place.T)
+        self.origin, self.centres = origin[places], centres[places]
         self.shared = response.ndim == 2
         self.bases: dict[int, Basis] = {}
         self.variance = variance
-        self._response = np.asarray(response[None] if self.shared else response[place], np.float32)
+        self._response = np.asarray(response[None] if self.shared else response[places], np.float32)
         if not self.shared and len(self.origin):
             self._response = self._clean(self._response)
         corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)
@@ -148,7 +149,8 @@ class Reference:
             if self.shared
             else evenly(len(self.origin), int(np.clip(GAIN_PIXELS // count, 12, self.sample)))
         )
-        return SmoothResponses(self._response[some], self.origin[some], self.window, self.cfa).gains
+        smooth = SmoothResponses(self._response[some], self.origin[some], self.window, self.cfa)
+        return there(smooth.gains)
 
     def response(self, which: np.ndarray) -> np.ndarray:
         """F (lenslet, pixel, band) of lenslets by their index."""

@@ -96,7 +96,7 @@ class SmoothResponses:
         response = np.ascontiguousarray(np.swapaxes(response, -1, -2), np.float32).reshape(
             len(response), -1, *self.window
         )
-        known = np.isfinite(response).all(axis=1)
+        known = np.all(np.isfinite(response), axis=1)
         if gains is None:
             self._set(
                 window,
@@ -109,7 +109,7 @@ class SmoothResponses:
 
     @classmethod
     def of(
-        cls, pictures: np.ndarray | None, window: tuple[int, int], cfa: str, gains: np.ndarray
+        cls, pictures: np.ndarray, window: tuple[int, int], cfa: str, gains: np.ndarray
     ) -> SmoothResponses:
         """From smooth pictures (lenslet, band, row, column) made before."""
         out = cls.__new__(cls)

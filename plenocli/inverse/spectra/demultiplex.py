@@ -95,7 +95,7 @@ def noise_variance(
     """
     radiance = np.clip(radiance, 0, None)
     mean = (np.nan_to_num(response) @ radiance[..., None])[..., 0]
-    variance = noise.variance(mean)
+    variance = np.asarray(noise.variance(mean))
     if response_variance is not None:
         spread = np.broadcast_to(
             np.nan_to_num(response_variance),
@@ -156,7 +156,7 @@ def demultiplex(
         part = slice(start, start + step)
         f = response[part] if per_lenslet else response[None]
         one = None if noise is None else noise[part]
-        if method == "single-pixel":
+        if method == "single-pixel" and pixels is not None:
             out[:, part] = _single_pixel(f, flat[part], pixels[part], one)
         else:
             out[:, part] = _least_squares(f, flat[part], method, one, prior)
@@ -202,9 +202,11 @@ def _least_squares(
         f = np.where(used[..., None], f, 0.0)
     weighted = method in ("wls", "lmmse") or (method == "nnls" and variance is not None)
     if weighted:
+        assert variance is not None
         root = 1 / np.sqrt(np.where(used, variance, 1.0))
         f, x = f * root[..., None], x * root
     if method == "lmmse":
+        assert prior is not None
         mean, covariance = (np.asarray(p, float) for p in prior)
         inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
         f = np.concatenate([f, np.broadcast_to(inverse_root, (len(f), bands, bands))], axis=1)

@@ -59,6 +59,16 @@ class FactoredResponses:
     sound: np.ndarray
 
     @property
+    def basis(self) -> np.ndarray:
+        """q, where it was kept.
+
+        Raises ValueError where it was not, which is a mistake of the caller.
+        """
+        if self.q is None:
+            raise ValueError("the basis of these responses was not kept")
+        return self.q
+
+    @property
     def shared(self) -> bool:
         """Whether one response serves all lenslets."""
         return len(self.r) == 1
@@ -71,7 +81,10 @@ class FactoredResponses:
     @cached_property
     def blank(self) -> tuple[np.ndarray, np.ndarray] | None:
         """(lenslets, their pixels) that are not used, ordered by lenslet; None where all are."""
-        return None if self.used is None else np.nonzero(~self.used)
+        if self.used is None:
+            return None
+        rows, pixels = np.nonzero(~self.used)
+        return rows, pixels
 
     def blanks(self, part: slice) -> tuple[np.ndarray | slice, np.ndarray] | None:
         """Pixels that are not used in a block of lenslets.
@@ -93,7 +106,7 @@ class FactoredResponses:
         if self.shared:
             return self
         return FactoredResponses(
-            q=self.q[which],
+            q=self.basis[which],
             r=self.r[which],
             used=None if self.used is None else self.used[which],
             sound=self.sound[which],
@@ -153,6 +166,7 @@ def factor(
     if response.ndim == 2:
         response, which = response[None], (np.zeros(1, int),)
     elif which is None:
+        assert isinstance(response, np.ndarray)  # made ones come with their places
         response = response.reshape(-1, *response.shape[-2:])
         which = (np.arange(len(response)),)
     total, (count, bands) = len(which[0]), response.shape[-2:]
@@ -235,25 +249,29 @@ def normal_equations(
     among: superpixels of which these are a part; None: all.
     """
     bands = factored.r.shape[-1]
-    basis = (_SharedBasis if factored.shared else _OwnBases)(factored.q)
+    basis = (_SharedBasis if factored.shared else _OwnBases)(factored.basis)
     variance = None if noise is None else _PixelVariance(factored, noise, response_variance, doubt)
-    out = NormalEquations.unfilled(total, bands, factored.q.shape[-1], sandwich)
+    out = NormalEquations.unfilled(total, bands, factored.basis.shape[-1], sandwich)
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
     kernel = (
         None
         if factored.shared or variance is None or radiance is not None or doubt is not None
-        else _kernel((among or total) * factored.q.shape[-1])
+        else _kernel((among or total) * factored.basis.shape[-1])
     )
     step = max(
         1,
         (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS)
-        // factored.q.shape[-1],
+        // factored.basis.shape[-1],
     )
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
         x = cut(part)
-        if kernel is None or not _compiled(kernel, factored, part, x, variance, out):
+        if (
+            kernel is None
+            or variance is None
+            or not _compiled(kernel, factored, part, x, variance, out)
+        ):
             x = x if kernel is None else cut(part)
             _block(
                 factored,
@@ -297,7 +315,7 @@ def streamed_equations(
         )
         factors.append((factored.r, factored.sound))
     r, sound = (np.concatenate(parts) for parts in zip(*factors))
-    joined = {
+    joined: dict[str, Any] = {
         one.name: None
         if getattr(sums[0], one.name) is None
         else np.concatenate([getattr(s, one.name) for s in sums])
@@ -335,7 +353,7 @@ def _compiled(
     known = variance.known if variance.known is not None else np.empty((0, x.shape[1]), np.float32)
     sandwich = out.spread is not None
     kernel(
-        factored.q[part],
+        factored.basis[part],
         factored.inverse[part],
         x,
         np.float32(variance.gain),
@@ -345,7 +363,7 @@ def _compiled(
         out.unweighted[part],
         out.normal[part],
         out.right[part],
-        out.spread[part] if sandwich else out.normal[part],
+        out.normal[part] if out.spread is None else out.spread[part],
         out.chi[part],
     )
     return not np.isnan(out.unweighted[part]).any()
@@ -445,7 +463,8 @@ class _SharedBasis:
         self.products = np.ascontiguousarray((self.wide[pairs[0]] * self.wide[pairs[1]]).T)
         self.unfold = np.zeros((bands, bands), int)
         self.unfold[pairs] = self.unfold[pairs[::-1]] = np.arange(len(pairs[0]))
-        self.buffer, self.terms = np.zeros((0, self.wide.shape[1]), np.float32), None
+        self.buffer = np.zeros((0, self.wide.shape[1]), np.float32)
+        self.terms: np.ndarray | None = None
 
     def rows(self, part: slice, rows: np.ndarray) -> _SharedBasis:
         return self
@@ -549,7 +568,7 @@ class _PixelVariance:
             None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32)
             for v in (response_variance, doubt)
         )
-        constant = np.full((1, factored.q.shape[-1]), self.read)
+        constant = np.full((1, factored.basis.shape[-1]), self.read)
         self.patterns = constant if self.known is None else np.concatenate([constant, self.known])
 
     def of(
@@ -626,12 +645,14 @@ def solve(
             sums.unweighted,
         )
     elif method == "pinv":
+        assert sums.spread is not None
         back = np.linalg.inv(normal)
         covariance, c = (
             back @ np.where(known[:, None, None], sums.spread, 0) @ back,
             sums.unweighted,
         )
     elif method == "lmmse":
+        assert prior is not None
         mean, given = (np.asarray(p, float) for p in prior)
         pull = np.swapaxes(inverse, -1, -2) @ np.linalg.inv(given) @ inverse
         covariance = np.linalg.inv(normal + pull)

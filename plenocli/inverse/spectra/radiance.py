@@ -73,7 +73,11 @@ def readout(
             path,
             "use files of one kind for all captures",
         )
-    scale = 1.0 if sensor.exposure is None else sensor.exposure / exposure.exposure_s
+    scale = (
+        1.0
+        if sensor.exposure is None or exposure.exposure_s is None
+        else sensor.exposure / exposure.exposure_s
+    )
     top = exposure.levels.white if np.isfinite(exposure.levels.white) else sensor.white_level
     signal = Readout(
         values=exposure.mosaic,
@@ -104,11 +108,12 @@ def light_prior(c: LensletResponses) -> Prior | None:
     from plenocli.forward.scene.tables import surfaces
     from plenocli.inverse.spectra.demultiplex import demultiplex
 
-    response, white = c.response, there(there(c.calibration.white).superpixels)
+    white = there(there(c.calibration.white).superpixels)
+    some = tuple(part[:: max(1, len(part) // LIT)] for part in c.sites)
+    response = c.at(some)
     if not c.shared:
-        some = tuple(part[:: max(1, len(part) // LIT)] for part in c.sites)
-        response, white = response[some], white[some]
-    light = demultiplex(response, white, "pinv")[0].reshape(-1, len(c.wavelengths))
+        white = white[some]
+    light: np.ndarray = demultiplex(response, white, "pinv")[0].reshape(-1, len(c.wavelengths))
     light = light[np.isfinite(light).all(axis=1)]
     light = np.median(light, axis=0) if len(light) else np.zeros(1)
     if not (light > 0).all():
@@ -185,7 +190,7 @@ def _with_stray(
     from plenocli.inverse.registration.moved_response import widened
 
     some = tuple(part[c.sample] for part in c.sites)
-    level = np.float32(max(float(np.nanmax(c.response if c.shared else c.response[some])), 1e-30))
+    level = np.float32(max(float(np.nanmax(c.at(some))), 1e-30))
     count = stray.shape[-1]
     variance = (
         None
@@ -250,16 +255,16 @@ class _Estimation:
             )
             return sums
         if which is None:
-            return normal_equations(self.factored, self.cut, self.total, **settings)
+            return normal_equations(self.widened.factored, self.cut, self.total, **settings)
         return normal_equations(
             self._some(which), lambda part: self.cut(which[part]), len(which), **settings
         )
 
     def _some(self, which: np.ndarray | None) -> FactoredResponses:
         if which is None or which is self.sample:
-            return self.factored if which is None else self.widened.sampled
+            return there(self.factored) if which is None else self.widened.sampled
         if not self.widened.passing:
-            return self.factored.some(which)
+            return self.widened.factored.some(which)
         from plenocli.inverse.spectra.factored import factor
 
         return factor(self.widened.response, tuple(part[which] for part in self.widened.sites))
@@ -273,7 +278,7 @@ class _Estimation:
             doubt=known if self.ratio else None,
             sandwich=sandwich,
         )
-        if not self.starved:
+        if self.prior is None or not self.starved:
             return self.equations(which, **settings)
         count = self.total if which is None else len(which)
         first = self.equations(
@@ -345,11 +350,7 @@ class _Estimation:
     def _double(self, which: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray]:
         from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
 
-        f = (
-            self.widened.response
-            if self.widened.shared
-            else self.widened.response[self.c.sites[0][which], self.c.sites[1][which]]
-        )
+        f = self.widened.at((self.c.sites[0][which], self.c.sites[1][which]))
         x, variance = self.cut(which), None
         if self.noise is not None:
             b = demultiplex(f, x, "pinv")[0]
@@ -369,6 +370,7 @@ class _Estimation:
         """Mean square error that single-pixel extraction would make on the sample: crosstalk
         bias and the noise of one pixel.
         """
+        assert self.noise is not None
         rows = self.c.sampled_pixels[1]
         own = np.diagonal(rows, axis1=-2, axis2=-1)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -94,6 +94,22 @@ class LensletResponses:
         return self.response.ndim == 2
 
     @property
+    def common(self) -> np.ndarray:
+        """The one F (pixel, band) of all lenslets.
+
+        Raises ValueError where each has its own, which is a mistake of the caller.
+        """
+        if not isinstance(self.response, np.ndarray) or not self.shared:
+            raise ValueError("every lenslet has responses of its own")
+        return self.response
+
+    def at(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
+        """F (lenslet, pixel, band) of lenslets by their rows and columns; (pixel, band) where one
+        serves all.
+        """
+        return self.common if self.shared else self.response[places]
+
+    @property
     def passing(self) -> bool:
         """Whether F is made lenslet by lenslet for one capture."""
         return not isinstance(self.response, np.ndarray)
@@ -177,8 +193,8 @@ class LensletResponses:
         from plenocli.inverse.spectra.demultiplex import choose_pixels
 
         if self.shared:
-            pixels = choose_pixels(self.response)[None]
-            return pixels, self.response[pixels].astype(float)
+            pixels = choose_pixels(self.common)[None]
+            return pixels, self.common[pixels].astype(float)
         rows, columns = (part[which] for part in self.sites)
         step = max(1, BATCH_NUMBERS // int(np.prod(self.response.shape[-2:])))
         found = []

@@ -1,6 +1,9 @@
 """What a file holds, in words and numbers: every artefact, EXR, RAW, DNG, PNG, TIFF and JPEG."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +19,9 @@ from plenocli.evaluation.inspection import (
     as_plain,
     statistics,
 )
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.schema import Schema
 
 
 def run_inspect(path: Path | str) -> FileReport:
@@ -41,6 +47,12 @@ def run_inspect(path: Path | str) -> FileReport:
     return FileReport(file=path.name, bytes=size, content=content)
 
 
+def _unit(schema: Schema, where: str, name: str) -> str:
+    attr = schema.attr_for(where, name)
+    assert attr is not None  # a file with others is refused when it is read
+    return attr.unit
+
+
 def _artefact(path: Path) -> ArtefactReport:
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.kinds import SCHEMAS
@@ -50,6 +62,7 @@ def _artefact(path: Path) -> ArtefactReport:
     datasets = {}
     for name, values in artefact.data.items():
         field = schema.field_for(name)
+        assert field is not None  # a file with others is refused when it is read
         datasets[name] = DatasetReport(
             shape=values.shape,
             dtype=str(values.dtype),
@@ -69,7 +82,7 @@ def _artefact(path: Path) -> ArtefactReport:
         datasets=datasets,
         attributes={
             where: {
-                name: AttributeReport(as_plain(value), schema.attr_for(where, name).unit)
+                name: AttributeReport(as_plain(value), _unit(schema, where, name))
                 for name, value in named.items()
             }
             for where, named in artefact.attrs.items()

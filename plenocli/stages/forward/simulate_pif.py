@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class Settings:
     """
 
     wavelengths: tuple[float, ...] = ()
-    spectral_step: float | str | None = None
+    spectral_step: float | Literal["auto"] | None = None
     superpixels: tuple[int, int] | str = "auto"
     coherent_ring: int | str = "auto"
     accuracy: float | None = None
@@ -133,7 +133,7 @@ class PifSummary:
             f"{self.pixels} pixels, {self.points} points; column energy "
             f"{min(found.energy_min):.3f} to {max(found.energy_max):.3f}"
         )
-        if found.rank is not None:
+        if not (found.rank is None or found.rank_60db is None or found.condition is None):
             text += (
                 f"; rank {min(found.rank)} ({min(found.rank_60db)} above 60 dB noise), "
                 f"condition {max(found.condition):.1e}"
@@ -182,6 +182,7 @@ def run_simulate_pif(
     plan = _planned(camera, settings)
     if explain:
         return _explained(plan, pif_pieces.cost(plan)[1])
+    assert output is not None  # _require_output
     chosen = pif_pieces.layout(plan, camera_path)
     _announce(plan, pif_pieces.cost(plan)[1])
     provenance = _provenance(camera_path, camera, settings, plan, command)
@@ -334,7 +335,7 @@ def _artefact(
 
 def _contents(
     matrix: SystemMatrix, found: Diagnosis, lattice: str
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+) -> tuple[dict[str, np.ndarray | None], dict[str, Any]]:
     """Datasets and attributes of a pif artefact."""
     notes = matrix.notes
     data = {

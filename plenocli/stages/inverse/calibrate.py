@@ -119,7 +119,12 @@ def run_calibrate(
 
     bands = sorted(bands, key=lambda pair: pair[0])
     _check_radiances(radiances, bands)
-    roles = {"white": list(whites), "dark": list(darks), "camera": camera, **_band_roles(bands)}
+    roles: dict[str, Any] = {
+        "white": list(whites),
+        "dark": list(darks),
+        "camera": camera,
+        **_band_roles(bands),
+    }
     check_output(
         output,
         overwrite=overwrite,

@@ -88,9 +88,8 @@ def _study(objectives: Mapping[str, str], seed: int) -> Study:
             "optimise needs Optuna, which is not installed", fix=how_to_install("optimise")
         ) from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    directions = ["maximize" if aim == "max" else "minimize" for aim in objectives.values()]
     return optuna.create_study(
-        directions=directions,
+        directions=["maximize" if aim == "max" else "minimize" for aim in objectives.values()],
         sampler=optuna.samplers.TPESampler(seed=seed % 2**32, multivariate=False),
     )
 
@@ -107,7 +106,8 @@ def _ask(study: Study, space: Space) -> tuple[Trial, dict[str, Any]]:
     for key, axis in space.axes.items():
         if isinstance(axis, Choice):
             numbers = [number(value) for value in axis.values]
-            ordered = all(n is not None for n in numbers) and bool(np.all(np.diff(numbers) > 0))
+            known = [n for n in numbers if n is not None]
+            ordered = len(known) == len(numbers) and bool(np.all(np.diff(known) > 0))
             count = len(axis.values)
             place = (
                 trial.suggest_int(key, 0, count - 1)
@@ -129,7 +129,8 @@ def _tell(study: Study, trial: Trial, point: DesignPoint, objectives: Mapping[st
 
     result = result_of(point)
     figures = [result.metrics.get(name, number(point.values.get(name))) for name in objectives]
-    if result.status or any(value is None for value in figures):
+    known = [value for value in figures if value is not None]
+    if result.status or len(known) < len(figures):
         study.tell(trial, state=TrialState.FAIL)
     else:
-        study.tell(trial, figures)
+        study.tell(trial, known)

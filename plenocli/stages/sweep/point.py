@@ -142,13 +142,14 @@ def _without(folder: Path, texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
-    from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
+    from plenocli.stages.forward.simulate_pif import PifSummary, Settings, run_simulate_pif
 
     report = run_simulate_pif(
         folder / "camera.toml",
         folder / "pif.h5",
         _settings(Settings, task.options("simulate-pif")),
     )
+    assert isinstance(report, PifSummary)  # nothing was to be explained
     return MatrixCost(matrix_seconds=report.nominal_seconds, matrix_bytes=report.bytes)
 
 

@@ -213,6 +213,7 @@ class _Work:
                 progress.update()
 
     def _job(self, point: DesignPoint, matrix: SharedMatrix | None = None) -> Job:
+        assert point.task is not None  # only points that can be are computed
         return Job(task=point.task, matrix=matrix, files=self.files, scratch=self.scratch)
 
     def _open(self, group: str) -> None:

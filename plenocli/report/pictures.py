@@ -305,18 +305,17 @@ def matrix_summary(
     values = None if singular_values is None else np.atleast_2d(singular_values)
     with drawing(9.4, 3.6) as made:
         left, right = made.figure.subplots(1, 2, width_ratios=(1.55, 1))
-        ranks = (
-            [None] * len(wavelengths)
-            if ranks is None
-            else np.broadcast_to(np.ravel(ranks), len(wavelengths))
-        )
+        if ranks is not None:
+            ranks = np.broadcast_to(np.ravel(ranks), len(wavelengths))
         chosen = np.unique(
             np.round(np.linspace(0, len(wavelengths) - 1, min(len(wavelengths), 6))).astype(int)
         )
-        for number, band in enumerate(chosen if values is not None else ()):
+        for number, band in enumerate(chosen):
+            if values is None:
+                break
             one = values[min(band, len(values) - 1)]
             kept = one[one > 0]
-            rank = "" if ranks[band] is None else f", rank {int(ranks[band])} of {len(one)}"
+            rank = "" if ranks is None else f", rank {int(ranks[band])} of {len(one)}"
             if len(kept):
                 left.semilogy(
                     np.arange(1, len(kept) + 1),
@@ -552,6 +551,7 @@ def dictionary_atoms(
     chosen = atoms[:, :count]
     parts = [("atoms in object space", chosen, object_shape)]
     if matrix is not None:
+        assert pixel_shape is not None
         parts.append(("the same atoms on the sensor, A phi", matrix @ chosen, pixel_shape))
     with drawing(5.1 * len(parts), 5.0 * -(-count // per_side) / per_side + 0.35) as made:
         for axes, (title, columns, shape) in zip(

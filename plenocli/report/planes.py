@@ -72,10 +72,9 @@ def _sharpness(field: LightField) -> bytes:
 
 
 def _depth(depth: DepthMap) -> bytes:
-    known = depth.distance is not None and np.isfinite(depth.distance).any()
-    values, bar = (
-        (1e3 * depth.distance, "distance [mm]") if known else (depth.slope, "slope [px/px]")
-    )
+    values, bar = depth.slope, "slope [px/px]"
+    if depth.distance is not None and np.isfinite(depth.distance).any():
+        values, bar = 1e3 * depth.distance, "distance [mm]"
     with drawing(8.6, 3.4) as made:
         left, right = made.figure.subplots(1, 2)
         low, high = np.nanpercentile(values, [2, 98])

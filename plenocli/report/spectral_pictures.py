@@ -181,7 +181,7 @@ def filters_picture(camera: "Camera") -> bytes:
             else Circle((0, 0), half, color="#444444")
         )
         for number, (((y0, y1, x0, x1), _), one) in enumerate(
-            zip(filter_cells(camera, filters[0].center), filters, strict=True)
+            zip(filter_cells(camera, filters[0].center) or (), filters, strict=True)
         ):
             colour = COLOURS[number % len(COLOURS)]
             pupil.add_patch(
@@ -299,7 +299,7 @@ def lenslet_spectra(
         order = known[np.argsort(level[tuple(known.T)], kind="stable")]
         lenslets = (
             [
-                tuple(int(n) for n in order[k])
+                (int(order[k][0]), int(order[k][1]))
                 for k in np.unique(
                     np.round(np.linspace(0.02, 0.98, 5) * (len(order) - 1)).astype(int)
                 )
@@ -499,7 +499,7 @@ def accuracy_bars(results: Sequence[ResultScore]) -> bytes:
     error_name = "six_patch_rmse_per_band" if six else "rmse_per_band"
     with_snr = any(one.bands("snr_capture_db") for one in shown)
     with drawing(9.6 if with_snr else 5.4, 3.1) as made:
-        panels = np.ravel(made.figure.subplots(1, 2 if with_snr else 1))
+        panels = made.figure.subplots(1, 2 if with_snr else 1, squeeze=False).ravel()
         _bars(panels[0], shown, error_name)
         panels[0].set(
             ylabel="RMSE in reflectance",

@@ -116,6 +116,7 @@ def stream_pif(
             diagnosis.add(band, superpixel, slab)
             writer.put(band, superpixel, slab)
             tails[band], last = builder.notes.field_tail, builder
+        assert diagnosis is not None and last is not None  # there is a piece in any plan
         pif = described(plan, last, list(tails.values()), writer.energy)
         found = diagnosis.result(pif.column_energy)
         writer.close(finish(pif, found))

@@ -4,8 +4,8 @@ the rest declares.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+import os
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -14,6 +14,7 @@ from h5py import h5d, h5ds, h5l, h5t, h5z
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 
+Name: TypeAlias = str | os.PathLike[str]
 _FIX = (
     "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length "
     "(numpy.bytes_), only"
@@ -29,7 +30,7 @@ _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
 
 
-def survey(path: Path, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def survey(path: Name, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
     Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
@@ -73,7 +74,7 @@ def survey(path: Path, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.d
     return dict(sorted(declared.items()))
 
 
-def _text(path: Path, name: bytes) -> str:
+def _text(path: Name, name: bytes) -> str:
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -84,13 +85,13 @@ def _text(path: Path, name: bytes) -> str:
         ) from error
 
 
-def _check_link(path: Path, group: Any, link: bytes, child: str) -> None:
+def _check_link(path: Name, group: Any, link: bytes, child: str) -> None:
     kind = group.links.get_info(link).type
     if kind != h5l.TYPE_HARD:
         raise InputError(f"'/{child}' is {_LINKS.get(kind, 'a user-defined')} link", path, _FIX)
 
 
-def _declaration(path: Path, dataset: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
+def _declaration(path: Name, dataset: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
     properties = dataset.get_create_plist()
     if properties.get_external_count() > 0:
         raise InputError(f"'/{name}' keeps its data in another file (external storage)", path, _FIX)
@@ -112,7 +113,7 @@ def _declaration(path: Path, dataset: Any, name: str) -> tuple[tuple[int, ...], 
     return tuple(dataset.shape), np.dtype(dataset.dtype)
 
 
-def _check_type(path: Path, kind: Any, where: str) -> None:
+def _check_type(path: Name, kind: Any, where: str) -> None:
     allowed = (
         kind.get_class() in (h5t.INTEGER, h5t.FLOAT)
         or (kind.get_class() == h5t.STRING and not kind.is_variable_str())
@@ -124,7 +125,7 @@ def _check_type(path: Path, kind: Any, where: str) -> None:
         )
 
 
-def _check_attributes(path: Path, target: Any, where: str) -> None:
+def _check_attributes(path: Name, target: Any, where: str) -> None:
     for position in range(h5py.h5a.get_num_attrs(target)):
         attribute = h5py.h5a.open(target, index=position)
         label = f"{where}@{_text(path, attribute.name)}"
@@ -160,7 +161,7 @@ def attribute_names(target: Any) -> list[str]:
     return sorted(set(target.attrs) - _AXIS_ATTRIBUTES)
 
 
-def read_attribute(path: Path, target: Any, name: str) -> Any:
+def read_attribute(path: Name, target: Any, name: str) -> Any:
     """One attribute as text, list of texts, Python number, bool or numpy array."""
     value = target.attrs[name]
     if isinstance(value, np.ndarray) and value.ndim == 0:

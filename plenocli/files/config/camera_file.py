@@ -1,5 +1,6 @@
 """The camera's description as TOML, both ways."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
 
 
-def load_camera(path: str | Path) -> Camera:
+def load_camera(path: str | os.PathLike[str]) -> Camera:
     """Read and check a camera description.
 
     path: of the TOML file.
@@ -19,7 +20,7 @@ def load_camera(path: str | Path) -> Camera:
     return parse_camera(read_text(Path(path), "camera"), path)
 
 
-def parse_camera(text: str, where: str | Path = "camera") -> Camera:
+def parse_camera(text: str, where: str | os.PathLike[str] = "camera") -> Camera:
     """A Camera from TOML text.
 
     text: of the description.

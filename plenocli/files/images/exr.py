@@ -185,7 +185,7 @@ def _digest(planes: Mapping[str, np.ndarray], attrs: Mapping[str, str]) -> str:
     digest = hashlib.sha256(json.dumps(sorted(attrs.items())).encode())
     for name in sorted(planes):
         digest.update(f"{name} {planes[name].shape}".encode())
-        digest.update(np.ascontiguousarray(planes[name], dtype="<f4"))
+        digest.update(np.ascontiguousarray(planes[name], dtype="<f4").data)
     return digest.hexdigest()
 
 

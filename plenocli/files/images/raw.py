@@ -164,7 +164,7 @@ def _from_child(path: Path, timeout_s: float) -> tuple[dict[str, Any], bytes]:
 
 def _reason(found: dict[str, Any], size: int) -> str:
     """A sentence for the user from what LibRaw said."""
-    known = _REASONS.get(found.get("error"))
+    known = _REASONS.get(found.get("error", ""))
     if known is None:
         return found["refused"] + (f" ({found['error']})" if "error" in found else "")
     return f"{known} ({size} bytes; LibRaw: {found['refused']})"
@@ -203,12 +203,13 @@ def _own_notes(path: Path, pixels: bytes) -> dict[str, Any]:
             path,
             "make it again",
         )
+    black: Any = notes.get("black")
     numbers = [
         notes.get("white"),
-        *np.ravel(notes.get("black")),
+        *np.ravel(black),
         *(notes[k] for k in ("exposure_s", "gain_e_per_dn", "band_m") if notes.get(k) is not None),
     ]
-    if np.size(notes.get("black")) not in (1, 4) or any(
+    if np.size(black) not in (1, 4) or any(
         isinstance(v, bool) or not isinstance(v, (int, float)) for v in numbers
     ):
         raise InputError(

@@ -106,11 +106,12 @@ def read_chart_folder(
             "name the captures so",
         )
     captures: dict[float, list[Shot]] = {}
-    white, shape = None, None
+    white = np.inf
+    shape: tuple[int, ...] | None = None
     for path in shots:
         capture, shape = _read(path, cfa, shape)
         white = capture.levels.white
-        band = int(_BAND.search(path.name)[1]) * 1e-9
+        band = int(_matched(_BAND, path.name)[1]) * 1e-9
         captures.setdefault(band, []).append(Shot(_seconds(path), capture.mosaic))
     kept, darks = [], []
     for path in dark_paths:
@@ -118,6 +119,7 @@ def read_chart_folder(
         if capture.shape == shape:
             kept.append(path)
             darks.append(Shot(_seconds(path), capture.mosaic))
+    assert shape is not None  # there are shots
     label_path, label_map = _labels(labels, found, shape, folder)
     table_path, table = _spectra(spectra, found, folder)
     data = ChartCaptures(
@@ -134,8 +136,15 @@ def read_chart_folder(
     return ChartFolder(data, files)
 
 
+def _matched(pattern: re.Pattern[str], name: str) -> re.Match[str]:
+    """The match in a name that was chosen for having one."""
+    match = pattern.search(name)
+    assert match is not None
+    return match
+
+
 def _seconds(path: Path) -> float:
-    value, unit = _TIME.search(path.name).groups()
+    value, unit = _matched(_TIME, path.name).groups()
     return float(value) * _UNIT[unit.lower()]
 
 
@@ -195,7 +204,7 @@ def _first(
             faults.append(error)
     if path:
         raise faults[0]
-    said = f": {faults[0].what} ({Path(faults[0].where).name})" if faults else ""
+    said = f": {faults[0].what} ({Path(faults[0].where or '').name})" if faults else ""
     raise InputError(f"holds no {what}{said}", folder, fix)
 
 
@@ -277,8 +286,8 @@ def _table(path: Path) -> _Table:
         )
     columns = {name: values[:, i] for i, name in enumerate(header)}
     filters = {
-        int(_FILTER.fullmatch(name)[1]) * 1e-9: columns[name]
+        int(match[1]) * 1e-9: columns[name]
         for name in header[1:]
-        if _FILTER.fullmatch(name)
+        if (match := _FILTER.fullmatch(name))
     }
     return _Table(wavelengths, np.array([columns[name] for name in names]), filters)

@@ -43,7 +43,7 @@ def read_scene(
             return Photograph(values[:, :, None], sampling, False)
         return Cube(artefact.data["image/wavelength"], values, sampling)
     picture = read_picture(path)
-    if picture.is_spectral:
+    if picture.wavelengths is not None:
         return Cube(picture.wavelengths, np.moveaxis(picture.values, -1, 0), sampling)
     return Photograph(picture.values, sampling, spectral)
 
@@ -58,7 +58,9 @@ def embedded_photograph(name: str) -> np.ndarray:
 
     from plenocli.files.images.pictures import read_picture
 
-    folder = Path(find_spec("skimage").submodule_search_locations[0]) / "data"
+    package = find_spec("skimage")
+    assert package is not None and package.submodule_search_locations is not None
+    folder = Path(package.submodule_search_locations[0]) / "data"
     for suffix in (".png", ".jpg"):
         if (folder / f"{name}{suffix}").is_file():
             return read_picture(folder / f"{name}{suffix}").values

@@ -2,7 +2,7 @@
 planes.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,7 +68,7 @@ def _response_of(artefact: "Artefact", path: Path) -> ComparedResponse:
     )
 
 
-def read_result(path: Path | str, kinds: Sequence[str] = PICTURES) -> Result:
+def read_result(path: Path | str, kinds: tuple[str, ...] = PICTURES) -> Result:
     """A picture, spectra or a dictionary from an artefact .h5 or an EXR picture.
 
     kinds: that will do.

@@ -310,7 +310,8 @@ def _rings_of(request: _Request, model: Model) -> Sequence[int]:
         for ring in request.rings
         if ring == 1
         or max(
-            coherent_window(v, request.superpixels, ring) * v.D2 / v.z3 for v in request.geometries
+            (coherent_window(v, request.superpixels, ring) or 0) * v.D2 / v.z3
+            for v in request.geometries
         )
         <= STEEPEST
     ]
@@ -356,7 +357,7 @@ def _sized(
     except NumericsError as error:
         return Candidate(name=model.name, model=model.kind, why=error.what)
     split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
-    if nodes:
+    if nodes and request.band is not None:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return Candidate(
@@ -378,7 +379,7 @@ def _sized(
 
 def _finest(request: _Request, nodes: int) -> list[Geometry]:
     """The geometries that node counts must serve: of a band, that of its shortest wavelength."""
-    if not nodes:
+    if not nodes or request.band is None:
         return request.geometries
     return [
         geometry_of(
@@ -400,7 +401,7 @@ def _fall_back(
     """
     asked, possible = request.accuracy, [c for c in found if math.isfinite(c.error)]
     least = min(
-        (math.hypot(*(v for k, v in c.split.items() if k != "sampling")) for c in possible),
+        (math.hypot(*(v for k, v in c.sources.items() if k != "sampling")) for c in possible),
         default=math.inf,
     )
     reached, again, best = _finest_served(
@@ -420,7 +421,7 @@ def _fall_back(
     why = next(c.why for c in found if c.name == best.name)
     if request.explicit:
         advice = f"ask for {reached:.2g} or coarser"
-        if request.model == "auto" and best.split["model"] > 0.5 * best.error:
+        if request.model == "auto" and best.sources["model"] > 0.5 * best.error:
             advice += (
                 f", or name a model (--model {best.model}) to ask for accuracy "
                 "within that model only"
@@ -531,7 +532,7 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         bytes=size,
         memory=best.bytes,
         estimated=best.error,
-        split=best.split,
+        split=best.sources,
         model_error=_model_error(request, best),
         dtype=request.dtype.name,
         reasons=tuple(request.reasons),

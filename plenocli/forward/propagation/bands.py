@@ -165,7 +165,9 @@ class BandFields(LensletFields):
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """As LensletFields.incident."""
-        return sum(w * f.incident(rows, columns) for f, w in zip(self._fields, self._weights))
+        return np.asarray(
+            sum(w * f.incident(rows, columns) for f, w in zip(self._fields, self._weights))
+        )
 
     def columns(self, rows: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
         """As LensletFields.columns."""
@@ -199,6 +201,7 @@ def band_fields(
     geometry: at the centre of the band;
     band: sized for the shortest of the wavelengths; it serves all of them.
     """
+    assert camera.light.band is not None
     wavelengths, weights = spectral_nodes(camera.light.band, plan.band_nodes)
     return BandFields(
         [

@@ -75,6 +75,13 @@ class Candidate:
     bytes: int = 0
     band_nodes: int = 0
 
+    @property
+    def sources(self) -> dict[str, float]:
+        """`split` of a candidate whose error is known; ValueError for another."""
+        if self.split is None:
+            raise ValueError(f"{self.name} without an error")
+        return self.split
+
     def seconds(self, rate: Callable[[bool], float] | None = None) -> float:
         """Seconds of one core, at the nominal rate or at `rate` (double -> operations a second)."""
         return (

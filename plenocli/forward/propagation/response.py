@@ -89,8 +89,6 @@ def uniform_response(
     separable = geometry.lenslet_shape == "square" and (
         model == "fresnel" or lens.aperture_shape == "square"
     )
-    spot = _spot(geometry, model) if separable else None
-    strips = _strips(geometry, lens, cells) if separable else None
     reach, scale = (
         _reach(geometry, model),
         1 / (aperture_area(lens) * geometry.row_spacing * geometry.D2**2),
@@ -107,6 +105,7 @@ def uniform_response(
         for axis in (0, 1)
     ]
     if separable:
+        spot, strips = _spot(geometry, model), _strips(geometry, lens, cells)
         out = _through_spot(geometry, spot, strips, edges, which, reach)
     else:
         out = np.stack(
@@ -126,10 +125,10 @@ def field_response(builder: PifBuilder) -> np.ndarray:
 
     Returns (superpixel, pixel).
     """
-    total = 0.0
+    total: np.ndarray | float = 0.0
     for _, block in builder.blocks():
         total = total + block.sum(axis=2, dtype=float)
-    return total / builder.points
+    return np.asarray(total / builder.points)
 
 
 def own_light(camera: Camera, wavelength: float, count: int = 256) -> float:
@@ -147,11 +146,12 @@ def own_light(camera: Camera, wavelength: float, count: int = 256) -> float:
     axis = ((np.arange(count) + 0.5) / count - 0.5) * lens.aperture_diameter
     y, x, step = axis[:, None], axis[None, :], lens.aperture_diameter / count / 2
     weight = aperture_picture(lens, y, x)
-    if camera.filter_array is not None:
-        weight = weight * sum(
-            t * ((y > y0) & (y < y1) & (x > x0) & (x < x1))
-            for (y0, y1, x0, x1), t in filter_cells(camera, wavelength)
-        )
+    cells = filter_cells(camera, wavelength)
+    if cells is not None:
+        passed: np.ndarray | int = 0
+        for (y0, y1, x0, x1), t in cells:
+            passed = passed + t * ((y > y0) & (y < y1) & (x > x0) & (x < x1))
+        weight = weight * passed
     down = geometry.eps * y + (wavefront(lens, y + step, x) - wavefront(lens, y - step, x)) / (
         2 * step
     )
@@ -348,7 +348,7 @@ def _through_opening(
     the lenslet's opening.
     """
     below, minify = pupil_measure(lens), geometry.z3 / geometry.z2
-    total = 0.0
+    total: np.ndarray | float = 0.0
     for uy, ux, weight in _opening_nodes(geometry):
         for rows, columns in geometry.neighbourhood(reach):
             for m in rows:
@@ -376,7 +376,7 @@ def _through_opening(
                             )
                         )
                         total = total + weight * t * light
-    return total * aperture_area(lens)
+    return np.asarray(total * aperture_area(lens))
 
 
 def _opening_nodes(geometry: Geometry) -> list[tuple[float, float, float]]:

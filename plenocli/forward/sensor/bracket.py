@@ -38,7 +38,8 @@ def merge_bracket(
 
     Returns (row, column) DN/s, NaN where all exposures saturate.
     """
-    total = time = 0.0
+    total: np.ndarray | float = 0.0
+    time: np.ndarray | float = 0.0
     for frame, exposure, dark in zip(frames, seconds, darks, strict=True):
         good = (frame >= floor) & (frame < ceiling * white)
         total = total + np.where(good, _signal(frame, dark, truncated), 0)

@@ -51,6 +51,7 @@ def sensitivity(camera: Camera, wavelengths: ArrayLike) -> tuple[tuple[str, ...]
         return (MONO,), np.full((1, len(wavelengths)), efficiency)
     from plenocli.forward.scene.tables import camera_sensitivity
 
+    assert camera.sensor.camera is not None  # a description with colours has one
     curves = camera_sensitivity(camera.sensor.camera, wavelengths)
     letters = tuple(dict.fromkeys(camera.sensor.cfa))
     return letters, efficiency * np.stack([curves[letter] for letter in letters])

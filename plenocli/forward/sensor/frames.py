@@ -40,22 +40,27 @@ class Dark:
         """Whether the dark image is the black level everywhere."""
         return bool((self.mean == tiled(self.black, self.mean.shape, self.mean.dtype)).all())
 
-    def grows(self, exposure: float | None) -> bool:
-        """Whether the dark image at another exposure (s) is another one."""
-        return not (
+    def growth(self, exposure: float | None) -> np.float32 | None:
+        """Factor by which the part above the black level grows at another exposure (s), None where
+        the dark image is the same.
+        """
+        if (
             self.exposure is None
             or exposure is None
             or abs(exposure / self.exposure - 1) < SAME_EXPOSURE
-        )
+        ):
+            return None
+        return np.float32(exposure / self.exposure)
 
     def at(self, exposure: float | None) -> np.ndarray:
         """Expected dark image (row, column), DN, at another exposure (s): the part above the black
         level grows with time.
         """
-        if not self.grows(exposure):
+        growth = self.growth(exposure)
+        if growth is None:
             return self.mean
         level = tiled(self.black, self.mean.shape)
-        return level + (self.mean - level) * np.float32(exposure / self.exposure)
+        return level + (self.mean - level) * growth
 
 
 def tiled(level: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
@@ -90,7 +95,7 @@ def make_dark(
         for f, e in zip(frames, exposures)
         if longest is None or (e and abs(e / longest - 1) < SAME_EXPOSURE)
     ]
-    mean = sum(chosen) / np.float32(len(chosen))
+    mean = np.asarray(sum(chosen) / np.float32(len(chosen)))
     if len(chosen) > 1:
         spread = float(
             np.sqrt(np.mean([np.var(a - b) / 2 for a, b in zip(chosen[::2], chosen[1::2])]))
@@ -141,14 +146,15 @@ def merge(
     exposure time in units of the reference: the variance of the signal is that of one frame
     (Noise.variance) over the weight, for frames near that exposure.
     """
-    total, time = 0.0, 0.0
+    total: np.ndarray | float = 0.0
+    time: np.ndarray | float = 0.0
     for frame, exposure in zip(frames, exposures):
         good = ~saturated(frame, dark.black, white)
         share = 1.0 if exposure is None or reference is None else exposure / reference
         total = total + np.where(good, np.asarray(frame, np.float32) - dark.at(exposure), 0)
         time = time + good.astype(np.float32) * np.float32(share)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(time > 0, total / time, np.nan).astype(np.float32), time
+        return np.where(time > 0, total / time, np.nan).astype(np.float32), np.asarray(time)
 
 
 def photon_transfer(

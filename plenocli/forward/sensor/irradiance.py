@@ -36,7 +36,8 @@ def superpixel_light(
     if picture is not None:
         margins = [(int(n) * k, int(n) * k) for n, k in zip(reach, samples)]
         points = to_blocks(np.pad(picture, margins, mode="symmetric"), samples)
-    light, white = np.zeros(()), np.zeros(())
+    light: np.ndarray = np.zeros(())
+    white: np.ndarray = np.zeros(())
     for part, block in blocks:
         if picture is not None:
             light = light + BlockToeplitz(block, offsets, points.shape[:2]).forward(

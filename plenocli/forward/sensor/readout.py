@@ -90,11 +90,7 @@ class _Cutter:
             if np.ptp(dark.black) == 0
             else _tiles(dark.black, window)
         )
-        self.growth = (
-            None
-            if dark.flat or not dark.grows(readout.exposure_s)
-            else np.float32(readout.exposure_s / dark.exposure)
-        )
+        self.growth = None if dark.flat else dark.growth(readout.exposure_s)
         black = np.asarray(readout.black, float)
         top = black + SATURATION * (readout.white - black)
         self.least = top.min()
@@ -124,16 +120,17 @@ class _Cutter:
             light[raw >= self._of(self.top, origin)] = np.nan
         return light
 
-    def _of(self, level: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    def _of(self, level: np.ndarray | np.floating, origin: np.ndarray) -> np.ndarray | np.floating:
         """A level under windows: one number, or (lenslet, pixel)."""
-        return level if level.ndim == 0 else level[origin[:, 0] % 2, origin[:, 1] % 2]
+        return level[origin[:, 0] % 2, origin[:, 1] % 2] if isinstance(level, np.ndarray) else level
 
 
 class DarkWindows:
     """The dark image under windows; `keep` holds them all, for many captures."""
 
     def __init__(self, dark: Dark, origin: np.ndarray, window: tuple[int, ...]) -> None:
-        self.origin, self.count, self.kept = origin, window[0] * window[1], None
+        self.origin, self.count = origin, window[0] * window[1]
+        self.kept: np.ndarray | None = None
         self.view = np.lib.stride_tricks.sliding_window_view(dark.mean, window)
 
     def keep(self) -> DarkWindows:

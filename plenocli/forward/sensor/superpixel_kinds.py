@@ -81,11 +81,11 @@ class SuperpixelKinds:
         """
         from plenocli.forward.camera.geometry import lenslet_shift
 
-        count, window = camera.lenslet_array.count, tuple(camera.sensor.pixels_per_lenslet)
+        count, window = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
         found = [lenslet_shift(camera, r, c) for r in range(count[0]) for c in range(count[1])]
         origin = np.array([(row, column) for row, column, _ in found]).reshape(*count, 2)
         shift = np.array([shift for *_, shift in found]).reshape(*count, 2)
-        shape = tuple(n * k for n, k in zip(count, window))
+        shape = count[0] * window[0], count[1] * window[1]
         return cls.sorted(
             centres=origin + (np.array(window) - 1) / 2 - shift,
             origin=origin,

@@ -27,6 +27,7 @@ from plenocli.forward.propagation.sampling import distinct, is_symmetric, superp
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import BandPlan
 
 CAUTION = 1.3
 """By how much more terms than expected a field is refused at once rather than after minutes."""
@@ -84,16 +85,18 @@ class _Sizes:
 
 
 def cost(
-    camera: Camera, geometry: Geometry, band: ExactBand, shape: tuple[int, ...], double: bool
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
 ) -> Cost:
     """The Cost of a matrix.
 
+    band: an ExactBand;
     shape: (band, superpixel, pixel, point) of it;
     double: whether its fields have double precision.
 
     Raises NumericsError where the superpixels beside the lenslet's own are expected to have more
     terms than a sketch may hold.
     """
+    assert isinstance(band, ExactBand)
     return law("exact, low rank").cost(features(camera, geometry, band, shape, double))
 
 

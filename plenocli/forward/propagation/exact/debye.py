@@ -20,6 +20,7 @@ sqrt(z2'^2 + r^2) + z2'.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera, MainLens
 
-APODISATION = {
+APODISATION: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "uniform-pupil": lambda cos2: 1 / cos2,
     "aplanatic": lambda cos2: cos2**-0.25,
     "uniform-sine": np.ones_like,
@@ -58,7 +59,7 @@ def spherical_field(
         return radial_field(camera, geometry, dy, dx, spherical_profile)
     g, lens = geometry, camera.main_lens
     reach = math.hypot(np.abs(dy).max(), np.abs(dx).max())
-    total = 0
+    total: np.ndarray | int = 0
     for rows in pupil_rows(camera, g, g.k * reach / g.z2):
         r2 = rows.y[:, None] ** 2 + rows.x**2
         cos2 = g.z2**2 / (g.z2**2 + r2)
@@ -66,7 +67,7 @@ def spherical_field(
         weight = rows.weight * np.exp(1j * g.k * (defocus_path(g, r2) - g.eps * r2 / 2))
         weight *= APODISATION[lens.apodisation](cos2) * cos2**2 / g.z2**2
         total = total + _transform(rows.y, rows.x, weight, np.sqrt(cos2) * g.k / g.z2, dy, dx)
-    return total / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
+    return np.asarray(total / (g.wavelength * math.sqrt(_aperture_norm(lens, g))))
 
 
 def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:

@@ -225,7 +225,9 @@ class Pair:
             _strong(np.outer(core.sum(axis=1 - axis), power.sum(axis=1 - axis)), tolerance / 15)
             for axis in (0, 1)
         ]
-        coupling = _coupled(*(thin(a.astype(self.row.dtype)) for a in (residual.core, field)), kept)
+        coupling = _coupled(
+            thin(residual.core.astype(self.row.dtype)), thin(field.astype(self.row.dtype)), kept
+        )
         x = self.row.sheet(
             self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0]
         )
@@ -271,7 +273,7 @@ def _coupled(core: Matrix, field: Matrix, kept: Sequence[tuple[np.ndarray, ...]]
     if sparse.issparse(core) and sparse.issparse(field):
         whole = sparse.kron(core, field, format="csr")
         return sparse.csr_array(whole)[r * field.shape[0] + i][:, s * field.shape[1] + j]
-    core, field = (a.toarray() if sparse.issparse(a) else a for a in (core, field))
+    core, field = (a if isinstance(a, np.ndarray) else a.toarray() for a in (core, field))
     out = core[r[:, None], s]
     for start in range(
         0, len(out), ROWS_AT_ONCE

@@ -310,7 +310,8 @@ class ExactSquareLenslets(LensletFields):
 
     def _gram(self, axis: int) -> np.ndarray:
         """(point, term, term): overlaps of the terms of h over the lenslets."""
-        g, total, points = self.geometry, 0, self._points(0, axis)
+        g, points = self.geometry, self._points(0, axis)
+        total: np.ndarray | int = 0
         half = g.lenslet_width / 2
         t, w = gauss(psf_nodes(g, half))
         for m in lit_lenslets(self._reach(axis), self.band.window):
@@ -318,7 +319,8 @@ class ExactSquareLenslets(LensletFields):
                 0, 2, 1
             )
             total = total + (values * (half * w)) @ values.conj().transpose(0, 2, 1)
-        return np.concatenate([total, total[: len(g.points(axis)) - len(points)][::-1]])
+        gram = np.asarray(total)
+        return np.concatenate([gram, gram[: len(g.points(axis)) - len(points)][::-1]])
 
     # products of two axes
 

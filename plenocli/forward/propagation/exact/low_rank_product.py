@@ -108,7 +108,7 @@ class Product:
         is seen of M through it.
         """
         columns = self._times(0, self._mixed(1, count if q is None else count - q.shape[1]))
-        if q is None:
+        if q is None or seen is None:
             q = orthonormal(columns)
             return q, self._through_basis(q)
         for _ in range(2):

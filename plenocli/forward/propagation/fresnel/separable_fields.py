@@ -54,7 +54,7 @@ class Factors:
             np.ascontiguousarray(high),
             np.ascontiguousarray(wide, dtype=high.dtype),
         )
-        self.pixel_shape, self.pixel_nodes = tuple(pixel_shape), pixel_nodes
+        self.pixel_shape, self.pixel_nodes = (pixel_shape[0], pixel_shape[1]), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
 
     def superpixel(

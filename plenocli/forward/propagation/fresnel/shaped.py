@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -214,7 +215,7 @@ class ShapedLenslets(LensletFields):
                     values[:, start:stop].reshape(len(values), len(x), -1).transpose(1, 0, 2)
                 )
                 start = stop
-            if sum(kept[0].base.nbytes for kept in self._kept.values()) > KEPT_BYTES:
+            if sum(_whole(kept[0]).nbytes for kept in self._kept.values()) > KEPT_BYTES:
                 self._kept.clear()
             self._kept[key] = parts
         return self._kept[key]
@@ -261,7 +262,7 @@ class ShapedLenslets(LensletFields):
             kernels = [
                 (
                     index,
-                    self._once(("scan", key, n), lambda n=n: self._kernel(products, n)),
+                    self._once(("scan", key, n), partial(self._kernel, products, n)),
                     self._mirrored(products, n),
                 )
                 for index, n in sites
@@ -393,6 +394,11 @@ class ShapedLenslets(LensletFields):
             weight = np.tile(w, len(positions)).astype(values.real.dtype)
             parts.append((values * weight[:, None]) @ values.conj().transpose(0, 2, 1))
         return _accumulated(np.concatenate(parts))
+
+
+def _whole(part: np.ndarray) -> np.ndarray:
+    """The array that holds the numbers of a view."""
+    return part if part.base is None else part.base
 
 
 def _accumulated(panels: np.ndarray) -> np.ndarray:

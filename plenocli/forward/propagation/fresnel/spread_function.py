@@ -249,7 +249,7 @@ def separable_field(
     terms = terms_within(s, tolerance)
     s_root = np.sqrt(s[:terms])
     a = u[:, :terms] * s_root / root[:, None]
-    b = a if signs is not None else v[:terms].T * s_root / root[:, None]
+    b = a if v is None else v[:terms].T * s_root / root[:, None]
     tail = float(np.linalg.norm(s[terms:]))
     step = 2 if even else 1
     project = legendre(t, len(t), step).T * w * ((2 * step * np.arange(len(t)) + 1) / 2)[:, None]
@@ -267,7 +267,9 @@ def separable_field(
     )
 
 
-def terms_within(values: np.ndarray, tolerance: float | np.ndarray, rest: float = 0.0) -> int:
+def terms_within(
+    values: np.ndarray, tolerance: float | np.ndarray, rest: float | np.floating = 0.0
+) -> int:
     """How many singular values it takes to lose no more than a tolerance, one at the least.
 
     values: (value,), the largest first;

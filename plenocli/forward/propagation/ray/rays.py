@@ -242,10 +242,10 @@ class RayLenslets(LensletFields):
         """Light (points, pixel rows, pixel columns) through rectangles with edges y, x in
         pairs, filters included.
         """
-        total = 0
+        total: np.ndarray | int = 0
         for (y0, y1, x0, x1), transmittance in self._cells:
             total = total + transmittance * self._rectangles(np.clip(y, y0, y1), np.clip(x, x0, x1))
-        return total
+        return np.asarray(total)
 
     def _rectangles(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Share of the open pupil in the rectangles between edges y and x (points, edges),

@@ -42,10 +42,11 @@ test: $(READY) ## all tests but the slow ones, one process a core
 lint: $(READY) ## layout, lint and types of the code
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/mypy
 
 extremes: $(READY) ## errors of the solvers against the condition of the matrix; cameras and captures at the edges
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/solvers/test_extremes.py tests/faults/test_cameras.py
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/inverse/test_extremes.py tests/faults/test_cameras.py
 
 faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults

@@ -102,3 +102,9 @@ def test_places_named_in_the_architecture_and_the_recipes_exist():
 
 def test_the_house_is_drawn_in_forty_lines():
     assert len((ROOT / "docs" / "architecture.md").read_text().splitlines()) <= 45
+
+
+def test_files_named_in_makefiles_exist():
+    for page in (ROOT / "Makefile", *(ROOT / "pipelines").glob("*.mk")):
+        for name in re.findall(r"\b(?:tests|pipelines|sample_configs)/[\w./-]+\w", page.read_text()):
+            assert (ROOT / name).exists(), (page.name, name)

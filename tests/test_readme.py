@@ -106,5 +106,6 @@ def test_the_house_is_drawn_in_forty_lines():
 
 def test_files_named_in_makefiles_exist():
     for page in (ROOT / "Makefile", *(ROOT / "pipelines").glob("*.mk")):
-        for name in re.findall(r"\b(?:tests|pipelines|sample_configs)/[\w./-]+\w", page.read_text()):
+        named = r"\b(?:tests|pipelines|sample_configs)/[\w./-]+\w"
+        for name in re.findall(named, page.read_text()):
             assert (ROOT / name).exists(), (page.name, name)

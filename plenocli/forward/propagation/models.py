@@ -35,12 +35,14 @@ class Model(ABC):
 
     name: as plans and tables show it;
     kind: "ray", "fresnel" or "exact", what --model asks for;
-    lenslets: the LensletFields that compute it.
+    lenslets: the LensletFields that compute it;
+    libraries: with threads of their own, which it computes with beside numpy.
     """
 
     name: str
     kind: str
     lenslets: type[LensletFields]
+    libraries: tuple[str, ...] = ()
 
     @abstractmethod
     def valid_for(self, camera: Camera, geometry: Geometry) -> str | None:
@@ -148,6 +150,7 @@ class ExactLowRank(Model):
     """Scalar waves without the paraxial approximation, through square lenslets."""
 
     name, kind, lenslets = "exact, low rank", "exact", exact.ExactSquareLenslets
+    libraries = ("scipy.linalg",)
     valid_for = staticmethod(exact.valid_for)
     size = staticmethod(exact.exact_band)
     cost = staticmethod(cost_law.cost)

@@ -8,6 +8,7 @@ normalised or thresholded.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -157,11 +158,11 @@ class PifBuilder:
             np.dtype(dtype),
         )
         camera = at_wavelength(camera, wavelength)
-        if plan.model == "exact":
-            # a library can be told to stay on one thread only once it is loaded
-            import scipy.linalg  # noqa: F401
+        model = model_named(plan.rung)
+        # a library can be told to stay on one thread only once it is loaded
+        for library in model.libraries:
+            importlib.import_module(library)
         with one_thread():
-            model = model_named(plan.rung)
             self.lenslets: LensletFields
             if plan.band_nodes:
                 self.lenslets = band_fields(model, camera, self.geometry, plan, band)

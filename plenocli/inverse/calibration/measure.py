@@ -201,6 +201,9 @@ def check_exposure_times(captures: Sequence[Capture]) -> None:
 
 
 def require_alike(capture: Capture, like: Capture) -> None:
+    """InputError where two captures are not of one camera at one setting: in size, colour filter
+    array or units.
+    """
     for what, ours, theirs in (
         ("size", by(capture.shape), by(like.shape)),
         ("colour filter array", capture.cfa, like.cfa),

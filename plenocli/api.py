@@ -291,10 +291,12 @@ def demultiplex(
     reflectance: of that reference.
     register: "auto", "on" or "off", whether motion since the calibration is looked for.
 
-    Raises InputError where capture and calibration do not go together, NumericsError where no
-    lenslet can be demultiplexed.
+    Raises UsageError for a calibration without a response, InputError where capture and calibration
+    do not go together, NumericsError where no lenslet can be demultiplexed.
     Berkner et al. 2013, section 2-3-2; docs/model.md, section 9.
     """
+    if calibration.response is None or calibration.white is None:
+        raise UsageError("the calibration holds no response", fix="give calibrate narrow bands")
     with one_thread():
         solver = Demultiplexer(
             calibration, method=method, register=register, ratio=white is not None

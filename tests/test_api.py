@@ -92,6 +92,12 @@ def test_spectra_are_those_of_the_commands(tmp_path, monkeypatch):
     np.testing.assert_allclose(again.value, found.value, rtol=1e-6)
 
 
+def white_image():
+    """Lenslets 20 px apart."""
+    bright = np.sin(np.pi * np.arange(240) / 20) ** 2
+    return 500 + 3000 * np.outer(bright, bright)
+
+
 def test_what_cannot_be_is_told(bench):
     camera, matrix, capture = bench
     with pytest.raises(UsageError, match="known: .*lmmse"):
@@ -100,6 +106,9 @@ def test_what_cannot_be_is_told(bench):
         pc.reconstruct(capture, matrix, method="dictionary")
     with pytest.raises(UsageError, match="camera"):
         pc.refocus(capture, distances=[0.5])
+    grid = pc.calibrate(pc.Capture(mosaic=white_image()))
+    with pytest.raises(UsageError, match="response"):
+        pc.demultiplex(pc.Capture(mosaic=white_image()), grid)
     with pytest.raises(UsageError, match="tiny.toml"):
         pc.sample("huge.toml")
     with pytest.raises(UsageError, match="truth"):

@@ -2,6 +2,7 @@
 transcript of refusals.
 """
 
+import dataclasses
 import hashlib
 import os
 import shutil
@@ -443,6 +444,11 @@ def _latin_text(file):
     file.attrs["command"] = np.bytes_(b"caf\xe9")
 
 
+def configured(artefact, text):
+    """Give an artefact another camera's description."""
+    artefact.provenance = dataclasses.replace(artefact.provenance, config=text)
+
+
 def _artefacts(folder):
     pif = (folder / "pif.h5").read_bytes()
     (folder / "cut.h5").write_bytes(pif[:-7])
@@ -610,7 +616,7 @@ def _artefacts(folder):
         "depth.h5",
         lambda a: a.data.update({"refocus/distance": np.array([0.6, np.nan, np.nan])}),
     )
-    changed("anonymous.h5", "capture.h5", lambda a: setattr(a.provenance, "config", ""))
+    changed("anonymous.h5", "capture.h5", lambda a: configured(a, ""))
     changed(
         "torn-pif.h5",
         "pif.h5",
@@ -619,7 +625,7 @@ def _artefacts(folder):
     changed(
         "wave-pif.h5",
         "pif.h5",
-        lambda a: setattr(a.provenance, "config", (folder / "wavefront-good.toml").read_text()),
+        lambda a: configured(a, (folder / "wavefront-good.toml").read_text()),
     )
     changed(
         "bare-sweep.h5",

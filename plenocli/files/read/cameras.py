@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from plenocli.base.errors import ConfigError, InputError
 
@@ -13,11 +14,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 Name = str | os.PathLike[str]
-_READERS = {
-    "aperture_image": "read_transmittance",
-    "wavefront": "read_wavefront",
-    "prescription": "load_lens",
-}
+_NAMED = ("aperture_image", "wavefront", "prescription")
+"""Keys of [main_lens] that name files."""
 
 
 def read_camera(path: Name) -> Camera:
@@ -27,13 +25,16 @@ def read_camera(path: Name) -> Camera:
     Raises InputError for a file that cannot be read or whose values cannot be, ConfigError for the
     description.
     """
-    from plenocli.files.config import lens_file as lens
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.files.images import maps
+    from plenocli.files.config.lens_file import load_lens
+    from plenocli.files.images.maps import read_transmittance, read_wavefront
 
+    readers: dict[str, Callable[[Path], Any]] = dict(
+        zip(_NAMED, (read_transmittance, read_wavefront, load_lens))
+    )
     camera = load_camera(path)
     for key, file in _named(path, camera).items():
-        values = getattr(lens if key == "prescription" else maps, _READERS[key])(file)
+        values = readers[key](file)
         try:
             camera = camera.attach(**{key: values})
         except ConfigError as error:
@@ -70,6 +71,6 @@ def _named(path: Name, camera: Camera) -> dict[str, Path]:
     lens = camera.main_lens
     return {
         key: Path(path).parent / getattr(lens, key)
-        for key in _READERS
+        for key in _NAMED
         if getattr(lens, key) is not None
     }

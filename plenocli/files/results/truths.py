@@ -61,12 +61,13 @@ def _scene_truth(
     truth: Path | str, result: Result, sampling: str, camera: Camera | None
 ) -> np.ndarray:
     """The truth of a scene, which has values at any wavelength."""
-    from plenocli.files.read.scenes import Chart, read_scene
+    from plenocli.files.read.scenes import read_scene
+    from plenocli.forward.scene.scenes import Chart
 
     rows, cols = result.grid
     spectral = result.wavelengths is not None
     scene = read_scene(truth, sampling=sampling, spectral=spectral)
-    if not spectral and getattr(scene, "spectral", False):
+    if not spectral and scene.spectral:
         raise InputError(
             "is spectral, the result is a single picture",
             truth,

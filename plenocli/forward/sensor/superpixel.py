@@ -57,9 +57,8 @@ def extract(
     Returns (lenslet_row, lenslet_column, pixel), NaN where a window is not wholly in the mosaic;
     float arrays keep their type, others become float64.
     """
-    if hasattr(mosaic, "cut"):
+    if not isinstance(mosaic, np.ndarray):
         return mosaic.cut(origin.reshape(-1, 2), window).reshape(*origin.shape[:-1], -1)
-    mosaic = np.asarray(mosaic)
     kind = mosaic.dtype if mosaic.dtype.kind == "f" else float
     good = inside(origin, window, mosaic.shape)
     out = np.full((*origin.shape[:-1], window[0] * window[1]), np.nan, kind)

@@ -8,6 +8,7 @@ Paraxial, square lenslets, each lit by the object in front of it only.
 from __future__ import annotations
 
 from collections.abc import Iterator
+
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, smooth_nodes
@@ -187,9 +188,7 @@ class MatrixAt:
         table = (kernel @ terms.reshape(len(terms), -1)).reshape(len(kernel), *terms.shape[1:])
         return np.ascontiguousarray(table.transpose(1, 0, 2))
 
-    def _fields(
-        self, left: np.ndarray, right: np.ndarray
-    ) -> Iterator[tuple[int, np.ndarray]]:
+    def _fields(self, left: np.ndarray, right: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """(column j of points, field (row of points x node, node)), without the amplitude."""
         flat = left.reshape(-1, left.shape[2])
         for j, columns in enumerate(right):

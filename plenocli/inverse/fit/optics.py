@@ -66,7 +66,7 @@ def all_parameters(camera: Camera) -> tuple[Parameter, ...]:
 
     camera: as described.
     """
-    lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
+    array, sensor = camera.lenslet_array, camera.sensor
     wavelength = camera.light.wavelengths[0]
     by_key = [
         ("focus", "object.distance", 0.02 * camera.object.distance),
@@ -75,7 +75,6 @@ def all_parameters(camera: Camera) -> tuple[Parameter, ...]:
         ("lenslet focal length", "lenslet_array.focal_length", 0.005 * array.focal_length),
         ("wavelength", "light.wavelengths", 10e-9),
     ]
-    del lens
     return (
         *(Parameter(name=n, unit="m", tolerance=t, key=k) for n, k, t in by_key),
         Parameter(name="shift, rows", unit="px", tolerance=0.3),
@@ -109,9 +108,7 @@ class CameraFamily:
     def _described(self, parameter: Parameter) -> float:
         if parameter.noll:
             return sum(
-                a.coefficient
-                for a in self.camera.main_lens.aberrations
-                if a.noll == parameter.noll
+                a.coefficient for a in self.camera.main_lens.aberrations if a.noll == parameter.noll
             )
         if parameter.name.startswith("shift"):
             axis = 0 if parameter.name.endswith("rows") else 1

@@ -94,9 +94,7 @@ class SpreadFamily:
         weight = np.array([1.0, *(self._step[p] for p in self.places)][: len(fields)])
         scaled = fields * weight[:, None, None]
         rows = self._basis(np.einsum("mij,mkj->ik", scaled, scaled.conj(), optimize=True))
-        columns = self._basis(
-            np.einsum("mji,mjk->ik", scaled, scaled.conj(), optimize=True)
-        )
+        columns = self._basis(np.einsum("mji,mjk->ik", scaled, scaled.conj(), optimize=True))
         cores = rows.conj().T @ fields @ columns.conj()
         return Core(
             rows=rows / root[:, None],

@@ -1,0 +1,98 @@
+"""The matrix that a fit works with: the same as the one that plenocli makes, and derivatives that
+finite differences confirm, both ways.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plenocli.base.errors import UsageError
+from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.propagation.system_matrix import build_pif
+from plenocli.inverse.fit.lenslet import LensletFamily
+from plenocli.inverse.fit.optics import (
+    CameraFamily,
+    all_parameters,
+    require_fittable,
+)
+from tests.forward.propagation.cameras import WAVELENGTH, accuracy, small_camera
+
+RANDOM = np.random.default_rng(20)
+PLACE = RANDOM.uniform(-1, 1, 12)
+
+
+def family(**changes):
+    camera = small_camera(**changes)
+    return CameraFamily(camera, geometry(camera, WAVELENGTH, (0.0, 0.0)), all_parameters(camera))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"main_lens__aperture_shape": "annulus", "main_lens__obscuration": 0.3},
+        {"main_lens__aperture_shape": "square", "lenslet_array__fill_factor": 0.8},
+        {
+            "main_lens__aberrations": (
+                {"noll": 7, "coefficient": 3e-8},
+                {"noll": 9, "coefficient": 4e-8},
+            )
+        },
+    ],
+)
+def test_the_matrix_is_that_of_the_forward_model(changes):
+    cameras = family(**changes)
+    values = cameras.start + 0.5 * cameras.tolerance * PLACE
+    found = LensletFamily(cameras, double=True).at(values).matrix
+    camera = cameras.camera_at(values)
+    plan = accuracy.plan_pif(
+        camera, accuracy=1e-6, model="fresnel", superpixels=(1, 1), coherent_ring=0
+    )
+    shift = cameras.geometry_at(values).pixel_shift
+    told = build_pif(camera, replace(plan, pixel_shift=shift)).A[0, 0]
+    assert np.linalg.norm(found - told) < 2e-5 * np.linalg.norm(told)
+    single = LensletFamily(cameras).at(values, slopes=True).matrix
+    assert np.linalg.norm(single - found) < 2e-6 * np.linalg.norm(found)
+
+
+def test_one_pass_back_gives_all_derivatives():
+    cameras = family(main_lens__aberrations=({"noll": 4, "coefficient": 4e-8},))
+    lenslets = LensletFamily(cameras, double=True, tolerance=1e-9)
+    values = cameras.start + 0.5 * cameras.tolerance * PLACE
+    at = lenslets.at(values, slopes=True)
+    weights = RANDOM.standard_normal(at.matrix.shape)
+    back, turn = at.back(weights), cameras.jacobian(values)
+    ahead = [np.vdot(weights, at.slope(place)) for place in range(len(turn))]
+    for i, tolerance in enumerate(cameras.tolerance):
+        step = np.zeros(len(values))
+        step[i] = 1e-4 * tolerance
+        rise = lenslets.at(values + step).matrix - lenslets.at(values - step).matrix
+        told = np.vdot(weights, rise) / 2e-4
+        scale = np.linalg.norm(rise) / 2e-4 * np.linalg.norm(weights) / rise.size**0.5
+        assert abs(back[i] * tolerance - told) < 1e-4 * scale, cameras.parameters[i].name
+        assert abs(ahead @ turn[:, i] * tolerance - told) < 1e-4 * scale
+
+
+def test_the_mirrored_camera_sees_turned_objects():
+    cameras = family()
+    lenslets = LensletFamily(cameras, double=True, tolerance=1e-9)
+    values = cameras.start + 0.5 * cameras.tolerance * PLACE
+    other = cameras.mirrored(values)
+    assert abs(other - values)[3] > 0.005 * values[3]
+    A, B = (lenslets.at(v).matrix for v in (values, other))
+    assert np.linalg.norm(A - B[:, ::-1]) < 1e-7 * np.linalg.norm(A)
+    assert np.linalg.norm(A - B) > 0.1 * np.linalg.norm(A)
+    assert np.allclose(cameras.mirrored(other), values, rtol=1e-12, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"lenslet_array__aperture_shape": "circle"},
+        {"light__wavelengths": (500e-9, 550e-9)},
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(changes):
+    with pytest.raises(UsageError, match="cannot be fitted"):
+        require_fittable(small_camera(**changes))

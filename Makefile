@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,6 +63,9 @@ spatial: $(READY) ## section 3-2 of the paper at full size: every reconstruction
 
 spatial-250um: $(READY) ## the same with 250 um lenslets, f/4.4 and 4.8 um pixels
 	$(PIPELINE) pipelines/spatial.mk RUN=$(RUNS)/spatial-250um CONFIG=sample_configs/seed_spatial_250um.toml
+
+mismatch: $(READY) ## captures of cameras that are not as described, every method: table in runs/mismatch (SIZE=full: hours; SCENES=, FIT=)
+	$(PIPELINE) pipelines/mismatch.mk RUN=$(RUNS)/mismatch
 
 spectral: $(READY) ## section 3-1 of the paper, for an achromat and for a singlet: predicted and measured response, every estimator
 	$(PIPELINE) pipelines/spectral.mk RUN=$(RUNS)/spectral/achromat CONFIG=sample_configs/seed_spectral.toml

@@ -8,7 +8,7 @@ all: $(RUN)/report.html
 .PHONY: all spatial spectral
 
 spatial:
-	$(SUB) $(HERE)spatial.mk RUN=$(RUN)/spatial CONFIG=sample_configs/demo_spatial.toml ITERATIONS=6
+	$(SUB) $(HERE)spatial.mk RUN=$(RUN)/spatial CONFIG=sample_configs/demo_spatial.toml EXPERIMENTS="paper stray" ITERATIONS=6
 
 spectral:
 	$(SUB) $(HERE)spectral.mk RUN=$(RUN)/spectral CONFIG=sample_configs/demo_spectral.toml METHODS="pinv single-pixel"

@@ -3,6 +3,7 @@
 #   stray/  captured with three times finer points, a 10 nm band (five wavelengths), the neighbours' light and lenslets PITCH times
 #           as large, pixels too; inverted with the coarse matrix of the camera as described, the neighbours' light taken away (and
 #           once without, to show what that costs). The score has beside each method what this is expected to cost
+#   model/  captured with the exact model, inverted with the paraxial matrix of paper/; as lmmse-right with the exact one
 CONFIG ?= sample_configs/seed_spatial.toml
 SCENE ?= skimage:astronaut
 SAMPLING ?= fit
@@ -12,6 +13,7 @@ PITCH ?= 1.001
 ITERATIONS ?= 10
 BATCH ?=
 TRAINING ?=
+EXPERIMENTS ?= paper stray model
 
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
@@ -21,11 +23,13 @@ OPTIONS_nnls-300 := --method nnls --nnls-iterations 300
 OPTIONS_lmmse-3x3 := --method lmmse --overlap 3
 OPTIONS_dictionary := --method dictionary --dictionary $(RUN)/dictionary.h5
 OPTIONS_lmmse-no-neighbours := --method lmmse --pif $(RUN)/pif.h5
-OPTIONS = $(or $(OPTIONS_$*),--method $*) $(if $(filter lmmse% tv pnp,$*),$(TRAINING:%=--training %))
+OPTIONS_lmmse-right := --method lmmse --pif $(RUN)/pif-exact.h5
+OPTIONS = $(or $(OPTIONS_$*),--method $*) $(if $(filter lmmse% tv pnp auto,$*),$(TRAINING:%=--training %))
 
 PAPER := $(patsubst %,$(RUN)/paper/%.h5,$(METHODS) lmmse-3x3)
 # converged nnls takes minutes a sweep and only shows again what it does on the paper's capture
 STRAY := $(patsubst %,$(RUN)/stray/%.h5,$(filter-out nnls,$(METHODS)) lmmse-no-neighbours)
+MODEL := $(patsubst %,$(RUN)/model/%.h5,$(filter-out nnls,$(METHODS)) auto lmmse-right)
 
 all: $(RUN)/report.html
 .PHONY: all
@@ -33,6 +37,10 @@ all: $(RUN)/report.html
 # the paper's matrix: one isolated lenslet
 $(RUN)/pif.h5: $(CONFIG) | $(RUN)
 	$(P) simulate-pif $< --model fresnel --superpixels 1x1 --coherent-ring 0 --accuracy 1e-5 -o $@ --overwrite
+
+# the same without the paraxial approximation
+$(RUN)/pif-exact.h5: $(CONFIG) | $(RUN)
+	$(P) simulate-pif $< --model exact --superpixels 1x1 --coherent-ring 0 --accuracy 1e-4 -o $@ --overwrite
 
 # the same lenslet among its neighbours, with the light that it sends to them
 $(RUN)/pif-3x3.h5: $(CONFIG) | $(RUN)
@@ -48,10 +56,13 @@ $(RUN)/stray/camera.toml: $(CONFIG) | $(RUN)/stray/
 $(RUN)/stray/capture.h5: $(RUN)/stray/camera.toml
 	$(P) capture-sim $< --model fresnel --accuracy 1e-3 --refine $(REFINE) --bandwidth 10nm --superpixels 3x3 --coherent-ring 1 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 2 -o $@ --overwrite
 
+$(RUN)/model/capture.h5: $(CONFIG) $(RUN)/pif-exact.h5 | $(RUN)/model/
+	$(P) capture-sim $(CONFIG) --pif $(RUN)/pif-exact.h5 --scene $(SCENE) --sampling $(SAMPLING) --snr $(SNR) --seed 1 -o $@ --overwrite
+
 $(RUN)/dictionary.h5: $(RUN)/pif.h5
 	$(P) learn-dict $(TRAINING) --pif $< $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 --synthesis -o $@ --overwrite
 
-$(RUN)/paper/dictionary.h5 $(RUN)/stray/dictionary.h5: $(RUN)/dictionary.h5
+$(RUN)/paper/dictionary.h5 $(RUN)/stray/dictionary.h5 $(RUN)/model/dictionary.h5: $(RUN)/dictionary.h5
 
 $(RUN)/paper/%.h5: $(RUN)/paper/capture.h5 $(RUN)/pif.h5
 	$(P) reconstruct $< --pif $(RUN)/pif.h5 $(OPTIONS) -o $@ --overwrite
@@ -62,11 +73,20 @@ $(RUN)/stray/lmmse-no-neighbours.h5: $(RUN)/stray/%.h5: $(RUN)/stray/capture.h5 
 $(RUN)/stray/%.h5: $(RUN)/stray/capture.h5 $(RUN)/pif-3x3.h5
 	$(P) reconstruct $< --pif $(RUN)/pif-3x3.h5 --overlap 3 $(OPTIONS) -o $@ --overwrite
 
+$(RUN)/model/lmmse-right.h5: $(RUN)/model/%.h5: $(RUN)/model/capture.h5 $(RUN)/pif-exact.h5
+	$(P) reconstruct $< $(OPTIONS) -o $@ --overwrite
+
+$(RUN)/model/%.h5: $(RUN)/model/capture.h5 $(RUN)/pif.h5
+	$(P) reconstruct $< --pif $(RUN)/pif.h5 $(OPTIONS) -o $@ --overwrite
+
 $(RUN)/score-paper.json: $(PAPER) $(RUN)/paper/capture.h5
 	$(P) score $(PAPER) --truth $(RUN)/paper/capture.h5 -o $@ --overwrite
 
 $(RUN)/score-stray.json: $(STRAY) $(RUN)/stray/capture.h5
 	$(P) score $(STRAY) --truth $(RUN)/stray/capture.h5 -o $@ --overwrite
 
-$(RUN)/report.html: $(RUN)/score-paper.json $(RUN)/score-stray.json
+$(RUN)/score-model.json: $(MODEL) $(RUN)/model/capture.h5
+	$(P) score $(MODEL) --truth $(RUN)/model/capture.h5 -o $@ --overwrite
+
+$(RUN)/report.html: $(EXPERIMENTS:%=$(RUN)/score-%.json)
 	$(P) report $(RUN) -o $@ --overwrite

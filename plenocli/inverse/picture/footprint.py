@@ -14,7 +14,9 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.nuisances.pixel_model import CHUNK
 from plenocli.inverse.picture.solvers.joint_lmmse import MOST
+from plenocli.inverse.picture.solvers.lmmse import SCALES
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 
 NUMBER = 8
@@ -99,6 +101,17 @@ def lmmse_phases(n: Sizes) -> list[float]:
         n.y + n.svd + 13 * n.block**2,
         n.svd + n.block**2 + n.lenslets * (2 * n.pixels + 4 * n.points + 240),
     ]
+
+
+def cleaned(phases: Phases) -> Phases:
+    """Those of a method whose capture is rid of its nuisances first, by LMMSE of each lenslet."""
+
+    def both(n: Sizes) -> list[float]:
+        together = min(n.lenslets, CHUNK) * 6 * n.pixels
+        tables = 2 * len(SCALES) * n.pixels + n.svd + n.block**2
+        return [*lmmse_phases(n), tables + 4.5 * n.y + together, *phases(n)]
+
+    return both
 
 
 def joint_phases(n: Sizes) -> list[float]:

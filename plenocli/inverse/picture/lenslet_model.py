@@ -79,11 +79,13 @@ def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
 class Superpixels:
     """A capture as the estimators take it.
 
-    y: (lenslet_row, lenslet_column, pixel) in units of A x.
+    y: (lenslet_row, lenslet_column, pixel) in units of A x; NaN where a pixel counts for nothing.
     noise: in these units, white, or None where it is not known.
     scene: name of what was captured, or None.
     accuracy: how accurately a capture was simulated, None of a real one.
     pif_digest: SHA-256 of the pif that a simulated capture was made with.
+    saturated: like y, which pixels were clipped at the value that they have; None where the capture
+        does not say.
     """
 
     y: np.ndarray
@@ -91,6 +93,7 @@ class Superpixels:
     scene: str | None = None
     accuracy: AccuracyRecord | None = None
     pif_digest: str | None = None
+    saturated: np.ndarray | None = None
 
     @property
     def sigma(self) -> float | None:

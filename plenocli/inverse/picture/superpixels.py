@@ -14,6 +14,7 @@ from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.base.tiling import to_blocks
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
@@ -57,12 +58,12 @@ def superpixels(
         )
     shape = _tiles(capture, system, path)
     signal, unit = capture.signal(), _unit(capture, path)
-    white = capture.levels.white
-    over = float(np.mean(capture.mosaic >= white)) if np.isfinite(white) else 0.0
-    if over > 0:
-        note(
-            f"{capture.name}: {over:.2%} of the pixels are saturated; the picture is too dark there"
-        )
+    levels = capture.levels
+    clipped = (
+        to_blocks(saturated(capture.mosaic, levels.black, levels.white), shape)
+        if np.isfinite(levels.white)
+        else None
+    )
     noise = capture.white_noise
     return Superpixels(
         y=to_blocks(signal, shape) / unit,
@@ -70,6 +71,7 @@ def superpixels(
         scene=capture.metadata.target,
         accuracy=AccuracyRecord.from_json(capture.metadata.accuracy),
         pif_digest=capture.metadata.matrix,
+        saturated=clipped,
     )
 
 

@@ -23,9 +23,11 @@ from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training
 from plenocli.inverse.picture.diagnosis import Seen, loss_db, what_is_seen
 from plenocli.inverse.picture.estimators import Estimators, Options
-from plenocli.inverse.picture.footprint import require_reconstruction
+from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
+from plenocli.inverse.picture.nuisances.clean import clean
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
 
@@ -428,16 +430,21 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     estimators, method = _estimators(recipe), METHODS[settings.method]
     system = estimators.system
     data = read_superpixels(capture, system, recipe.calibration)
+    look = method.sees is not Sees.LENSLET_AS_IS
     require_reconstruction(
         estimators,
         data,
         capture,
-        method.phases,
+        cleaned(method.phases) if look else method.phases,
         joint=method.makes_joint_estimate(estimators),
     )
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
+    bare = clean(estimators, data, look=look)
+    bare.tell()
+    data = bare.data
     found = method.reconstruct(estimators, data, truth)
+    found = replace(found, trace=(*bare.findings, *found.trace))
     sigma = data.sigma if found.noise_level is None else found.noise_level.sigma
     limits = _limits(estimators, data, found, sigma)
     seen = what_is_seen(estimators, sigma) if sigma else None

@@ -1,0 +1,199 @@
+"""Even light on top of A x: a veil of stray light over the sensor, and an offset of each lenslet's
+own, by generalised least squares under the model of LMMSE.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
+from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
+
+SURE = 4.0
+"""Standard deviations from which on a veil is said to be there."""
+EXPLAINED = 1.3
+"""Noise found over noise expected, median of the lenslets, up to which the model explains a
+capture but for its veil.
+"""
+LOUD = 3.0
+"""Variance of lenslets' own offsets, over that of their noise, from which on they are believed."""
+NOT_STRAIGHT = 0.1
+"""Of offsets that go with a lenslet's brightness, what does not do so in proportion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VeilFound:
+    """Even light on top of A x, in units of A x.
+
+    level: common to all lenslets; sigma: its standard deviation.
+    spread: of the lenslets' own offsets about it, standard deviation; 0 where they are not told
+        apart from noise, or from an error of the matrix.
+    share: of the capture's mean, level over that.
+    removed: whether it was taken away.
+    """
+
+    level: float
+    sigma: float
+    spread: float
+    share: float
+    removed: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether there is anything to tell."""
+        return self.removed
+
+    @property
+    def sentence(self) -> str:
+        """What was found, for a person."""
+        error = abs(self.share) * self.sigma / max(abs(self.level), np.finfo(float).tiny)
+        own = (
+            ""
+            if not self.spread
+            else f", {abs(self.share) * self.spread / abs(self.level):.2%} more or less by lenslet"
+        )
+        return (
+            f"an even light of {self.share:.2%} of the mean (+- {error:.2%}{own}) lies over the "
+            "superpixels: it was taken away"
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        return {
+            "veil": {
+                "level": self.level,
+                "sigma": self.sigma,
+                "spread": self.spread,
+                "share": self.share,
+                "removed": self.removed,
+            }
+        }
+
+
+@dataclass(frozen=True)
+class _Offsets:
+    """Even light of each lenslet, (signal,).
+
+    value, variance: by generalised least squares; brightness: of what the free patterns see.
+    misfit: noise found over noise expected.
+    """
+
+    value: np.ndarray
+    variance: np.ndarray
+    brightness: np.ndarray
+    misfit: np.ndarray
+
+
+def find_veil(
+    model: PixelModel, y: np.ndarray, *, alone: bool = True
+) -> tuple[VeilFound | None, np.ndarray]:
+    """The even light over superpixels.
+
+    Where the model explains what else there is, each lenslet has an offset of its own, drawn
+    towards the common one by how far they differ beyond their noise. Where it does not, or where
+    the offsets go with the lenslets' brightness, the matrix is wrong: its error looks like an
+    offset in proportion to the brightness. Then only what is there without brightness is a veil.
+
+    model: veiled.
+    y: (pixel, signal) without defects.
+    alone: whether no light of neighbours was taken away, whose errors look like offsets.
+
+    Returns (what was found, None where an even object and an even light look alike; the light to
+    take away, (signal,)).
+    """
+    found, nothing = _offsets(model, y), np.zeros(y.shape[1])
+    told = np.isfinite(found.variance)
+    if not told.any():
+        return None, nothing
+    value, variance = found.value[told], found.variance[told]
+    line, extra = _straight_line(value, found.brightness[told]), 0.0
+    if np.median(found.misfit) > EXPLAINED or line.falls:
+        level, sigma = line.level, line.sigma
+    else:
+        extra = _beyond_noise(value - np.median(value), variance)
+        level, sigma = _mean(value, variance + extra)
+        extra = extra if alone else 0.0
+    removed = abs(level) > SURE * sigma or extra > 0
+    mean = float(np.mean(y))
+    told_of = VeilFound(
+        level=level,
+        sigma=sigma,
+        spread=float(np.sqrt(extra)),
+        share=level / mean if mean else 0.0,
+        removed=bool(removed),
+    )
+    if not removed:
+        return told_of, nothing
+    own = np.full(y.shape[1], level)
+    own[told] += extra / (extra + variance) * (value - level)
+    return told_of, own
+
+
+def _offsets(model: PixelModel, y: np.ndarray) -> _Offsets:
+    value, variance, brightness, misfit = np.empty((4, y.shape[1]))
+    even = model.free @ model.free.sum(axis=0)
+    for part in chunks(y.shape[1]):
+        rest = model.rest(y[:, part])
+        value[part], variance[part] = rest.offset, rest.offset_variance
+        misfit[part] = by_lenslet(np.abs(rest.value) / (model.sigma * np.sqrt(rest.open)))
+        brightness[part] = even @ y[:, part] / (even @ even)
+    return _Offsets(value, variance, brightness, misfit)
+
+
+def _mean(value: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """Mean of values of different variance and its standard deviation, outliers counting less
+    (Huber).
+    """
+    level = float(np.median(value))
+    for _ in range(10):
+        weight = 1 / variance / np.maximum(1, np.abs(value - level) / (1.5 * np.sqrt(variance)))
+        level = float(weight @ value / weight.sum())
+    return level, float(1 / np.sqrt(weight.sum()))
+
+
+def _beyond_noise(difference: np.ndarray, variance: np.ndarray) -> float:
+    """Variance of offsets about their mean beyond that of their noise, by medians; 0 unless that is
+    LOUD times as much, surely: the noise's variance rests on what photographs have in common.
+    """
+    count = len(difference)
+    far = NORMAL**2 * float(np.median(difference**2 / variance))
+    if count < 4 or far < 1 + LOUD + SURE * np.sqrt(2 / count):
+        return 0.0
+    return max(NORMAL**2 * float(np.median(difference**2)) - float(np.median(variance)), 0.0)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A straight line through offsets over brightness.
+
+    level, sigma: what is there without brightness, and how surely it is known.
+    falls: whether offsets go with the brightness.
+    """
+
+    level: float
+    sigma: float
+    falls: bool
+
+
+def _straight_line(value: np.ndarray, brightness: np.ndarray) -> _Line:
+    """The line, outliers counting less (Huber). What goes with the brightness does so in
+    proportion only up to NOT_STRAIGHT of it, which the level is uncertain by.
+    """
+    if len(value) < 4:
+        return _Line(0.0, np.inf, False)
+    design = np.stack([np.ones_like(brightness), brightness], axis=1)
+    weight = np.ones_like(value)
+    for _ in range(10):
+        normal = design.T @ (weight[:, None] * design)
+        if np.linalg.cond(normal) > 1e12:
+            return _Line(0.0, np.inf, False)
+        level, slope = np.linalg.solve(normal, design.T @ (weight * value))
+        far = np.abs(value - level - slope * brightness)
+        spread = max(NORMAL * float(np.median(far)), np.finfo(float).tiny)
+        weight = 1 / np.maximum(1, far / (1.5 * spread))
+    own, of_slope = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+    bent = NOT_STRAIGHT * slope * float(np.mean(brightness))
+    return _Line(float(level), float(np.hypot(own, bent)), bool(abs(slope) > SURE * of_slope))

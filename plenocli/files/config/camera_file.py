@@ -42,6 +42,8 @@ _NUMBERS = {
     "quantum_efficiency",
     "peak",
     "blocking",
+    "pixel_shift",
+    "model_error",
 }
 
 

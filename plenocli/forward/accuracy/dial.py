@@ -238,11 +238,12 @@ class _Request:
 def _place(
     camera: Camera, lenslet: tuple[int, int] | None
 ) -> tuple[tuple[float, float] | None, bool]:
-    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; (None,
-    False) for the one on the axis.
+    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; for the one
+    on the axis the shift that a fit found, or None.
     """
     if lenslet is None:
-        return None, False
+        shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
+        return (shift if any(shift) else None), False
     count = camera.lenslet_array.count
     if not all(0 <= n < m for n, m in zip(lenslet, count)):
         raise UsageError(
@@ -546,7 +547,9 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
 
 def _model_error(request: _Request, best: Candidate) -> float:
     model = next(m for m in MODELS if m.name == best.name)
-    return max(model.error_bound(request.camera, v) for v in request.geometries)
+    error = max(model.error_bound(request.camera, v) for v in request.geometries)
+    fitted = request.camera.fitted
+    return error if fitted is None else math.hypot(error, fitted.model_error)
 
 
 def seconds_here(candidate: Candidate) -> float:

@@ -292,6 +292,9 @@ class Filter(Section):
     blocking: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
+PixelShift = Annotated[float, Field(ge=-0.5, le=0.5)]
+
+
 class FilterArray(Section):
     layout: Pair
     gap: Gap = 0.0
@@ -307,6 +310,16 @@ class FilterArray(Section):
                 f"{len(self.filters)}"
             )
         return self
+
+
+class Fitted(Section):
+    """What a fit to captures found beside the description (plenocli.inverse.fit): how far the
+    pixels of every superpixel are shifted from its chief ray, and the relative error that a system
+    matrix of this camera is still expected to have.
+    """
+
+    pixel_shift: tuple[PixelShift, PixelShift] = (0.0, 0.0)
+    model_error: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
 
 def _check_range(section: str, glass: str, wavelengths: Sequence[float]) -> None:
@@ -331,6 +344,7 @@ class Camera(Section):
     sensor: Sensor
     light: Light
     filter_array: FilterArray | None = None
+    fitted: Fitted | None = None
     _text: str = PrivateAttr("")
 
     @model_validator(mode="after")
@@ -383,6 +397,11 @@ class Camera(Section):
         pitch = self.superpixel_pitch / self.sensor.pixel_pitch
         rows, columns = self.sensor.pixels_per_lenslet
         return pitch * self.lenslet_array.row_spacing - rows, pitch - columns
+
+    def with_fit(self, pixel_shift: tuple[float, float], model_error: float) -> "Camera":
+        """This camera with what a fit found beside it, as in Fitted."""
+        fitted = Fitted(pixel_shift=pixel_shift, model_error=model_error)
+        return self.model_copy(update={"fitted": fitted})
 
     def replace(self, **changes: Any) -> "Camera":
         """A camera with dotted keys changed to SI values: replace(**{"object.distance": 0.6}).

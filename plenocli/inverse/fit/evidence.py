@@ -144,6 +144,20 @@ class EvidenceAt:
             by_seen += (data - whole @ outer)[:, :-1]
         return by_seen @ self._of.prior.patterns.T
 
+    def objects(self, index: int, factor: float) -> np.ndarray:
+        """What lies in front of the lenslets of a capture, as far as they tell, (point, lenslet).
+
+        index: of the capture.
+        """
+        noise = (factor * self._of.captures[index].sigma) ** 2
+        likelihood = self._likelihood(index, factor)
+        weight = np.exp(likelihood - logsumexp(likelihood, axis=0))
+        found = np.zeros_like(self._spectra[index][0].u)
+        for spectrum, scale, share in zip(self._spectra[index], self._of.scales, weight):
+            mean = spectrum.vectors @ (spectrum.u / (spectrum.values + noise)[:, None])
+            found += scale[:, None] * mean * share
+        return self._of.prior.patterns @ found[:-1]
+
     def contrasts(self, factor: float) -> list[np.ndarray]:
         """How many lenslets of each capture have each contrast, (contrast,), as far as is known."""
         counts = []

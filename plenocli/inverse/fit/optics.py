@@ -122,6 +122,14 @@ class CameraFamily:
         """The value of the parameter `name` in `values` (parameter,), or what is described."""
         return float(values[self._place[name]]) if name in self._place else otherwise
 
+    def has(self, name: str) -> bool:
+        """Whether the parameter `name` may change."""
+        return name in self._place
+
+    def place(self, name: str) -> int:
+        """Where the parameter `name` stands among the parameters."""
+        return self._place[name]
+
     def geometry_at(self, values: np.ndarray) -> Geometry:
         """The Geometry with the parameters at `values` (parameter,); ray_reach as described."""
         g, camera = self.geometry, self.camera

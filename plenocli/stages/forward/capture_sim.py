@@ -323,7 +323,7 @@ def _read_pif(
             fix="leave one of them out",
         )
     made_for = parse_camera(artefact.provenance.config, path)
-    for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array"):
+    for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array", "fitted"):
         drop = _OF_THE_DETECTOR.get(section, set())
         ours, theirs = getattr(camera, section), getattr(made_for, section)
         if (ours and ours.model_dump(exclude=drop)) != (theirs and theirs.model_dump(exclude=drop)):

@@ -1,0 +1,156 @@
+"""The way up to the most likely camera: Levenberg's steps on Fisher's matrix, lengthened while the
+evidence rises, with noise that starts as large as the captures' misfit makes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.inverse.fit.evidence import Evidence, EvidenceAt
+from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt
+from plenocli.inverse.fit.optics import CameraFamily
+
+GAIN = 0.3
+"""A step that makes the captures less than this more likely (log) is the last one."""
+LONGER = 2.5
+"""By how much a step that helped is lengthened, again and again."""
+FAR = 20.0
+"""No step is longer, in tolerances, before it has shown that it helps."""
+MISFIT = 1.02
+"""Noise over the noise told, above which mirrored cameras are looked at on the way."""
+LOUD = 0.7
+"""Fisher's matrix is made of patterns only that stand out of so much of the noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """A camera on the way.
+
+    x: (parameter,) from the described camera, in tolerances;
+    height: log of the evidence and of what is believed of the parameters, at noise `factor` times
+        the noise told.
+    """
+
+    x: np.ndarray
+    factor: float
+    height: float
+    evidence: EvidenceAt
+    matrix: MatrixAt
+
+
+class Ascent:
+    """One problem: a family of cameras and captures of one of them."""
+
+    def __init__(
+        self,
+        family: CameraFamily,
+        evidence: Evidence,
+        *,
+        tolerance: float = 1e-5,
+        progress: Callable[[], object] | None = None,
+    ) -> None:
+        """tolerance: root energy of the spread function that may be lost; progress: called at
+        every step.
+        """
+        self.family, self.evidence, self._progress = family, evidence, progress
+        self.lenslets = LensletFamily(family, tolerance=tolerance)
+        self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=1)
+        sigma = min(c.sigma for c in evidence.captures)
+        told = self._coarse.at(family.start).matrix
+        self._loud = Evidence(evidence.captures, evidence.prior.seen(told, LOUD * sigma))
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """(parameter,) in their units, of x in tolerances."""
+        return self.family.start + x * self.family.tolerance
+
+    def point(self, x: np.ndarray, factor: float | None = None, *, slopes: bool = False) -> Point:
+        """The Point at x; factor: of the noise, None for the most likely one, 1 at the least."""
+        matrix = self.lenslets.at(self.values(x), slopes=slopes)
+        found = self.evidence.at(matrix.matrix)
+        if factor is None:
+            factor = max(1.0, found.noise_factor())
+        height = found.value(factor) - 0.5 * float(x @ x)
+        return Point(x=x, factor=factor, height=height, evidence=found, matrix=matrix)
+
+    def information(self, at: Point) -> tuple[np.ndarray, np.ndarray]:
+        """(Fisher's matrix by parameters in tolerances, with what is believed of them (parameter,
+        parameter); products of the matrix's slopes by them (parameter, parameter)), both from a
+        coarse matrix.
+        """
+        values = self.values(at.x)
+        state = self._coarse.at(values, slopes=True)
+        slopes = [state.slope(place) for place in range(len(self.family.optics(values)))]
+        counts = at.evidence.contrasts(at.factor)
+        by_optics = self._loud.at(state.matrix).fisher(slopes, at.factor, counts)
+        turn = self.family.jacobian(values) * self.family.tolerance
+        flat = np.array([np.asarray(s, float).ravel() for s in slopes])
+        return turn.T @ by_optics @ turn + np.eye(len(at.x)), turn.T @ (flat @ flat.T) @ turn
+
+    def climb(self, x: np.ndarray, steps: int) -> Point:
+        """The Point, with slopes, where going on from x gains nothing, or after so many steps."""
+        at, damping = self.point(x, slopes=True), 1e-3
+        for step in range(steps):
+            if self._progress is not None:
+                self._progress()
+            rise = at.matrix.back(at.evidence.by_matrix(at.factor)) * self.family.tolerance - at.x
+            best, damping = self._step(at, rise, damping)
+            if at.factor > MISFIT and step % 3 == 2:
+                best = max([best, *self._mirrored(best)], key=lambda p: p.height)
+            if best is at:
+                break
+            gain = best.height - at.height
+            at = self.point(best.x, slopes=True)
+            if gain < GAIN:
+                break
+        return at
+
+    def _step(self, at: Point, rise: np.ndarray, damping: float) -> tuple[Point, float]:
+        """(the Point after one step, `at` itself where none rises; damping for the next).
+
+        rise: (parameter,) derivatives of the height.
+        """
+        fisher, _ = self.information(at)
+        for _ in range(6):
+            way = _damped(fisher, damping, rise)
+            while np.linalg.norm(way) > FAR:
+                damping *= 3
+                way = _damped(fisher, damping, rise)
+            best = self._along(at, way)
+            if best is not at:
+                return best, max(damping / 5, 1e-5)
+            damping = max(damping * 10, 1e-2)
+        return at, damping
+
+    def _along(self, at: Point, way: np.ndarray) -> Point:
+        """The highest of the points at + way, at + LONGER way, ... as far as they rise; `at`
+        itself where none does.
+        """
+        best, length = at, 1.0
+        while length < 400:
+            found = self.point(at.x + length * way, at.factor)
+            if not found.height > best.height:
+                break
+            best, length = found, length * LONGER
+        return best
+
+    def _mirrored(self, at: Point) -> list[Point]:
+        """Cameras with defocus and aberrations mirrored, but not the lenslets' curvature, which
+        captures tell weakly so that it stays behind on the wrong side: as it is, and as described.
+        """
+        mirrored = self.family.mirrored(self.values(at.x))
+        if mirrored is None:
+            return []
+        found = []
+        place = self.family.place("lenslet focal length")
+        for kept in (at.x[place], 0.0):
+            x = (mirrored - self.family.start) / self.family.tolerance
+            x[place] = kept
+            found.append(self.point(x, at.factor))
+        return found
+
+
+def _damped(fisher: np.ndarray, damping: float, rise: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(fisher + damping * np.diag(np.diag(fisher)), rise)

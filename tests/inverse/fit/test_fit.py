@@ -1,0 +1,119 @@
+"""A camera fitted to captures that another one made, of pictures unlike those of training."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from skimage import data
+
+from plenocli.base.errors import InputError
+from plenocli.base.tiling import to_blocks
+from plenocli.files.config.camera_file import parse_camera, to_toml
+from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.propagation.system_matrix import build_pif
+from plenocli.inverse.fit.fit import CapturedLenslets, accepted_ratio, fit_camera
+from plenocli.inverse.fit.optics import CameraFamily, all_parameters
+from tests.forward.propagation.cameras import WAVELENGTH, accuracy, small_camera
+
+CAMERA = small_camera(
+    object__samples_per_lenslet=(10, 10),
+    sensor__pixels_per_lenslet=(16, 16),
+    lenslet_array__pitch=31.5e-6,
+    lenslet_array__focal_length=256e-6,
+    sensor__distance=256e-6,
+)
+FAMILY = CameraFamily(CAMERA, geometry(CAMERA, WAVELENGTH, (0.0, 0.0)), all_parameters(CAMERA))
+TRAINING = [np.asarray(getattr(data, n)(), float) / 255 for n in ("camera", "brick", "moon")]
+SNR = 50
+
+
+@cache
+def exact(values, finer):
+    """The matrix of the forward model, of points `finer` times as fine."""
+    camera = FAMILY.camera_at(np.array(values)).replace(
+        **{"object.samples_per_lenslet": (10 * finer, 10 * finer)}
+    )
+    plan = accuracy.plan_pif(
+        camera, accuracy=1e-5, model="fresnel", superpixels=(1, 1), coherent_ring=0
+    )
+    shift = FAMILY.geometry_at(np.array(values)).pixel_shift
+    return np.asarray(build_pif(camera, replace(plan, pixel_shift=shift)).A[0, 0], float)
+
+
+def captured(values, count=6, scale=1.0):
+    """Superpixels of a photograph twice as fine as it is modelled."""
+    picture = np.asarray(data.coffee(), float).mean(axis=2)[60:, 150:] / 255
+    scene = to_blocks(picture[: 20 * count, : 20 * count], (20, 20))
+    y = scene @ exact(tuple(values), 2).T / 4
+    sigma = np.sqrt(np.mean(y**2)) * 10 ** (-SNR / 20)
+    noise = np.random.default_rng(3).standard_normal(y.shape)
+    return CapturedLenslets(scale * (y + sigma * noise), scale * sigma)
+
+
+@cache
+def fitted(kind):
+    x = {
+        "all": 0.2 * np.random.default_rng(8).uniform(-1, 1, 12),
+        "mirrored": np.array([-0.5, 0, 0, 0, 0, 0.2, 0, 0.3, 0, 0, -0.3, 0]),
+    }[kind]
+    truth = FAMILY.start + x * FAMILY.tolerance
+    scale = 1e-9 if kind == "all" else 1.0
+    return truth, fit_camera(CAMERA, [captured(truth, scale=scale)], TRAINING)
+
+
+@pytest.mark.parametrize("kind", ["all", "mirrored"])
+def test_a_camera_is_found_from_a_photograph(kind):
+    truth, fit = fitted(kind)
+    right = exact(tuple(truth), 1)
+    start = np.linalg.norm(exact(tuple(FAMILY.start), 1) - right) / np.linalg.norm(right)
+    error = np.linalg.norm(fit.matrix - right) / np.linalg.norm(right)
+    assert fit.accepted, fit.why
+    assert error < 0.1 * start
+    assert error < 3 * fit.model_error < 0.3 * start
+    assert fit.noise_ratio < 1.05 < fit.noise_ratio_before
+    assert fit.turned > 1.2
+    wrong = [
+        p.name for p, t in zip(fit.parameters, truth) if abs(p.value - t) > 4 * p.sigma + 1e-30
+    ]
+    assert not wrong
+    assert ("pitch", "wavelength") in fit.inseparable or "pitch" in fit.unmeasured
+
+
+def test_the_fitted_camera_is_a_camera_file_like_any_other():
+    truth, fit = fitted("all")
+    camera = parse_camera(to_toml(fit.camera))
+    plan = accuracy.plan_pif(
+        camera, accuracy=1e-4, model="fresnel", superpixels=(1, 1), coherent_ring=0
+    )
+    found = build_pif(camera, plan)
+    A = found.A[0, 0]
+    assert np.linalg.norm(A - fit.matrix) < 5e-4 * np.linalg.norm(A)
+    assert found.accuracy.model_error >= fit.model_error > 0
+    plain = accuracy.plan_pif(
+        CAMERA, accuracy=1e-4, model="fresnel", superpixels=(1, 1), coherent_ring=0
+    )
+    bare = float(np.hypot(plain.model_error, fit.model_error))
+    assert abs(found.accuracy.model_error - bare) < 0.05 * bare
+
+
+def test_a_fit_that_cannot_be_says_so_and_changes_nothing():
+    rng = np.random.default_rng(1)
+    noise = CapturedLenslets(rng.random((2, 2, 256)), 1e-2)
+    fit = fit_camera(CAMERA, [noise], TRAINING, parameters=all_parameters(CAMERA)[:3])
+    assert not fit.accepted
+    assert fit.camera == CAMERA
+    assert "noise" in fit.why
+
+
+@pytest.mark.parametrize(
+    "capture",
+    [CapturedLenslets(np.zeros((2, 2, 256)), 1.0), CapturedLenslets(np.ones((2, 2, 256)), 0.0)],
+)
+def test_captures_without_light_or_noise_are_refused(capture):
+    with pytest.raises(InputError):
+        fit_camera(CAMERA, [capture], TRAINING)
+
+
+def test_few_pixels_may_look_noisier():
+    assert accepted_ratio(100) > 1.2 > 1.03 > accepted_ratio(10**6) > 1.02

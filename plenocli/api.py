@@ -14,7 +14,6 @@ Nothing here writes a file. Rows go down and come first, lengths are metres, whi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +50,10 @@ from plenocli.inverse.calibration import measure
 from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.lightfield.light_field import Optics, refocused, samples_of, usual_slopes
 from plenocli.inverse.lightfield.planes import LightField
+from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
-from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
-from plenocli.inverse.picture.nuisances.clean import clean
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, split_by_scene
@@ -375,14 +373,8 @@ def reconstruct(
         None if dictionary is None else lambda: dictionary,
         threads=1,
     )
-    cleaned = clean(
-        estimators,
-        superpixels(_capture(capture), system, calibration),
-        look=METHODS[method].sees is not Sees.LENSLET_AS_IS,
-    )
-    cleaned.tell()
-    found = METHODS[method].reconstruct(estimators, cleaned.data)
-    found = replace(found, trace=(*cleaned.findings, *found.trace))
+    data = superpixels(_capture(capture), system, calibration)
+    found, _ = estimate(estimators, METHODS[method], data)
     return found.as_picture(system.object_shape)
 
 

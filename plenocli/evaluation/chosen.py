@@ -59,7 +59,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "noise_relative",
         "model_error_relative",
         "limited_by",
-        "loss_at_most_db",
+        "noise_raised",
+        "detail_kept",
         "seen_share",
     ),
     "snr": (

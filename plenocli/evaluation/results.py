@@ -16,7 +16,8 @@ class ToldFigures:
     noise_relative: float | None = None
     model_error_relative: float | None = None
     limited_by: str | None = None
-    loss_at_most_db: float | None = None
+    noise_raised: float | None = None
+    detail_kept: float | None = None
     seen_share: float | None = None
 
 

@@ -188,7 +188,10 @@ def test_what_cannot_be_seen_is_told(single, tmp_path, capsys):
     folder, truth = single
     image = reconstruct(folder, "--method", "tikhonov", output="seen.h5")
     seen, told = image.data["image/seen"], image.attrs["image"]["parameters"]["seen"]
-    a, ratio = matrices(False)[0][0], (image.attrs["image"]["parameters"]["noise_sigma"] / 0.1) ** 2
+    a, noise = matrices(False)[0][0], image.attrs["image"]["parameters"]["noise_sigma"]
+    # half the brightness of the picture is the contrast of photographs
+    bright = reconstruct(folder, "--method", "block-mean", output="mean.h5").data["image/value"]
+    ratio = (noise / (0.5 * np.sqrt(np.mean(bright**2)))) ** 2
     expected = np.diag(np.linalg.solve(a.T @ a + ratio * np.eye(N * N), a.T @ a))
     np.testing.assert_allclose(seen, expected.reshape(N, N), atol=1e-6)
     assert (
@@ -293,38 +296,35 @@ def test_light_that_the_matrix_lacks_does_not_pass_for_contrast(tmp_path):
     assert psnr(image.data["image/value"], truth) > 19
 
 
-@pytest.mark.parametrize("stray, gain", [(1.0, 3), (3.0, 1), (10.0, -0.5)])
-def test_light_that_no_photograph_explains_is_not_amplified(tmp_path, stray, gain, capsys):
-    """A matrix without neighbours takes their light for contrast; plug and play had 6 dB less
-    than the mean of each block.
+@pytest.mark.parametrize("stray, gain", [(1.0, 3), (3.0, 1), (10.0, -0.2)])
+def test_light_that_the_matrix_lacks_is_not_amplified(tmp_path, stray, gain, capsys):
+    """A matrix without neighbours takes their light for contrast; believed, it would cost up to
+    6 dB more than the mean of each block.
     """
     truth = make_files(tmp_path, coupled=True, stray=stray)
     floor = psnr(reconstruct(tmp_path, "--method", "block-mean").data["image/value"], truth)
     capsys.readouterr()
-    for method in ("lmmse", "pnp"):
+    for method, less in (("lmmse", 0), ("pnp", 2), ("tv", 0), ("tikhonov", 2), ("tsvd", 2)):
         image = reconstruct(tmp_path, "--method", method, "--overlap", "1")
-        assert psnr(image.data["image/value"], truth) > floor + gain, method
-        assert (
-            image.attrs["image"]["parameters"]["noise_source"] == "what photographs do not explain"
-        )
-        assert "only if sigma =" in capsys.readouterr().err
+        # light of the neighbours is as continuous as they are, and Tikhonov knows no photographs
+        least = max(gain - less, -0.2 if method != "tikhonov" else -0.6)
+        assert psnr(image.data["image/value"], truth) > floor + least, method
+        parameters = image.attrs["image"]["parameters"]
+        assert not parameters["matrix_believed"] and parameters["noise_raised"] > 5
+        assert "is not quite this camera's" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("stray", [1.2, 1.5])
-def test_light_that_the_matrix_lacks_costs_no_more_than_is_said(tmp_path, stray):
-    """Against the picture of LMMSE from a capture without fault: what is said of that is small."""
+@pytest.mark.parametrize("stray, lost", [(1.2, 2), (1.5, 8)])
+def test_some_light_that_the_matrix_lacks_costs_little(tmp_path, stray, lost):
     faultless = make_files(tmp_path, coupled=True)
     image = reconstruct(tmp_path, "--method", "lmmse")
-    best, said = (
-        psnr(image.data["image/value"], faultless),
-        image.attrs["image"]["parameters"]["limits"]["loss_at_most_db"],
-    )
-    assert 0 <= said < 1
+    assert image.attrs["image"]["parameters"]["matrix_believed"]
+    best = psnr(image.data["image/value"], faultless)
     truth = make_files(tmp_path, coupled=True, stray=stray)
     for method in ("lmmse", "tikhonov", "tv", "pnp"):
         image = reconstruct(tmp_path, "--method", method)
-        loss = image.attrs["image"]["parameters"]["limits"]["loss_at_most_db"]
-        assert best - psnr(image.data["image/value"], truth) <= loss, method
+        assert image.attrs["image"]["parameters"]["matrix_believed"] == (stray == 1.2), method
+        assert psnr(image.data["image/value"], truth) > best - lost, method
 
 
 def test_dictionary_chain(single, tmp_path, capsys):

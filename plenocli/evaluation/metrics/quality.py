@@ -36,9 +36,13 @@ DEFINITIONS = {
         "was simulated with the same matrix"
     ),
     "limited_by": "the larger of the two: noise or model",
-    "loss_at_most_db": (
-        "how much larger the error is at most than what LMMSE expects where the system matrix is "
-        "right and knows all of the light; dB"
+    "noise_raised": (
+        "root mean square of the noise that was reckoned with over the capture's own: 1 where "
+        "nothing in the capture speaks against the system matrix"
+    ),
+    "detail_kept": (
+        "share of the method's detail that was kept, as far as it goes on across the lenslets' "
+        "borders; the rest is the mean of each lenslet"
     ),
     "seen_share": (
         "share of the directions of a lenslet's object that stand above the capture's noise; the "

@@ -147,7 +147,8 @@ def _told(parameters: Any) -> ToldFigures:
         noise_relative=limits.get("noise"),
         model_error_relative=limits.get("model_error"),
         limited_by=limits.get("limited_by"),
-        loss_at_most_db=limits.get("loss_at_most_db"),
+        noise_raised=parameters.get("noise_raised"),
+        detail_kept=parameters.get("detail_kept"),
         seen_share=seen.get("share"),
     )
 

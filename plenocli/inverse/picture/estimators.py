@@ -5,6 +5,7 @@ camera.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -113,6 +114,29 @@ class Estimators:
         )
         one.svd, one.prior = self.svd, self.prior
         return one
+
+    def with_options(self, options: Options) -> Estimators:
+        """The same with other options; what was worked out is shared, both ways."""
+        other = copy(self)
+        other.options = options
+        other.svd, other.prior = self.svd, self.prior
+        return other
+
+    def seen_through(self, rows: np.ndarray) -> Estimators:
+        """The same for superpixels of which only `rows` (row, pixel) are looked at: their noise is
+        white then. Batches stay in this process.
+        """
+        blocks = np.stack([rows @ block for block in self.system.blocks])
+        other = Estimators(
+            replace(self.system, blocks=blocks, pixel_shape=(len(rows), 1)),
+            self.options,
+            self.read_pictures,
+            None if self.read_dictionary is None else lambda: self.learnt,
+            threads=self.threads,
+        )
+        other.prior.pictures_of = self.prior.pictures_of
+        other.prior.statistics = self.prior.statistics
+        return other
 
     def sensor(self, count: tuple[int, int]) -> BlockToeplitz:
         """The matrix of `count` lenslets (rows, columns), neighbours' light included."""

@@ -1,4 +1,4 @@
-"""The noise of a capture, LMMSE over 3x3 lenslets, and what it tells of the neighbours' light."""
+"""LMMSE over 3x3 lenslets, and what it tells of the neighbours' light."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
-from plenocli.inverse.picture import noise_level
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.noise_level import NoiseLevel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,70 +17,34 @@ class JointEstimate:
 
     value, sigma: (lenslet_row, lenslet_column, point), the picture and its standard deviation.
     scale: factor of the photographs' covariance.
-    noise_level: what was taken for noise in the end.
     """
 
     value: np.ndarray
     sigma: np.ndarray
     scale: float
-    noise_level: NoiseLevel
-
-
-def noise_of(estimators: Estimators, data: Superpixels) -> NoiseLevel:
-    """What the estimate of all of the capture takes for noise. A matrix with neighbours is believed
-    first: the joint estimate tells better what is left over than block means do.
-    """
-    if estimators.coupled and data.sigma is not None:
-        return believed_noise(estimators, data, data.y, look=False)
-    return believed_noise(estimators, data, estimators.without_stray(data.y))
-
-
-def believed_noise(
-    estimators: Estimators,
-    data: Superpixels,
-    y: np.ndarray,
-    *,
-    look: bool = True,
-    at_least: float = 0.0,
-) -> NoiseLevel:
-    """The noise of superpixels.
-
-    data: the capture that they are of.
-    y: (lenslet_row, lenslet_column, pixel).
-    look: for what no object gives.
-    at_least: what the joint estimate found before.
-    """
-    given = estimators.options.noise_sigma
-    if given is not None:
-        return NoiseLevel(sigma=float(given), source=noise_level.GIVEN)
-    if not look:
-        return noise_level.believed(y, data.sigma, None)
-    known_to_matrix = estimators.coupled and estimators.overlap == 3
-    stacked = y.reshape(-1, y.shape[-1]).T
-    return noise_level.believed(
-        y,
-        data.sigma,
-        max(noise_level.outside(estimators.svd, y, data.sigma) or 0.0, at_least),
-        hint=""
-        if known_to_matrix
-        else ". If it is the neighbours' light, use a pif of --superpixels 3x3 with --overlap 3",
-        implausible=lambda sigma: estimators.prior.lmmse(sigma, data.scene).implausible(stacked),
-    )
 
 
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
-    """LMMSE over 3x3 lenslets, the covariance scaled to this picture's contrast; once more where a
-    matrix with neighbours leaves more over than the capture's noise.
+    """LMMSE over 3x3 lenslets with scale x covariance, one scale a picture; steps of sqrt(2), so
+    that captures of one kind share what is worked out. sigma goes by the geometric mean of that
+    scale and the one of each lenslet's own light (docs/model.md, "Spatial reconstruction").
     """
-    noise = noise_of(estimators, data)
-    first = _scaled(estimators, data, noise)
-    if not estimators.coupled or noise.source != noise_level.TOLD:
-        return first
-    left = _left_over(estimators, data.y, first.value)
-    more = noise_level.believed(data.y, data.sigma, left)
-    if more.sigma > noise.sigma:
-        return _scaled(estimators, data, more)
-    return JointEstimate(value=first.value, sigma=first.sigma, scale=first.scale, noise_level=more)
+    own = estimators.prior.lmmse(data.known_sigma, data.scene)
+    y = estimators.without_stray(data.y)
+    y = y[INNER] if min(y.shape[:2]) > 2 else y
+    scale = own.common_scale(y.reshape(-1, y.shape[2]).T)
+    # never above 1: light that the matrix does not produce passes for contrast, and
+    # would be amplified
+    scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
+    joint = estimators.prior.joint(data.known_sigma / np.sqrt(scale), data.scene)
+    x, sigma = joint.apply(data.y)
+    y = own_light(estimators, data.y, x) if estimators.coupled else data.y
+    contrast = scale * own.scales(y.reshape(-1, y.shape[2]).T)
+    return JointEstimate(
+        value=x,
+        sigma=sigma * contrast.reshape(*y.shape[:2], 1) ** 0.25,
+        scale=scale,
+    )
 
 
 def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -105,31 +67,7 @@ def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarra
     return y - estimators.sensor(beyond.shape[:2]).neighbours_only().forward(beyond)[inside]
 
 
-def _scaled(estimators: Estimators, data: Superpixels, noise: NoiseLevel) -> JointEstimate:
-    """The joint estimate with scale x covariance, one scale a picture; steps of sqrt(2), so that
-    captures of one kind share what is worked out. sigma goes by the geometric mean of that scale
-    and the one of each lenslet's own light (docs/model.md, "Spatial reconstruction").
-    """
-    own = estimators.prior.lmmse(noise.sigma, data.scene)
-    y = estimators.without_stray(data.y)
-    y = y[INNER] if min(y.shape[:2]) > 2 else y
-    scale = own.common_scale(y.reshape(-1, y.shape[2]).T)
-    # never above 1: light that the matrix does not produce passes for contrast, and
-    # would be amplified
-    scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
-    joint = estimators.prior.joint(noise.sigma / np.sqrt(scale), data.scene)
-    x, sigma = joint.apply(data.y)
-    y = own_light(estimators, data.y, x) if estimators.coupled else data.y
-    contrast = scale * own.scales(y.reshape(-1, y.shape[2]).T)
-    return JointEstimate(
-        value=x,
-        sigma=sigma * contrast.reshape(*y.shape[:2], 1) ** 0.25,
-        scale=scale,
-        noise_level=noise,
-    )
-
-
-def _left_over(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> float:
+def left_over(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> float:
     """Root mean square of y - A x over the lenslets that have all their neighbours
     (all, where none has).
     """

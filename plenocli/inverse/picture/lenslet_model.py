@@ -99,3 +99,10 @@ class Superpixels:
     def sigma(self) -> float | None:
         """Standard deviation of the known noise, in units of A x."""
         return None if self.noise is None else self.noise.sigma
+
+    @property
+    def known_sigma(self) -> float:
+        """The same; ValueError where it is not known."""
+        if self.noise is None:
+            raise ValueError("the noise of the superpixels is not known")
+        return self.noise.sigma

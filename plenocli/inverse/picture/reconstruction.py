@@ -10,7 +10,7 @@ import numpy as np
 
 from plenocli.base.tiling import to_plane
 from plenocli.forward.sensor.noise import Noise
-from plenocli.inverse.picture.noise_level import NoiseLevel
+from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 
 
 class Entry(Protocol):
@@ -62,27 +62,20 @@ class ContrastScale:
 
 @dataclass(frozen=True, kw_only=True)
 class NeighboursTaken:
-    """The neighbours' light was taken away before the method itself.
-
-    noise: as the joint estimate that knows the neighbours' light found it, None where the capture
-        does not say its own.
-    scale: that estimate's factor of the covariance, likewise.
+    """The neighbours' light was taken away before the method itself, as the joint estimate sees
+    it; scale: that estimate's factor of the covariance.
     """
 
-    noise: NoiseLevel | None
-    scale: float | None
+    scale: float
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""
-        told: dict[str, Any] = {
+        return {
             "neighbours": "their light is taken away as LMMSE over 3x3 lenslets sees it",
             "border": "lenslets that lack neighbours are those of LMMSE over 3x3 lenslets: light "
             "from beyond the array cannot be taken away",
+            "scale": self.scale,
         }
-        if self.noise is not None:
-            told |= {"noise_sigma": self.noise.sigma, "scale": self.scale}
-            told |= {} if self.noise.excess is None else {"excess": self.noise.excess}
-        return told
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,7 @@ class ScenePrior:
         """
         self.system, self.svd, self.read_pictures, self.seed = system, svd, read_pictures, seed
         self.pictures_of: dict[str | None, list[TrainingPicture]] = {}
-        self._statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
+        self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
         self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
         self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
 
@@ -69,7 +69,7 @@ class ScenePrior:
 
     def lmmse(self, sigma: float, scene: str | None) -> lmmse.Lmmse:
         """LMMSE of a lenslet by itself, at noise `sigma` of a pixel."""
-        if scene not in self._statistics:
+        if scene not in self.statistics:
             shape = self.system.object_shape
             patches = natural_images.draw_patches(
                 self.pictures(scene),
@@ -77,8 +77,8 @@ class ScenePrior:
                 PATCHES_A_POINT * int(np.prod(shape)),
                 stream(self.seed, "reconstruct"),
             )
-            self._statistics[scene] = natural_images.mean_covariance(patches)
-        mean, covariance = self._statistics[scene]
+            self.statistics[scene] = natural_images.mean_covariance(patches)
+        mean, covariance = self.statistics[scene]
         return _kept(
             self._own,
             (sigma, scene),

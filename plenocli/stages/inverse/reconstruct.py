@@ -21,13 +21,13 @@ from plenocli.files.read.captures import read_superpixels, read_white
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.files.read.training import files_of, read_training
-from plenocli.inverse.picture.diagnosis import Seen, loss_db, what_is_seen
+from plenocli.inverse.picture.diagnosis import Seen
+from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
-from plenocli.inverse.picture.nuisances.clean import clean
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
 
@@ -98,22 +98,6 @@ class Recipe:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureLimits:
-    """What limits a picture.
-
-    limits: the capture's noise against the error of the matrix.
-    loss_at_most_db: what the latter may cost, None where that is not known.
-    """
-
-    limits: Limits
-    loss_at_most_db: float | None
-
-    def as_json(self) -> dict[str, Any]:
-        """Names and values, as artefacts hold them."""
-        return self.limits.as_json() | {"loss_at_most_db": self.loss_at_most_db}
-
-
-@dataclass(frozen=True, kw_only=True)
 class Solved:
     """The picture of a capture.
 
@@ -127,7 +111,7 @@ class Solved:
 
     found: Reconstruction
     seen: Seen | None = None
-    limits: PictureLimits | None = None
+    limits: Limits | None = None
     negative_share: float
     block: tuple[int, int] | None = None
     bands: tuple[float, ...] = ()
@@ -161,7 +145,7 @@ class PictureSummary:
 
     output: str
     account: Account
-    limits: PictureLimits | None
+    limits: Limits | None
     seen: Seen | None
     rows: int
     columns: int
@@ -440,14 +424,9 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     )
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
-    bare = clean(estimators, data, look=look)
-    bare.tell()
-    data = bare.data
-    found = method.reconstruct(estimators, data, truth)
-    found = replace(found, trace=(*bare.findings, *found.trace))
-    sigma = data.sigma if found.noise_level is None else found.noise_level.sigma
-    limits = _limits(estimators, data, found, sigma)
-    seen = what_is_seen(estimators, sigma) if sigma else None
+    limits = _limits(estimators, data)
+    off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+    found, seen = estimate(estimators, method, data, truth, model_error=off)
     return _solved(
         found.as_picture(system.object_shape),
         settings,
@@ -467,27 +446,21 @@ def _solved(found: Reconstruction, settings: Settings, **more: Any) -> Solved:
     )
 
 
-def _limits(
-    estimators: Estimators, data: Superpixels, found: Reconstruction, sigma: float | None
-) -> PictureLimits | None:
-    """Whether the capture's noise `sigma` or the error of the matrix decides, and what the latter
-    is expected to cost; None where that is not known.
+def _limits(estimators: Estimators, data: Superpixels) -> Limits | None:
+    """Whether the capture's noise or the error of the matrix decides, by their records; None where
+    that is not known.
     """
     from plenocli.files.artefacts.provenance import file_digest
     from plenocli.forward.accuracy.limiting_error import what_limits
 
-    system = estimators.system
+    system, sigma = estimators.system, estimators.options.noise_sigma or data.sigma
     signal = float(np.sqrt(np.mean(np.square(data.y))))
-    limits = what_limits(
+    return what_limits(
         sigma / signal if sigma and signal else None,
         system.accuracy,
         data.accuracy,
         data.pif_digest is not None and data.pif_digest == file_digest(system.path),
     )
-    if limits is None:
-        return None
-    loss = loss_db(estimators, data, found, limits.model_error * signal)
-    return PictureLimits(limits=limits, loss_at_most_db=loss)
 
 
 def _truth(

@@ -13,8 +13,8 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.registry import METHODS, takers
-from plenocli.inverse.picture.noise_level import NoiseLevel
 from plenocli.inverse.picture.reconstruction import Choice, ContrastScale, Reconstruction
+from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 
 POINTS, PIXELS, SIGMA = (3, 3), (4, 4), 1e-3
 RING = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
@@ -84,11 +84,11 @@ def test_later_findings_overrule_earlier_ones():
         method="lmmse",
         trace=(
             Choice(method="lmmse", reason="asked for"),
-            NoiseLevel(sigma=1.0, source="from the capture", excess=0.5),
+            NoiseLevel(sigma=1.0, source="from the capture", found=1.25),
             ContrastScale(0.5),
             NoiseLevel(sigma=2.0, source="given"),
         ),
     )
     told = found.as_json()
-    assert told["noise_sigma"] == 2.0 and told["excess"] == 0.5 and told["scale"] == 0.5
+    assert told["noise_sigma"] == 2.0 and told["excess"] == 0.75 and told["scale"] == 0.5
     assert found.as_picture(POINTS).value.shape == POINTS and found.sigma is None

@@ -269,7 +269,7 @@ def test_all_nuisances_at_once_cost_little(declared):
         told |= finding.as_json()
     assert set(told) == {"defects", "veil", "saturated"}
     assert told["defects"]["bright"] >= 1 and told["defects"]["dark"] >= 5
-    assert told["veil"]["level"] == pytest.approx(0.02 * y.mean(), rel=0.05)
+    assert told["veil"]["share"] == pytest.approx(0.02, rel=0.05)
     assert told["saturated"]["declared"] == declared
 
 

@@ -15,7 +15,6 @@ from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_squ
 from plenocli.inverse.picture.footprint import Phases
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, own_light
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.noise_level import NoiseLevel
 from plenocli.inverse.picture.reconstruction import (
     Choice,
     ContrastScale,
@@ -43,14 +42,12 @@ class OwnLight:
     truth: (lenslet_row, lenslet_column, point) the true objects, to choose a weight with hindsight.
     joint: the estimate that took the neighbours' light away, None where there is none of it; then
         the lenslets of the border stay what they are there.
-    at_least: noise that is known to be there, as that estimate found it.
     """
 
     data: Superpixels
     y: np.ndarray
     truth: np.ndarray | None = None
     joint: JointEstimate | None = None
-    at_least: float = 0.0
 
     @property
     def inner(self) -> tuple[slice, slice] | EllipsisType:
@@ -64,14 +61,12 @@ class Estimate:
 
     value: (lenslet_row, lenslet_column, point).
     sigma: its standard deviation, or None.
-    noise_level: what was taken for noise, None where the method does not ask.
     from_lmmse: root mean square distance from LMMSE of each lenslet, where that is known.
     stats: of the method.
     """
 
     value: np.ndarray
     sigma: np.ndarray | None = None
-    noise_level: NoiseLevel | None = None
     from_lmmse: float | None = None
     stats: Stats | None = None
 
@@ -112,11 +107,13 @@ class Method(ABC):
         data: Superpixels,
         truth: np.ndarray | None = None,
         choice: Choice | None = None,
+        joint: JointEstimate | None = None,
     ) -> Reconstruction:
-        """The picture of a capture.
+        """The picture of a capture whose noise is known, all of A x and white noise.
 
         truth: (lenslet_row, lenslet_column, point) chooses the weight with hindsight.
         choice: why this method was taken; None: it was asked for.
+        joint: LMMSE over 3x3 lenslets, where it was made before.
         """
 
 
@@ -135,6 +132,7 @@ class Estimator(Method):
         data: Superpixels,
         truth: np.ndarray | None = None,
         choice: Choice | None = None,
+        joint: JointEstimate | None = None,
     ) -> Reconstruction:
         """As in Method: the neighbours' light is taken away first, where the matrix knows it."""
         choice = choice or Choice(method=self.name, reason="asked for")
@@ -142,33 +140,23 @@ class Estimator(Method):
         if not self.makes_joint_estimate(estimators):
             own = self.estimate(estimators, OwnLight(data=data, y=data.y, truth=truth))
             return self._result(estimators, choice, own)
-        joint = estimate_jointly(estimators, data)
+        joint = joint or estimate_jointly(estimators, data)
         if self.sees is Sees.RING:
             return Reconstruction(
                 value=joint.value,
                 sigma=joint.sigma,
                 method=self.name,
                 overlap=estimators.overlap,
-                noise_level=joint.noise_level,
                 scale=joint.scale,
                 from_lmmse=0.0,
-                trace=(choice, joint.noise_level, ContrastScale(joint.scale)),
+                trace=(choice, ContrastScale(joint.scale)),
             )
-        known = data.sigma is not None
-        taken = NeighboursTaken(
-            noise=joint.noise_level if known else None, scale=joint.scale if known else None
-        )
+        taken = NeighboursTaken(scale=joint.scale)
         y = own_light(estimators, data.y, joint.value)
         if min(y.shape[:2]) <= 2:
             border = Estimate(value=joint.value, sigma=joint.sigma)
             return self._result(estimators, choice, border, taken)
-        light = OwnLight(
-            data=data,
-            y=y,
-            truth=truth,
-            joint=joint,
-            at_least=joint.noise_level.sigma if known else 0.0,
-        )
+        light = OwnLight(data=data, y=y, truth=truth, joint=joint)
         own = self.estimate(estimators, light)
         distance = root_mean_square(own.value - joint.value)
         return self._result(estimators, choice, own, taken, distance)
@@ -181,18 +169,15 @@ class Estimator(Method):
         taken: NeighboursTaken | None = None,
         from_lmmse: float | None = None,
     ) -> Reconstruction:
-        trace = tuple(entry for entry in (choice, taken, own.noise_level) if entry is not None)
-        before = None if taken is None else taken.noise
         return Reconstruction(
             value=own.value,
             sigma=own.sigma,
             method=self.name,
             overlap=estimators.overlap,
-            noise_level=own.noise_level or before,
             scale=None if taken is None else taken.scale,
             from_lmmse=own.from_lmmse if from_lmmse is None else from_lmmse,
             stats=own.stats,
-            trace=trace,
+            trace=(choice,) if taken is None else (choice, taken),
         )
 
     def _note_overlap(self, estimators: Estimators) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.joint import believed_noise
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.reconstruction import Stats
 from plenocli.inverse.picture.solvers import least_squares
@@ -258,9 +257,8 @@ def adaptive_lmmse(
 
 def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:
     y = light.y[light.inner]
-    noise = believed_noise(estimators, light.data, y, at_least=light.at_least)
-    x, sigma = adaptive_lmmse(estimators, noise.sigma, light.data.scene, y)
-    return Estimate(value=x, sigma=sigma, noise_level=noise, from_lmmse=0.0)
+    x, sigma = adaptive_lmmse(estimators, light.data.known_sigma, light.data.scene, y)
+    return Estimate(value=x, sigma=sigma, from_lmmse=0.0)
 
 
 def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLight) -> Estimate:
@@ -270,17 +268,15 @@ def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLig
     """
     y, truth = light.y[light.inner], light.truth
     rows, columns = y.shape[:2]
-    noise = believed_noise(estimators, light.data, y, at_least=light.at_least) if noisy else None
     if truth is not None:
         truth = truth[light.inner].reshape(-1, truth.shape[2]).T
-    found, stats = solve(
-        estimators, y.reshape(rows * columns, -1).T, 0.0 if noise is None else noise.sigma, truth
-    )
+    sigma = light.data.known_sigma if noisy else 0.0
+    found, stats = solve(estimators, y.reshape(rows * columns, -1).T, sigma, truth)
     value = found.T.reshape(rows, columns, -1)
     if light.joint is not None:
         value, inside = light.joint.value.copy(), value
         value[light.inner] = inside
-    return Estimate(value=value, noise_level=noise, stats=stats)
+    return Estimate(value=value, stats=stats)
 
 
 BLOCK_MEAN = Estimator(

@@ -21,7 +21,7 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, TrialKey
 from plenocli.inverse.picture.footprint import Sizes
-from plenocli.inverse.picture.joint import noise_of
+from plenocli.inverse.picture.joint import JointEstimate
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.per_lenslet import DICTIONARY, LMMSE
@@ -56,14 +56,15 @@ class Trial(Method):
         data: Superpixels,
         truth: np.ndarray | None = None,
         choice: Choice | None = None,
+        joint: JointEstimate | None = None,
     ) -> Reconstruction:
         """As in Method, by the method that does best in the trial."""
         method, choice = self.choose(estimators, data)
-        return method.reconstruct(estimators, data, truth, choice)
+        return method.reconstruct(estimators, data, truth, choice, joint)
 
     def choose(self, estimators: Estimators, data: Superpixels) -> tuple[Method, Choice]:
         """The best method for a capture, and why; trials are kept for captures to come."""
-        sigma = noise_of(estimators, data).sigma
+        sigma = data.known_sigma
         # an empty capture is all noise
         loudness = max(np.sqrt(np.mean(np.square(data.y))), 1e-3 * sigma)
         key = (float(f"{sigma / loudness:.1e}"), _contrast(estimators, data, sigma), data.scene)

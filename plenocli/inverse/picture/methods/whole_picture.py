@@ -13,7 +13,6 @@ from plenocli.base.progress import bar
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
-from plenocli.inverse.picture.joint import believed_noise
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
 from plenocli.inverse.picture.solvers import whole_sensor
@@ -72,25 +71,24 @@ def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estima
     estimate.
     """
     shape, y, inner, joint = estimators.system.object_shape, light.y, light.inner, light.joint
-    noise = believed_noise(estimators, light.data, y[inner], at_least=light.at_least)
+    noise = light.data.known_sigma
     if joint is None:
         x, sigma = np.empty((2, *y.shape[:2], estimators.svd.vt.shape[1]))
     else:
         x, sigma = joint.value.copy(), joint.sigma.copy()
-    x[inner], sigma[inner] = adaptive_lmmse(estimators, noise.sigma, light.data.scene, y[inner])
+    x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
     error = root_mean_square(sigma[inner])
     held = None
     if joint is not None:
         edge = np.ones(y.shape[:2], bool)
         edge[inner] = False
         held = edge, x.copy()
-    term = whole_sensor.DataTerm(estimators.svd, shape, y, noise.sigma, 2 * error, held)
+    term = whole_sensor.DataTerm(estimators.svd, shape, y, noise, 2 * error, held)
     picture, rule, rounds = solve(estimators, term, to_plane(x, shape), error)
     found = to_blocks(picture, shape)
     return Estimate(
         value=found,
         sigma=sigma,
-        noise_level=noise,
         from_lmmse=root_mean_square(found - x),
         stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule),
     )

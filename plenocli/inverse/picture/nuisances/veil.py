@@ -49,28 +49,27 @@ class VeilFound:
     @property
     def sentence(self) -> str:
         """What was found, for a person."""
-        error = abs(self.share) * self.sigma / max(abs(self.level), np.finfo(float).tiny)
-        own = (
-            ""
-            if not self.spread
-            else f", {abs(self.share) * self.spread / abs(self.level):.2%} more or less by lenslet"
-        )
+        error, spread = self.of_mean(self.sigma), self.of_mean(self.spread)
+        own = f", {spread:.2%} more or less by lenslet" if spread else ""
         return (
             f"an even light of {self.share:.2%} of the mean (+- {error:.2%}{own}) lies over the "
             "superpixels: it was taken away"
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Names and values, as artefacts hold them."""
+        """Names and values, as artefacts hold them: shares of the capture's mean."""
         return {
             "veil": {
-                "level": self.level,
-                "sigma": self.sigma,
-                "spread": self.spread,
                 "share": self.share,
+                "sigma": self.of_mean(self.sigma),
+                "spread": self.of_mean(self.spread),
                 "removed": self.removed,
             }
         }
+
+    def of_mean(self, value: float) -> float:
+        """A value in units of A x as a share of the capture's mean."""
+        return abs(self.share) * value / max(abs(self.level), np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,8 @@ class Lmmse:
     offset, analysis: (k,) and (k, pixel), y to uncorrelated coordinates.
     power: (k,) their variance at scale 1.
     gain: (point, k) back to the field.
-    sigma: noise of a pixel.
+    noise: (k,) variance of the noise in each coordinate.
+    sigma: noise of a pixel, in the brightness.
     """
 
     levels: np.ndarray
@@ -58,24 +59,29 @@ class Lmmse:
     power: np.ndarray
     gain: np.ndarray
     variance: np.ndarray
+    noise: np.ndarray
     sigma: float
 
     def apply(self, y: np.ndarray, scale: float | np.ndarray = 1.0) -> np.ndarray:
         """(pixel, signal) -> (point, signal), with the covariance times `scale`, a
         number or one a signal.
         """
-        w = self._coordinates(y)
-        field = self.gain @ (
-            w / (self.power[:, None] + self.sigma**2 / np.broadcast_to(scale, w.shape[1:]))
+        w = self.coordinates(y)
+        return (
+            self.even @ (self.levels @ y) + self.mean[:, None] + self.gain @ self.shrunk(w, scale)
         )
-        return self.even @ (self.levels @ y) + self.mean[:, None] + field
+
+    def shrunk(self, w: np.ndarray, scale: float | np.ndarray) -> np.ndarray:
+        """What `gain` takes back to the field, (k, signal), of coordinates w (k, signal)."""
+        noise = self.noise[:, None] / np.broadcast_to(scale, w.shape[1:])
+        return w / (self.power[:, None] + noise)
 
     def adaptive(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the
         estimates and their predicted standard deviations (point, signal), the scales (signal,).
         """
         scale = self.scales(y)
-        left = self.gain**2 @ (1 / (self.power[:, None] + self.sigma**2 / scale))
+        left = self.gain**2 @ (1 / (self.power[:, None] + self.noise[:, None] / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
         # the patterns are orthogonal
         level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]
@@ -86,11 +92,18 @@ class Lmmse:
         times the given one.
         """
         left = scale * np.maximum(
-            self.variance - self.gain**2 @ (1 / (self.power + self.sigma**2 / scale)), 0
+            self.variance - self.gain**2 @ (1 / (self.power + self.noise / scale)), 0
         )
         return float(
             np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1))))
         )
+
+    def whitening(self) -> np.ndarray:
+        """What of superpixels the estimate looks at, brightness first, weighted so that all of its
+        noise is that of a pixel, (row, pixel).
+        """
+        level = self.levels / np.linalg.norm(self.levels, axis=1)[:, None]
+        return np.concatenate([level, self.analysis * (self.sigma / np.sqrt(self.noise))[:, None]])
 
     def brightness(self, y: np.ndarray) -> np.ndarray:
         """Mean over its points and bands of each field behind y (pixel, signal), (signal,)."""
@@ -98,7 +111,7 @@ class Lmmse:
 
     def common_scale(self, y: np.ndarray) -> float:
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
-        return float(SCALES[np.argmax(self._likelihood(self._coordinates(y)).sum(axis=1))])
+        return float(SCALES[np.argmax(self._likelihood(self.coordinates(y)).sum(axis=1))])
 
     def implausible(self, y: np.ndarray) -> bool:
         """Whether the signals y (pixel, signal) together would need more contrast than a
@@ -110,17 +123,17 @@ class Lmmse:
         """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale,
         signal), but for a constant.
         """
-        expected = np.outer(SCALES, self.power) + self.sigma**2
+        expected = np.outer(SCALES, self.power) + self.noise
         return -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
 
-    def _coordinates(self, y: np.ndarray) -> np.ndarray:
+    def coordinates(self, y: np.ndarray) -> np.ndarray:
         """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
         return self.analysis @ y - self.offset[:, None]
 
     def scales(self, y: np.ndarray) -> np.ndarray:
         """The scale of each signal: the posterior mean of its logarithm.
 
-        Coordinates have variance scale power + sigma^2. The prior of log scale is normal, with the
+        Coordinates have variance scale power + noise. The prior of log scale is normal, with the
         mean and the deviation (at least 0.2) that make all signals together most likely; one signal
         alone says little where noise is strong.
 
@@ -128,7 +141,7 @@ class Lmmse:
 
         Returns (signal,).
         """
-        likelihood = self._likelihood(self._coordinates(y))
+        likelihood = self._likelihood(self.coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
         logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
         for _ in range(ROUNDS):
@@ -213,6 +226,7 @@ def prepare(
         power=power,
         gain=cross @ vectors,
         variance=variance,
+        noise=np.full(len(power), float(sigma) ** 2),
         sigma=float(sigma),
     )
 

@@ -1,0 +1,221 @@
+"""The picture behind a capture: what every method is given, and what becomes of its estimate.
+
+A capture is brought to the brightness of photographs, so that no result depends on its unit; its
+noise is settled (trust); a method then meets superpixels that are A x and white noise of a known
+standard deviation, whatever the model's error; and what it makes of them is kept as far as it goes
+on across the borders of lenslets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from plenocli.base.progress import note
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
+from plenocli.inverse.picture.estimators import INNER, Estimators
+from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.methods.method import Method, Sees
+from plenocli.inverse.picture.nuisances.clean import clean
+from plenocli.inverse.picture.reconstruction import Reconstruction
+from plenocli.inverse.picture.trust.believe import Belief, believe
+from plenocli.inverse.picture.trust.guard import guarded
+from plenocli.inverse.picture.trust.noise_level import NoiseLevel, noise_level
+
+BRIGHTNESS = 0.2
+"""Mean of the photographs that the statistics are from, about: captures are estimated at it."""
+DEFECTIVE = 0.1
+"""What defective pixels may add to the brightness before it is settled anew."""
+MISFIT = 1.5
+"""What the joint estimate leaves over, in terms of the noise, from which on it counts: light from
+beyond the array is in it.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trusted:
+    """How far the matrix was trusted.
+
+    level: noise of a pixel.
+    right, continuity, raised: as in Belief.
+    kept: share of the picture's detail that was kept.
+    """
+
+    level: NoiseLevel
+    right: bool
+    continuity: float | None
+    raised: float
+    kept: float
+
+    @classmethod
+    def of(cls, belief: Belief, kept: float, unit: float) -> Trusted:
+        """In the units of the capture, one of which is `unit` times what was estimated with."""
+        level = belief.level
+        return cls(
+            level=replace(
+                level,
+                sigma=level.sigma * unit,
+                found=None if level.found is None else level.found * unit,
+            ),
+            right=belief.right,
+            continuity=belief.continuity,
+            raised=belief.raised,
+            kept=kept,
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        told: dict[str, Any] = self.level.as_json() | {"matrix_believed": self.right}
+        told |= {} if self.continuity is None else {"continuity": self.continuity}
+        return told | {"noise_raised": self.raised, "detail_kept": self.kept}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Settled:
+    """A capture whose noise is settled.
+
+    belief: what it says of the matrix.
+    own: (lenslet_row, lenslet_column, pixel) without the neighbours' light.
+    joint: LMMSE over 3x3 lenslets with the noise as told, where that was made.
+    """
+
+    belief: Belief
+    own: np.ndarray
+    joint: JointEstimate | None
+
+
+def estimate(
+    estimators: Estimators,
+    method: Method,
+    data: Superpixels,
+    truth: np.ndarray | None = None,
+    *,
+    model_error: float = 0.0,
+) -> tuple[Reconstruction, Seen | None]:
+    """The picture behind a capture by a method, and what of the objects can be seen.
+
+    data: the capture.
+    truth: (lenslet_row, lenslet_column, point) chooses the weight with hindsight.
+    model_error: of the matrix against this capture by their records, relative.
+
+    Raises NumericsError where the noise is not known and cannot be found.
+    docs/model.md, "Spatial reconstruction".
+    """
+    if method.sees is Sees.LENSLET_AS_IS:
+        bare = clean(estimators, data, look=False)
+        bare.tell()
+        found = method.reconstruct(estimators, bare.data, truth)
+        return replace(found, trace=(*bare.findings, *found.trace)), None
+    unit = _unit(estimators, data.y)
+    estimators, data = _at_unit(estimators, data, unit)
+    bare = clean(estimators, data)
+    bare.tell()
+    data, bright = bare.data, _unit(estimators, bare.data.y)
+    if abs(bright - 1) > DEFECTIVE:
+        estimators, data = _at_unit(estimators, data, bright)
+        unit *= bright
+    settled = _settle(estimators, method, data, model_error)
+    belief, joint = settled.belief, settled.joint
+    data = replace(data, noise=Noise.of_sigma(belief.level.sigma))
+    looked_through = estimators
+    if not belief.right:
+        _tell(belief, model_error, coupled=estimators.coupled and estimators.overlap == 3)
+        rows = belief.lmmse.whitening()
+        looked_through, joint = estimators.seen_through(rows), None
+        data = replace(data, y=data.y @ rows.T)
+    truth = None if truth is None else truth / unit
+    found = method.reconstruct(looked_through, data, truth, joint=joint)
+    found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
+    if kept < 1:
+        note(
+            f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
+            "lenslet: more of it would not go on across the lenslets' borders"
+        )
+    seen = what_is_seen(looked_through, belief.level.sigma)
+    found = replace(found, trace=(*bare.findings, *found.trace))
+    return _in_unit(found, Trusted.of(belief, kept, unit), unit), seen
+
+
+def _unit(estimators: Estimators, y: np.ndarray) -> float:
+    """What a capture is divided by to have the brightness of photographs; 1 for an empty one."""
+    levels = estimators.system.levels(np.where(np.isfinite(y), y, 0))
+    found = float(np.sqrt(np.mean(levels**2))) / BRIGHTNESS
+    return found if found > 0 else 1.0
+
+
+def _at_unit(
+    estimators: Estimators, data: Superpixels, unit: float
+) -> tuple[Estimators, Superpixels]:
+    """The same, the capture and what a person gave in its units divided by `unit`."""
+    options = estimators.options
+    sigma, lam = options.noise_sigma, options.lam
+    scaled = replace(
+        options,
+        noise_sigma=None if sigma is None else sigma / unit,
+        lam=None if lam is None else lam / unit,
+    )
+    noise = None if data.noise is None else data.noise.scaled(1 / unit)
+    return estimators.with_options(scaled), replace(data, y=data.y / unit, noise=noise)
+
+
+def _in_unit(found: Reconstruction, trusted: Trusted, unit: float) -> Reconstruction:
+    """A picture in the unit of its capture, with what is told of its noise."""
+    distance = found.from_lmmse
+    return replace(
+        found,
+        value=found.value * unit,
+        sigma=None if found.sigma is None else found.sigma * unit,
+        from_lmmse=None if distance is None else distance * unit,
+        noise_level=trusted.level,
+        trace=(*found.trace, trusted),
+    )
+
+
+def _settle(
+    estimators: Estimators, method: Method, data: Superpixels, model_error: float
+) -> _Settled:
+    """The noise of a capture, by the light of each lenslet alone: that of the neighbours is taken
+    away, as the joint estimate with the noise as told sees it.
+    """
+    given, svd = estimators.options.noise_sigma, estimators.svd
+    takes_away = estimators.coupled and estimators.overlap == 3
+    plain = estimators.without_stray(data.y) if takes_away else data.y
+    level = noise_level(data.y, given, data.sigma, svd, plain)
+    told = replace(data, noise=Noise.of_sigma(level.sigma))
+    if not takes_away:
+        jointly = method.makes_joint_estimate(estimators)
+        joint = estimate_jointly(estimators, told) if jointly else None
+        belief = believe(estimators, plain, level, data.scene, model_error=model_error)
+        return _Settled(belief=belief, own=plain, joint=joint)
+    joint = estimate_jointly(estimators, told)
+    left = left_over(estimators, data.y, joint.value)
+    level = replace(level, found=left)
+    own = own_light(estimators, data.y, joint.value)
+    inner = own[INNER] if min(own.shape[:2]) > 3 else own
+    belief = believe(estimators, inner, level, data.scene, model_error=model_error, misfit=MISFIT)
+    return _Settled(belief=belief, own=own, joint=joint)
+
+
+def _tell(belief: Belief, model_error: float, *, coupled: bool) -> None:
+    """A note of what speaks against the matrix, and what was done about it."""
+    level, against, advice = belief.level, [], "plenocli fit-camera finds the camera that fits"
+    if not coupled:
+        advice += "; neighbours' light takes a pif of --superpixels 3x3 and --overlap 3"
+    if level.found is not None and level.found > level.sigma:
+        against.append(f"what it cannot produce is {level.found / level.sigma:.3g} times the noise")
+    if belief.continuity is not None:
+        against.append(
+            "across the lenslets' borders the picture goes on "
+            f"{max(belief.continuity, 0):.2g} times as well as with a right matrix"
+        )
+    if model_error > 0:
+        against.append(f"its own record says it is off by {model_error:.2g}")
+    note(
+        f"the system matrix is not quite this camera's ({'; '.join(against)}): where that does "
+        f"harm the noise is taken {belief.raised:.3g} times as large, at the cost of detail. "
+        + advice
+    )

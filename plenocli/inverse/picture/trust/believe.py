@@ -1,0 +1,198 @@
+"""What a capture says of its matrix, and the noise that follows.
+
+Two witnesses that need no truth: what lies where the matrix reaches nothing, and how well the
+picture goes on across the lenslets' borders. Where both agree with the matrix, noise is what the
+capture says. Else it is raised coordinate by coordinate: by what the lenslets together hold beyond
+photographs and noise, and, where that does not do, until the picture is continuous.
+
+docs/model.md, "Spatial reconstruction".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plenocli.base.random_streams import stream
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.solvers.lmmse import Lmmse
+from plenocli.inverse.picture.trust.continuity import (
+    Jumps,
+    detail_jumps,
+    group_factors,
+    groups,
+    pieces,
+    relative_factor,
+)
+from plenocli.inverse.picture.trust.excess import with_excess
+from plenocli.inverse.picture.trust.noise_level import NoiseLevel
+
+CONTINUOUS = 0.6
+"""Factor relative to photographs under the right matrix from which on a picture is believed: of
+25 photographs at 60, 40 and 20 dB the right matrix has more.
+"""
+NOTHING_OUTSIDE = 1.03
+"""Noise found over the capture's own up to which nothing is found; more where few lenslets leave
+more to chance.
+"""
+LEAST_PAIRS = 8
+"""Borders between lenslets that it takes to judge continuity."""
+ROUNDS = 2
+LEAST_FACTOR = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Belief:
+    """How far a capture is believed to be A x and noise.
+
+    level: noise of a pixel.
+    lmmse: of a lenslet by itself, with the noise that is believed in each coordinate.
+    right: whether nothing speaks against the matrix; the noise is white then.
+    continuity: factor of the picture relative to photographs under the right matrix, before
+        anything was raised; None where there are too few lenslets.
+    reference: factor of these photographs, for what is made with the noise that is believed.
+    raised: root mean square over the coordinates in use of the noise over that of a pixel.
+    """
+
+    level: NoiseLevel
+    lmmse: Lmmse
+    right: bool
+    continuity: float | None = None
+    reference: float | None = None
+    raised: float = 1.0
+
+
+def believe(
+    estimators: Estimators,
+    y: np.ndarray,
+    level: NoiseLevel,
+    scene: str | None,
+    *,
+    model_error: float = 0.0,
+    misfit: float = NOTHING_OUTSIDE,
+) -> Belief:
+    """What superpixels say of the matrix that explains them.
+
+    y: (lenslet_row, lenslet_column, pixel), neighbours' light taken away.
+    level: their noise.
+    scene: that training leaves out.
+    model_error: of the matrix by its own record, relative; an error above the noise is believed.
+    misfit: what `level` found over the noise from which on it speaks against the matrix.
+    """
+    lmmse = estimators.prior.lmmse(level.sigma, scene)
+    stacked = y.reshape(-1, y.shape[-1]).T
+    judge = _Judge.of(estimators, lmmse, y, scene)
+    first = None if judge is None else judge.of_lmmse(lmmse)
+    loud = float(np.sqrt(np.mean(y**2)))
+    chance = _chance(estimators, stacked.shape[1])
+    found = level.found is not None and level.found > level.sigma * (misfit + chance)
+    suspect = found or model_error * loud > level.sigma
+    if not suspect and (first is None or first.relative >= CONTINUOUS):
+        return Belief(
+            level=level,
+            lmmse=lmmse,
+            right=True,
+            continuity=None if first is None else first.relative,
+            reference=None if first is None else first.reference,
+        )
+    floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
+    raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
+    now = None if judge is None else judge.of_lmmse(raised)
+    for _ in range(ROUNDS):
+        if judge is None or now is None or now.relative >= CONTINUOUS or not len(raised.power):
+            break
+        raised = _calmer(raised, stacked, now)
+        now = judge.of_lmmse(raised)
+    power = float(np.mean(raised.noise)) if len(raised.noise) else level.sigma**2
+    return Belief(
+        level=level,
+        lmmse=raised,
+        right=False,
+        continuity=None if first is None else first.relative,
+        reference=None if now is None else now.reference,
+        raised=float(np.sqrt(power)) / level.sigma,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Verdict:
+    """Jumps of a capture and of photographs under the right matrix."""
+
+    found: Jumps
+    right: Jumps
+
+    @property
+    def relative(self) -> float:
+        return relative_factor(self.found, self.right)
+
+    @property
+    def reference(self) -> float:
+        return self.right.factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judge:
+    """What continuity is judged by.
+
+    y: (lenslet_row, lenslet_column, pixel) of the capture.
+    clear: (piece, 2, 2, pixel) of photographs, without noise.
+    noise: the same shape, of variance 1.
+    shape: (rows, columns) of an object in one band.
+    """
+
+    y: np.ndarray
+    clear: np.ndarray
+    noise: np.ndarray
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, estimators: Estimators, lmmse: Lmmse, y: np.ndarray, scene: str | None
+    ) -> _Judge | None:
+        """None where lenslets or training pictures are too few or too small."""
+        system, (rows, columns) = estimators.system, y.shape[:2]
+        if rows * (columns - 1) + columns * (rows - 1) < LEAST_PAIRS:
+            return None
+        stacked = y.reshape(-1, y.shape[-1]).T
+        bright = float(np.mean(lmmse.brightness(stacked)))
+        if not bright > 0:
+            return None
+        contrast = lmmse.common_scale(stacked) * float(lmmse.variance.mean()) / bright**2
+        rng = stream(estimators.options.seed, "continuity")
+        pictures = estimators.prior.pictures(scene)
+        grey = pieces(pictures, system.object_shape, contrast, bright, rng)
+        if grey is None:
+            return None
+        clear = np.tile(grey, max(1, len(system.bands))) @ system.own.T
+        return cls(
+            y=y,
+            clear=clear,
+            noise=rng.standard_normal(clear.shape),
+            shape=system.object_shape,
+        )
+
+    def of_lmmse(self, lmmse: Lmmse) -> _Verdict:
+        """Noise of the photographs is that of a pixel, and in the coordinates what is believed."""
+        coordinates = lmmse.analysis.T * (np.sqrt(lmmse.noise) - lmmse.sigma)
+        noise = lmmse.sigma * self.noise + (self.noise @ lmmse.analysis.T) @ coordinates.T
+        return _Verdict(
+            found=detail_jumps(lmmse, self.y, self.shape),
+            right=detail_jumps(lmmse, self.clear + noise, self.shape),
+        )
+
+
+def _chance(estimators: Estimators, signals: int) -> float:
+    """What chance may add to the noise where the matrix reaches nothing, relative."""
+    pixels = estimators.system.own.shape[0]
+    return 4 / np.sqrt(2 * max(signals * (pixels - estimators.svd.rank(1e-6)), 1))
+
+
+def _calmer(lmmse: Lmmse, y: np.ndarray, verdict: _Verdict) -> Lmmse:
+    """The same with noise so raised that the detail of each group shrinks by its factor."""
+    scale = float(np.exp(np.mean(np.log(lmmse.scales(y)))))
+    noise = lmmse.noise.copy()
+    for group, factor in zip(groups(lmmse.power), group_factors(verdict.found, verdict.right)):
+        signal = scale * lmmse.power[group]
+        noise[group] = (signal + noise[group]) / max(float(factor), LEAST_FACTOR) - signal
+    return replace(lmmse, noise=noise)

@@ -1,0 +1,63 @@
+"""Noise by coordinate: what a capture holds in each coordinate of LMMSE beyond what photographs and
+noise explain.
+
+Light that the matrix does not know is structured: of a wrong focus, a shift or a veil most lies in
+a few directions, and what falls there upon strong coordinates does no harm that falling upon weak
+ones would. So noise is not raised in all of them, as a white one would be, but where the capture's
+lenslets together show more than is expected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse
+
+STRONG = 20
+"""Strongest coordinates, which tell the lenslets' contrast before anything is known of excess."""
+TOGETHER = 9
+"""Coordinates of similar power whose excess is averaged."""
+TIMES = 1.5
+"""Times what is expected, from which on there is an excess: photographs differ so much."""
+ROUNDS = 4
+
+
+def with_excess(lmmse: Lmmse, y: np.ndarray, floor: float) -> np.ndarray:
+    """(k,) variance of the noise in each coordinate of `lmmse`.
+
+    y: (pixel, signal) superpixels.
+    floor: least variance.
+    """
+    w = lmmse.coordinates(y)
+    order = np.argsort(-lmmse.power, kind="stable")
+    noise = np.maximum(lmmse.noise, floor)
+    used = order[:STRONG]
+    for _ in range(ROUNDS):
+        scale = float(np.mean(_contrasts(lmmse.power[used], noise[used], w[used])))
+        expected = scale * lmmse.power + np.maximum(lmmse.noise, floor)
+        ratio = np.mean(w**2, axis=1) / expected
+        ratio[order] = _running_mean(ratio[order])
+        noise = np.maximum(lmmse.noise, floor)
+        noise = noise + np.where(ratio > TIMES, ratio - 1, 0) * expected
+        used = order
+    return noise
+
+
+def _contrasts(power: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """(signal,) most likely scale of each, on the whole, of coordinates w (k, signal)."""
+    expected = np.outer(SCALES, power) + noise
+    likelihood = -0.5 * (np.log(expected).sum(axis=1)[:, None] + (1 / expected) @ w**2)
+    likelihood = np.exp(likelihood - likelihood.max(axis=0))
+    prior = np.full(len(SCALES), 1 / len(SCALES))
+    for _ in range(5):
+        posterior = likelihood * prior[:, None]
+        posterior /= posterior.sum(axis=0)
+        prior = np.maximum(posterior.mean(axis=1), 1e-12)
+    return np.exp(np.log(SCALES) @ posterior)
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Means of TOGETHER values in a row, as many as come out where there are fewer."""
+    half = TOGETHER // 2
+    padded = np.pad(values, half, mode="edge")
+    return np.convolve(padded, np.full(2 * half + 1, 1 / (2 * half + 1)), "valid")

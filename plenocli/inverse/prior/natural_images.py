@@ -124,16 +124,10 @@ def autocovariance(images: Sequence[np.ndarray], reach: int) -> tuple[float, np.
     lags = np.arange(-reach, reach + 1)
     for image in images:
         shape = [next_fast_len(n + reach, real=True) for n in image.shape]
-        power = [
-            np.abs(rfft2(x, shape)) ** 2
-            for x in (np.asarray(image, float) - mean, np.ones(image.shape))
-        ]
-        lag_sum, lag_count = (irfft2(p, shape) for p in power)
-        reached = (np.abs(lags)[:, None] < image.shape[0]) & (
-            np.abs(lags)[None, :] < image.shape[1]
-        )
-        total += np.where(reached, lag_sum[np.ix_(lags, lags)], 0)
-        overlap += np.where(reached, np.round(lag_count[np.ix_(lags, lags)]), 0)
+        lag_sum = irfft2(np.abs(rfft2(np.asarray(image, float) - mean, shape)) ** 2, shape)
+        pairs = np.outer(*(np.maximum(n - np.abs(lags), 0) for n in image.shape))
+        total += np.where(pairs > 0, lag_sum[np.ix_(lags, lags)], 0)
+        overlap += pairs
     field = total / np.maximum(overlap, 1)
     field = (field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]) / 4
     half = np.median([min(i.shape) for i in images]) / 2

@@ -17,6 +17,11 @@ from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLigh
 from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
 from plenocli.inverse.picture.solvers import whole_sensor
 
+WIDE = 80
+"""Directions that are heard of a superpixel up to which plug and play starts from LMMSE over 3x3
+lenslets. With more the lenslet itself tells what its neighbours could, and they take long.
+"""
+
 Solve = Callable[
     [Estimators, whole_sensor.DataTerm, np.ndarray, float], tuple[np.ndarray, str, int]
 ]
@@ -29,6 +34,7 @@ class WholePictureStats:
     """What a method of the whole picture did.
 
     expected_error: root mean square error that LMMSE, from which it starts, expects of itself.
+    wide: whether that looked at 3x3 lenslets.
     rounds: of turns between data and prior.
     rule: in words.
     """
@@ -36,10 +42,12 @@ class WholePictureStats:
     expected_error: float
     rounds: int
     rule: str
+    wide: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""
-        start = f"lmmse, which expects an error of {self.expected_error:.3g}"
+        over = " over 3x3 lenslets" if self.wide else ""
+        start = f"lmmse{over}, which expects an error of {self.expected_error:.3g}"
         return {"start": start, "rule": self.rule}
 
 

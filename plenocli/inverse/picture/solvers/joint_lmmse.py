@@ -23,6 +23,14 @@ from plenocli.inverse.picture.solvers.lmmse import require_noise
 RING = 1
 MOST = 256
 """Singular vectors through which a superpixel is seen at most."""
+CONTRASTS = 2.0 ** np.arange(-5, 5)
+"""Scales of the covariance of which `adaptive` takes a mean."""
+LOUD = 0.005
+"""Power of a direction of a superpixel over that of the noise, from which on it is worth a look:
+photographs of sixteen times the usual variance then add a twelfth to the noise.
+"""
+ROUNDS = 10
+"""Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +42,7 @@ class JointLmmse:
     cross: (point, 9 k) covariance of the block with the coordinates of the ring.
     data: (9 k, 9 k) covariance of these.
     variance: (point,) of the block.
+    sigma: noise of a pixel, whose variance `data` includes.
     """
 
     mean: float
@@ -42,6 +51,7 @@ class JointLmmse:
     cross: np.ndarray
     data: np.ndarray
     variance: np.ndarray
+    sigma: float
 
     def apply(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The picture behind superpixels.
@@ -55,33 +65,121 @@ class JointLmmse:
         """
         from scipy.linalg import cholesky, solve_triangular
 
+        x, sigma = np.empty((2, *y.shape[:2], len(self.variance)))
+        for seen_by in self._alike(y):
+            cross = self.cross[:, seen_by.kept]
+            factor = cholesky(self.data[np.ix_(seen_by.kept, seen_by.kept)], lower=True)
+            whitened = solve_triangular(factor, cross.T, lower=True)
+            estimate = self.mean + whitened.T @ solve_triangular(factor, seen_by.z, lower=True)
+            x[seen_by.at] = estimate.T
+            sigma[seen_by.at] = np.sqrt(
+                np.maximum(self.variance - np.einsum("ij,ij->j", whitened, whitened), 0)
+            )
+        return x, sigma
+
+    def adaptive(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The picture behind superpixels whose contrast differs from place to place.
+
+        The covariance about each lenslet is that of photographs times an unknown scale, the same
+        over its ring: a Gaussian scale mixture (Portilla, Strela, Wainwright, Simoncelli, IEEE
+        Trans. Image Processing 12 (2003) 1338). The estimate is the posterior mean over CONTRASTS,
+        their prior a normal distribution of the logarithm fitted to all lenslets, as in
+        lmmse.Lmmse.scales, but with what all nine superpixels say.
+
+        y: (lenslet_row, lenslet_column, pixel).
+
+        Returns (x, its standard deviation), both (lenslet_row, lenslet_column, point).
+        """
+        groups = self._alike(y)
+        turned = [self._turned(group) for group in groups]
+        likelihood = np.empty((len(CONTRASTS), *y.shape[:2]))
+        for group, (power, _, seen) in zip(groups, turned):
+            for k, scale in enumerate(CONTRASTS):
+                expected = scale * power + self.sigma**2
+                likelihood[k][group.at] = -0.5 * (np.log(expected).sum() + (1 / expected) @ seen**2)
+        share = _posterior(likelihood)
+        x, sigma = np.empty((2, *y.shape[:2], len(self.variance)))
+        for group, (power, gain, seen) in zip(groups, turned):
+            shares = share[:, group.at[0], group.at[1]]
+            shrink = 1 / (power + self.sigma**2 / CONTRASTS[:, None])
+            middle = gain @ (seen * (shrink.T @ shares))
+            variance = np.zeros_like(middle)
+            for scale, taken, part in zip(CONTRASTS, shares, shrink):
+                left = scale * np.maximum(self.variance - gain**2 @ part, 0)
+                apart = gain @ (seen * part[:, None]) - middle
+                variance += taken * (left[:, None] + apart**2)
+            x[group.at], sigma[group.at] = self.mean + middle.T, np.sqrt(variance).T
+        return x, sigma
+
+    def _turned(self, group: _Alike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(power (k,), gain (point, k), coordinates (k, lenslet)) in the eigenvectors of the
+        signal's covariance, where those of a group have the variance scale power + sigma^2.
+        """
+        power, vectors = np.linalg.eigh(self.data[np.ix_(group.kept, group.kept)])
+        return (
+            np.maximum(power - self.sigma**2, 0),
+            self.cross[:, group.kept] @ vectors,
+            vectors.T @ group.z,
+        )
+
+    def _alike(self, y: np.ndarray) -> list[_Alike]:
+        """The lenslets of superpixels y in groups that have the same neighbours."""
         rows, columns = y.shape[:2]
-        z = y @ self.analysis.T - self.offset
-        x, sigma = np.empty((2, rows, columns, len(self.variance)))
-        ring = _ring(RING)
-        alike: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
+        z, ring = y @ self.analysis.T - self.offset, _ring(RING)
+        groups: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
         for r in range(rows):
             for c in range(columns):
                 inside = tuple(0 <= r + dr < rows and 0 <= c + dc < columns for dr, dc in ring)
-                alike.setdefault(inside, []).append((r, c))
-        used = self.analysis.shape[0]
-        for inside, lenslets in alike.items():
-            keep = np.flatnonzero(np.repeat(inside, used))
-            cross = self.cross[:, keep]
-            factor = cholesky(self.data[np.ix_(keep, keep)], lower=True)
-            whitened = solve_triangular(factor, cross.T, lower=True)
+                groups.setdefault(inside, []).append((r, c))
+        found = []
+        for inside, lenslets in groups.items():
             near = [d for d, there in zip(ring, inside) if there]
-            seen = np.stack(
-                [np.concatenate([z[r + dr, c + dc] for dr, dc in near]) for r, c in lenslets],
-                axis=1,
+            found.append(
+                _Alike(
+                    at=(np.array([r for r, _ in lenslets]), np.array([c for _, c in lenslets])),
+                    kept=np.flatnonzero(np.repeat(inside, self.analysis.shape[0])),
+                    z=np.stack(
+                        [
+                            np.concatenate([z[r + dr, c + dc] for dr, dc in near])
+                            for r, c in lenslets
+                        ],
+                        axis=1,
+                    ),
+                )
             )
-            estimate = self.mean + whitened.T @ solve_triangular(factor, seen, lower=True)
-            error = np.sqrt(
-                np.maximum(self.variance - np.einsum("ij,ij->j", whitened, whitened), 0)
-            )
-            for k, (r, c) in enumerate(lenslets):
-                x[r, c], sigma[r, c] = estimate[:, k], error
-        return x, sigma
+        return found
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """Lenslets that have the same neighbours.
+
+    at: (rows, columns) of the lenslets.
+    kept: coordinates of the ring that there are.
+    z: (k, lenslet) their values.
+    """
+
+    at: tuple[np.ndarray, np.ndarray]
+    kept: np.ndarray
+    z: np.ndarray
+
+
+def _posterior(likelihood: np.ndarray) -> np.ndarray:
+    """Share of each of CONTRASTS at each lenslet, (scale, lenslet_row, lenslet_column).
+
+    likelihood: its logarithm, alike.
+    """
+    logs = np.log(CONTRASTS)
+    likelihood = np.exp(likelihood - likelihood.max(axis=0))
+    prior = np.full(len(logs), 1 / len(logs))
+    for _ in range(ROUNDS):
+        share = likelihood * prior[:, None, None]
+        share /= share.sum(axis=0)
+        prior = share.mean(axis=(1, 2))
+        middle = prior @ logs
+        deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
+        prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+    return share
 
 
 def prepare_joint(
@@ -95,6 +193,7 @@ def prepare_joint(
     bands: np.ndarray | Sequence[Sequence[float]] = ((1.0,),),
     *,
     most: int = MOST,
+    directions: np.ndarray | None = None,
 ) -> JointLmmse:
     """Set up LMMSE from 3x3 superpixels for a stationary scene.
 
@@ -112,6 +211,7 @@ def prepare_joint(
     sigma: noise of a pixel, > 0.
     bands: (band, band) covariance of the bands at a point, its diagonal about 1.
     most: singular vectors at most.
+    directions: (pixel, k) orthonormal, to look through instead of singular vectors.
 
     Raises NumericsError where sigma is not positive.
     docs/model.md, "Spatial reconstruction".
@@ -122,7 +222,8 @@ def prepare_joint(
     brightest = np.linalg.eigvalsh(bands)[-1]
     strength = svd.s**2 * np.abs(autocovariance).max() * brightest * rows * columns
     used = max(1, min(int(np.count_nonzero(strength > 1e-4 * sigma**2)), most, svd.rank()))
-    analysis = svd.u[:, :used].T
+    analysis = svd.u[:, :used].T if directions is None else directions.T
+    used = len(analysis)
     response = np.stack([analysis @ block for block in np.asarray(blocks, float)])
     footprint = _footprints(response, offsets, object_shape, used * count)
     margin = 2 * RING * np.array([rows, columns])
@@ -143,7 +244,28 @@ def prepare_joint(
         cross=cross,
         data=data,
         variance=np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns),
+        sigma=float(sigma),
     )
+
+
+def loud_directions(
+    svd: Svd, covariance: np.ndarray, sigma: float, bands: np.ndarray
+) -> np.ndarray:
+    """Directions of a superpixel in which photographs have at least LOUD times the noise's power.
+
+    svd: of the own block.
+    covariance: (point, point) of fields of photographs in one band.
+    sigma: noise of a pixel.
+    bands: (band, band) covariance of the bands at a point.
+
+    Returns (pixel, k), orthonormal, the loudest last.
+    """
+    least = LOUD * sigma**2
+    strength = svd.s**2 * np.trace(covariance) * np.linalg.eigvalsh(bands)[-1]
+    used = max(1, min(int(np.count_nonzero(strength > least)), svd.rank()))
+    seen = svd.s[:used, None] * svd.vt[:used]
+    power, vectors = np.linalg.eigh(seen @ np.kron(bands, covariance) @ seen.T)
+    return svd.u[:, :used] @ vectors[:, power > min(least, power[-1] / 2)]
 
 
 def _covariances(

@@ -43,7 +43,7 @@ class ScenePrior:
         self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
         self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
         self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
-        self._loud: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
+        self._wide: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
         self._lags: dict[str | None, tuple[float, np.ndarray]] = {}
 
     def pictures(self, scene: str | None, without: Collection[str] = ()) -> list[np.ndarray]:
@@ -87,37 +87,39 @@ class ScenePrior:
             lambda: lmmse.prepare(self.svd, mean, covariance, sigma, self.bands()),
         )
 
-    def joint(
-        self, sigma: float, scene: str | None, *, loud: bool = False
-    ) -> joint_lmmse.JointLmmse:
-        """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel.
+    def joint(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
+        """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel."""
+        return _kept(self._joint, (sigma, scene), lambda: self._prepared(sigma, scene))
 
-        loud: look through the directions alone in which photographs stand above the noise.
+    def wide(self, sigma: float, scene: str | None, most: int) -> joint_lmmse.JointLmmse | None:
+        """The same through the directions alone in which photographs matter at this noise; None
+        where these are more than `most`.
         """
+        self.lmmse(sigma, scene)  # draws the patches
+        directions = joint_lmmse.loud_directions(
+            self.svd, self.statistics[scene][1], sigma, self.bands()
+        )
+        if directions.shape[1] > most:
+            return None
+        return _kept(self._wide, (sigma, scene), lambda: self._prepared(sigma, scene, directions))
+
+    def _prepared(
+        self, sigma: float, scene: str | None, directions: np.ndarray | None = None
+    ) -> joint_lmmse.JointLmmse:
         system = self.system
-
-        def make() -> joint_lmmse.JointLmmse:
-            if scene not in self._lags:
-                reach = joint_lmmse.needed_reach(system.object_shape, system.offsets)
-                self._lags[scene] = natural_images.autocovariance(self.pictures(scene), reach)
-            directions = None
-            if loud:
-                self.lmmse(sigma, scene)  # knows the covariance
-                directions = joint_lmmse.loud_directions(
-                    self.svd, self._statistics[scene][1], sigma, self.bands()
-                )
-            return joint_lmmse.prepare_joint(
-                self.svd,
-                system.blocks,
-                system.offsets,
-                system.object_shape,
-                *self._lags[scene],
-                sigma,
-                self.bands(),
-                directions=directions,
-            )
-
-        return _kept(self._loud if loud else self._joint, (sigma, scene), make)
+        if scene not in self._lags:
+            reach = joint_lmmse.needed_reach(system.object_shape, system.offsets)
+            self._lags[scene] = natural_images.autocovariance(self.pictures(scene), reach)
+        return joint_lmmse.prepare_joint(
+            self.svd,
+            system.blocks,
+            system.offsets,
+            system.object_shape,
+            *self._lags[scene],
+            sigma,
+            self.bands(),
+            directions=directions,
+        )
 
 
 def _kept(

@@ -74,9 +74,11 @@ def plug_and_play(
     return picture, rule, len(taus)
 
 
-def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estimate:
-    """The Estimate of `solve`, started from LMMSE of each lenslet, whose sigma it keeps: an upper
-    estimate.
+def _from_lmmse(solve: Solve, wide: bool, estimators: Estimators, light: OwnLight) -> Estimate:
+    """The Estimate of `solve`, started from LMMSE, whose sigma it keeps: an upper estimate.
+
+    wide: whether that may look over 3x3 lenslets, where the noise leaves something to be learnt
+        from neighbours.
     """
     shape, y, inner, joint = estimators.system.object_shape, light.y, light.inner, light.joint
     noise = light.data.known_sigma
@@ -84,7 +86,14 @@ def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estima
         x, sigma = np.empty((2, *y.shape[:2], estimators.svd.vt.shape[1]))
     else:
         x, sigma = joint.value.copy(), joint.sigma.copy()
-    x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
+    ring = None
+    if wide and estimators.options.overlap != 1:
+        ring = estimators.prior.wide(noise, light.data.scene, WIDE)
+    if ring is not None:
+        around = ring.adaptive(light.data.y)
+        x[inner], sigma[inner] = around[0][inner], around[1][inner]
+    else:
+        x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
     error = root_mean_square(sigma[inner])
     held = None
     if joint is not None:
@@ -98,7 +107,9 @@ def _from_lmmse(solve: Solve, estimators: Estimators, light: OwnLight) -> Estima
         value=found,
         sigma=sigma,
         from_lmmse=root_mean_square(found - x),
-        stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule),
+        stats=WholePictureStats(
+            expected_error=error, rounds=rounds, rule=rule, wide=ring is not None
+        ),
     )
 
 
@@ -106,11 +117,11 @@ TV = Estimator(
     name="tv",
     sees=Sees.PICTURE,
     phases=footprint.tv_phases,
-    estimate=partial(_from_lmmse, total_variation),
+    estimate=partial(_from_lmmse, total_variation, False),
 )
 PNP = Estimator(
     name="pnp",
     sees=Sees.PICTURE,
     phases=footprint.pnp_phases,
-    estimate=partial(_from_lmmse, plug_and_play),
+    estimate=partial(_from_lmmse, plug_and_play, True),
 )

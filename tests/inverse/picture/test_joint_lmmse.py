@@ -4,6 +4,7 @@ that make poor ones, down to almost no noise.
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance
@@ -100,3 +101,59 @@ def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
             mean + gain @ seen @ (y - matrix.sum(axis=1, keepdims=True) * mean) - x[own],
             atol=1e-6 * np.sqrt(found.max()),
         )
+
+
+def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
+    """Each contrast with the dense covariance and density of the superpixels that there are; the
+    distribution of contrasts fitted to all lenslets as the docstring says.
+    """
+    rng, own = np.random.default_rng(8), np.zeros((1, 2), int)
+    block = rng.random((20, 12)) * np.logspace(0, -3, 20)[:, None]
+    mean, found = natural.autocovariance(
+        [picture("photograph")], reach := joint_lmmse.needed_reach(POINTS, own)
+    )
+    sigma = 0.05
+    svd = linear.decompose(block)
+    joint = joint_lmmse.prepare_joint(svd, block[None], own, POINTS, mean, found, sigma)
+    lenslet, point = np.divmod(np.arange(9 * 12), 12)
+    r = lenslet // 3 * POINTS[0] + point // POINTS[1]
+    c = lenslet % 3 * POINTS[1] + point % POINTS[1]
+    cover = found[r[:, None] - r + reach, c[:, None] - c + reach]
+    bright = np.linalg.cholesky(cover + 1e-9 * np.eye(len(cover))) @ rng.standard_normal(108)
+    x = (mean + bright.reshape(9, 12) * np.geomspace(0.3, 3, 9)[:, None]).reshape(3, 3, 12)
+    y = x @ block.T + sigma * rng.standard_normal((3, 3, 20))
+    estimate, spread = joint.adaptive(y)
+
+    scales, seen = joint_lmmse.CONTRASTS, joint.analysis
+    z = (y - mean * block.sum(axis=1)) @ seen.T
+    log, values, spreads = np.empty((len(scales), 9)), {}, {}
+    for k, scale in enumerate(scales):
+        for n in range(9):
+            near = [m for m in range(9) if max(abs(m // 3 - n // 3), abs(m % 3 - n % 3)) <= 1]
+            points = np.concatenate([np.arange(12) + 12 * m for m in near])
+            matrix = np.kron(np.eye(len(near)), seen @ block)
+            prior = scale * cover[np.ix_(points, points)]
+            data = matrix @ prior @ matrix.T + sigma**2 * np.eye(len(matrix))
+            told = z.reshape(9, -1)[near].ravel()
+            log[k, n] = multivariate_normal(cov=data).logpdf(told)
+            cross = scale * cover[12 * n : 12 * n + 12][:, points] @ matrix.T
+            values[k, n] = mean + cross @ np.linalg.solve(data, told)
+            spreads[k, n] = np.diag(
+                scale * cover[12 * n : 12 * n + 12, 12 * n : 12 * n + 12]
+                - cross @ np.linalg.solve(data, cross.T)
+            )
+    logs, prior = np.log(scales), np.full(len(scales), 1 / len(scales))
+    for _ in range(joint_lmmse.ROUNDS):
+        share = np.exp(log - log.max(axis=0)) * prior[:, None]
+        share /= share.sum(axis=0)
+        middle = (weight := share.mean(axis=1)) @ logs
+        width = max(np.sqrt(weight @ (logs - middle) ** 2), 0.5)
+        prior = np.maximum(np.exp(-((logs - middle) ** 2) / 2 / width**2), 1e-30)
+    for n in range(9):
+        expected = sum(share[k, n] * values[k, n] for k in range(len(scales)))
+        variance = sum(
+            share[k, n] * (spreads[k, n] + (values[k, n] - expected) ** 2)
+            for k in range(len(scales))
+        )
+        np.testing.assert_allclose(estimate[n // 3, n % 3], expected, atol=1e-6)
+        np.testing.assert_allclose(spread[n // 3, n % 3], np.sqrt(variance), rtol=1e-4)

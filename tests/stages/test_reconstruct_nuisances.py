@@ -1,8 +1,11 @@
 """reconstruct of captures with a veil, defective and saturated pixels, through the command line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import plenocli as pc
 from plenocli.evaluation.metrics.quality import psnr
 from plenocli.files.artefacts.container import read_artefact, write_artefact
 from tests.stages.test_reconstruct import make_files, reconstruct
@@ -64,3 +67,35 @@ def test_a_disturbed_capture_gives_the_picture_of_an_undisturbed_one(
         assert psnr(image.data["image/value"], truth) > least - 0.3
         assert words in capsys.readouterr().err
         assert name in image.attrs["image"]["parameters"]
+
+
+def test_the_white_image_undoes_vignetting_and_knows_dead_pixels(tmp_path):
+    """A camera of small superpixels whose lenslets and pixels differ, seen by its white image."""
+    text = pc.sample("seed_spatial.toml").read_text()
+    for old, new in (
+        ("= [40, 40]", "= [10, 10]"),
+        ("= [52, 52]", "= [13, 13]"),
+        ("= [11, 11]", "= [6, 6]"),
+        ('= "2 um"', '= "8 um"'),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "camera.toml").write_text(text)
+    camera = pc.read_camera(tmp_path / "camera.toml")
+    matrix = pc.system_matrix(camera, superpixels=(1, 1), accuracy=1e-2)
+    scene = pc.simulate_capture(camera, "skimage:astronaut", matrix=matrix, snr_db=50, seed=2)
+    white = pc.simulate_capture(camera, np.ones((60, 60)), matrix=matrix, snr_db=50, seed=1)
+    rng = np.random.default_rng(3)
+    lenslet, pixel = np.divmod(np.arange(78), 13)
+    place, corner = (pixel - 6) / 6, (lenslet - 2.5) / 2.5
+    edge = (place - 0.3 * corner) ** 2
+    gain = 1 - 0.1 * (edge[:, None] + edge)
+    gain *= np.kron(rng.uniform(0.97, 1.03, (6, 6)), np.ones((13, 13)))
+    gain *= rng.random(gain.shape) > 0.003
+
+    def quality(factor):
+        seen = [replace(one.capture, mosaic=one.capture.mosaic * factor) for one in (white, scene)]
+        found = pc.reconstruct(seen[1], matrix, method="lmmse", calibration=pc.calibrate(seen[0]))
+        return psnr(found.value, scene.scene[0])
+
+    assert quality(gain) > quality(np.ones(gain.shape)) - 0.3

@@ -19,10 +19,14 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.nuisances.vignetting import falloff
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
+
+TOLD = 0.01
+"""Difference between the white image and the matrix's, root mean square, that is told."""
 
 
 def superpixels(
@@ -102,7 +106,9 @@ def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, 
 def _along_the_grid(
     capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
 ) -> Superpixels:
-    """Lit superpixels in units of A x, by the light of a white object; dark ones are zero."""
+    """Superpixels in units of A x, by the light of a white object; NaN where a pixel is off the
+    sensor, or bad to the calibration.
+    """
     signal, white = windows_of(capture, calibration)
     if signal.shape[2] != system.own.shape[0]:
         raise InputError(
@@ -110,10 +116,44 @@ def _along_the_grid(
             where,
             "simulate-pif with pixels_per_lenslet as measured",
         )
-    lit = np.all(np.isfinite(signal), axis=2)
-    scale = system.own.sum() / np.where(lit, white.sum(axis=2), np.inf)
-    y = np.where(lit[:, :, None], signal, 0) * scale[:, :, None]
-    return Superpixels(y=y)
+    even = system.own.sum(axis=1)
+    known = np.isfinite(signal) & np.isfinite(white)
+    relative = np.where(known, white * _brightness(white, even, known)[:, :, None], np.nan)
+    flat = falloff(relative.reshape(-1, even.size), even, system.pixel_shape).reshape(signal.shape)
+    known &= np.isfinite(flat)
+    scale = _brightness(white, even * flat, known)
+    off = np.where(known, (flat - 1) ** 2, 0.0).mean(axis=(0, 1))
+    away = float(np.sqrt(np.average(off, weights=even)))
+    if away > TOLD:
+        note(
+            f"{capture.name}: within superpixels a white object's light differs by {away:.1%} from "
+            "what the system matrix expects (vignetting, or a matrix that is not quite this "
+            "camera's): it is divided out by the white image"
+        )
+    y = np.where(known, signal, np.nan) * (scale[:, :, None] / flat)
+    return Superpixels(y=y, saturated=_clipped(capture, calibration))
+
+
+def _brightness(white: np.ndarray, even: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """What makes the white of each lenslet (lenslet_row, lenslet_column) as bright as `even`.
+
+    white, known: (lenslet_row, lenslet_column, pixel); even: likewise, or (pixel,).
+    """
+    light = np.where(known, white, 0.0).sum(axis=2)
+    expected = np.where(known, even, 0.0).sum(axis=2)
+    return np.divide(expected, light, out=np.zeros_like(light), where=light > 0)
+
+
+def _clipped(capture: Capture, calibration: Calibration) -> np.ndarray | None:
+    """Which pixels of the windows are saturated, (lenslet_row, lenslet_column, pixel); None where
+    nobody says where the sensor saturates.
+    """
+    white = min(capture.levels.white, calibration.sensor.white_level)
+    if not np.isfinite(white):
+        return None
+    windows = there(calibration.windows)
+    clipped = saturated(capture.mosaic, capture.levels.black, white).astype(float)
+    return extract(clipped, windows.origin, windows.shape) == 1
 
 
 def _tiles(capture: Capture, system: LensletMatrix, path: Path | None) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from plenocli.inverse.picture.nuisances.defects import find_defects
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel
 from plenocli.inverse.picture.nuisances.saturation import censored, piled_up
 from plenocli.inverse.picture.nuisances.veil import find_veil
+from plenocli.inverse.picture.nuisances.vignetting import falloff
 from plenocli.inverse.picture.solvers.least_squares import decompose
 from plenocli.inverse.picture.solvers.lmmse import SCALES, prepare
 
@@ -296,3 +297,23 @@ def test_pixels_that_are_known_to_be_bad_count_for_nothing():
     assert cleaned.findings[0].known == np.count_nonzero(some)
     roughly = clean(estimators, data, look=False).data.y
     assert np.isfinite(roughly).all() and not roughly[0, 5].any()
+
+
+def test_vignetting_is_what_the_white_has_over_even_light():
+    """A quadratic of each lenslet's own and a pattern of all, from whites with noise."""
+    rng = np.random.default_rng(9)
+    even = blurred().sum(axis=1)
+    at = np.linspace(-1, 1, PIXELS)
+    rows, columns = (axis.ravel() for axis in np.meshgrid(at, at, indexing="ij"))
+    tilt = rng.uniform(-0.1, 0.1, (60, 2))
+    own = 1 - 0.2 * (rows**2 + columns**2) + tilt[:, :1] * rows + tilt[:, 1:] * columns
+    common = 1 + 0.03 * rng.standard_normal(even.size)
+    white = even * own * common * (1 + 0.002 * rng.standard_normal(own.shape))
+    white[rng.random(white.shape) < 0.01] = np.nan
+    found = falloff(white, even, (PIXELS, PIXELS))
+    bright = even > 0.15 * even.max()
+    relative = (found / (own * common))[:, bright]
+    assert np.abs(relative / relative.mean(axis=1, keepdims=True) - 1).max() < 0.01
+    noise = even * (1 + 0.002 * rng.standard_normal(own.shape))
+    assert np.abs(falloff(noise, even, (PIXELS, PIXELS)) - 1).max() < 0.001
+    assert (falloff(np.full((2, even.size), np.nan), even, (PIXELS, PIXELS)) == 1).all()

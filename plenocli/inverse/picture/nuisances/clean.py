@@ -34,6 +34,8 @@ LEAST_NOISE = 1e-6
 """Of the signal, root mean square: less noise than this is rounding."""
 STRAY_ROUNDS = 3
 """Estimates of the neighbours, one after the other, for their light."""
+STRAY_UNSURE = 0.05
+"""Share of the neighbours' light by which it may be wrong everywhere."""
 SOME = 64
 """Lenslets from which an unknown noise is estimated."""
 
@@ -214,7 +216,7 @@ class _Task:
         lost = unknown | (sign != 0)
         if hot.any():
             clean = self.model.impute(own, lost | clipped)
-        veil, light = self._veil(clean, clipped.any(axis=0))
+        veil, light = self._veil(clean, clipped.any(axis=0), float(np.mean(np.abs(stray))))
         bare = replace(self.model, veiled=False)
         better = own - light
         if lost.any():
@@ -263,15 +265,17 @@ class _Task:
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
 
-    def _veil(self, y: np.ndarray, guessed: np.ndarray) -> tuple[VeilFound | None, np.ndarray]:
+    def _veil(
+        self, y: np.ndarray, guessed: np.ndarray, stray: float
+    ) -> tuple[VeilFound | None, np.ndarray]:
         """Veil and light to take away (signal,), from lenslets that are wholly measured and know
-        all their neighbours, where there are some.
+        all their neighbours, where there are some; stray: mean light of the neighbours.
         """
         coupled = self.estimators.coupled
         sure = ~guessed & self.inner[~self.blind] if coupled else ~guessed
         if np.count_nonzero(sure) < min(4, len(sure)):
             sure = np.ones(len(sure), bool)
-        veil, light = find_veil(self.model, y[:, sure], alone=not coupled)
+        veil, light = find_veil(self.model, y[:, sure], unsure=STRAY_UNSURE * stray)
         common = veil.level if veil is not None and veil.removed else 0.0
         every = np.full(y.shape[1], common)
         every[sure] = light

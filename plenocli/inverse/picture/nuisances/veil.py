@@ -87,7 +87,7 @@ class _Offsets:
 
 
 def find_veil(
-    model: PixelModel, y: np.ndarray, *, alone: bool = True
+    model: PixelModel, y: np.ndarray, *, unsure: float = 0.0
 ) -> tuple[VeilFound | None, np.ndarray]:
     """The even light over superpixels.
 
@@ -98,7 +98,8 @@ def find_veil(
 
     model: veiled.
     y: (pixel, signal) without defects.
-    alone: whether no light of neighbours was taken away, whose errors look like offsets.
+    unsure: what all offsets may be wrong by, as light of neighbours was taken away that is not
+        known exactly; then lenslets have no offsets of their own.
 
     Returns (what was found, None where an even object and an even light look alike; the light to
     take away, (signal,)).
@@ -110,11 +111,11 @@ def find_veil(
     value, variance = found.value[told], found.variance[told]
     line, extra = _straight_line(value, found.brightness[told]), 0.0
     if np.median(found.misfit) > EXPLAINED or line.falls:
-        level, sigma = line.level, line.sigma
+        level, sigma = max(line.level, 0.0), line.sigma  # what is left over may be of either sign
     else:
         extra = _beyond_noise(value - np.median(value), variance)
         level, sigma = _mean(value, variance + extra)
-        extra = extra if alone else 0.0
+        extra, sigma = 0.0 if unsure else extra, float(np.hypot(sigma, unsure))
     removed = abs(level) > SURE * sigma or extra > 0
     mean = float(np.mean(y))
     told_of = VeilFound(

@@ -45,7 +45,7 @@ def falloff(white: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.n
         own = _smooth(np.where(inner, good, np.nan) / common, even, shape)
         common = _common(good / own)
         far = ratio / (own * common)
-        seen = np.where(np.isfinite(far).any(axis=1)[:, None], far, 1.0)
+        seen = np.where(np.isfinite(far).any(axis=1, keepdims=True), far, 1.0)
         middle = np.nanmedian(seen, axis=1, keepdims=True)
         bad = np.abs(far - middle) > BAD * middle
     return np.where(bad, np.nan, np.clip(own * common, 1 / STEEPEST, STEEPEST))

@@ -47,8 +47,8 @@ def clipped_in_silence(mosaic, rng):
 @pytest.mark.parametrize(
     "change, coupled, name, words",
     [
-        (veil, False, "veil", "an even light of 4."),
-        (veil, True, "veil", "an even light of 5."),
+        (veil, False, "veil", "an even light of"),
+        (veil, True, "veil", "an even light of"),
         (dead, True, "defects", "too dark"),
         (hot, False, "defects", "too bright"),
         (clipped, False, "saturated", "are saturated: they"),

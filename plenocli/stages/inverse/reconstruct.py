@@ -454,7 +454,8 @@ def _limits(estimators: Estimators, data: Superpixels) -> Limits | None:
     from plenocli.forward.accuracy.limiting_error import what_limits
 
     system, sigma = estimators.system, estimators.options.noise_sigma or data.sigma
-    signal = float(np.sqrt(np.mean(np.square(data.y))))
+    known = data.y[np.isfinite(data.y)]
+    signal = float(np.sqrt(np.mean(np.square(known)))) if known.size else 0.0
     return what_limits(
         sigma / signal if sigma and signal else None,
         system.accuracy,

@@ -133,7 +133,10 @@ def test_a_veil_is_found_and_none_where_there_is_none(light):
         assert found.removed == found.found == (light > 0)
         assert found.level == pytest.approx(light, abs=4.5 * found.sigma)
         assert np.abs(own - light).max() <= 5 * found.sigma + 1e-12
-        assert f"{found.share:.2%}" in found.sentence
+        assert found.as_json()["veil"]["share"] == pytest.approx(
+            found.level / y.mean(), rel=0.02, abs=1e-4
+        )
+        assert f"{found.as_json()['veil']['share']:.2%}" in found.sentence
 
 
 def test_offsets_of_their_own_are_told_apart():

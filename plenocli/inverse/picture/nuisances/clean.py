@@ -34,7 +34,7 @@ LEAST_NOISE = 1e-6
 """Of the signal, root mean square: less noise than this is rounding."""
 STRAY_ROUNDS = 3
 """Estimates of the neighbours, one after the other, for their light."""
-STRAY_UNSURE = 0.05
+STRAY_UNSURE = 0.02
 """Share of the neighbours' light by which it may be wrong everywhere."""
 SOME = 64
 """Lenslets from which an unknown noise is estimated."""

@@ -26,19 +26,19 @@ NOT_STRAIGHT = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class VeilFound:
-    """Even light on top of A x, in units of A x.
+    """Even light on top of A x.
 
-    level: common to all lenslets; sigma: its standard deviation.
+    level: common to all lenslets, in units of y; sigma: its standard deviation.
     spread: of the lenslets' own offsets about it, standard deviation; 0 where they are not told
         apart from noise, or from an error of the matrix.
-    share: of the capture's mean, level over that.
+    mean: of the capture without it, which all is told relative to.
     removed: whether it was taken away.
     """
 
     level: float
     sigma: float
     spread: float
-    share: float
+    mean: float
     removed: bool
 
     @property
@@ -49,27 +49,24 @@ class VeilFound:
     @property
     def sentence(self) -> str:
         """What was found, for a person."""
-        error, spread = self.of_mean(self.sigma), self.of_mean(self.spread)
-        own = f", {spread:.2%} more or less by lenslet" if spread else ""
+        told = self.as_json()["veil"]
+        own = f", {told['spread']:.2%} more or less by lenslet" if self.spread else ""
         return (
-            f"an even light of {self.share:.2%} of the mean (+- {error:.2%}{own}) lies over the "
-            "superpixels: it was taken away"
+            f"an even light of {told['share']:.2%} of the mean (+- {told['sigma']:.2%}{own}) lies "
+            "over the superpixels: it was taken away"
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Names and values, as artefacts hold them: shares of the capture's mean."""
+        """Names and values, as artefacts hold them; shares of the capture's mean."""
+        mean = abs(self.mean) or 1.0
         return {
             "veil": {
-                "share": self.share,
-                "sigma": self.of_mean(self.sigma),
-                "spread": self.of_mean(self.spread),
+                "share": self.level / mean,
+                "sigma": self.sigma / mean,
+                "spread": self.spread / mean,
                 "removed": self.removed,
             }
         }
-
-    def of_mean(self, value: float) -> float:
-        """A value in units of A x as a share of the capture's mean."""
-        return abs(self.share) * value / max(abs(self.level), np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
@@ -117,12 +114,11 @@ def find_veil(
         level, sigma = _mean(value, variance + extra)
         extra, sigma = 0.0 if unsure else extra, float(np.hypot(sigma, unsure))
     removed = abs(level) > SURE * sigma or extra > 0
-    mean = float(np.mean(y))
     told_of = VeilFound(
         level=level,
         sigma=sigma,
         spread=float(np.sqrt(extra)),
-        share=level / mean if mean else 0.0,
+        mean=float(np.mean(y)) - level,
         removed=bool(removed),
     )
     if not removed:

@@ -10,8 +10,9 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
+from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, MatrixOrigin, gathered
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -57,7 +58,8 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
             path,
             "run simulate-pif again",
         )
-    bands, weights, illuminant = _bands(artefact, path) if by_band else ((), None, None)
+    camera = _camera(artefact, path)
+    bands, weights, illuminant = _bands(artefact, camera) if by_band else ((), None, None)
     if weights is None and len(matrices) > 1:
         note(
             f"{Path(path).name} holds {len(matrices)} wavelengths; they are averaged, as "
@@ -72,23 +74,43 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
         accuracy=AccuracyRecord.from_json(artefact.provenance.accuracy),
         bands=bands,
         illuminant=illuminant,
+        origin=_origin(artefact, camera, weights),
+    )
+
+
+def _camera(artefact: "Artefact", path: Path) -> Camera | None:
+    """The camera that a pif was computed for, where it says so."""
+    from plenocli.files.config.camera_file import parse_camera
+
+    config = artefact.provenance.config
+    return parse_camera(config, path) if config else None
+
+
+def _origin(
+    artefact: "Artefact", camera: Camera | None, weights: np.ndarray | None
+) -> MatrixOrigin | None:
+    """What a pif was computed from; None where it does not say, or for a lenslet off the axis."""
+    about = artefact.attrs.get("pif", {})
+    if camera is None or "first_pixel" in (about.get("notes") or {}):
+        return None
+    return MatrixOrigin(
+        camera=camera,
+        wavelengths=tuple(float(w) for w in artefact.data["pif/wavelength"]),
+        weights=weights,
+        coherent_ring=int(about.get("coherent_ring") or 0),
     )
 
 
 def _bands(
-    artefact: "Artefact", path: Path
+    artefact: "Artefact", camera: Camera | None
 ) -> tuple[tuple[float, ...], np.ndarray | None, str | None]:
     """(wavelengths of the bands, weights (band, wavelength), illuminant) of a pif whose camera
     has filters; ((), None, None) for others.
     """
-    from plenocli.files.config.camera_file import parse_camera
     from plenocli.forward.scene.light import band_weights
     from plenocli.forward.scene.tables import illuminant
 
-    if not artefact.provenance.config:
-        return (), None, None
-    camera = parse_camera(artefact.provenance.config, path)
-    if camera.filter_array is None:
+    if camera is None or camera.filter_array is None:
         return (), None, None
     bands, weights = band_weights(
         camera, artefact.data["pif/wavelength"], lambda w: illuminant(camera.light.illuminant, w)

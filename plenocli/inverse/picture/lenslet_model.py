@@ -8,8 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
+from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.noise import Noise
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatrixOrigin:
+    """What a matrix was computed from.
+
+    camera: its description.
+    wavelengths: (wavelength,) m.
+    weights: (band, wavelength) share of each in a band, None for equal ones of one band.
+    coherent_ring: rings of lenslets whose fields add.
+    """
+
+    camera: Camera
+    wavelengths: tuple[float, ...]
+    weights: np.ndarray | None = None
+    coherent_ring: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +42,7 @@ class LensletMatrix:
     bands: (band,) wavelengths (m) of the pictures that the object has, () where it is one picture
         without a colour.
     illuminant: the light that the bands' shares are for.
+    origin: what it was computed from, None where that is not known.
     """
 
     path: Path
@@ -35,6 +53,7 @@ class LensletMatrix:
     accuracy: AccuracyRecord | None = None
     bands: tuple[float, ...] = ()
     illuminant: str | None = None
+    origin: MatrixOrigin | None = None
 
     @property
     def own(self) -> np.ndarray:

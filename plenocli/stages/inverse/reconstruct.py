@@ -268,6 +268,7 @@ def run_reconstruct(
             return _summary(summarise(batch, done))
     finally:
         _estimators.cache_clear()
+        _finer.cache_clear()
 
 
 def _summary(done: BatchSummary) -> ReconstructSummary:
@@ -328,6 +329,19 @@ def _estimators(recipe: Recipe) -> Estimators:
         None if learnt is None else partial(read_dictionary, learnt, system),
         threads=recipe.threads,
     )
+
+
+@lru_cache(maxsize=1)
+def _finer(recipe: Recipe) -> Estimators | None:
+    """The same by a finer matrix of the camera, where it can be had."""
+    from plenocli.inverse.picture.trust.finer import finer_matrix
+
+    rough = _estimators(recipe)
+    system = finer_matrix(rough.system)
+    if system is None:
+        return None
+    learnt = None if rough.read_dictionary is None else lambda: rough.learnt
+    return Estimators(system, rough.options, rough.read_pictures, learnt, threads=rough.threads)
 
 
 def _solve_in_pool(
@@ -425,6 +439,9 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
     limits = _limits(estimators, data)
+    if look and limits is not None and limits.limited_by == "model":
+        estimators = _finer(recipe) or estimators
+        limits = _limits(estimators, data)
     off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
     found, seen = estimate(estimators, method, data, truth, model_error=off)
     return _solved(

@@ -1,0 +1,231 @@
+"""Whether a capture is believed to be A x and noise: cameras that differ from the one assumed,
+brightnesses and units, and the pieces that decide.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from plenocli import api
+from plenocli.base.progress import collected_notes
+from plenocli.base.tiling import to_blocks
+from plenocli.files.read.scenes import embedded_photograph
+from plenocli.files.read.training import read_training
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture.estimate import estimate
+from plenocli.inverse.picture.estimators import Estimators, Options
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.methods.registry import METHODS
+from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
+from plenocli.inverse.picture.trust.excess import with_excess
+
+SHAPE, COUNT = (20, 20), 5
+HALF = (("[40, 40]", "[20, 20]"), ("[52, 52]", "[26, 26]"), ('"2 um"', '"4 um"'))
+
+
+@cache
+def matrix(*changes, model="fresnel"):
+    """(pixel, point) of the half-sized seed camera with texts of its description replaced."""
+    text = api.sample("seed_spatial.toml").read_text()
+    for old, new in (*HALF, *changes):
+        assert old in text
+        text = text.replace(old, new)
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        (path := Path(folder) / "camera.toml").write_text(text)
+        camera = api.read_camera(path)
+    found = api.system_matrix(
+        camera, superpixels=(1, 1), coherent_ring=0, accuracy=1e-5, model=model
+    )
+    return np.asarray(found.A, float)[0, 0]
+
+
+@cache
+def pictures():
+    return read_training((), SHAPE, not_scene="astronaut")
+
+
+def estimators(**options):
+    system = LensletMatrix(
+        path=Path("pif.h5"),
+        blocks=matrix()[None],
+        offsets=np.zeros((1, 2), int),
+        pixel_shape=(26, 26),
+        object_shape=SHAPE,
+    )
+    return Estimators(system, Options(**options), lambda scene: pictures(), threads=1)
+
+
+@cache
+def scene():
+    """(lenslet_row, lenslet_column, point) of a photograph that training leaves out."""
+    from skimage.color import rgb2gray
+    from skimage.transform import resize
+
+    grey = rgb2gray(np.asarray(embedded_photograph("astronaut"), float))
+    return to_blocks(resize(grey, (COUNT * 20, COUNT * 20), anti_aliasing=True), SHAPE)
+
+
+def captured(a, snr_db=60, seed=0):
+    y = scene() @ a.T
+    sigma = np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20)
+    noise = sigma * np.random.default_rng(seed).standard_normal(y.shape)
+    return Superpixels(y=y + noise, noise=Noise.of_sigma(sigma))
+
+
+def made(method, data, assumed=None, **options):
+    with collected_notes():
+        found, _ = estimate(assumed or estimators(**options), METHODS[method], data)
+    return found
+
+
+def psnr(found):
+    return -10 * np.log10(np.mean((found.value - scene()) ** 2))
+
+
+DISTURBED = {
+    "focus": (('distance = "550 mm"', 'distance = "556 mm"'),),
+    "wavelength": (("550 nm", "560 nm"),),
+    "sensor": (('distance = "832 um"', 'distance = "836.16 um"'),),
+    "lenslets": (('focal_length = "832 um"', 'focal_length = "836.16 um"'),),
+    "pitch": (('"104 um"', '"104.104 um"'), ('"4 um"', '"4.004 um"')),
+}
+
+
+@pytest.mark.parametrize("snr_db", [60, 40])
+@pytest.mark.parametrize("name", DISTURBED)
+def test_a_wrong_matrix_is_never_worse_than_the_mean_of_each_lenslet(name, snr_db):
+    data = captured(matrix(*DISTURBED[name]), snr_db)
+    shared, floor = estimators(), psnr(made("block-mean", data))
+    for method in ("lmmse", "tikhonov", "tsvd", "tv"):
+        assert psnr(made(method, data, shared)) > floor - 0.2, method
+
+
+def test_a_shift_is_never_worse_than_the_mean_of_each_lenslet():
+    spectrum = np.fft.fft(matrix().reshape(26, 26, -1), axis=0)
+    turn = np.exp(-2j * np.pi * np.fft.fftfreq(26) * 0.1)[:, None, None]
+    data = captured(np.fft.ifft(spectrum * turn, axis=0).real.reshape(matrix().shape))
+    shared, floor = estimators(), psnr(made("block-mean", data))
+    for method in ("lmmse", "tikhonov", "tsvd", "tv", "pnp"):
+        assert psnr(made(method, data, shared)) > floor - 0.2, method
+
+
+@pytest.mark.parametrize("snr_db", [60, 40, 20])
+def test_the_right_matrix_is_believed(snr_db):
+    found = made("lmmse", captured(matrix(), snr_db))
+    told = found.as_json()
+    assert told["matrix_believed"] and told["noise_raised"] == 1 and told["detail_kept"] == 1
+    assert told["continuity"] > 0.6
+    assert found.noise.sigma == pytest.approx(captured(matrix(), snr_db).sigma, rel=1e-12)
+
+
+def test_the_noise_of_a_wrong_matrix_says_how_wrong_it_is():
+    """Between the error in all pixels, spread evenly, and what falls upon single coordinates."""
+    told = made("lmmse", captured(matrix(*DISTURBED["pitch"]))).as_json()
+    assert not told["matrix_believed"] and told["noise_raised"] > 2
+    assert told["continuity"] < 0.6 and told["excess"] > told["noise_sigma"]
+
+
+@pytest.mark.parametrize("method", ["lmmse", "tikhonov", "tsvd", "tv", "pnp"])
+def test_units_and_brightness_change_nothing_but_units(method):
+    data, shared = captured(matrix()), estimators()
+    one = made(method, data, shared)
+    for factor in (1e-30, 1e-4, 0.013, 1.7e30):
+        scaled = replace(data, y=data.y * factor, noise=data.noise.scaled(factor))
+        other = made(method, scaled, shared)
+        assert np.abs(other.value / factor - one.value).max() < 1e-9, factor
+        assert other.method == one.method
+        if one.sigma is not None:
+            np.testing.assert_allclose(other.sigma / factor, one.sigma, rtol=1e-6)
+
+
+def test_given_weights_are_in_the_unit_of_the_capture():
+    data = captured(matrix())
+    sigma = data.sigma
+    one = made("lmmse", replace(data, noise=None), noise_sigma=sigma)
+    other = made("lmmse", data)
+    np.testing.assert_allclose(one.value, other.value, atol=1e-9)
+    assert one.noise.sigma == pytest.approx(sigma, rel=1e-12)
+
+
+def test_the_least_jumps_by_brute_force():
+    rng = np.random.default_rng(3)
+    x = rng.random((3, 4, 2 * 6))  # two bands of 2x3 points
+    mean = x.mean(axis=2, keepdims=True) + 0 * x
+    found = Jumps(level=jumps(mean, (2, 3)), detail=jumps(x - mean, (2, 3))[:, None])
+    assert found.level.size == 2 * (3 * 3 * 2 + 2 * 4 * 3)
+    picture = x.reshape(3, 4, 2, 2, 3)
+
+    def energy(factor):
+        total, p = (
+            0.0,
+            mean.reshape(picture.shape) + factor * (picture - mean.reshape(picture.shape)),
+        )
+        for r in range(3):
+            for c in range(4):
+                total += ((p[r, c, :, :, -1] - p[r, c + 1, :, :, 0]) ** 2).sum() if c < 3 else 0
+                total += ((p[r, c, :, -1] - p[r + 1, c, :, 0]) ** 2).sum() if r < 2 else 0
+        return total
+
+    assert found.factor == pytest.approx(minimize_scalar(energy).x, abs=1e-6)
+
+
+def test_detail_with_independent_error_is_shrunk_as_wiener_would():
+    """A smooth scene, whose adjacent points are equal; error as strong as the detail."""
+    rng = np.random.default_rng(4)
+    n, count = 24, 40
+    axis = np.arange(n * count) / (n * count)
+    plane = sum(
+        np.cos(2 * np.pi * (a * axis[:, None] + b * axis[None, :]) + c)
+        for a, b, c in zip(rng.uniform(10, 30, 9), rng.uniform(10, 30, 9), rng.uniform(0, 6, 9))
+    )
+    x = to_blocks(plane, (n, n))
+    mean = x.mean(axis=2, keepdims=True) + 0 * x
+    detail = jumps(x - mean, (n, n))
+    error = rng.standard_normal(x.shape) * np.sqrt(np.mean(detail**2) / 2)
+    level = jumps(mean, (n, n))
+    for share in (0.0, 0.5, 1.0, 2.0):
+        noisy = detail + share * jumps(error, (n, n))
+        found = Jumps(level=level, detail=noisy[:, None])
+        assert found.factor == pytest.approx(1 / (1 + share**2), abs=0.08)
+    wrong = Jumps(level=level, detail=np.stack([detail, 2 * jumps(error, (n, n))], axis=1))
+    right = Jumps(level=level, detail=np.stack([detail, detail], axis=1) / 2)
+    factors = group_factors(wrong, right)
+    assert factors[1] < 0.3 < factors[0]
+
+
+def test_excess_is_found_where_it_is():
+    rng, shared = np.random.default_rng(5), estimators()
+    data = captured(matrix())
+    lmmse = shared.prior.lmmse(data.sigma, None)
+    stacked = data.y.reshape(COUNT**2, -1).T
+    quiet = with_excess(lmmse, stacked, data.sigma**2)
+    assert np.mean(quiet == data.sigma**2) > 0.9
+    weak = np.argsort(-lmmse.power)[100:130]
+    added = 100 * data.sigma
+    spoilt = stacked + lmmse.analysis[weak].T @ (added * rng.standard_normal((30, COUNT**2)))
+    noise = with_excess(lmmse, spoilt, data.sigma**2)
+    assert np.all(noise[weak[6:-6]] > 0.2 * added**2)
+    assert np.all(noise[weak[6:-6]] < 5 * added**2)
+    far = np.setdiff1d(np.argsort(-lmmse.power), np.argsort(-lmmse.power)[90:140])
+    assert np.mean(noise[far] == data.sigma**2) > 0.9
+
+
+def test_looking_through_whitened_rows_is_lmmse_with_that_noise():
+    """The same estimate by another way: a matrix whose noise is white again."""
+    data, shared = captured(matrix()), estimators()
+    lmmse = shared.prior.lmmse(data.sigma, None)
+    rng = np.random.default_rng(6)
+    raised = replace(lmmse, noise=lmmse.noise * 10 ** rng.uniform(0, 4, lmmse.noise.shape))
+    rows = raised.whitening()
+    y = data.y.reshape(COUNT**2, -1).T
+    other = shared.seen_through(rows).prior.lmmse(data.sigma, None)
+    for scale in (0.1, 1.0, 3.0):
+        one, two = raised.apply(y, scale), other.apply(rows @ y, scale)
+        # coordinates below a hundredth of the noise are left out once more
+        assert np.abs(one - two).max() < 2e-3 * np.abs(one).max()

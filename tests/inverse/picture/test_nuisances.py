@@ -320,3 +320,12 @@ def test_vignetting_is_what_the_white_has_over_even_light():
     noise = even * (1 + 0.002 * rng.standard_normal(own.shape))
     assert np.abs(falloff(noise, even, (PIXELS, PIXELS)) - 1).max() < 0.001
     assert (falloff(np.full((2, even.size), np.nan), even, (PIXELS, PIXELS)) == 1).all()
+
+
+def test_a_method_that_does_not_look_says_what_is_saturated():
+    _, _, spoilt, above = all_at_once(np.random.default_rng(2))
+    estimators, data = camera(spoilt, saturated=above.T.reshape(7, 7, -1))
+    found = clean(estimators, data, look=False)
+    assert np.array_equal(found.data.y, data.y)
+    assert "the picture is too dark there" in found.findings[0].sentence
+    assert found.findings[0].pixels == np.count_nonzero(above)

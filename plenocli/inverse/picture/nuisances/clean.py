@@ -23,7 +23,7 @@ from plenocli.inverse.picture.nuisances.defects import (
     find_defects,
 )
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel
-from plenocli.inverse.picture.nuisances.saturation import SaturationFound, censored, piled_up
+from plenocli.inverse.picture.nuisances.saturation import censored, piled_up, saturation
 from plenocli.inverse.picture.nuisances.veil import VeilFound, find_veil
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import Lmmse
@@ -95,7 +95,7 @@ def clean(estimators: Estimators, data: Superpixels, *, look: bool = True) -> Cl
     declared = data.saturated is not None
     clipped = data.saturated if data.saturated is not None else piled_up(data.y)
     clipped = np.zeros(y.shape, bool) if clipped is None else clipped.reshape(y.shape)
-    bare = Cleaned(filled, _known_before(known, y.size))
+    bare = Cleaned(filled, (*_known_before(known, y.size), *saturation(clipped, declared=declared)))
     if not look or blind.all() or not filled.y.any():
         return bare
     try:
@@ -236,16 +236,8 @@ class _Task:
         ]
         findings += [] if veil is None else [veil]
         if clipped.any():
-            level = np.abs(own[clipped])
-            findings.append(
-                SaturationFound(
-                    pixels=int(np.count_nonzero(clipped)),
-                    lenslets=int(np.count_nonzero(clipped.any(axis=0))),
-                    share=float(np.mean(clipped)),
-                    declared=self.declared,
-                    raised=float(np.mean((better - own + light)[clipped]) / np.mean(level)),
-                )
-            )
+            raised = np.mean((better - own + light)[clipped]) / np.mean(np.abs(own[clipped]))
+            findings += saturation(clipped.T, declared=self.declared, raised=float(raised))
         return _Found(out.reshape(shape), tuple(findings))
 
     def _own_light(self, y: np.ndarray) -> np.ndarray:

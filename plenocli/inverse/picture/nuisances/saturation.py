@@ -27,14 +27,15 @@ class SaturationFound:
 
     pixels: how many; lenslets: that have some; share: of all pixels.
     declared: whether the capture says where its sensor saturates.
-    raised: mean of what they were raised by, over the level at which they were clipped.
+    raised: mean of what they were raised by, over the level at which they were clipped; None where
+        they were left as they are.
     """
 
     pixels: int
     lenslets: int
     share: float
     declared: bool
-    raised: float
+    raised: float | None = None
 
     @property
     def found(self) -> bool:
@@ -45,8 +46,10 @@ class SaturationFound:
     def sentence(self) -> str:
         """What was found, for a person."""
         how = "" if self.declared else ", by the pile-up at the largest value"
-        return (
-            f"{self.share:.2%} of the pixels, in {self.lenslets} lenslets, are saturated{how}: "
+        where = f"{self.share:.2%} of the pixels, in {self.lenslets} lenslets, are saturated{how}: "
+        if self.raised is None:
+            return where + "the picture is too dark there"
+        return where + (
             f"they count as no darker than that, and were raised by {self.raised:.1%} on average; "
             "what was brighter is a guess there"
         )
@@ -62,6 +65,23 @@ class SaturationFound:
                 "raised": self.raised,
             }
         }
+
+
+def saturation(
+    clipped: np.ndarray, *, declared: bool, raised: float | None = None
+) -> tuple[SaturationFound, ...]:
+    """What there is to tell of clipped pixels (lenslet, pixel): nothing where there are none."""
+    if not clipped.any():
+        return ()
+    return (
+        SaturationFound(
+            pixels=int(np.count_nonzero(clipped)),
+            lenslets=int(np.count_nonzero(clipped.any(axis=1))),
+            share=float(np.mean(clipped)),
+            declared=declared,
+            raised=raised,
+        ),
+    )
 
 
 def piled_up(y: np.ndarray) -> np.ndarray | None:

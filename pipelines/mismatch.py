@@ -42,6 +42,8 @@ ROWS = {
     "dim-1000": "a thousandth of the light, same SNR",
 }
 """Row -> what is disturbed."""
+SAID = ("lost", "noise", "kept")
+"""What the second table has of each method."""
 FINER = 3
 """Pixels of the matrix that the shifted one is put together from, a side of each pixel."""
 SHIFT = 0.1
@@ -224,27 +226,30 @@ def report(run, output):
     page.table(header, rows)
     told = [
         "disturbance",
-        *(f"{m}: {what}" for m in _told(found, said) for what in ("lost", "said")),
+        *(f"{m}: {what}" for m in _told(found, said) for what in SAID),
     ]
     claims = [[ROWS[row], *_claims(found, said, scenes, row)] for row in ROWS]
     page.section(
         "What is said of it",
-        "dB lost to the disturbance with the nominal matrix, and what the score says that its "
-        "matrix costs at most (the worst scene of each).",
+        "dB lost to the disturbance with the nominal matrix, and what the picture says of it: how "
+        "many times its noise the capture seems to have, and the share of detail that was kept "
+        "(the worst scene of each).",
     )
     page.table(told, claims)
     publish(output, page.render().encode(), overwrite=True)
     publish(output.with_name("table.md"), _markdown(header, rows).encode(), overwrite=True)
     with open(output.with_name("table.csv"), "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["scene", "row", "matrix", "method", "psnr_db", "said_at_most_db"])
+        writer.writerow(["scene", "row", "matrix", "method", "psnr_db", "noise_raised", "kept"])
         for key, value in found.items():
-            writer.writerow([*key, f"{value:.3f}", said.get(key, "")])
+            writer.writerow([*key, f"{value:.3f}", *said.get(key, ())])
     print(_markdown(header, rows))
 
 
 def _figures(files):
-    """{(scene, row, matrix, method): PSNR} and the same of what is said to be lost at most."""
+    """{(scene, row, matrix, method): PSNR} and what the pictures say, {the same: (noise over the
+    capture's, share of detail kept)}.
+    """
     found, said = {}, {}
     # a document tells a result by its name, which it has in every folder, and its digest
     folders = {
@@ -259,8 +264,8 @@ def _figures(files):
         for number, one in enumerate(document.results, start=1):
             key = scene, row, *folders[document.inputs[f"result {number}"].sha256]
             found[key] = one.number("psnr_db") - brighter
-            if one.number("loss_at_most_db") is not None:
-                said[key] = one.number("loss_at_most_db")
+            if one.number("noise_raised") is not None:
+                said[key] = one.number("noise_raised"), one.number("detail_kept")
     return found, said
 
 
@@ -284,16 +289,16 @@ def _told(found, said):
 def _claims(found, said, scenes, row):
     cells = []
     for method in _told(found, said):
-        lost, claims = [], []
+        lost, raised, kept = [], [], []
         for scene in scenes:
-            best = found.get((scene, row, "right", method))
             key = scene, row, "nominal", method
-            if key in found and best is not None:
-                lost.append(best - found[key])
-                claims.append(said.get(key))
+            if key in found:
+                lost.append(found[scene, row, "right", method] - found[key])
+            if key in said:
+                raised.append(said[key][0])
+                kept.append(said[key][1])
         cells.append(f"{max(lost):.1f}" if lost else "")
-        known = [c for c in claims if c is not None]
-        cells.append(f"{min(known):.1f}" if known else "nothing")
+        cells += [f"{max(raised):.3g}", f"{min(kept):.2f}"] if raised else ["nothing", ""]
     return cells
 
 

@@ -491,7 +491,8 @@ def score(
         raise UsageError(f"the truth is {truth.shape}, the result {value.shape}")
     if isinstance(result, Spectra):
         return score_cube(value, truth, result.wavelength)
-    return score_picture(value, truth, block)
+    sigma = result.sigma if isinstance(result, Reconstruction) else None
+    return score_picture(value, truth, block, sigma)
 
 
 def _scene(scene: Picture | Scene | str | Path, *, spectral: bool) -> Scene:

@@ -21,6 +21,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "ssim": ("ssim",),
     "block-mean": ("block_mean_psnr_db", "gain_over_block_mean_db"),
     "rmse": ("rmse", "rmse_per_band"),
+    "intervals": ("interval_coverage",),
     "patches": (
         "patches",
         "patch_rmse_per_band",

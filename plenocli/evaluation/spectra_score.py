@@ -91,7 +91,7 @@ def score_spectra(
             result.path,
             "check the calibration it was made with",
         )
-    picture = score_picture(values, truth) if result.kind == "image" else None
+    picture = score_picture(values, truth, sigma=result.sigma) if result.kind == "image" else None
     patches, classification = None, None
     listed: tuple[PatchScore, ...] = ()
     if labels is not None:

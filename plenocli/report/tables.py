@@ -42,6 +42,7 @@ LABELS = {
     "response_pixel_per_band": ("largest error of a pixel over the brightest", ""),
     "response_gain_per_band": ("gain that was fitted", ""),
     "response_leak": ("leak between bands", ""),
+    "interval_coverage": ("points within their 95 % interval", "share"),
     "noise_relative": ("noise of the capture, relative", ""),
     "model_error_relative": ("error of the model, relative", ""),
     "limited_by": ("limited by", ""),

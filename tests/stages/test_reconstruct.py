@@ -196,7 +196,7 @@ def test_what_cannot_be_seen_is_told(single, tmp_path, capsys):
     np.testing.assert_allclose(seen, expected.reshape(N, N), atol=1e-6)
     assert (
         told["share"] == pytest.approx(expected.mean(), abs=1e-6)
-        and 0 < told["directions"] <= N * N
+        and 0 < told["degrees_of_freedom"] <= N * N
         and "symmetric" not in told
     )
     louder = tmp_path / "louder"

@@ -11,6 +11,7 @@ METRICS = (
     "ssim",
     "block-mean",
     "rmse",
+    "intervals",
     "patches",
     "spectral-angle",
     "delta-e",
@@ -114,13 +115,13 @@ def command(
     """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr)
     with the truth, side by side in one table.
 
-    Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline. Spectra: error per band and over
-    the six patches of the paper, spectral angle, colour difference, SNR under three names, how
-    often a lenslet tells its patch (with scikit-learn installed also by a trained classifier), and
-    all against single pixel where one of the RESULTs is that. Dictionaries: coherence.
-    Calibrations: response against response. Refocused planes (made with --camera): depth over the
-    geometric limit. OUT is JSON with the definition of every number; null stands for "infinite" (no
-    error at all) or "does not apply".
+    Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline, the share of points whose 95 %
+    interval holds the truth. Spectra: error per band and over the six patches of the paper,
+    spectral angle, colour difference, SNR under three names, how often a lenslet tells its patch
+    (with scikit-learn installed also by a trained classifier), and all against single pixel where
+    one of the RESULTs is that. Dictionaries: coherence. Calibrations: response against response.
+    Refocused planes (made with --camera): depth over the geometric limit. OUT is JSON with the
+    definition of every number; null stands for "infinite" (no error at all) or "does not apply".
 
     \b
     Examples:

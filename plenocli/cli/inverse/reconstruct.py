@@ -131,7 +131,7 @@ def command(
     of all bands: with simulate-pif --spectral-step auto for the whole width of the filters, else
     one wavelength stands for each.
 
-    OUT is an image .h5 (with the predicted standard deviation for lmmse, tv and pnp, and what of a
+    OUT is an image .h5 (with the predicted standard deviation for all but block-mean, and what of a
     lenslet's object the sensor can see at all) or .exr; with several captures a folder with one
     file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the
     others. --workers and --scheduler share captures out, or batches of the lenslets of a single one

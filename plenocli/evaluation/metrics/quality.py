@@ -12,6 +12,8 @@ import numpy as np
 from plenocli.forward.scene.sample import block_mean
 
 PEAK = 1.0
+INTERVAL = 1.96
+"""Standard deviations, each way, of an interval of 95 %."""
 
 DEFINITIONS = {
     "psnr_db": (
@@ -44,6 +46,10 @@ DEFINITIONS = {
         "share of the method's detail that was kept, as far as it goes on across the lenslets' "
         "borders; the rest is the mean of each lenslet"
     ),
+    "interval_coverage": (
+        "share of the points that lie within 1.96 predicted standard deviations of the truth; 0.95 "
+        "where these hold"
+    ),
     "seen_share": (
         "share of the directions of a lenslet's object that stand above the capture's noise; the "
         "rest lies in the null space and is filled in by the method"
@@ -70,6 +76,7 @@ class PictureScore:
     psnr_db, psnr_clipped_db: dB, infinite for equal pictures.
     rmse: in the unit of the picture.
     ssim: -1 to 1, NaN where the picture is too small for it.
+    interval_coverage: see DEFINITIONS, None where no deviation is known.
     lenslets: None where their blocks are not known.
     """
 
@@ -77,6 +84,7 @@ class PictureScore:
     psnr_clipped_db: float
     rmse: float
     ssim: float
+    interval_coverage: float | None = None
     lenslets: LensletScore | None = None
 
 
@@ -153,6 +161,14 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     )
 
 
+def coverage(estimate: np.ndarray, truth: np.ndarray, sigma: np.ndarray) -> float:
+    """Share of the samples whose interval of 95 % holds the truth.
+
+    estimate, truth, sigma: of one shape; sigma is half the width of the interval over INTERVAL.
+    """
+    return float(np.mean(np.abs(estimate - truth) <= INTERVAL * sigma))
+
+
 def block_mean_baseline(truth: np.ndarray, block: tuple[int, int]) -> np.ndarray:
     """The truth with each lenslet's block replaced by its mean.
 
@@ -166,13 +182,17 @@ def block_mean_baseline(truth: np.ndarray, block: tuple[int, int]) -> np.ndarray
 
 
 def score_picture(
-    estimate: np.ndarray, truth: np.ndarray, block: tuple[int, int] | None = None
+    estimate: np.ndarray,
+    truth: np.ndarray,
+    block: tuple[int, int] | None = None,
+    sigma: np.ndarray | None = None,
 ) -> PictureScore:
     """All measures of DEFINITIONS for one picture.
 
     estimate, truth: (..., row, column), linear, white is 1.
     block: (rows, columns) of samples under one lenslet; without it the lenslet-wise measures
         are left out.
+    sigma: predicted standard deviation, like estimate.
     """
     estimate, truth = _pair(estimate, truth)
     whole = psnr(estimate, truth)
@@ -181,6 +201,7 @@ def score_picture(
         psnr_clipped_db=psnr(np.clip(estimate, 0, PEAK), truth),
         rmse=rmse(estimate, truth),
         ssim=ssim(estimate, truth),
+        interval_coverage=None if sigma is None else coverage(estimate, truth, sigma),
         lenslets=None if block is None else _score_lenslets(estimate, truth, whole, block),
     )
 

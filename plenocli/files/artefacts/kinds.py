@@ -533,7 +533,7 @@ IMAGE = Schema(
             "row column | band row column",
             "f",
             "1",
-            "predicted standard deviation",
+            "predicted standard deviation: 1.96 of it each way hold the truth at 95 % of points",
             optional=True,
             minimum=0,
         ),

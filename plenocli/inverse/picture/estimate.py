@@ -135,7 +135,7 @@ def estimate(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
             "lenslet: more of it would not go on across the lenslets' borders"
         )
-    seen = what_is_seen(looked_through, belief.level.sigma)
+    seen = what_is_seen(looked_through, settled.own, belief.lmmse)
     found = replace(found, trace=(*bare.findings, *found.trace))
     return _in_unit(found, Trusted.of(belief, kept, unit), unit), seen
 

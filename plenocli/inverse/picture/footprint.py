@@ -99,7 +99,7 @@ def lmmse_phases(n: Sizes) -> list[float]:
     """Of LMMSE of each lenslet by itself."""
     return [
         n.y + n.svd + 13 * n.block**2,
-        n.svd + n.block**2 + n.lenslets * (2 * n.pixels + 4 * n.points + 240),
+        n.svd + n.block**2 + n.lenslets * (2 * n.pixels + 6 * n.points + 4 * n.least + 240),
     ]
 
 

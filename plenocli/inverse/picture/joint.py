@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.inverse.picture import error_bars
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.lenslet_model import Superpixels
 
@@ -26,8 +27,8 @@ class JointEstimate:
 
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
     """LMMSE over 3x3 lenslets with scale x covariance, one scale a picture; steps of sqrt(2), so
-    that captures of one kind share what is worked out. sigma goes by the geometric mean of that
-    scale and the one of each lenslet's own light (docs/model.md, "Spatial reconstruction").
+    that captures of one kind share what is worked out. sigma is what each lenslet's own light
+    leaves open (docs/model.md, "Error bars").
     """
     own = estimators.prior.lmmse(data.known_sigma, data.scene)
     y = estimators.without_stray(data.y)
@@ -37,12 +38,12 @@ def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate
     # would be amplified
     scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
     joint = estimators.prior.joint(data.known_sigma / np.sqrt(scale), data.scene)
-    x, sigma = joint.apply(data.y)
+    x, _ = joint.apply(data.y)
     y = own_light(estimators, data.y, x) if estimators.coupled else data.y
-    contrast = scale * own.scales(y.reshape(-1, y.shape[2]).T)
+    apart, left = error_bars.posterior(own, y, estimators.system.object_shape)
     return JointEstimate(
         value=x,
-        sigma=sigma * contrast.reshape(*y.shape[:2], 1) ** 0.25,
+        sigma=error_bars.JOINTLY * error_bars.about(x - apart, left),
         scale=scale,
     )
 

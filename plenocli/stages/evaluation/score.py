@@ -434,7 +434,7 @@ def _score_picture(
             result.path,
             "correct --block",
         )
-    return score_picture(result.values, truth, block)
+    return score_picture(result.values, truth, block, result.sigma)
 
 
 def _sensor_snr(path: Path | str) -> float:

@@ -177,7 +177,7 @@ class PictureSummary:
         seen = bands = ""
         if self.seen is not None:
             seen = (
-                f", {self.seen.directions} of {self.seen.points} directions of the object above "
+                f", {self.seen.degrees:.0f} degrees of freedom of {self.seen.points} points above "
                 "the noise"
             )
         if len(self.bands) > 1:

@@ -57,7 +57,8 @@ def test_every_method_gives_a_picture_and_its_account(name, coupled):
     found = method.reconstruct(estimators, data)
     assert found.value.shape == truth.shape
     assert np.sqrt(np.mean((found.value - truth) ** 2)) < 0.5
-    assert (found.sigma is not None) == (found.method in ("lmmse", "pnp", "tv"))
+    assert (found.sigma is None) == (found.method == "block-mean")
+    assert found.sigma is None or (found.sigma.shape == truth.shape and found.sigma.min() > 0)
     assert found.overlap == (3 if coupled else 1)
     told = json.loads(json.dumps(found.as_json()))
     assert told["method"] == found.method and told["reason"] == found.reason

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.inverse.picture import footprint
+from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.reconstruction import Stats
@@ -257,14 +257,19 @@ def adaptive_lmmse(
 
 def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:
     y = light.y[light.inner]
-    x, sigma = adaptive_lmmse(estimators, light.data.known_sigma, light.data.scene, y)
-    return Estimate(value=x, sigma=sigma, from_lmmse=0.0)
+    x, _ = adaptive_lmmse(estimators, light.data.known_sigma, light.data.scene, y)
+    return Estimate(
+        value=x, sigma=error_bars.of_picture(estimators, light.data, y, x), from_lmmse=0.0
+    )
 
 
-def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLight) -> Estimate:
+def _by_lenslet(
+    solve: Solve, noisy: bool, bars: bool, estimators: Estimators, light: OwnLight
+) -> Estimate:
     """The Estimate of `solve`, on all superpixels at once.
 
     noisy: whether it has a use for the noise.
+    bars: whether it has a standard deviation, which needs the noise too.
     """
     y, truth = light.y[light.inner], light.truth
     rows, columns = y.shape[:2]
@@ -273,10 +278,20 @@ def _by_lenslet(solve: Solve, noisy: bool, estimators: Estimators, light: OwnLig
     sigma = light.data.known_sigma if noisy else 0.0
     found, stats = solve(estimators, y.reshape(rows * columns, -1).T, sigma, truth)
     value = found.T.reshape(rows, columns, -1)
+    left = error_bars.of_picture(estimators, light.data, y, value) if bars else None
     if light.joint is not None:
-        value, inside = light.joint.value.copy(), value
-        value[light.inner] = inside
-    return Estimate(value=value, stats=stats)
+        value = _with_border(light, light.joint.value, value)
+        left = None if left is None else _with_border(light, light.joint.sigma, left)
+    return Estimate(value=value, sigma=left, stats=stats)
+
+
+def _with_border(light: OwnLight, joint: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """The values (lenslet_row, lenslet_column, point) of a method inside, of the joint estimate at
+    the border.
+    """
+    found = joint.copy()
+    found[light.inner] = inside
+    return found
 
 
 BLOCK_MEAN = Estimator(
@@ -284,23 +299,23 @@ BLOCK_MEAN = Estimator(
     sees=Sees.LENSLET_AS_IS,
     phases=footprint.no_more,
     needs_pif=False,
-    estimate=partial(_by_lenslet, block_mean, False),
+    estimate=partial(_by_lenslet, block_mean, False, False),
 )
 TIKHONOV = Estimator(
     name="tikhonov",
     sees=Sees.LENSLET,
-    phases=footprint.no_more,
+    phases=footprint.lmmse_phases,
     options=("alpha",),
     hindsight=True,
-    estimate=partial(_by_lenslet, tikhonov, True),
+    estimate=partial(_by_lenslet, tikhonov, True, True),
 )
 TSVD = Estimator(
     name="tsvd",
     sees=Sees.LENSLET,
-    phases=footprint.no_more,
+    phases=footprint.lmmse_phases,
     options=("rank",),
     hindsight=True,
-    estimate=partial(_by_lenslet, tsvd, True),
+    estimate=partial(_by_lenslet, tsvd, True, True),
 )
 NNLS = Estimator(
     name="nnls",
@@ -308,7 +323,7 @@ NNLS = Estimator(
     phases=footprint.nnls_phases,
     options=("nnls_iterations",),
     in_batches=True,
-    estimate=partial(_by_lenslet, nnls, False),
+    estimate=partial(_by_lenslet, nnls, False, True),
 )
 LMMSE = Estimator(name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse)
 DICTIONARY = Estimator(
@@ -318,5 +333,5 @@ DICTIONARY = Estimator(
     needs_dictionary=True,
     options=("lam", "dictionary"),
     in_batches=True,
-    estimate=partial(_by_lenslet, dictionary, True),
+    estimate=partial(_by_lenslet, dictionary, True, True),
 )

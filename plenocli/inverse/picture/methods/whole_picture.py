@@ -11,7 +11,7 @@ import numpy as np
 
 from plenocli.base.progress import bar
 from plenocli.base.tiling import to_blocks, to_plane
-from plenocli.inverse.picture import footprint
+from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
@@ -74,9 +74,12 @@ def plug_and_play(
     return picture, rule, len(taus)
 
 
-def _from_lmmse(solve: Solve, wide: bool, estimators: Estimators, light: OwnLight) -> Estimate:
-    """The Estimate of `solve`, started from LMMSE, whose sigma it keeps: an upper estimate.
+def _from_lmmse(
+    solve: Solve, wide: bool, factor: float, estimators: Estimators, light: OwnLight
+) -> Estimate:
+    """The Estimate of `solve`, started from LMMSE.
 
+    factor: of its standard deviation, see error_bars.
     wide: whether that may look over 3x3 lenslets, where the noise leaves something to be learnt
         from neighbours.
     """
@@ -103,6 +106,7 @@ def _from_lmmse(solve: Solve, wide: bool, estimators: Estimators, light: OwnLigh
     term = whole_sensor.DataTerm(estimators.svd, shape, y, noise, 2 * error, held)
     picture, rule, rounds = solve(estimators, term, to_plane(x, shape), error)
     found = to_blocks(picture, shape)
+    sigma[inner] = error_bars.of_picture(estimators, light.data, y[inner], found[inner], factor)
     return Estimate(
         value=found,
         sigma=sigma,
@@ -117,11 +121,11 @@ TV = Estimator(
     name="tv",
     sees=Sees.PICTURE,
     phases=footprint.tv_phases,
-    estimate=partial(_from_lmmse, total_variation, False),
+    estimate=partial(_from_lmmse, total_variation, False, error_bars.BY_VARIATION),
 )
 PNP = Estimator(
     name="pnp",
     sees=Sees.PICTURE,
     phases=footprint.pnp_phases,
-    estimate=partial(_from_lmmse, plug_and_play, True),
+    estimate=partial(_from_lmmse, plug_and_play, True, error_bars.BY_MATCHING),
 )

@@ -131,15 +131,22 @@ class Lmmse:
         return self.analysis @ y - self.offset[:, None]
 
     def scales(self, y: np.ndarray) -> np.ndarray:
-        """The scale of each signal: the posterior mean of its logarithm.
+        """The scale of each signal: the posterior mean of its logarithm (see `contrast`).
+
+        y: (pixel, signal).
+
+        Returns (signal,).
+        """
+        return np.exp(np.log(SCALES) @ self.contrast(y))
+
+    def contrast(self, y: np.ndarray) -> np.ndarray:
+        """Probability of each of SCALES, (scale, signal), for each signal.
 
         Coordinates have variance scale power + noise. The prior of log scale is normal, with the
         mean and the deviation (at least 0.2) that make all signals together most likely; one signal
         alone says little where noise is strong.
 
         y: (pixel, signal).
-
-        Returns (signal,).
         """
         likelihood = self._likelihood(self.coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
@@ -151,7 +158,18 @@ class Lmmse:
             middle = prior @ logs
             deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
             prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-        return np.exp(logs @ posterior)
+        return posterior
+
+    def degrees(self, y: np.ndarray) -> float:
+        """Degrees of freedom that the estimate has of an object, the mean over the signals: the
+        trace of its influence matrix, d(A x)/dy at its contrast, brightness included.
+
+        y: (pixel, signal).
+        """
+        stronger = np.outer(self.power, self.scales(y))
+        return len(self.levels) + float(
+            np.mean(np.sum(stronger / (stronger + self.noise[:, None]), axis=0))
+        )
 
 
 def require_noise(sigma: float) -> None:

@@ -117,6 +117,7 @@ def estimators_of(own, options, dictionary=None):
 
 def judged(args):
     """[{"lenslets", "scene", "fitted", "snr_db", "method", "coverage", "z_rms"}]."""
+    from plenocli.inverse.picture.estimate import estimate
     from plenocli.inverse.picture.methods.registry import METHODS as BY_NAME
 
     rows = []
@@ -131,7 +132,7 @@ def judged(args):
                 for method in args.methods:
                     one = estimators_of(own, METHODS[method], args.dictionary)
                     one.svd, one.prior = first.svd, first.prior
-                    found = BY_NAME[METHODS[method]["method"]].reconstruct(one, data)
+                    found = estimate(one, BY_NAME[METHODS[method]["method"]], data)[0]
                     z = (found.value - truth) / found.sigma
                     rows.append(
                         {

@@ -69,7 +69,7 @@ def posterior(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> tuple[np.n
     shape: points (rows, columns) of a block in one band.
 
     Returns (x, sigma), (lenslet_row, lenslet_column, point) each.
-    docs/model.md, "Error bars".
+    docs/model.md, "Spatial reconstruction".
     """
     rows, columns = y.shape[:2]
     signals = y.reshape(rows * columns, -1).T

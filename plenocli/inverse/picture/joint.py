@@ -28,7 +28,7 @@ class JointEstimate:
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
     """LMMSE over 3x3 lenslets with scale x covariance, one scale a picture; steps of sqrt(2), so
     that captures of one kind share what is worked out. sigma is what each lenslet's own light
-    leaves open (docs/model.md, "Error bars").
+    leaves open (docs/model.md, "Spatial reconstruction").
     """
     own = estimators.prior.lmmse(data.known_sigma, data.scene)
     y = estimators.without_stray(data.y)

@@ -132,7 +132,12 @@ def judged(args):
                 for method in args.methods:
                     one = estimators_of(own, METHODS[method], args.dictionary)
                     one.svd, one.prior = first.svd, first.prior
-                    found = estimate(one, BY_NAME[METHODS[method]["method"]], data)[0]
+                    by_name = BY_NAME[METHODS[method]["method"]]
+                    found = (
+                        by_name.reconstruct(one, data)
+                        if args.alone
+                        else estimate(one, by_name, data)[0]
+                    )
                     z = (found.value - truth) / found.sigma
                     rows.append(
                         {
@@ -251,6 +256,9 @@ def main():
     parser.add_argument("--finer", action="store_true", help="capture three times finer")
     parser.add_argument(
         "--wrong", type=float, default=0.0, help="relative error of the lenslets' focal length"
+    )
+    parser.add_argument(
+        "--alone", action="store_true", help="the methods alone, which believe matrix and noise"
     )
     parser.add_argument("--fit", action="store_true", help="print the constants, judge nothing")
     args = parser.parse_args()

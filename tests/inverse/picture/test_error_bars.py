@@ -175,3 +175,14 @@ def test_a_photograph_lies_in_the_intervals_of_every_method(photographed, snr_db
         found = METHODS[name].reconstruct(one, data)
         held = np.mean(np.abs(found.value - truth) < 1.96 * found.sigma)
         assert 0.90 < held < 0.99, (name, overlap, held)
+
+
+def test_detail_that_is_given_up_is_in_the_error_bars(lens):
+    """Drawn halfway to the mean of each field, as the guard does, the intervals still hold."""
+    _, lmmse, _ = lens
+    x, y = drawn(lens, 1.0, 1500, 9)
+    contrast = lmmse.contrast(y)
+    found = lmmse.apply(y, lmmse.scales(y))
+    drawn_back = 0.5 * (found - found.mean(axis=0)) + found.mean(axis=0)
+    left = error_bars.about(drawn_back - found, error_bars.spread(lmmse, y, contrast))
+    assert np.mean(np.abs(drawn_back - x) < 1.96 * left) == pytest.approx(0.95, abs=0.01)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from plenocli.inverse.picture.error_bars import about
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.trust.believe import CONTINUOUS, Belief
 from plenocli.inverse.picture.trust.continuity import LEAST_REFERENCE, Jumps, jumps
@@ -37,7 +38,7 @@ def guarded(
 ) -> tuple[Reconstruction, float]:
     """(the picture with as much of its detail as `detail_kept` says, that share).
 
-    Its standard deviation grows by that of the detail that is given up, as photographs have it.
+    Its standard deviation grows by the detail that is given up, see error_bars.about.
 
     y: (lenslet_row, lenslet_column, pixel) own light.
     """
@@ -46,8 +47,6 @@ def guarded(
     kept = detail_kept(found.value, mean, belief, shape)
     if kept == 1:
         return found, kept
-    sigma = found.sigma
-    if sigma is not None:
-        lost = (lmmse.scales(stacked) * lmmse.variance.mean()).reshape(*y.shape[:2], 1)
-        sigma = np.sqrt((kept * sigma) ** 2 + (1 - kept) ** 2 * lost)
-    return replace(found, value=mean + kept * (found.value - mean), sigma=sigma), kept
+    drawn = mean + kept * (found.value - mean)
+    sigma = None if found.sigma is None else about(drawn - found.value, found.sigma)
+    return replace(found, value=drawn, sigma=sigma), kept

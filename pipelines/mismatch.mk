@@ -2,7 +2,7 @@
 # described (nominal), and with the matrix that made the capture (right). make -f pipelines/mismatch.mk RUN=runs/mine SIZE=full
 #   SIZE=half    half as many points and pixels a side, lenslets half as wide; full is CONFIG as it stands
 #   COUNT        lenslets a side, at most
-#   METHODS      by the nominal matrix; RIGHT: by the right one
+#   METHODS      by the nominal matrix; RIGHT: by the right one; FIT: by that of the camera fitted to each capture
 # What each row disturbs stands in mismatch.py. Lenslets are isolated, as in the paper's experiment.
 CONFIG ?= sample_configs/seed_spatial.toml
 SIZE ?= half
@@ -69,14 +69,27 @@ $(foreach row,$(CHANGED),$(eval $(call changed,$(row))))
 $(RUN)/dictionaries/%.h5: $(RUN)/pifs/%.h5 | $(RUN)/dictionaries/
 	$(P) learn-dict $(TRAINING) --pif $< --batch $(BATCH) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 --synthesis -o $@ --overwrite
 
-# all captures of a method in one run, which sets it up once; a file says that they are done. $(1): folder, $(2): method, $(3): more
+# all captures of a method in one run, which sets it up once; a file says that they are done. $(1): folder, $(2): method
 define by_nominal
 $(RUN)/$(1)/$(2)/.done: $(CAPTURES) $(FAST_CAPTURES) $(PIFS) $(if $(filter dictionary,$(2)),$(RUN)/dictionaries/nominal.h5 $(RUN)/dictionaries/nominal-fast.h5) | $(RUN)/$(1)/$(2)/
-	$(P) reconstruct $(CAPTURES) --pif $(RUN)/pifs/nominal.h5 $(call OPTIONS,$(2)) $(call DICTIONARY,$(2),nominal) $(3) -o $(RUN)/$(1)/$(2) --overwrite
-	$(foreach capture,$(FAST_CAPTURES),$(P) reconstruct $(capture) --pif $(RUN)/pifs/nominal-fast.h5 $(call OPTIONS,$(2)) $(call DICTIONARY,$(2),nominal-fast) $(3) -o $(RUN)/$(1)/$(2)/$(notdir $(capture)) --overwrite &&) touch $$@
+	$(P) reconstruct $(CAPTURES) --pif $(RUN)/pifs/nominal.h5 $(call OPTIONS,$(2)) $(call DICTIONARY,$(2),nominal) -o $(RUN)/$(1)/$(2) --overwrite
+	$(foreach capture,$(FAST_CAPTURES),$(P) reconstruct $(capture) --pif $(RUN)/pifs/nominal-fast.h5 $(call OPTIONS,$(2)) $(call DICTIONARY,$(2),nominal-fast) -o $(RUN)/$(1)/$(2)/$(notdir $(capture)) --overwrite &&) touch $$@
 endef
 $(foreach method,$(METHODS),$(eval $(call by_nominal,nominal,$(method))))
-$(foreach method,$(FIT),$(eval $(call by_nominal,fit,$(method),--fit --camera $(RUN)/cameras/nominal.toml)))
+
+# the camera as described made true by the capture itself, and its matrix
+$(RUN)/fitted/%.toml: $(RUN)/captures/%.h5 | $(RUN)/cameras/nominal.toml $(RUN)/cameras/nominal-fast.toml $(RUN)/fitted/
+	$(P) fit-camera $< --camera $(RUN)/cameras/nominal$(if $(filter %-fast,$*),-fast).toml -o $@ --overwrite
+
+$(RUN)/fitted/%.h5: $(RUN)/fitted/%.toml
+	$(P) simulate-pif $< --model $(or $(MODEL_$(lastword $(subst --, ,$*))),fresnel --accuracy 1e-5) --superpixels 1x1 --coherent-ring 0 -o $@ --overwrite
+
+FITTED := $(call named,none $(OWN) $(FAST) veil-1 dead)
+define by_fit
+$(RUN)/fit/$(1)/.done: $(FITTED:%=$(RUN)/fitted/%.h5) | $(RUN)/fit/$(1)/
+	$(foreach name,$(FITTED),$(P) reconstruct $(RUN)/captures/$(name).h5 --pif $(RUN)/fitted/$(name).h5 $(call OPTIONS,$(1)) -o $(RUN)/fit/$(1)/$(name).h5 --overwrite &&) touch $$@
+endef
+$(foreach method,$(FIT),$(eval $(call by_fit,$(method))))
 
 define by_right
 $(RUN)/right/$(1)/.done: $(CAPTURES) $(FAST_CAPTURES) $(PIFS) | $(RUN)/right/$(1)/

@@ -112,6 +112,7 @@ def positive(text: str) -> float:
 
 
 FRACTION = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30, 1.0))
+SHARE = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-3, 0.5))
 
 
 class Whole(click.IntRange):

@@ -6,7 +6,18 @@ import click
 
 from plenocli.cli import options
 
-METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionary", "tv", "pnp")
+METHODS = (
+    "auto",
+    "block-mean",
+    "tikhonov",
+    "tsvd",
+    "nnls",
+    "lmmse",
+    "weighted",
+    "dictionary",
+    "tv",
+    "pnp",
+)
 
 
 @click.command("reconstruct", short_help="Recover the picture behind each lenslet from captures.")
@@ -84,6 +95,14 @@ METHODS = ("auto", "block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "dictionar
     help="Stop nnls after so many gradient steps; default converged.",
 )
 @click.option(
+    "--hold-out",
+    type=options.SHARE,
+    help=(
+        "Leave this share of the pixels out, such as 0.1, and say how well --method weighted "
+        "predicts them: a judgement of the pif on a capture whose truth nobody knows."
+    ),
+)
+@click.option(
     "--clip", is_flag=True, help="Set negative values to zero; their share is reported either way."
 )
 @options.file_type("h5", "exr")
@@ -111,6 +130,7 @@ def command(
     rank: int | None,
     lam: float | None,
     nnls_iterations: int | None,
+    hold_out: float | None,
     clip: bool,
     suffix: str,
     output: Path,
@@ -126,6 +146,9 @@ def command(
     pnp takes turns between the data of every lenslet and a denoiser that sees the whole picture; tv
     prefers flat areas. auto captures pieces of training photographs with this matrix and this
     noise, and takes what does best on them.
+
+    weighted is lmmse for captures of real cameras, with --calibration: superpixels are sampled
+    about their lenslets, evened by white, and every pixel counts by its own noise.
 
     A pif of a camera with filters in its pupil gives a picture for each band, from one linear model
     of all bands: with simulate-pif --spectral-step auto for the whole width of the filters, else
@@ -144,6 +167,8 @@ def command(
       plenocli reconstruct capture.h5 --pif pif.h5 --method dictionary \\
           --dictionary d.h5 -o picture.exr
       plenocli reconstruct shots/*.h5 --pif pif.h5 --workers 2 -o pictures/
+      plenocli reconstruct shot.png --calibration cal.h5 --pif pif.h5 --method weighted \\
+          --hold-out 0.1 -o picture.h5
       plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
     """
     from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
@@ -162,6 +187,7 @@ def command(
             rank=rank,
             lam=lam,
             nnls_iterations=nnls_iterations,
+            hold_out=hold_out,
             clip=clip,
             seed=seed,
             workers=workers,

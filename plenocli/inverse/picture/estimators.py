@@ -43,6 +43,7 @@ class Options:
     rank: directions kept.
     lam: weight of |c|_1, in the scaled problem of learn-dict.
     nnls_iterations: gradient steps after which to stop.
+    hold_out: share of the pixels that are left out and predicted, to judge the matrix.
     seed: of every random stream.
     """
 
@@ -53,6 +54,7 @@ class Options:
     rank: int | None = None
     lam: float | None = None
     nnls_iterations: int | None = None
+    hold_out: float | None = None
     seed: int = 0
 
 

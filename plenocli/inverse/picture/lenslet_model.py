@@ -105,6 +105,8 @@ class Superpixels:
     pif_digest: SHA-256 of the pif that a simulated capture was made with.
     saturated: like y, which pixels were clipped at the value that they have; None where the capture
         does not say.
+    variance: like y, of every pixel, inf where it counts for nothing; None where all are alike or
+        nothing is known.
     """
 
     y: np.ndarray
@@ -113,6 +115,7 @@ class Superpixels:
     accuracy: AccuracyRecord | None = None
     pif_digest: str | None = None
     saturated: np.ndarray | None = None
+    variance: np.ndarray | None = None
 
     @property
     def sigma(self) -> float | None:

@@ -19,7 +19,11 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+<<<<<<< HEAD
 from plenocli.inverse.picture.nuisances.vignetting import falloff
+=======
+from plenocli.inverse.picture.real_light import along_the_grid
+>>>>>>> fc6a9fa (Pictures of real cameras: superpixels about their lenslets, evened by white, every pixel with its own noise, judged by pixels that were left out)
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
@@ -53,7 +57,7 @@ def superpixels(
             "use --calibration with --method block-mean, or demux",
         )
     if calibration is not None:
-        return _along_the_grid(capture, system, calibration, where)
+        return along_the_grid(capture, system, calibration, where)
     light = capture.metadata.illuminant
     if system.illuminant and light and light != system.illuminant:
         note(
@@ -103,6 +107,7 @@ def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, 
     return signal, np.broadcast_to(white, signal.shape)
 
 
+<<<<<<< HEAD
 def _along_the_grid(
     capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
 ) -> Superpixels:
@@ -156,6 +161,8 @@ def _clipped(capture: Capture, calibration: Calibration) -> np.ndarray | None:
     return extract(clipped, windows.origin, windows.shape) == 1
 
 
+=======
+>>>>>>> fc6a9fa (Pictures of real cameras: superpixels about their lenslets, evened by white, every pixel with its own noise, judged by pixels that were left out)
 def _tiles(capture: Capture, system: LensletMatrix, path: Path | None) -> tuple[int, int]:
     """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
     system matrix.

@@ -42,7 +42,7 @@ class Settings:
     """Options of the command.
 
     method: name of one of METHODS.
-    overlap, noise_sigma, alpha, rank, lam, nnls_iterations: as in Options.
+    overlap, noise_sigma, alpha, rank, lam, nnls_iterations, hold_out: as in Options.
     dictionary: artefact of learn-dict.
     training: photographs for the statistics; () for those of scikit-image.
     truth: what chooses a weight with hindsight.
@@ -61,6 +61,7 @@ class Settings:
     rank: int | None = None
     lam: float | None = None
     nnls_iterations: int | None = None
+    hold_out: float | None = None
     clip: bool = False
     seed: int = 0
     workers: int = 1
@@ -76,6 +77,7 @@ class Settings:
             rank=self.rank,
             lam=self.lam,
             nnls_iterations=self.nnls_iterations,
+            hold_out=self.hold_out,
             seed=self.seed,
         )
 
@@ -405,6 +407,7 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
         ("rank", "rank", settings.rank),
         ("lam", "lambda", settings.lam),
         ("nnls_iterations", "nnls-iterations", settings.nnls_iterations),
+        ("hold_out", "hold-out", settings.hold_out),
         ("dictionary", "dictionary", settings.dictionary),
     ):
         if value is not None and option not in method.options:

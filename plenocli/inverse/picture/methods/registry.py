@@ -12,9 +12,21 @@ from plenocli.inverse.picture.methods.per_lenslet import (
     TSVD,
 )
 from plenocli.inverse.picture.methods.trial import AUTO
+from plenocli.inverse.picture.methods.weighted import WEIGHTED
 from plenocli.inverse.picture.methods.whole_picture import PNP, TV
 
-ALL: tuple[Method, ...] = (AUTO, BLOCK_MEAN, TIKHONOV, TSVD, NNLS, LMMSE, DICTIONARY, TV, PNP)
+ALL: tuple[Method, ...] = (
+    AUTO,
+    BLOCK_MEAN,
+    TIKHONOV,
+    TSVD,
+    NNLS,
+    LMMSE,
+    WEIGHTED,
+    DICTIONARY,
+    TV,
+    PNP,
+)
 """In the order in which --method offers them."""
 METHODS = {method.name: method for method in ALL}
 

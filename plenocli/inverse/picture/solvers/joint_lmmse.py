@@ -226,14 +226,7 @@ def prepare_joint(
     used = len(analysis)
     response = np.stack([analysis @ block for block in np.asarray(blocks, float)])
     footprint = _footprints(response, offsets, object_shape, used * count)
-    margin = 2 * RING * np.array([rows, columns])
-    filtered = _filter(footprint, autocovariance, margin)
-    if count > 1 or bands[0, 0] != 1:
-        filtered = np.einsum(
-            "ab,kbrc->karc", bands, filtered.reshape(used, count, *filtered.shape[1:])
-        ).reshape(filtered.shape)
-
-    data, cross = _covariances(footprint, filtered, used, object_shape)
+    data, cross = _covariances(footprint, autocovariance, bands, used, object_shape)
     rounding = _rounding(footprint.reshape(used, -1), np.abs(autocovariance).sum(), brightest)
     data[np.diag_indices(len(data))] += sigma**2 + np.tile(rounding, len(data) // used)
     middle = autocovariance.shape[0] // 2
@@ -268,18 +261,50 @@ def loud_directions(
     return svd.u[:, :used] @ vectors[:, power > min(least, power[-1] / 2)]
 
 
+def ring_covariances(
+    response: np.ndarray,
+    offsets: np.ndarray,
+    object_shape: tuple[int, int],
+    autocovariance: np.ndarray,
+    bands: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a stationary scene makes of the superpixels within one ring, without noise.
+
+    response: (offset, k, point) objects to the k coordinates of a superpixel, points of several
+        bands one band after the other.
+    offsets, object_shape, autocovariance: as in `prepare_joint`.
+    bands: (band, band) covariance of the bands at a point.
+
+    Returns (9 k, 9 k), the covariance of the ring's coordinates, and (point, 9 k), that of the
+    middle object with them.
+    """
+    used = response.shape[1]
+    footprint = _footprints(response, offsets, object_shape, used * len(bands))
+    return _covariances(footprint, autocovariance, bands, used, object_shape)
+
+
 def _covariances(
-    footprint: np.ndarray, filtered: np.ndarray, used: int, shape: tuple[int, int]
+    footprint: np.ndarray,
+    autocovariance: np.ndarray,
+    bands: np.ndarray,
+    used: int,
+    shape: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
     """(data, cross) of JointLmmse, without noise.
 
     footprint: (coordinate times band, row, column).
-    filtered: the same, filtered by the scene's covariance and larger by 2 RING objects on each
-        side.
+    autocovariance: of the scene.
+    bands: (band, band) covariance of the bands at a point.
     used: coordinates of a superpixel.
     shape: (rows, columns) of an object in one band.
     """
     (rows, columns), flat, ring = shape, footprint.reshape(used, -1), _ring(RING)
+    # larger by 2 RING objects on each side
+    filtered = _filter(footprint, autocovariance, 2 * RING * np.array(shape))
+    if len(bands) > 1 or bands[0, 0] != 1:
+        filtered = np.einsum(
+            "ab,kbrc->karc", bands, filtered.reshape(used, len(bands), *filtered.shape[1:])
+        ).reshape(filtered.shape)
 
     def shifted(dr: int, dc: int) -> np.ndarray:
         """The filtered footprints as seen by a lenslet (dr, dc) from the one whose

@@ -1,0 +1,138 @@
+"""LMMSE over 3x3 lenslets with every pixel's own noise: for captures of real cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from plenocli.base.random_streams import stream
+from plenocli.inverse.picture import hold_out
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.footprint import joint_phases
+from plenocli.inverse.picture.hold_out import HeldOut
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
+from plenocli.inverse.picture.solvers.joint_lmmse import needed_reach
+from plenocli.inverse.picture.solvers.lmmse import require_noise
+from plenocli.inverse.picture.solvers.weighted_lmmse import WeightedLmmse, prepare_weighted
+from plenocli.inverse.prior.natural_images import autocovariance
+
+ROUNDS = 1
+"""Of what the matrix does not explain and the contrast in turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightedStats:
+    """What LMMSE with weights found.
+
+    scale: factor of the photographs' covariance, geometric mean of the lenslets.
+    misfit: what the matrix leaves over, in terms of the noise of each pixel, median of the
+        lenslets; the noise of each is taken to be so much larger.
+    held_out: predictions of pixels that were left out.
+    """
+
+    scale: float
+    misfit: float
+    held_out: tuple[HeldOut, ...]
+
+    @property
+    def rule(self) -> str:
+        """In words."""
+        left = f"every pixel with its own noise, of which {self.misfit:.2f} times is left over"
+        return "; ".join([left, *(one.sentence for one in self.held_out)])
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values, as artefacts hold them."""
+        told: dict[str, Any] = {"scale": self.scale, "misfit": self.misfit, "rule": self.rule}
+        held = {"held_out": [one.as_json() for one in self.held_out]}
+        return told | (held if self.held_out else {})
+
+
+def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
+    """LMMSE from the superpixels as they are, neighbours' light included.
+
+    light: of a real capture, with a variance for every pixel; or of another, whose noise is known.
+
+    Raises NumericsError where the noise is not known.
+    """
+    y, weight = light.y, _weights(estimators, light.data)
+    solver = _prepare(estimators, light.data, weight)
+    misfit = np.ones((*y.shape[:2], 1))
+    for _ in range(ROUNDS):
+        scale = solver.contrasts(y, weight / misfit**2)
+        made = solver.apply(y, weight / misfit**2, scale, only_superpixels=True).superpixels
+        misfit = np.maximum(misfit, _left_over(solver, y, weight, made))
+    scale = solver.contrasts(y, weight / misfit**2)
+    found = solver.apply(y, weight / misfit**2, scale)
+    share = estimators.options.hold_out
+    held_out: tuple[HeldOut, ...] = ()
+    if share:
+        held_out = hold_out.judge(
+            estimators.system,
+            y,
+            weight,
+            lambda w: solver.apply(y, w / misfit**2, scale, only_superpixels=True).superpixels,
+            share,
+            stream(estimators.options.seed, "hold out"),
+        )
+    seen = weight.any(axis=2)
+    stats = WeightedStats(
+        scale=float(np.exp(np.mean(np.log(scale[seen])))) if seen.any() else 1.0,
+        misfit=float(np.median(misfit[seen])) if seen.any() else 1.0,
+        held_out=held_out,
+    )
+    return Estimate(value=found.value, sigma=found.sigma, stats=stats)
+
+
+def _weights(estimators: Estimators, data: Superpixels) -> np.ndarray:
+    """One over the variance of every pixel, with that of the matrix by its own record; 0 where it
+    counts for nothing.
+    """
+    record = estimators.system.accuracy
+    error = 0.0 if record is None or record.estimated is None else record.estimated
+    model = (error * np.nan_to_num(data.y)) ** 2
+    if data.variance is not None:
+        return np.where(np.isfinite(data.variance), 1 / (data.variance + model), 0.0)
+    sigma = estimators.options.noise_sigma or data.sigma or 0.0
+    require_noise(sigma)
+    return 1 / (sigma**2 + model)
+
+
+def _prepare(estimators: Estimators, data: Superpixels, weight: np.ndarray) -> WeightedLmmse:
+    """The solver, for the noise that this capture has."""
+    system = estimators.system
+    seen = weight.any(axis=2)
+    typical = np.median(weight[seen], axis=0) if seen.any() else np.zeros(weight.shape[2])
+    least = 1e-6 * max(float(typical.max()), np.finfo(float).tiny)
+    reach = needed_reach(system.object_shape, system.offsets)
+    _, covariance = autocovariance(estimators.prior.pictures(data.scene), reach)
+    return prepare_weighted(
+        system,
+        covariance,
+        1 / np.sqrt(np.maximum(typical, least)),
+        estimators.prior.bands(),
+    )
+
+
+def _left_over(
+    solver: WeightedLmmse, y: np.ndarray, weight: np.ndarray, made: np.ndarray
+) -> np.ndarray:
+    """What each lenslet leaves over, in terms of the noise, at least 1: (lenslet_row,
+    lenslet_column, 1).
+
+    made: like y, A x.
+    """
+    square = np.where(weight > 0, weight * (made - y) ** 2, 0).sum(axis=2, keepdims=True)
+    free = (weight > 0).sum(axis=2, keepdims=True) - solver.basis.shape[1] / 2
+    return np.sqrt(np.maximum(square / np.maximum(free, 1), 1.0))
+
+
+WEIGHTED = Estimator(
+    name="weighted",
+    sees=Sees.LENSLET_AS_IS,
+    phases=joint_phases,
+    options=("hold_out",),
+    estimate=weighted,
+)

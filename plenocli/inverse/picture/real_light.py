@@ -1,0 +1,279 @@
+"""Superpixels of a real capture along the grid of a calibration, in units of A x.
+
+Lenslets of a real array lie between pixels, and move by parts of a pixel between white image and
+capture; pixels have noise, dust and gains of their own. So every superpixel is sampled about its
+lenslet's centre (quintic splines: the image of the pupil is finer than the pixels by several
+times), evened by the white image, and each pixel keeps the variance that it has then.
+docs/model.md, "Real light".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.base.errors import InputError
+from plenocli.base.progress import note
+from plenocli.base.text import by
+from plenocli.forward.sensor.noise import Noise
+from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.calibration.calibration import there
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
+    from plenocli.inverse.calibration.calibration import Calibration
+
+CENTRED = 0.01
+"""px: windows that lie so well about their lenslets are taken as they are."""
+FARTHEST = 2.0
+"""px: more than this between white image and capture is no motion of the array."""
+FLAT = 0.25
+"""Share of the lenslets, those with the least structure, that tell the motion."""
+DARK = 0.02
+"""Of the brightest pixel of white, below which a pixel has nothing to tell."""
+UNLIKE = 6.0
+"""Standard deviations from which on a pixel of white is not that of all lenslets: dust."""
+DUST = 0.5
+"""Of the white that all lenslets have, below which a pixel counts for nothing."""
+BRIGHT = 0.8
+"""Of the brightest pixel of white in a superpixel, where the noise is told from differences."""
+NORMAL = 1.4826
+"""Standard deviation over median absolute deviation, of a normal distribution."""
+
+
+def along_the_grid(
+    capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
+) -> Superpixels:
+    """A capture cut out along a calibration's grid, with the variance of every pixel.
+
+    system: the system matrix, with the pixels of the calibration's windows, or with pixels that
+        hold a whole number of them.
+    calibration: with windows, white and dark.
+    where: the calibration's file, for messages.
+
+    Returns y, NaN where a pixel counts for nothing, and its variance, inf there.
+    Raises InputError where sizes differ.
+    """
+    windows, window_shape = there(calibration.windows), there(calibration.windows).shape
+    bins = _bins(window_shape, system.pixel_shape, where)
+    signal = _signal(capture, calibration)
+    white = there(there(calibration.white).superpixels)
+    count = calibration.grid.valid.shape
+    white = np.broadcast_to(white, (*count, white.shape[-1])).astype(float)
+    cut = extract(signal, windows.origin, window_shape)
+    lit = calibration.grid.valid & np.isfinite(white).any(axis=2) & np.isfinite(cut).any(axis=2)
+    usable = np.isfinite(cut) & np.isfinite(white) & lit[..., None]
+    over = capture.levels.white - float(np.max(capture.levels.black))
+    usable &= cut < over if np.isfinite(over) else True
+    moved = motion(cut, white, usable, window_shape)
+    middle = windows.origin + (np.asarray(window_shape) - 1) / 2
+    aside = np.where(lit[..., None], calibration.grid.centres - middle, 0.0)
+    noise = _noise(capture, calibration, cut, white, usable)
+    if np.abs(aside).max(initial=0) > CENTRED or np.abs(moved).max() > CENTRED:
+        image = _pasted(white, windows.origin, window_shape, signal.shape)
+        places = np.where(lit[..., None], middle + aside, 0.0)
+        cut = sampled(signal, places + moved, window_shape)
+        white = sampled(image, places, window_shape)
+    if np.abs(moved).max() > CENTRED:
+        note(
+            f"{capture.name}: the lenslets lie {moved[0]:+.2f} rows and {moved[1]:+.2f} columns "
+            "from where the white image has them; superpixels are taken there"
+        )
+    cut, white, usable = (_binned(a, window_shape, bins) for a in (cut, white, usable * 1.0))
+    even = system.blocks.sum(axis=(0, 2))
+    white, dusty = typical_white(white, lit)
+    usable = (usable > 0.99) & ~dusty & (even > DARK * even.max()) & (white > 0)
+    factor = np.where(usable, even / np.where(usable, white, 1.0), 0.0)
+    variance = noise.variance(np.maximum(np.where(usable, cut, 0.0), 0.0)) / np.prod(bins)
+    return Superpixels(
+        y=np.where(usable, np.where(usable, cut, 0.0) * factor, np.nan),
+        variance=np.where(usable, variance * factor**2, np.inf),
+    )
+
+
+def motion(
+    cut: np.ndarray, white: np.ndarray, usable: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
+    """Where the lenslets of a capture lie, from where the white image has them.
+
+    An evenly lit superpixel is b white(p - d) + o; d is fitted with b and o to first order in every
+    lenslet, and the median over those with the least structure taken.
+
+    cut, white: (lenslet_row, lenslet_column, pixel).
+    usable: like cut.
+    shape: (rows, columns) of a superpixel.
+
+    Returns d (2,) rows and columns, px; 0 where it is not above four standard errors.
+    """
+    found = []
+    for y, w, good in zip(*(a.reshape(-1, a.shape[-1]) for a in (cut, white, usable))):
+        if not good.all():
+            continue
+        down, right = np.gradient(w.reshape(shape))
+        terms = np.stack([w, -down.ravel(), -right.ravel(), np.ones_like(w)], axis=1)
+        fitted = np.linalg.lstsq(terms, y, rcond=None)[0]
+        if fitted[0] > DARK:
+            rest = np.sqrt(np.mean((y - terms @ fitted) ** 2)) / (fitted[0] * w.max())
+            found.append([rest, *(fitted[1:3] / fitted[0])])
+    if len(found) < 8:
+        return np.zeros(2)
+    rests = np.array(found)
+    calm = rests[np.argsort(rests[:, 0])[: max(8, int(FLAT * len(rests)))], 1:]
+    shift = np.median(calm, axis=0)
+    error = NORMAL * np.median(np.abs(calm - shift), axis=0) * np.sqrt(np.pi / 2 / len(calm))
+    sure = (np.abs(shift) > 4 * error) & (np.abs(shift) < FARTHEST)
+    return np.where(sure, shift, 0.0)
+
+
+def sampled(image: np.ndarray, centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Windows of an image about places between its pixels, by quintic splines.
+
+    image: (row, column), NaN where a pixel counts for nothing.
+    centres: (.., 2) px.
+    shape: (rows, columns) of a window, px.
+
+    Returns (.., pixel), NaN near pixels that count for nothing and off the image.
+    """
+    from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates
+
+    lost = ~np.isfinite(image)
+    if lost.any():
+        nearest = distance_transform_edt(lost, return_distances=False, return_indices=True)
+        image = image[tuple(nearest)]
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in shape)
+    place = np.empty((2, *centres.shape[:-1], *shape))
+    place[0] = centres[..., 0, None, None] + rows[:, None]
+    place[1] = centres[..., 1, None, None] + columns
+    values = map_coordinates(image, place, order=5, mode="nearest")
+    size = np.array(image.shape).reshape(2, *[1] * (place.ndim - 1))
+    off = ((place < -1) | (place > size)).any(axis=0)
+    if lost.any():
+        spoilt = binary_dilation(lost, iterations=1)
+        at = np.clip(np.rint(place), 0, size - 1).astype(int)
+        off |= spoilt[at[0], at[1]]
+    return np.where(off, np.nan, values).reshape(*centres.shape[:-1], -1)
+
+
+def typical_white(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The white image with less noise: what all lenslets have in common, times the brightness of
+    each; where a pixel differs from that beyond the noise, its own.
+
+    white: (lenslet_row, lenslet_column, pixel).
+    lit: (lenslet_row, lenslet_column), which of them count.
+
+    Returns it, and which pixels lie under dust.
+    """
+    own = np.where(np.isfinite(white), white, 0.0)
+    level = own.mean(axis=2, keepdims=True)
+    if np.count_nonzero(lit) < 16:
+        return own, np.zeros(white.shape, bool)
+    shares = own[lit] / np.where(level[lit] > 0, level[lit], 1.0)
+    common = np.median(shares, axis=0)
+    spread = NORMAL * np.median(np.abs(shares - common), axis=0)
+    unlike = np.abs(own - level * common) > UNLIKE * spread * level
+    return np.where(unlike, own, level * common), own < DUST * level * common
+
+
+def _bins(
+    window: tuple[int, int], pixels: tuple[int, int], where: str | Path | None
+) -> tuple[int, int]:
+    """Pixels (rows, columns) of the sensor in one of the matrix."""
+    bins = window[0] // pixels[0], window[1] // pixels[1]
+    if (bins[0] * pixels[0], bins[1] * pixels[1]) != tuple(window) or 0 in bins:
+        raise InputError(
+            (
+                f"holds windows of {by(window)} pixels, the system matrix {by(pixels)}, which is "
+                "no whole part of them"
+            ),
+            where,
+            "simulate-pif with pixels_per_lenslet as measured, or a whole part of it",
+        )
+    return bins
+
+
+def _signal(capture: Capture, calibration: Calibration) -> np.ndarray:
+    """(row, column) above the dark level, at the calibration's exposure; NaN where masked."""
+    dark = there(calibration.dark).mean
+    if dark.ndim == 2 and dark.shape != capture.shape:
+        raise InputError(
+            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
+            capture.metadata.path,
+            "use captures of the calibrated camera",
+        )
+    reference = calibration.sensor.exposure
+    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
+    signal = (capture.mosaic - dark) * scale
+    if capture.mask is not None:
+        signal[capture.mask] = np.nan
+    return signal
+
+
+def _pasted(
+    superpixels: np.ndarray, origin: np.ndarray, shape: tuple[int, int], sensor: tuple[int, ...]
+) -> np.ndarray:
+    """An image (row, column) of superpixels where they lie; between them the nearest pixel."""
+    from scipy.ndimage import distance_transform_edt
+
+    image = np.full(sensor, np.nan)
+    for window, (row, column) in zip(
+        superpixels.reshape(-1, *shape), origin.reshape(-1, 2).tolist()
+    ):
+        if np.isfinite(window).any() and row >= 0 and column >= 0:
+            image[row : row + shape[0], column : column + shape[1]] = window
+    nearest = distance_transform_edt(
+        ~np.isfinite(image), return_distances=False, return_indices=True
+    )
+    return image[tuple(nearest)]
+
+
+def _binned(values: np.ndarray, shape: tuple[int, int], bins: tuple[int, int]) -> np.ndarray:
+    """(.., pixel) averaged over bins (rows, columns) of pixels."""
+    rows, columns = shape[0] // bins[0], shape[1] // bins[1]
+    parts = values.reshape(*values.shape[:-1], rows, bins[0], columns, bins[1])
+    return parts.mean(axis=(-3, -1)).reshape(*values.shape[:-1], -1)
+
+
+def _noise(
+    capture: Capture,
+    calibration: Calibration,
+    cut: np.ndarray,
+    white: np.ndarray,
+    usable: np.ndarray,
+) -> Noise:
+    """Of a pixel: as the capture tells, as the calibration does, else from the capture itself."""
+    if capture.noise is not None and capture.noise.without_signal > 0:
+        return capture.noise
+    sensor = calibration.sensor
+    if sensor.gain is not None:
+        return Noise(gain=sensor.gain, read_variance=sensor.read_variance)
+    found = transfer_noise(cut, white, usable, there(calibration.windows).shape)
+    # a sensor without noise is none
+    least = max(sensor.read_variance, (1e-6 * float(np.nanmax(np.abs(white)))) ** 2)
+    return Noise(gain=found, read_variance=least)
+
+
+def transfer_noise(
+    cut: np.ndarray, white: np.ndarray, usable: np.ndarray, shape: tuple[int, int]
+) -> float:
+    """Photon transfer of one capture: the variance of mixed second differences of pixels, which
+    what lenslets show has little of, against their level.
+
+    cut, white: (lenslet_row, lenslet_column, pixel).
+    usable: like cut.
+    shape: (rows, columns) of a superpixel, px.
+
+    Returns the variance for one unit of signal.
+    """
+    peak = np.nanmax(np.where(usable, white, 0.0), axis=2, keepdims=True)
+    bright = np.where(usable & (white > BRIGHT * peak), cut, np.nan).reshape(-1, *shape)
+    second = bright[:, 2:] - 2 * bright[:, 1:-1] + bright[:, :-2]
+    mixed = (second[:, :, 2:] - 2 * second[:, :, 1:-1] + second[:, :, :-2]) / 6
+    level = bright[:, 1:-1, 1:-1]
+    good = np.isfinite(mixed) & (level > 0)
+    if np.count_nonzero(good) < 100:
+        return 0.0
+    share = np.abs(mixed[good]) / np.sqrt(level[good])
+    return float((NORMAL * np.median(share)) ** 2)

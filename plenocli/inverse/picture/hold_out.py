@@ -63,8 +63,8 @@ class HeldOut:
         which = "of lenslets that show something" if self.structured else "of all lenslets"
         return (
             f"{self.pixels} pixels {which} left out in patches of {self.patch} x {self.patch}: "
-            f"predicted within {self.model:.2%} of white (noise {self.noise:.2%}), with what is left "
-            f"over around {self.both:.2%}; from the pixels around {self.neighbours:.2%}, over "
+            f"predicted within {self.model:.2%} of white (noise {self.noise:.2%}), with what is "
+            f"left over around {self.both:.2%}; from the pixels around {self.neighbours:.2%}, over "
             f"white {self.neighbours_over_white:.2%}; block mean {self.block_mean:.2%}"
         )
 
@@ -76,7 +76,7 @@ def judge(
     predict: Predict,
     share: float,
     rng: np.random.Generator,
-    patches: tuple[int, ...] = PATCHES,
+    patches: tuple[int, ...],
 ) -> tuple[HeldOut, ...]:
     """Leave pixels out and predict them.
 

@@ -19,6 +19,8 @@ from plenocli.inverse.picture.solvers.lmmse import require_noise
 from plenocli.inverse.picture.solvers.weighted_lmmse import WeightedLmmse, prepare_weighted
 from plenocli.inverse.prior.natural_images import autocovariance
 
+BRIGHTNESS = 0.2
+"""Mean of the photographs that the statistics are from, about."""
 ROUNDS = 1
 """Of what the matrix does not explain and the contrast in turn."""
 
@@ -57,7 +59,8 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
 
     Raises NumericsError where the noise is not known.
     """
-    y, weight = light.y, _weights(estimators, light.data)
+    recorded, unit = _weights(estimators, light.data), _unit(estimators, light.y)
+    y, weight = np.where(recorded > 0, light.y, 0) / unit, recorded * unit**2
     solver = _prepare(estimators, light.data, weight)
     misfit = np.ones((*y.shape[:2], 1))
     for _ in range(ROUNDS):
@@ -66,16 +69,22 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
         misfit = np.maximum(misfit, _left_over(solver, y, weight, made))
     scale = solver.contrasts(y, weight / misfit**2)
     found = solver.apply(y, weight / misfit**2, scale)
+
+    def predict(kept: np.ndarray) -> np.ndarray:
+        weight = kept * (unit / misfit) ** 2
+        return solver.apply(y, weight, scale, only_superpixels=True).superpixels * unit
+
     share = estimators.options.hold_out
     held_out: tuple[HeldOut, ...] = ()
     if share:
         held_out = hold_out.judge(
             estimators.system,
-            y,
-            weight,
-            lambda w: solver.apply(y, w / misfit**2, scale, only_superpixels=True).superpixels,
+            y * unit,
+            recorded,
+            predict,
             share,
             stream(estimators.options.seed, "hold out"),
+            hold_out.PATCHES,
         )
     seen = weight.any(axis=2)
     stats = WeightedStats(
@@ -83,7 +92,13 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
         misfit=float(np.median(misfit[seen])) if seen.any() else 1.0,
         held_out=held_out,
     )
-    return Estimate(value=found.value, sigma=found.sigma, stats=stats)
+    return Estimate(value=found.value * unit, sigma=found.sigma * unit, stats=stats)
+
+
+def _unit(estimators: Estimators, y: np.ndarray) -> float:
+    """What a capture is divided by to have the brightness of photographs; 1 for an empty one."""
+    levels = estimators.system.levels(np.where(np.isfinite(y), y, 0))
+    return float(np.sqrt(np.mean(levels**2))) / BRIGHTNESS or 1.0
 
 
 def _weights(estimators: Estimators, data: Superpixels) -> np.ndarray:

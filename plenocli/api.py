@@ -373,8 +373,9 @@ def reconstruct(
         None if dictionary is None else lambda: dictionary,
         threads=1,
     )
-    data = superpixels(_capture(capture), system, calibration)
-    found, _ = estimate(estimators, METHODS[method], data)
+    way = METHODS[method]
+    data = superpixels(_capture(capture), system, calibration, each_pixel=way.each_pixel)
+    found, _ = estimate(estimators, way, data)
     return found.as_picture(system.object_shape)
 
 

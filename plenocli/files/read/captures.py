@@ -12,7 +12,11 @@ from plenocli.inverse.picture.superpixels import superpixels
 
 
 def read_superpixels(
-    path: str | Path, system: LensletMatrix, calibration: str | Path | None = None
+    path: str | Path,
+    system: LensletMatrix,
+    calibration: str | Path | None = None,
+    *,
+    each_pixel: bool = False,
 ) -> Superpixels:
     """Superpixels of a capture.
 
@@ -20,13 +24,16 @@ def read_superpixels(
     system: the system matrix in whose units they are wanted.
     calibration: artefact along whose lenslet grid they are cut out; without it the capture is
         tiled as its file says.
+    each_pixel: as for plenocli.inverse.picture.superpixels.superpixels.
 
     Raises InputError where sizes disagree or the scale is not known.
     """
     capture = read_capture(path)
     if calibration is None or capture.cfa != "mono":
         return superpixels(capture, system)
-    return superpixels(capture, system, read_white(calibration), where=calibration)
+    return superpixels(
+        capture, system, read_white(calibration), where=calibration, each_pixel=each_pixel
+    )
 
 
 def read_white(path: str | Path) -> Calibration:

@@ -59,7 +59,9 @@ def along_the_grid(
     """
     windows, window_shape = there(calibration.windows), there(calibration.windows).shape
     bins = _bins(window_shape, system.pixel_shape, where)
-    signal = _signal(capture, calibration)
+    signal = above_dark(capture, calibration)
+    if capture.mask is not None:
+        signal = np.where(capture.mask, np.nan, signal)
     white = there(there(calibration.white).superpixels)
     count = calibration.grid.valid.shape
     white = np.broadcast_to(white, (*count, white.shape[-1])).astype(float)
@@ -92,6 +94,23 @@ def along_the_grid(
         y=np.where(usable, np.where(usable, cut, 0.0) * factor, np.nan),
         variance=np.where(usable, variance * factor**2, np.inf),
     )
+
+
+def above_dark(capture: Capture, calibration: Calibration) -> np.ndarray:
+    """Signal (row, column) above the dark level of a calibration, at its exposure.
+
+    Raises InputError where the two sensors differ.
+    """
+    dark = there(calibration.dark).mean
+    if dark.ndim == 2 and dark.shape != capture.shape:
+        raise InputError(
+            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
+            capture.metadata.path,
+            "use captures of the calibrated camera",
+        )
+    reference = calibration.sensor.exposure
+    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
+    return (capture.mosaic - dark) * scale
 
 
 def motion(
@@ -192,23 +211,6 @@ def _bins(
             "simulate-pif with pixels_per_lenslet as measured, or a whole part of it",
         )
     return bins
-
-
-def _signal(capture: Capture, calibration: Calibration) -> np.ndarray:
-    """(row, column) above the dark level, at the calibration's exposure; NaN where masked."""
-    dark = there(calibration.dark).mean
-    if dark.ndim == 2 and dark.shape != capture.shape:
-        raise InputError(
-            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
-            capture.metadata.path,
-            "use captures of the calibrated camera",
-        )
-    reference = calibration.sensor.exposure
-    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
-    signal = (capture.mosaic - dark) * scale
-    if capture.mask is not None:
-        signal[capture.mask] = np.nan
-    return signal
 
 
 def _pasted(

@@ -19,11 +19,8 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-<<<<<<< HEAD
 from plenocli.inverse.picture.nuisances.vignetting import falloff
-=======
-from plenocli.inverse.picture.real_light import along_the_grid
->>>>>>> fc6a9fa (Pictures of real cameras: superpixels about their lenslets, evened by white, every pixel with its own noise, judged by pixels that were left out)
+from plenocli.inverse.picture.real_light import above_dark, along_the_grid
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
@@ -39,6 +36,7 @@ def superpixels(
     calibration: Calibration | None = None,
     *,
     where: str | Path | None = None,
+    each_pixel: bool = False,
 ) -> Superpixels:
     """Superpixels of a capture.
 
@@ -46,6 +44,8 @@ def superpixels(
     calibration: along whose lenslet grid they are cut out, with windows, white and dark; without it
         the capture is tiled as it says itself.
     where: the calibration's file, for messages.
+    each_pixel: with a calibration, sample superpixels about their lenslets, and tell the variance
+        of every pixel (plenocli.inverse.picture.real_light).
 
     Raises InputError where sizes disagree or the scale is not known.
     """
@@ -57,7 +57,8 @@ def superpixels(
             "use --calibration with --method block-mean, or demux",
         )
     if calibration is not None:
-        return along_the_grid(capture, system, calibration, where)
+        cut_out = along_the_grid if each_pixel else _along_the_grid
+        return cut_out(capture, system, calibration, where)
     light = capture.metadata.illuminant
     if system.illuminant and light and light != system.illuminant:
         note(
@@ -92,22 +93,13 @@ def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, 
     superpixel is not wholly on the sensor.
     Raises InputError where the two sensors differ.
     """
-    dark, windows = there(calibration.dark).mean, there(calibration.windows)
-    if dark.ndim == 2 and dark.shape != capture.shape:
-        raise InputError(
-            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
-            capture.metadata.path,
-            "use captures of the calibrated camera",
-        )
-    reference = calibration.sensor.exposure
-    scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
-    signal = extract((capture.mosaic - dark) * scale, windows.origin, windows.shape)
+    windows = there(calibration.windows)
+    signal = extract(above_dark(capture, calibration), windows.origin, windows.shape)
     signal[~calibration.grid.valid] = np.nan
     white = there(there(calibration.white).superpixels)
     return signal, np.broadcast_to(white, signal.shape)
 
 
-<<<<<<< HEAD
 def _along_the_grid(
     capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
 ) -> Superpixels:
@@ -161,8 +153,6 @@ def _clipped(capture: Capture, calibration: Calibration) -> np.ndarray | None:
     return extract(clipped, windows.origin, windows.shape) == 1
 
 
-=======
->>>>>>> fc6a9fa (Pictures of real cameras: superpixels about their lenslets, evened by white, every pixel with its own noise, judged by pixels that were left out)
 def _tiles(capture: Capture, system: LensletMatrix, path: Path | None) -> tuple[int, int]:
     """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
     system matrix.

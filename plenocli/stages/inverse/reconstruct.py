@@ -430,7 +430,7 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
         return _solved(found, settings)
     estimators, method = _estimators(recipe), METHODS[settings.method]
     system = estimators.system
-    data = read_superpixels(capture, system, recipe.calibration)
+    data = read_superpixels(capture, system, recipe.calibration, each_pixel=method.each_pixel)
     look = method.sees is not Sees.LENSLET_AS_IS
     require_reconstruction(
         estimators,

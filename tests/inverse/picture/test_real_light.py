@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import plenocli as pc
-
 from plenocli.base.errors import InputError
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.sensor.capture import Capture, Levels

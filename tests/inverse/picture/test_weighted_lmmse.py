@@ -1,5 +1,5 @@
-"""LMMSE with a weight for every pixel, against the dense solution over the ring; what is left out is
-predicted; units do not matter.
+"""LMMSE with a weight for every pixel, against the dense solution over the ring; what is left out
+is predicted; units do not matter.
 """
 
 import numpy as np

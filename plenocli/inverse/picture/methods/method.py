@@ -82,6 +82,7 @@ class Method(ABC):
     needs_dictionary: whether it does nothing without a dictionary.
     options: names of the Options and inputs that mean something to it alone.
     hindsight: whether the truth may choose its weight.
+    each_pixel: whether every pixel counts by its own noise.
     in_batches: whether its lenslets are solved in batches, which processes may share.
     """
 
@@ -92,6 +93,7 @@ class Method(ABC):
     needs_dictionary: bool = False
     options: tuple[str, ...] = ()
     hindsight: bool = False
+    each_pixel: bool = False
     in_batches: bool = False
 
     def makes_joint_estimate(self, estimators: Estimators) -> bool:

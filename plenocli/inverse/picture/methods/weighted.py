@@ -149,5 +149,6 @@ WEIGHTED = Estimator(
     sees=Sees.LENSLET_AS_IS,
     phases=joint_phases,
     options=("hold_out",),
+    each_pixel=True,
     estimate=weighted,
 )

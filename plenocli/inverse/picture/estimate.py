@@ -16,6 +16,7 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
+from plenocli.inverse.picture.error_bars import posterior
 from plenocli.inverse.picture.estimators import INNER, Estimators
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
 from plenocli.inverse.picture.lenslet_model import Superpixels
@@ -129,6 +130,11 @@ def estimate(
         data = replace(data, y=data.y @ rows.T)
     truth = None if truth is None else truth / unit
     found = method.reconstruct(looked_through, data, truth, joint=joint)
+    if found.sigma is not None and not belief.right:
+        # noise that was raised swallows contrast: the bars are no shorter than with the noise told
+        told = estimators.prior.lmmse(belief.level.sigma, data.scene)
+        _, left = posterior(told, settled.own, estimators.system.object_shape)
+        found = replace(found, sigma=np.maximum(found.sigma, left))
     found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
     if kept < 1:
         note(

@@ -10,13 +10,18 @@ import numpy as np
 from plenocli.base.random_streams import stream
 from plenocli.inverse.picture import hold_out
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.footprint import joint_phases
+from plenocli.inverse.picture.footprint import Sizes, lmmse_phases
 from plenocli.inverse.picture.hold_out import HeldOut
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.solvers.joint_lmmse import needed_reach
 from plenocli.inverse.picture.solvers.lmmse import require_noise
-from plenocli.inverse.picture.solvers.weighted_lmmse import WeightedLmmse, prepare_weighted
+from plenocli.inverse.picture.solvers.weighted_lmmse import (
+    MOST,
+    SCALES,
+    WeightedLmmse,
+    prepare_weighted,
+)
 from plenocli.inverse.prior.natural_images import autocovariance
 
 BRIGHTNESS = 0.2
@@ -144,10 +149,24 @@ def _left_over(
     return np.sqrt(np.maximum(square / np.maximum(free, 1), 1.0))
 
 
+def weighted_phases(n: Sizes) -> list[float]:
+    """Numbers held: every lenslet has a matrix of its coordinates, in four forms at once."""
+    used, wide = min(MOST + 1, n.pixels), 2 * n.reach + 1
+    ring = (9 * used) ** 2 + 9 * used * n.points
+    footprints = (2 * wide**2 + (wide + 4) ** 2 + n.offsets + 18) * used * n.points
+    own = n.lenslets * (4 * used**2 + 2 * len(SCALES) * used + 8 * n.pixels + 3 * n.points)
+    return [
+        *lmmse_phases(n),
+        n.offsets * n.pixels * n.points + 4 * n.pixels**2 + 3 * n.points**2,
+        n.y + footprints + 3 * ring,
+        2 * ring + own,
+    ]
+
+
 WEIGHTED = Estimator(
     name="weighted",
     sees=Sees.LENSLET_AS_IS,
-    phases=joint_phases,
+    phases=weighted_phases,
     options=("hold_out",),
     each_pixel=True,
     estimate=weighted,

@@ -15,7 +15,7 @@ from plenocli.base.budget import budget
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.nuisances.pixel_model import CHUNK
-from plenocli.inverse.picture.solvers.joint_lmmse import MOST
+from plenocli.inverse.picture.solvers.joint_lmmse import MOST, WIDE
 from plenocli.inverse.picture.solvers.lmmse import SCALES
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 
@@ -148,8 +148,14 @@ def tv_phases(n: Sizes) -> list[float]:
 
 
 def pnp_phases(n: Sizes) -> list[float]:
-    """Of plug and play, which starts from LMMSE."""
-    return [*lmmse_phases(n), n.svd + n.block**2 + n.lenslets * n.points * 137]
+    """Of plug and play, which starts from LMMSE, over 3x3 lenslets where noise is strong."""
+    side, directions = 2 * n.reach + 1, min(WIDE, n.least)
+    around = (2 * side**2 + (side + 4) ** 2 + n.offsets + 67) * directions * n.points
+    return [
+        *lmmse_phases(n),
+        n.y + n.svd + n.block**2 + around + 511 * directions**2,
+        n.svd + n.block**2 + n.lenslets * n.points * 137,
+    ]
 
 
 def reconstruction(n: Sizes, phases: Phases, *, joint: bool = False) -> float:

@@ -16,11 +16,7 @@ from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
 from plenocli.inverse.picture.solvers import whole_sensor
-
-WIDE = 80
-"""Directions that are heard of a superpixel up to which plug and play starts from LMMSE over 3x3
-lenslets. With more the lenslet itself tells what its neighbours could, and they take long.
-"""
+from plenocli.inverse.picture.solvers.joint_lmmse import WIDE
 
 Solve = Callable[
     [Estimators, whole_sensor.DataTerm, np.ndarray, float], tuple[np.ndarray, str, int]

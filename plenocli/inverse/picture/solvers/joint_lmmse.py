@@ -23,6 +23,10 @@ from plenocli.inverse.picture.solvers.lmmse import require_noise
 RING = 1
 MOST = 256
 """Singular vectors through which a superpixel is seen at most."""
+WIDE = 80
+"""Directions that are heard of a superpixel up to which contrasts are tried. With more the lenslet
+itself tells what its neighbours could, and they take long.
+"""
 CONTRASTS = 2.0 ** np.arange(-5, 5)
 """Scales of the covariance of which `adaptive` takes a mean."""
 LOUD = 0.005
@@ -257,7 +261,9 @@ def loud_directions(
     strength = svd.s**2 * np.trace(covariance) * np.linalg.eigvalsh(bands)[-1]
     used = max(1, min(int(np.count_nonzero(strength > least)), svd.rank()))
     seen = svd.s[:used, None] * svd.vt[:used]
-    power, vectors = np.linalg.eigh(seen @ np.kron(bands, covariance) @ seen.T)
+    pulled = seen.reshape(used, len(bands), -1) @ covariance
+    pulled = np.einsum("ab,kbp->kap", bands, pulled).reshape(seen.shape)
+    power, vectors = np.linalg.eigh(pulled @ seen.T)
     return svd.u[:, :used] @ vectors[:, power > min(least, power[-1] / 2)]
 
 

@@ -48,6 +48,10 @@ from plenocli.forward.sensor.exposure import simulate_capture as expose
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration import measure
 from plenocli.inverse.calibration.calibration import Calibration
+from plenocli.inverse.fit.camera_fit import CameraFit
+from plenocli.inverse.fit.captures import captured_lenslets
+from plenocli.inverse.fit.fit import fit_camera as fit_to_captures
+from plenocli.inverse.fit.optics import parameters_without
 from plenocli.inverse.lightfield.light_field import Optics, refocused, samples_of, usual_slopes
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.inverse.picture.estimate import estimate
@@ -69,6 +73,7 @@ __all__ = [
     "Calibration",
     "Camera",
     "Capture",
+    "CameraFit",
     "CubeScore",
     "Dictionary",
     "LightField",
@@ -81,6 +86,7 @@ __all__ = [
     "SystemMatrix",
     "calibrate",
     "demultiplex",
+    "fit_camera",
     "learn_dictionary",
     "plan",
     "read_calibration",
@@ -377,6 +383,47 @@ def reconstruct(
     data = superpixels(_capture(capture), system, calibration, each_pixel=way.each_pixel)
     found, _ = estimate(estimators, way, data)
     return found.as_picture(system.object_shape)
+
+
+def fit_camera(
+    camera: Camera,
+    captures: Capture | SimulatedCapture | Sequence[Capture | SimulatedCapture],
+    *,
+    calibration: Calibration | None = None,
+    pictures: Sequence[Picture] | None = None,
+    noise_sigma: float | None = None,
+    fixed: Sequence[str] = (),
+    seed: int = 0,
+) -> CameraFit:
+    """A camera's description made true by its own captures, of any scenes.
+
+    camera: as described; square lenslets, one wavelength.
+    captures: of that camera.
+    calibration: along whose lenslets real captures are cut; None: they were simulated.
+    pictures: photographs (row, column) in [0, 1] for the statistics; None: those of scikit-image.
+    noise_sigma: standard deviation of the noise in units of A x; None: as the captures tell.
+    fixed: names of parameters that stay as described.
+    seed: of the training patches.
+
+    Returns the fit: its camera, its parameters with their standard deviations and correlations,
+    and whether the camera explains the captures; if not, its camera is the described one.
+    Raises UsageError for other cameras, InputError for captures that do not go with the camera.
+    docs/model.md, "A camera that fits itself".
+    """
+    several = [captures] if isinstance(captures, Capture | SimulatedCapture) else captures
+    shape = camera.object.samples_per_lenslet
+    known = read_training((), shape) if pictures is None else _named(pictures)
+    lenslets = [
+        captured_lenslets(_capture(one), camera, calibration, noise_sigma=noise_sigma)
+        for one in several
+    ]
+    return fit_to_captures(
+        camera,
+        lenslets,
+        [picture for _, picture in at_scales(known, shape)],
+        parameters=parameters_without(camera, fixed),
+        seed=seed,
+    )
 
 
 def learn_dictionary(

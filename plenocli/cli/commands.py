@@ -12,6 +12,7 @@ COMMANDS = {
     "calibrate": "inverse",
     "demux": "inverse",
     "learn-dict": "inverse",
+    "fit-camera": "inverse",
     "reconstruct": "inverse",
     "refocus": "inverse",
     "score": "evaluation",

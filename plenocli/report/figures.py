@@ -218,3 +218,23 @@ def image_figures(result: Result, name: str, seen: np.ndarray | None = None) -> 
             )
         )
     return figures
+
+
+def fit_figures(
+    names: Sequence[str],
+    value: np.ndarray,
+    sigma: np.ndarray,
+    described: np.ndarray,
+    tolerance: np.ndarray,
+    correlation: np.ndarray,
+) -> Figures:
+    """What a fit made of a camera: its parameters with error bars, and their correlations.
+
+    names: of the parameters.
+    value, sigma, described, tolerance: (parameter,) in units of their own.
+    correlation: (parameter, parameter).
+    """
+    from plenocli.report.pictures import fit_picture
+
+    picture = fit_picture(names, (value - described) / tolerance, sigma / tolerance, correlation)
+    return [(picture, "Parameters of a fitted camera from the described ones, in tolerances.")]

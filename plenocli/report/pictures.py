@@ -617,3 +617,27 @@ def learning_history(history: Mapping[str, np.ndarray]) -> bytes:
             axes.xaxis.get_major_locator().set_params(integer=True)
             axes.grid(True)
     return made.png
+
+
+def fit_picture(
+    names: Sequence[str], change: np.ndarray, sigma: np.ndarray, correlation: np.ndarray
+) -> bytes:
+    """Parameters with error bars, and the correlations of their errors.
+
+    change, sigma: (parameter,) in tolerances.
+    correlation: (parameter, parameter).
+
+    Returns a PNG.
+    """
+    places = np.arange(len(names))
+    with drawing(7.5, 0.28 * len(names) + 0.9) as made:
+        left, right = made.figure.subplots(1, 2, sharey=True)
+        left.errorbar(change, places, xerr=sigma, fmt="o", color=COLOURS[0], markersize=3)
+        left.axvline(0, color=COLOURS[7], linewidth=0.7)
+        left.set_yticks(places, list(names))
+        left.set_xlabel("change, tolerances")
+        image = right.imshow(correlation, cmap=SIGN_MAP, vmin=-1, vmax=1, aspect="auto")
+        right.set_xticks([])
+        right.set_title("correlation of the errors")
+        made.figure.colorbar(image, ax=right)
+    return made.png

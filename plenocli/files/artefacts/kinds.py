@@ -740,6 +740,48 @@ LIGHTFIELD = Schema(
     default=("refocus",),
 )
 
+FIT = Schema(
+    kind="fit",
+    version=1,
+    doc="A camera fitted to its own captures: its parameters and how sure they are.",
+    fields=(
+        dataset("fit/value", "parameter", "f", "see units", "after the fit"),
+        dataset("fit/sigma", "parameter", "f", "see units", "standard deviation", minimum=0),
+        dataset("fit/described", "parameter", "f", "see units", "before the fit"),
+        dataset(
+            "fit/tolerance",
+            "parameter",
+            "f",
+            "see units",
+            "standard deviation of what was believed before",
+            minimum=0,
+        ),
+        dataset("fit/correlation", "parameter parameter", "f", "1", "of the errors that are left"),
+    ),
+    attrs={
+        "fit": (
+            attribute("names", "json", "", "of the parameters"),
+            attribute("units", "json", "", "of the parameters: m or px"),
+            attribute("inseparable", "json", "", "pairs that captures do not tell apart"),
+            attribute("noise_ratio", "number", "1", "most likely noise over the noise told"),
+            attribute("noise_ratio_before", "number", "1", "the same for the camera as described"),
+            attribute(
+                "model_error", "number", "1", "relative error of the matrix that is still expected"
+            ),
+            attribute(
+                "turned",
+                "number",
+                "1",
+                "steps over lenslet borders with objects turned by 180 degrees, over the others",
+            ),
+            attribute("lenslets", "number", "1", "looked at"),
+            _NOTES,
+        )
+    },
+    plots={"fit": ("correlation", ())},
+    default=("fit",),
+)
+
 SCHEMAS = {
     schema.kind: schema
     for schema in (
@@ -752,5 +794,6 @@ SCHEMAS = {
         IMAGE,
         SWEEP,
         LIGHTFIELD,
+        FIT,
     )
 }

@@ -38,16 +38,23 @@ HIDDEN = 0.15
 """Patterns of photographs that all together stay below so much of the noise are left out."""
 LOST = 0.01
 """Of the noise: what may be cut from the spread function."""
-SLACK, DEVIATIONS = 0.02, 4.0
+SLACK, DEVIATIONS = 0.025, 4.0
 """Noise over the noise told, less one, up to which a fit explains its captures: photographs are
 not quite what the prior says, and the noise of few pixels is known so well only.
 """
-INFLATION = 1.5
+INFLATION = 2.5
 """By how much the standard deviations exceed Fisher's: draws of cameras were this much farther."""
-FINER = 4e-3
+MATRIX_INFLATION = 2.0
+"""The same for the error of the matrix, to which errors of parameters add up less."""
+FINER, FINER_IN_MATRIX = 3e-3, 2e-3
 """What objects finer than the points of a lenslet add to the noise, of a capture's root mean
-square, where the standard deviations are worked out: it shifts above all the sensor distance.
+square, where standard deviations and the error of the matrix are worked out: such objects shift
+above all the sensor distance.
 """
+LEFT_OVER = 0.03
+"""By how much of what a fit leaves over, beyond the noise, the variances grow."""
+SECONDS = 3e-5
+"""A fit takes on one core for each pixel and point of a lenslet, about."""
 MOST_LENSLETS = 16
 """Lenslets looked at along each side of a capture, from its middle."""
 
@@ -88,11 +95,8 @@ def fit_camera(
     docs/model.md, "A camera that fits itself".
     """
     require_fittable(camera)
-    shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
-    wavelength = camera.light.wavelengths[0]
-    known = tuple(all_parameters(camera) if parameters is None else parameters)
-    family = CameraFamily(camera, geometry(camera, wavelength, shift), known)
-    told = LensletFamily(family, tolerance=1e-4).at(family.start).matrix
+    family = _family(camera, parameters)
+    told = _matrix(family)
     middle = [_middle(c) for c in captures]
     data = [_scaled(c, told) for c in middle]
     prior = photograph_prior(pictures, family.geometry.object_shape, seed)
@@ -101,13 +105,35 @@ def fit_camera(
     signal = max(float(np.sqrt(np.mean(c.y**2))) for c in data)
     lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
     ascent = Ascent(family, evidence, tolerance=lost, progress=progress)
-    before = ascent.point(np.zeros(len(known))).evidence.noise_factor()
+    before = ascent.point(np.zeros(len(family.parameters))).evidence.noise_factor()
     limit = accepted_ratio(sum(c.y.size for c in data))
     best = _highest(ascent, limit)
     turned = None
     if best.evidence.noise_factor() <= limit:
         best, turned = _told_apart(ascent, best, middle)
     return _described(ascent, best, limit, before, turned)
+
+
+def described_matrix(camera: Camera) -> np.ndarray:
+    """The matrix (pixel, point) of one lenslet of a camera as described, where fits start."""
+    return _matrix(_family(camera, None))
+
+
+def expected_seconds(camera: Camera) -> float:
+    """About how long a fit takes on one core, s."""
+    pixels = float(np.prod(camera.sensor.pixels_per_lenslet))
+    points = float(np.prod(camera.object.samples_per_lenslet))
+    return SECONDS * pixels * points
+
+
+def _family(camera: Camera, parameters: Sequence[Parameter] | None) -> CameraFamily:
+    shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
+    known = tuple(all_parameters(camera) if parameters is None else parameters)
+    return CameraFamily(camera, geometry(camera, camera.light.wavelengths[0], shift), known)
+
+
+def _matrix(family: CameraFamily) -> np.ndarray:
+    return LensletFamily(family, tolerance=1e-4).at(family.start).matrix
 
 
 def accepted_ratio(values: int) -> float:
@@ -195,20 +221,36 @@ def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets
     return total / count if count else None
 
 
+def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """(standard deviations (parameter,) in tolerances, correlations (parameter, parameter),
+    relative error of the matrix) at the end of a fit that leaves `ratio` times the noise.
+    """
+    captures = ascent.evidence.captures
+    values = sum(c.y.size for c in captures)
+    quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in captures)
+    excess = max(0.0, ratio**2 - 1 - 2 * float(np.sqrt(2 / values))) * values
+
+    def covariance(finer: float) -> tuple[np.ndarray, np.ndarray]:
+        factor = max(at.factor, float(np.hypot(1, finer * quiet)))
+        information, products = ascent.information(replace(at, factor=factor))
+        return np.linalg.inv(information), products
+
+    found, _ = covariance(FINER)
+    found = found * (INFLATION**2 + LEFT_OVER * excess)
+    sigma = np.sqrt(np.diag(found))
+    correlation = found / np.outer(sigma, sigma)
+    narrower, products = covariance(FINER_IN_MATRIX)
+    error = MATRIX_INFLATION * float(np.sqrt(max(np.sum(narrower * products), 0.0)))
+    # nothing is known less well than before
+    return np.minimum(sigma, 1.0), correlation, error / float(np.linalg.norm(at.matrix.matrix))
+
+
 def _described(
     ascent: Ascent, at: Point, limit: float, before: float, turned: float | None
 ) -> CameraFit:
     """The CameraFit of the point where a fit ended."""
     family, ratio = ascent.family, at.evidence.noise_factor()
-    quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in ascent.evidence.captures)
-    factor = max(at.factor, float(np.hypot(1, FINER * quiet)))
-    information, products = ascent.information(replace(at, factor=factor))
-    covariance = INFLATION**2 * np.linalg.inv(information)
-    sigma = np.sqrt(np.diag(covariance))
-    # nothing is known less well than before
-    sigma, correlation = np.minimum(sigma, 1.0), covariance / np.outer(sigma, sigma)
-    A = np.asarray(at.matrix.matrix, float)
-    error = float(np.sqrt(max(np.sum(covariance * products), 0.0)) / np.linalg.norm(A))
+    sigma, correlation, error = _uncertainty(ascent, at, ratio)
     values = ascent.values(at.x)
     accepted, why = ratio <= limit, f"explains the captures to {ratio:.3f} times their noise"
     if not accepted:
@@ -242,6 +284,6 @@ def _described(
         noise_ratio_before=before,
         model_error=error,
         turned=turned,
-        matrix=A,
+        matrix=np.asarray(at.matrix.matrix, float),
         lenslets=ascent.evidence.lenslets,
     )

@@ -15,6 +15,7 @@ a point to the lenslet array" and "From the array to the sensor".
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -84,6 +85,27 @@ def all_parameters(camera: Camera) -> tuple[Parameter, ...]:
             for noll, (name, waves) in ZERNIKES.items()
         ),
     )
+
+
+def parameters_without(camera: Camera, fixed: Sequence[str]) -> tuple[Parameter, ...]:
+    """The parameters of a fit without those that stay as described.
+
+    fixed: their names.
+
+    Raises UsageError for a name that there is not, or where none is left.
+    """
+    known = all_parameters(camera)
+    unknown = sorted(set(fixed) - {p.name for p in known})
+    if unknown:
+        raise UsageError(
+            f"there is no parameter {unknown[0]!r}",
+            "--fix",
+            f"known: {', '.join(repr(p.name) for p in known)}",
+        )
+    left = tuple(p for p in known if p.name not in fixed)
+    if not left:
+        raise UsageError("nothing is left to fit", "--fix", "leave some out")
+    return left
 
 
 class CameraFamily:

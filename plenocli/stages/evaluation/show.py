@@ -226,6 +226,15 @@ def _lightfield(file: _File, choice: _Choice) -> Figures:
     return lightfield_figures(lightfield_of(file.stored()))
 
 
+def _fit(file: _File, choice: _Choice) -> Figures:
+    from plenocli.report.figures import fit_figures
+
+    stored = file.stored()
+    names = [str(name) for name in stored.attrs["fit"]["names"]]
+    parts = ("value", "sigma", "described", "tolerance", "correlation")
+    return fit_figures(names, *(stored.data[f"fit/{part}"] for part in parts))
+
+
 _FIGURES = {
     "pif": _pif,
     "capture": _capture,
@@ -235,6 +244,7 @@ _FIGURES = {
     "image": _image,
     "sweep": _sweep,
     "lightfield": _lightfield,
+    "fit": _fit,
 }
 
 

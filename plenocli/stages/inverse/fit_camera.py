@@ -1,0 +1,171 @@
+"""fit-camera: a camera's description made true by its own captures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plenocli.base.errors import NumericsError, UsageError
+
+if TYPE_CHECKING:
+    from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFitSummary:
+    """What fit-camera found.
+
+    output: the fitted description.
+    captures: how many were looked at.
+    fit: the CameraFit.
+    """
+
+    output: str
+    captures: int
+    fit: CameraFit
+
+    def as_json(self) -> dict[str, Any]:
+        """Names and values of --json."""
+        return {"output": self.output, "captures": self.captures} | self.fit.as_json()
+
+    def line(self) -> str:
+        """One line for a person, and one for each parameter."""
+        fit = self.fit
+        head = (
+            f"{self.output}: {fit.why} (as described {fit.noise_ratio_before:.3g} times), "
+            f"{fit.lenslets} lenslets; a matrix made from it is off by about {fit.model_error:.1g}"
+        )
+        return "\n".join([head, *(f"  {text}" for text in told(fit))])
+
+
+def run_fit_camera(
+    captures: Sequence[Path],
+    output: Path,
+    *,
+    camera: Path,
+    calibration: Path | None = None,
+    details: Path | None = None,
+    training: Sequence[str] = (),
+    noise_sigma: float | None = None,
+    fixed: Sequence[str] = (),
+    seed: int = 0,
+    overwrite: bool = False,
+    command: str = "",
+) -> CameraFitSummary:
+    """Fit a camera to captures and write its description.
+
+    captures: files, all of one camera.
+    output: the fitted description (.toml).
+    camera: the description to start from.
+    calibration: along whose lenslet grid captures are cut out; without it as they say themselves.
+    details: artefact (.h5) with parameters, standard deviations and correlations.
+    training: photographs for the statistics; () for those of scikit-image.
+    noise_sigma: standard deviation of the noise in units of A x; None as the captures say.
+    fixed: names of parameters that stay as described.
+    seed: of the training patches.
+
+    Raises UsageError, InputError, OutputError; NumericsError where no camera near the described one
+    explains the captures: then nothing is written.
+    """
+    from plenocli.base.progress import bar, note
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.atomic import check_output, publish
+    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.read.cameras import camera_files, read_camera
+    from plenocli.files.read.captures import read_white
+    from plenocli.files.read.training import files_of, read_training
+    from plenocli.files.results.camera_fits import fit_artefact
+    from plenocli.inverse.fit.captures import captured_lenslets
+    from plenocli.inverse.fit.fit import STEPS, expected_seconds, fit_camera
+    from plenocli.inverse.fit.optics import parameters_without, require_fittable
+    from plenocli.inverse.prior.natural_images import at_scales
+
+    output, inputs = Path(output), [*captures, camera, calibration, *(files_of(training) or ())]
+    check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".toml",))
+    if details is not None:
+        check_output(details, overwrite=overwrite, inputs=[*inputs, output], suffixes=(".h5",))
+    described = read_camera(camera)
+    require_fittable(described)
+    named = camera_files(camera, described)
+    if len(named) > 1 and output.resolve().parent != Path(camera).resolve().parent:
+        raise UsageError(
+            f"names files beside {Path(camera).name}", output, "write OUT into the folder of CAMERA"
+        )
+    parameters = parameters_without(described, fixed)
+    grid = None if calibration is None else read_white(calibration)
+    read = [read_capture(path) for path in captures]
+    lenslets = [
+        captured_lenslets(one, described, grid, noise_sigma=noise_sigma, where=calibration)
+        for one in read
+    ]
+    scenes = {one.metadata.target for one in read if one.metadata.target}
+    shape = described.object.samples_per_lenslet
+    pictures = read_training(training, shape, not_scene=scenes.pop() if len(scenes) == 1 else None)
+    scaled = [picture for _, picture in at_scales(pictures, shape)]
+    seconds = expected_seconds(described)
+    if seconds > 20:
+        note(f"the fit takes about {seconds:.0f} s of one core, up to four times that at worst")
+    with bar(None, STEPS, "steps of the fit") as progress:
+        fit = fit_camera(
+            described,
+            lenslets,
+            scaled,
+            parameters=parameters,
+            seed=seed,
+            progress=progress.update,
+        )
+    if not fit.accepted:
+        raise NumericsError(
+            f"no camera near the described one explains the captures: the best {fit.why}",
+            Path(camera).name,
+            "check its distances, the calibration and --noise-sigma, or give more captures",
+        )
+    if details is not None:
+        origin = describe_inputs({**named, "capture": captures, "calibration": calibration})
+        provenance = Provenance(command=command, inputs=origin, seed=seed)
+        write_artefact(details, fit_artefact(fit, provenance), overwrite=overwrite)
+    publish(output, fitted_toml(fit, camera, captures).encode(), overwrite=overwrite)
+    return CameraFitSummary(output=str(output), captures=len(captures), fit=fit)
+
+
+def told(fit: CameraFit) -> list[str]:
+    """A line for each parameter, and what captures do not tell apart."""
+    lines = [_line(parameter) for parameter in fit.parameters]
+    for one, other in fit.inseparable:
+        lines.append(f"{one} and {other} are not told apart: only together do they fit")
+    return lines
+
+
+def _line(parameter: FittedParameter) -> str:
+    """Values with as many digits as the standard deviation gives them."""
+    name, unit = "px", 1.0
+    if parameter.unit == "m":
+        largest = max(abs(parameter.value), abs(parameter.described), parameter.sigma)
+        name, unit = next(
+            (n, u)
+            for n, u in (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+            if largest >= u or n == "nm"
+        )
+    scaled = [v / unit for v in (parameter.value, parameter.sigma, parameter.described)]
+    digits = max(0, 1 - math.floor(math.log10(max(scaled[1], 1e-12))))
+    value, sigma, described = (f"{v:.{digits}f}" for v in scaled)
+    untold = "" if parameter.measured else ", not measured: no more than was believed before"
+    return f"{parameter.name}: {value} +- {sigma} {name} (described {described}){untold}"
+
+
+def fitted_toml(fit: CameraFit, camera: Path, captures: Sequence[Path]) -> str:
+    """The description of the fitted camera, its uncertainty in comments."""
+    from plenocli.files.config.camera_file import to_toml
+
+    names = ", ".join(Path(path).name for path in captures)
+    head = [
+        f"{Path(camera).name}, fitted to {names} by plenocli fit-camera",
+        fit.why,
+        "values with one standard deviation:",
+        *(f"  {text}" for text in told(fit)),
+    ]
+    return "\n".join([*(f"# {text}" for text in head), "", to_toml(fit.camera)])

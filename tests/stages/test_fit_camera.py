@@ -1,0 +1,130 @@
+"""fit-camera: from a capture of a camera that is not quite the described one to a description that
+explains it, and to the matrix made from that.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from plenocli.cli.main import run
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.config.camera_file import load_camera, to_toml
+from plenocli.files.read.system_matrices import read_lenslet_matrix
+from tests.forward.propagation.cameras import small_camera
+
+KEYS = {
+    "object__samples_per_lenslet": (10, 10),
+    "sensor__pixels_per_lenslet": (16, 16),
+    "sensor__distance": 256e-6,
+    "lenslet_array__focal_length": 256e-6,
+    "lenslet_array__pitch": 32e-6 / (1 + 256e-6 / 55e-3),
+    "lenslet_array__count": (6, 6),
+}
+DISTANCE = 256.6e-6
+ALONE = ("--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A description, the real camera and its capture."""
+    folder = tmp_path_factory.mktemp("fit")
+    real = KEYS | {
+        "sensor__distance": DISTANCE,
+        "lenslet_array__pitch": 32e-6 / (1 + DISTANCE / 55e-3),
+        "object__distance": 0.553,
+        "main_lens__aberrations": ({"noll": 7, "coefficient": 2e-8},),
+    }
+    (folder / "camera.toml").write_text(to_toml(small_camera(**KEYS)))
+    (folder / "real.toml").write_text(to_toml(small_camera(**real)))
+    place = str(folder)
+    assert run(["simulate-pif", f"{place}/real.toml", *ALONE, "-o", f"{place}/real.h5"]) == 0
+    made = ["capture-sim", f"{place}/real.toml", "--pif", f"{place}/real.h5", "--snr", "50dB"]
+    assert run([*made, "--scene", "skimage:astronaut", "-o", f"{place}/capture.h5"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    command = ["fit-camera", "capture.h5", "--camera", "camera.toml", "-o", "fitted.toml"]
+    command = [str(folder / word) if "." in word else word for word in command]
+    assert run([*command, "--details", str(folder / "fit.h5")]) == 0
+    return folder
+
+
+def test_the_fitted_description_explains_the_capture(fitted):
+    camera = load_camera(fitted / "fitted.toml")
+    assert abs(camera.object.distance - 0.553) < 3e-4
+    assert abs(camera.sensor.distance - DISTANCE) < 3e-7
+    coma = {a.noll: a.coefficient for a in camera.main_lens.aberrations}[7]
+    assert abs(coma - 2e-8) < 2e-9
+    text = (fitted / "fitted.toml").read_text()
+    assert "# camera.toml, fitted to capture.h5" in text
+    assert "#   focus: 55" in text and "+-" in text and "(described 550" in text
+    assert "not measured" in text
+
+
+def test_what_is_left_open_goes_into_the_matrix(fitted):
+    pif = ["simulate-pif", str(fitted / "fitted.toml"), *ALONE, "-o", str(fitted / "pif.h5")]
+    assert run(pif) == 0
+    found, right = (read_lenslet_matrix(fitted / name) for name in ("pif.h5", "real.h5"))
+    error = np.linalg.norm(found.own - right.own) / np.linalg.norm(right.own)
+    told = load_camera(fitted / "fitted.toml").fitted.model_error
+    assert found.accuracy.model_error > told > 0
+    assert error < 2 * told < 0.05
+    data, attrs = (
+        getattr(read_artefact(fitted / "fit.h5", "fit"), part) for part in ("data", "attrs")
+    )
+    names = attrs["fit"]["names"]
+    place = names.index("sensor distance")
+    assert abs(data["fit/value"][place] - DISTANCE) < 4 * data["fit/sigma"][place]
+    assert np.allclose(np.diag(data["fit/correlation"]), 1)
+    assert attrs["fit"]["model_error"] == told
+
+
+def test_a_fit_that_did_not_converge_writes_nothing(folder, capsys):
+    out = folder / "none.toml"
+    base = ["fit-camera", str(folder / "capture.h5"), "--camera", str(folder / "camera.toml")]
+    fixed = [
+        word
+        for name in ("focus", "sensor distance", "coma, vertical", "lenslet focal length")
+        for word in ("--fix", name)
+    ]
+    few = [*fixed, "--fix", "spherical aberration", "--fix", "astigmatism, vertical"]
+    assert run([*base, *few, "--fix", "wavelength", "-o", str(out), "--json"]) == 5
+    said = capsys.readouterr()
+    assert "no camera near the described one explains the captures" in said.err
+    assert said.out == "" and not out.exists()
+
+
+def test_the_summary_as_json(folder, capsys):
+    command = ["fit-camera", str(folder / "capture.h5"), "--camera", str(folder / "real.toml")]
+    fixed = ["focus", "pitch", "wavelength", "lenslet focal length"]
+    command += [word for name in fixed for word in ("--fix", name)]
+    assert run([*command, "-o", str(folder / "same.toml"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["accepted"] and told["captures"] == 1 and told["lenslets"] == 36
+    assert not set(fixed) & set(told["parameters"])
+    assert abs(told["parameters"]["shift, rows"]["value"]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--fix", "colour"], 2, "there is no parameter 'colour'"),
+        (["--camera", "round.toml"], 2, "its lenslets are not square"),
+        (["-o", "fitted.h5"], 2, "is written as .toml"),
+        (["--details", "fit.toml"], 2, "is written as .h5"),
+        (["--camera", "large.toml"], 3, "superpixels"),
+    ],
+)
+def test_refusals(folder, monkeypatch, capsys, words, code, said):
+    monkeypatch.chdir(folder)
+    round_one = small_camera(**KEYS, lenslet_array__aperture_shape="circle")
+    (folder / "round.toml").write_text(to_toml(round_one))
+    large = small_camera(**KEYS | {"sensor__pixels_per_lenslet": (14, 14)})
+    (folder / "large.toml").write_text(to_toml(large))
+    command = ["fit-camera", "capture.h5", "--camera", "camera.toml", "-o", "refused.toml", *words]
+    assert run(command) == code
+    assert said in capsys.readouterr().err
+    assert not (folder / "refused.toml").exists()

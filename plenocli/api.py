@@ -49,7 +49,7 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration import measure
 from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.fit.camera_fit import CameraFit
-from plenocli.inverse.fit.captures import captured_lenslets
+from plenocli.inverse.fit.captures import believed_model, captured_lenslets
 from plenocli.inverse.fit.fit import fit_camera as fit_to_captures
 from plenocli.inverse.fit.optics import parameters_without
 from plenocli.inverse.lightfield.light_field import Optics, refocused, samples_of, usual_slopes
@@ -393,6 +393,7 @@ def fit_camera(
     pictures: Sequence[Picture] | None = None,
     noise_sigma: float | None = None,
     fixed: Sequence[str] = (),
+    model: str = "auto",
     seed: int = 0,
 ) -> CameraFit:
     """A camera's description made true by its own captures, of any scenes.
@@ -403,6 +404,7 @@ def fit_camera(
     pictures: photographs (row, column) in [0, 1] for the statistics; None: those of scikit-image.
     noise_sigma: standard deviation of the noise in units of A x; None: as the captures tell.
     fixed: names of parameters that stay as described.
+    model: of propagation; "auto" for the one that simulated captures were made with, or the finest.
     seed: of the training patches.
 
     Returns the fit: its camera, its parameters with their standard deviations and correlations,
@@ -410,18 +412,20 @@ def fit_camera(
     Raises UsageError for other cameras, InputError for captures that do not go with the camera.
     docs/model.md, "A camera that fits itself".
     """
-    several = [captures] if isinstance(captures, Capture | SimulatedCapture) else captures
+    if isinstance(captures, Capture | SimulatedCapture):
+        captures = [captures]
+    several = [_capture(one) for one in captures]
     shape = camera.object.samples_per_lenslet
     known = read_training((), shape) if pictures is None else _named(pictures)
     lenslets = [
-        captured_lenslets(_capture(one), camera, calibration, noise_sigma=noise_sigma)
-        for one in several
+        captured_lenslets(one, camera, calibration, noise_sigma=noise_sigma) for one in several
     ]
     return fit_to_captures(
         camera,
         lenslets,
         [picture for _, picture in at_scales(known, shape)],
         parameters=parameters_without(camera, fixed),
+        model=believed_model(model, several),
         seed=seed,
     )
 

@@ -44,6 +44,13 @@ from plenocli.cli import options
     metavar="NAME",
     help='Keep a parameter as described, such as "wavelength". Repeatable.',
 )
+@click.option(
+    "--model",
+    type=click.Choice(["auto", "fresnel", "exact"]),
+    default="auto",
+    show_default=True,
+    help="Of propagation; auto: the one of simulated captures, else the finest that serves.",
+)
 @options.output
 @options.seed
 @options.mem_limit
@@ -60,6 +67,7 @@ def command(
     training: tuple[str, ...],
     noise_sigma: float | None,
     fixed: tuple[str, ...],
+    model: str,
     output: Path,
     seed: int,
     overwrite: bool,
@@ -92,6 +100,7 @@ def command(
         training=training,
         noise_sigma=noise_sigma,
         fixed=fixed,
+        model=model,
         seed=seed,
         overwrite=overwrite,
         command=options.command_line(ctx),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.inverse.fit.evidence import Evidence, EvidenceAt
+from plenocli.inverse.fit.finer import FinerModel
 from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt
 from plenocli.inverse.fit.optics import CameraFamily
 
@@ -19,6 +20,8 @@ LONGER = 2.5
 """By how much a step that helped is lengthened, again and again."""
 FAR = 20.0
 """No step is longer, in tolerances, before it has shown that it helps."""
+ROUNDS = 3
+"""How often the difference of the models is brought up to date."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
 LOUD = 0.7
@@ -31,14 +34,22 @@ class Point:
 
     x: (parameter,) from the described camera, in tolerances;
     height: log of the evidence and of what is believed of the parameters, at noise `factor` times
-        the noise told.
+        the noise told;
+    finer: (pixel, point) what a finer model adds to the paraxial matrix, None where none does.
     """
 
     x: np.ndarray
     factor: float
     height: float
     evidence: EvidenceAt
-    matrix: MatrixAt
+    paraxial: MatrixAt
+    finer: np.ndarray | None
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(pixel, point), what the captures were held against."""
+        paraxial = self.paraxial.matrix
+        return paraxial if self.finer is None else paraxial + self.finer
 
 
 class Ascent:
@@ -50,12 +61,14 @@ class Ascent:
         evidence: Evidence,
         *,
         tolerance: float = 1e-5,
+        model: FinerModel | None = None,
         progress: Callable[[], object] | None = None,
     ) -> None:
-        """tolerance: root energy of the spread function that may be lost; progress: called at
-        every step.
+        """tolerance: root energy of the spread function that may be lost; model: finer than the
+        paraxial one; progress: called at every step.
         """
         self.family, self.evidence, self._progress = family, evidence, progress
+        self._model = model
         self.lenslets = LensletFamily(family, tolerance=tolerance)
         self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=1)
         sigma = min(c.sigma for c in evidence.captures)
@@ -66,14 +79,27 @@ class Ascent:
         """(parameter,) in their units, of x in tolerances."""
         return self.family.start + x * self.family.tolerance
 
-    def point(self, x: np.ndarray, factor: float | None = None, *, slopes: bool = False) -> Point:
-        """The Point at x; factor: of the noise, None for the most likely one, 1 at the least."""
+    def point(
+        self,
+        x: np.ndarray,
+        factor: float | None = None,
+        *,
+        slopes: bool = False,
+        finer: np.ndarray | None = None,
+    ) -> Point:
+        """The Point at x.
+
+        factor: of the noise, None for the most likely one, 1 at the least;
+        finer: as in Point.
+        """
         matrix = self.lenslets.at(self.values(x), slopes=slopes)
-        found = self.evidence.at(matrix.matrix)
+        found = self.evidence.at(matrix.matrix if finer is None else matrix.matrix + finer)
         if factor is None:
             factor = max(1.0, found.noise_factor())
         height = found.value(factor) - 0.5 * float(x @ x)
-        return Point(x=x, factor=factor, height=height, evidence=found, matrix=matrix)
+        return Point(
+            x=x, factor=factor, height=height, evidence=found, paraxial=matrix, finer=finer
+        )
 
     def information(self, at: Point) -> tuple[np.ndarray, np.ndarray]:
         """(Fisher's matrix by parameters in tolerances, with what is believed of them (parameter,
@@ -89,20 +115,38 @@ class Ascent:
         flat = np.array([np.asarray(s, float).ravel() for s in slopes])
         return turn.T @ by_optics @ turn + np.eye(len(at.x)), turn.T @ (flat @ flat.T) @ turn
 
-    def climb(self, x: np.ndarray, steps: int) -> Point:
-        """The Point, with slopes, where going on from x gains nothing, or after so many steps."""
-        at, damping = self.point(x, slopes=True), 1e-3
+    def settle(self, x: np.ndarray, steps: int) -> Point:
+        """The Point where climbs from x end whose matrix is the finer model's there: first
+        paraxially, then with the difference of the models where the climb before ended.
+        """
+        at = self.climb(x, steps)
+        for _ in range(ROUNDS if self._model is not None else 0):
+            at = self.climb(at.x, steps, self.difference(at.x))
+        return at
+
+    def difference(self, x: np.ndarray) -> np.ndarray | None:
+        """What the finer model adds to the paraxial matrix at x, None without a finer model."""
+        if self._model is None:
+            return None
+        values = self.values(x)
+        return self._model.matrix(values) - self.lenslets.at(values).matrix
+
+    def climb(self, x: np.ndarray, steps: int, finer: np.ndarray | None = None) -> Point:
+        """The Point, with slopes, where going on from x gains nothing, or after so many steps;
+        finer: as in Point, kept.
+        """
+        at, damping = self.point(x, slopes=True, finer=finer), 1e-3
         for step in range(steps):
             if self._progress is not None:
                 self._progress()
-            rise = at.matrix.back(at.evidence.by_matrix(at.factor)) * self.family.tolerance - at.x
+            rise = at.paraxial.back(at.evidence.by_matrix(at.factor)) * self.family.tolerance - at.x
             best, damping = self._step(at, rise, damping)
             if at.factor > MISFIT and step % 3 == 2:
                 best = max([best, *self._mirrored(best)], key=lambda p: p.height)
             if best is at:
                 break
             gain = best.height - at.height
-            at = self.point(best.x, slopes=True)
+            at = self.point(best.x, slopes=True, finer=best.finer)
             if gain < GAIN:
                 break
         return at
@@ -130,7 +174,7 @@ class Ascent:
         """
         best, length = at, 1.0
         while length < 400:
-            found = self.point(at.x + length * way, at.factor)
+            found = self.point(at.x + length * way, at.factor, finer=at.finer)
             if not found.height > best.height:
                 break
             best, length = found, length * LONGER
@@ -148,7 +192,8 @@ class Ascent:
         for kept in (at.x[place], 0.0):
             x = (mirrored - self.family.start) / self.family.tolerance
             x[place] = kept
-            found.append(self.point(x, at.factor))
+            finer = None if at.finer is None else at.finer[:, ::-1]
+            found.append(self.point(x, at.factor, finer=finer))
         return found
 
 

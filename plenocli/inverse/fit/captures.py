@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,3 +53,13 @@ def captured_lenslets(
     if not y.any():
         raise InputError("holds no light that a fit could look at", path, "give another capture")
     return CapturedLenslets(y, sigma)
+
+
+def believed_model(model: str, captures: Sequence[Capture]) -> str:
+    """The model of propagation behind captures: what simulated ones say, where `model` is "auto"
+    and they agree.
+    """
+    made = {str((one.metadata.accuracy or {}).get("model")) for one in captures}
+    if model == "auto" and len(made) == 1 and made <= {"fresnel", "exact"}:
+        return made.pop()
+    return model

@@ -15,8 +15,10 @@ from plenocli.forward.camera.geometry import geometry
 from plenocli.inverse.fit.ascent import Ascent, Point
 from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
 from plenocli.inverse.fit.evidence import Evidence, Lenslets
+from plenocli.inverse.fit.finer import FinerModel
 from plenocli.inverse.fit.lenslet import LensletFamily
 from plenocli.inverse.fit.optics import (
+    ZERNIKES,
     CameraFamily,
     Parameter,
     all_parameters,
@@ -27,12 +29,17 @@ from plenocli.inverse.fit.prior import BRIGHTNESS, photograph_prior
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
-STEPS, TRIAL = 40, 8
-"""Steps from one start at the most, and of those that compete for being gone on from."""
-STARTS = (0.25, -0.25, 1.0, -1.0)
-"""Further starts, in tolerances of the focus, where the way from the described camera does not lead
-to one that explains the captures: in focus a camera and its mirror image are alike, and the
-evidence has a saddle.
+STEPS, TRIAL, TRIALS = 40, 8, 3
+"""Steps from one start at the most, of those that compete for being gone on from, and how many
+compete.
+"""
+STARTS = (
+    *(("focus", far) for far in (0.25, -0.25, 1.0, -1.0)),
+    *((ZERNIKES[noll][0], far) for noll in (5, 6, 7, 8) for far in (0.8, -0.8)),
+)
+"""Further starts, in tolerances, where the way from the described camera does not lead to one that
+explains the captures: in focus a camera and its mirror image are alike, and the evidence has a
+saddle.
 """
 HIDDEN = 0.15
 """Patterns of photographs that all together stay below so much of the noise are left out."""
@@ -41,6 +48,9 @@ LOST = 0.01
 SLACK, DEVIATIONS = 0.025, 4.0
 """Noise over the noise told, less one, up to which a fit explains its captures: photographs are
 not quite what the prior says, and the noise of few pixels is known so well only.
+"""
+UNRESOLVED = 4e-4
+"""What objects finer than the points of a lenslet may leave over, of a capture's root mean square.
 """
 INFLATION = 2.5
 """By how much the standard deviations exceed Fisher's: draws of cameras were this much farther."""
@@ -78,6 +88,7 @@ def fit_camera(
     pictures: Sequence[np.ndarray],
     *,
     parameters: Sequence[Parameter] | None = None,
+    model: str = "auto",
     seed: int = 0,
     progress: Callable[[], object] | None = None,
 ) -> CameraFit:
@@ -87,6 +98,8 @@ def fit_camera(
     captures: of one camera, whose superpixels are cut out around their centres.
     pictures: training photographs, linear luminance (row, column) in [0, 1], at several scales.
     parameters: that may change, with their tolerances; None: all_parameters.
+    model: of propagation behind which captures are believed to have come about: "auto" for the
+        finest that serves, "exact" or "fresnel".
     seed: of the training patches.
     progress: called at every step.
 
@@ -104,14 +117,16 @@ def fit_camera(
     evidence = Evidence(data, prior.seen(told, HIDDEN * sigma))
     signal = max(float(np.sqrt(np.mean(c.y**2))) for c in data)
     lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
-    ascent = Ascent(family, evidence, tolerance=lost, progress=progress)
-    before = ascent.point(np.zeros(len(family.parameters))).evidence.noise_factor()
-    limit = accepted_ratio(sum(c.y.size for c in data))
-    best = _highest(ascent, limit)
+    finer = None if model == "fresnel" else FinerModel(family, model)
+    ascent = Ascent(family, evidence, tolerance=lost, model=finer, progress=progress)
+    start = np.zeros(len(family.parameters))
+    before = ascent.point(start, finer=ascent.difference(start)).evidence.noise_factor()
+    limits = accepted_ratios(sum(c.y.size for c in data), signal / sigma)
+    best = _highest(ascent, limits[0])
     turned = None
-    if best.evidence.noise_factor() <= limit:
+    if best.evidence.noise_factor() <= limits[1]:
         best, turned = _told_apart(ascent, best, middle)
-    return _described(ascent, best, limit, before, turned)
+    return _described(ascent, best, limits[1], before, turned)
 
 
 def described_matrix(camera: Camera) -> np.ndarray:
@@ -136,9 +151,15 @@ def _matrix(family: CameraFamily) -> np.ndarray:
     return LensletFamily(family, tolerance=1e-4).at(family.start).matrix
 
 
-def accepted_ratio(values: int) -> float:
-    """Most likely noise over the noise told up to which a fit of so many pixels is accepted."""
-    return 1 + SLACK + DEVIATIONS / float(np.sqrt(2 * values))
+def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
+    """(most likely noise over the noise told up to which a fit is taken without looking farther,
+    the same up to which the best fit is accepted).
+
+    values: pixels of all lenslets;
+    quiet: root mean square of the captures over their noise.
+    """
+    sure = DEVIATIONS / float(np.sqrt(2 * values))
+    return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
 
 
 def _middle(capture: CapturedLenslets) -> CapturedLenslets:
@@ -172,16 +193,26 @@ def _highest(ascent: Ascent, limit: float) -> Point:
     """Where the way up leads from the described camera or, if that explains nothing, from the best
     of further starts.
     """
-    first = ascent.climb(np.zeros(len(ascent.family.parameters)), STEPS)
-    if first.evidence.noise_factor() <= limit or not ascent.family.has("focus"):
+    first = ascent.settle(np.zeros(len(ascent.family.parameters)), STEPS)
+    if first.evidence.noise_factor() <= limit:
         return first
-    found = [first]
-    for focus in STARTS:
-        x = np.zeros_like(first.x)
-        x[ascent.family.place("focus")] = focus
-        found.append(ascent.climb(x, TRIAL))
-    best = max(found, key=lambda p: p.evidence.value(1.0) - 0.5 * float(p.x @ p.x))
-    return best if best is first else ascent.climb(best.x, STEPS)
+    starts = []
+    for name, far in STARTS:
+        if ascent.family.has(name):
+            x = np.zeros_like(first.x)
+            x[ascent.family.place(name)] = far
+            starts.append(ascent.point(x))
+    starts = sorted(starts, key=lambda p: p.height, reverse=True)[:TRIALS]
+    found = [ascent.climb(start.x, TRIAL) for start in starts]
+    if not found:
+        return first
+    other = ascent.settle(max(found, key=_likely).x, STEPS)
+    return max([first, other], key=_likely)
+
+
+def _likely(at: Point) -> float:
+    """How likely the captures are at a point, whatever the noise."""
+    return at.evidence.value(max(1.0, at.evidence.noise_factor())) - 0.5 * float(at.x @ at.x)
 
 
 def _told_apart(
@@ -193,13 +224,14 @@ def _told_apart(
     mirrored = ascent.family.mirrored(ascent.values(at.x))
     if mirrored is None:
         return at, None
-    other = ascent.point((mirrored - ascent.family.start) / ascent.family.tolerance, at.factor)
+    x = (mirrored - ascent.family.start) / ascent.family.tolerance
+    other = ascent.point(x, at.factor, finer=ascent.difference(x))
     steps = [_border_steps(p, ascent, captures) for p in (at, other)]
     if steps[0] is None or steps[1] is None:
         return at, None
     if steps[0] <= steps[1]:
         return at, steps[1] / steps[0]
-    return ascent.climb(other.x, STEPS), steps[0] / steps[1]
+    return ascent.climb(other.x, STEPS, other.finer), steps[0] / steps[1]
 
 
 def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets]) -> float | None:
@@ -242,7 +274,7 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
     narrower, products = covariance(FINER_IN_MATRIX)
     error = MATRIX_INFLATION * float(np.sqrt(max(np.sum(narrower * products), 0.0)))
     # nothing is known less well than before
-    return np.minimum(sigma, 1.0), correlation, error / float(np.linalg.norm(at.matrix.matrix))
+    return np.minimum(sigma, 1.0), correlation, error / float(np.linalg.norm(at.matrix))
 
 
 def _described(
@@ -284,6 +316,6 @@ def _described(
         noise_ratio_before=before,
         model_error=error,
         turned=turned,
-        matrix=np.asarray(at.matrix.matrix, float),
+        matrix=np.asarray(at.matrix, float),
         lenslets=ascent.evidence.lenslets,
     )

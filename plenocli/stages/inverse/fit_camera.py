@@ -51,6 +51,7 @@ def run_fit_camera(
     training: Sequence[str] = (),
     noise_sigma: float | None = None,
     fixed: Sequence[str] = (),
+    model: str = "auto",
     seed: int = 0,
     overwrite: bool = False,
     command: str = "",
@@ -65,6 +66,8 @@ def run_fit_camera(
     training: photographs for the statistics; () for those of scikit-image.
     noise_sigma: standard deviation of the noise in units of A x; None as the captures say.
     fixed: names of parameters that stay as described.
+    model: of propagation, as simulate-pif takes it; "auto" for the one that simulated captures were
+        made with, or the finest.
     seed: of the training patches.
 
     Raises UsageError, InputError, OutputError; NumericsError where no camera near the described one
@@ -79,7 +82,7 @@ def run_fit_camera(
     from plenocli.files.read.captures import read_white
     from plenocli.files.read.training import files_of, read_training
     from plenocli.files.results.camera_fits import fit_artefact
-    from plenocli.inverse.fit.captures import captured_lenslets
+    from plenocli.inverse.fit.captures import believed_model, captured_lenslets
     from plenocli.inverse.fit.fit import STEPS, expected_seconds, fit_camera
     from plenocli.inverse.fit.optics import parameters_without, require_fittable
     from plenocli.inverse.prior.natural_images import at_scales
@@ -115,6 +118,7 @@ def run_fit_camera(
             lenslets,
             scaled,
             parameters=parameters,
+            model=believed_model(model, read),
             seed=seed,
             progress=progress.update,
         )

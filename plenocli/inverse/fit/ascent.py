@@ -20,8 +20,8 @@ LONGER = 2.5
 """By how much a step that helped is lengthened, again and again."""
 FAR = 20.0
 """No step is longer, in tolerances, before it has shown that it helps."""
-ROUNDS = 3
-"""How often the difference of the models is brought up to date."""
+NODES = 2
+"""Of a pixel along each side, where a finer model makes up for what they miss."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
 LOUD = 0.7
@@ -62,14 +62,17 @@ class Ascent:
         *,
         tolerance: float = 1e-5,
         model: FinerModel | None = None,
+        rounds: int = 0,
         progress: Callable[[], object] | None = None,
     ) -> None:
         """tolerance: root energy of the spread function that may be lost; model: finer than the
-        paraxial one; progress: called at every step.
+        paraxial one, whose difference from it is brought up to date `rounds` times; progress:
+        called at every step.
         """
         self.family, self.evidence, self._progress = family, evidence, progress
-        self._model = model
-        self.lenslets = LensletFamily(family, tolerance=tolerance)
+        self._model, self._rounds = model, rounds
+        nodes = None if model is None else NODES
+        self.lenslets = LensletFamily(family, tolerance=tolerance, pixel_nodes=nodes)
         self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=1)
         sigma = min(c.sigma for c in evidence.captures)
         told = self._coarse.at(family.start).matrix
@@ -101,26 +104,37 @@ class Ascent:
             x=x, factor=factor, height=height, evidence=found, paraxial=matrix, finer=finer
         )
 
-    def information(self, at: Point) -> tuple[np.ndarray, np.ndarray]:
-        """(Fisher's matrix by parameters in tolerances, with what is believed of them (parameter,
-        parameter); products of the matrix's slopes by them (parameter, parameter)), both from a
-        coarse matrix.
+    def information(self, at: Point) -> np.ndarray:
+        """Fisher's matrix by parameters in tolerances, with what is believed of them (parameter,
+        parameter), from a coarse matrix.
+        """
+        state, slopes, turn = self._slopes(at)
+        counts = at.evidence.contrasts(at.factor)
+        by_optics = self._loud.at(state.matrix).fisher(slopes, at.factor, counts)
+        return turn.T @ by_optics @ turn + np.eye(len(at.x))
+
+    def products(self, at: Point) -> np.ndarray:
+        """Products of the matrix's slopes by parameters in tolerances (parameter, parameter)."""
+        _, slopes, turn = self._slopes(at)
+        # slopes are transposed views: their own order costs no copies
+        pairs = [[float(np.vdot(a.T, b.T)) for b in slopes] for a in slopes]
+        return turn.T @ np.array(pairs) @ turn
+
+    def _slopes(self, at: Point) -> tuple[MatrixAt, list[np.ndarray], np.ndarray]:
+        """(a coarse matrix at a point, its slopes by the optics, derivatives of the optics by
+        parameters in tolerances).
         """
         values = self.values(at.x)
         state = self._coarse.at(values, slopes=True)
         slopes = [state.slope(place) for place in range(len(self.family.optics(values)))]
-        counts = at.evidence.contrasts(at.factor)
-        by_optics = self._loud.at(state.matrix).fisher(slopes, at.factor, counts)
-        turn = self.family.jacobian(values) * self.family.tolerance
-        flat = np.array([np.asarray(s, float).ravel() for s in slopes])
-        return turn.T @ by_optics @ turn + np.eye(len(at.x)), turn.T @ (flat @ flat.T) @ turn
+        return state, slopes, self.family.jacobian(values) * self.family.tolerance
 
     def settle(self, x: np.ndarray, steps: int) -> Point:
         """The Point where climbs from x end whose matrix is the finer model's there: first
         paraxially, then with the difference of the models where the climb before ended.
         """
         at = self.climb(x, steps)
-        for _ in range(ROUNDS if self._model is not None else 0):
+        for _ in range(self._rounds):
             at = self.climb(at.x, steps, self.difference(at.x))
         return at
 
@@ -156,7 +170,7 @@ class Ascent:
 
         rise: (parameter,) derivatives of the height.
         """
-        fisher, _ = self.information(at)
+        fisher = self.information(at)
         for _ in range(6):
             way = _damped(fisher, damping, rise)
             while np.linalg.norm(way) > FAR:

@@ -11,7 +11,7 @@ from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.inverse.fit.optics import CameraFamily
 
-ACCURACY = 1e-3
+ACCURACY = 3e-4
 """Of the finer matrix, where the dial reaches it."""
 
 
@@ -21,7 +21,7 @@ class FinerModel:
     """
 
     def __init__(self, family: CameraFamily, model: str) -> None:
-        """model: "auto" or "exact", as simulate-pif takes it."""
+        """model: "auto", "fresnel" or "exact", as simulate-pif takes it."""
         self._family, self._model = family, model
 
     def matrix(self, values: np.ndarray) -> np.ndarray:

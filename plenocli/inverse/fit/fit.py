@@ -29,9 +29,9 @@ from plenocli.inverse.fit.prior import BRIGHTNESS, photograph_prior
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
-STEPS, TRIAL, TRIALS = 40, 8, 3
-"""Steps from one start at the most, of those that compete for being gone on from, and how many
-compete.
+STEPS, TRIAL, TRIALS, ROUNDS = 40, 8, 3, 3
+"""Steps from one start at the most, of those that compete for being gone on from, how many
+compete, and how often the difference of a finer model is brought up to date.
 """
 STARTS = (
     *(("focus", far) for far in (0.25, -0.25, 1.0, -1.0)),
@@ -117,8 +117,14 @@ def fit_camera(
     evidence = Evidence(data, prior.seen(told, HIDDEN * sigma))
     signal = max(float(np.sqrt(np.mean(c.y**2))) for c in data)
     lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
-    finer = None if model == "fresnel" else FinerModel(family, model)
-    ascent = Ascent(family, evidence, tolerance=lost, model=finer, progress=progress)
+    ascent = Ascent(
+        family,
+        evidence,
+        tolerance=lost,
+        model=FinerModel(family, model),
+        rounds=1 if model == "fresnel" else ROUNDS,
+        progress=progress,
+    )
     start = np.zeros(len(family.parameters))
     before = ascent.point(start, finer=ascent.difference(start)).evidence.noise_factor()
     limits = accepted_ratios(sum(c.y.size for c in data), signal / sigma)
@@ -262,17 +268,15 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
     quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in captures)
     excess = max(0.0, ratio**2 - 1 - 2 * float(np.sqrt(2 / values))) * values
 
-    def covariance(finer: float) -> tuple[np.ndarray, np.ndarray]:
+    def covariance(finer: float) -> np.ndarray:
         factor = max(at.factor, float(np.hypot(1, finer * quiet)))
-        information, products = ascent.information(replace(at, factor=factor))
-        return np.linalg.inv(information), products
+        return np.linalg.inv(ascent.information(replace(at, factor=factor)))
 
-    found, _ = covariance(FINER)
-    found = found * (INFLATION**2 + LEFT_OVER * excess)
+    found = covariance(FINER) * (INFLATION**2 + LEFT_OVER * excess)
     sigma = np.sqrt(np.diag(found))
     correlation = found / np.outer(sigma, sigma)
-    narrower, products = covariance(FINER_IN_MATRIX)
-    error = MATRIX_INFLATION * float(np.sqrt(max(np.sum(narrower * products), 0.0)))
+    missed = float(np.sum(covariance(FINER_IN_MATRIX) * ascent.products(at)))
+    error = MATRIX_INFLATION * float(np.sqrt(max(missed, 0.0)))
     # nothing is known less well than before
     return np.minimum(sigma, 1.0), correlation, error / float(np.linalg.norm(at.matrix))
 

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 from plenocli.base.errors import NumericsError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
 
 
@@ -80,12 +83,11 @@ def run_fit_camera(
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.cameras import camera_files, read_camera
     from plenocli.files.read.captures import read_white
-    from plenocli.files.read.training import files_of, read_training
+    from plenocli.files.read.training import files_of
     from plenocli.files.results.camera_fits import fit_artefact
     from plenocli.inverse.fit.captures import believed_model, captured_lenslets
     from plenocli.inverse.fit.fit import STEPS, expected_seconds, fit_camera
     from plenocli.inverse.fit.optics import parameters_without, require_fittable
-    from plenocli.inverse.prior.natural_images import at_scales
 
     output, inputs = Path(output), [*captures, camera, calibration, *(files_of(training) or ())]
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".toml",))
@@ -105,10 +107,7 @@ def run_fit_camera(
         captured_lenslets(one, described, grid, noise_sigma=noise_sigma, where=calibration)
         for one in read
     ]
-    scenes = {one.metadata.target for one in read if one.metadata.target}
-    shape = described.object.samples_per_lenslet
-    pictures = read_training(training, shape, not_scene=scenes.pop() if len(scenes) == 1 else None)
-    scaled = [picture for _, picture in at_scales(pictures, shape)]
+    scaled = _photographs(training, read, described.object.samples_per_lenslet)
     seconds = expected_seconds(described)
     if seconds > 20:
         note(f"the fit takes about {seconds:.0f} s of one core, up to four times that at worst")
@@ -134,6 +133,18 @@ def run_fit_camera(
         write_artefact(details, fit_artefact(fit, provenance), overwrite=overwrite)
     publish(output, fitted_toml(fit, camera, captures).encode(), overwrite=overwrite)
     return CameraFitSummary(output=str(output), captures=len(captures), fit=fit)
+
+
+def _photographs(
+    training: Sequence[str], captures: Sequence[Capture], shape: tuple[int, int]
+) -> list[np.ndarray]:
+    """Training pictures at several scales, without the scene of the captures."""
+    from plenocli.files.read.training import read_training
+    from plenocli.inverse.prior.natural_images import at_scales
+
+    scenes = {one.metadata.target for one in captures if one.metadata.target}
+    pictures = read_training(training, shape, not_scene=scenes.pop() if len(scenes) == 1 else None)
+    return [picture for _, picture in at_scales(pictures, shape)]
 
 
 def told(fit: CameraFit) -> list[str]:

@@ -52,6 +52,10 @@ not quite what the prior says, and the noise of few pixels is known so well only
 UNRESOLVED = 4e-4
 """What objects finer than the points of a lenslet may leave over, of a capture's root mean square.
 """
+CLEAR = 4.0
+"""Steps over lenslet borders under the mirrored camera, over those under the found one, from which
+on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
+"""
 INFLATION = 2.5
 """By how much the standard deviations exceed Fisher's: draws of cameras were this much farther."""
 MATRIX_INFLATION = 2.0
@@ -132,7 +136,9 @@ def fit_camera(
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
         best, turned = _told_apart(ascent, best, middle)
-    return _described(ascent, best, limits[1], before, turned)
+    # what is left over beyond the noise is believed of fine objects only where pictures go on
+    sure = turned is not None and turned >= CLEAR
+    return _described(ascent, best, limits[1] if sure else limits[0], before, turned)
 
 
 def described_matrix(camera: Camera) -> np.ndarray:

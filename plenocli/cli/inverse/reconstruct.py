@@ -103,6 +103,14 @@ METHODS = (
     ),
 )
 @click.option(
+    "--fit",
+    is_flag=True,
+    help=(
+        "Fit the camera to each capture first (as fit-camera does) and use its matrix; the pif "
+        "says which camera to start from. Where none fits, the pif is used and a note says so."
+    ),
+)
+@click.option(
     "--clip", is_flag=True, help="Set negative values to zero; their share is reported either way."
 )
 @options.file_type("h5", "exr")
@@ -131,6 +139,7 @@ def command(
     lam: float | None,
     nnls_iterations: int | None,
     hold_out: float | None,
+    fit: bool,
     clip: bool,
     suffix: str,
     output: Path,
@@ -188,6 +197,7 @@ def command(
             lam=lam,
             nnls_iterations=nnls_iterations,
             hold_out=hold_out,
+            fit=fit,
             clip=clip,
             seed=seed,
             workers=workers,

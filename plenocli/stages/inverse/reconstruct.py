@@ -30,6 +30,7 @@ from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
+from plenocli.stages.inverse.fitted_matrix import with_fitted_camera
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -46,6 +47,7 @@ class Settings:
     dictionary: artefact of learn-dict.
     training: photographs for the statistics; () for those of scikit-image.
     truth: what chooses a weight with hindsight.
+    fit: fit the camera to each capture first.
     clip: set negative values to zero.
     seed: of every random stream.
     workers: processes.
@@ -62,6 +64,7 @@ class Settings:
     lam: float | None = None
     nnls_iterations: int | None = None
     hold_out: float | None = None
+    fit: bool = False
     clip: bool = False
     seed: int = 0
     workers: int = 1
@@ -392,6 +395,8 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
             "--pif",
             "give it, or use --method block-mean",
         )
+    if settings.fit and (pif is None or not method.needs_pif and method.name == "block-mean"):
+        raise UsageError("--fit means nothing without a system matrix", "--fit", "leave it out")
     if method.needs_dictionary and settings.dictionary is None:
         raise UsageError(
             f"--method {method.name} needs --dictionary", fix="learn one with learn-dict"
@@ -442,6 +447,9 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
     limits = _limits(estimators, data)
+    if settings.fit:
+        estimators, _ = with_fitted_camera(estimators, data, capture)
+        limits = _limits(estimators, data)
     if look and limits is not None and limits.limited_by == "model":
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)

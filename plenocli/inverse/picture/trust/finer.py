@@ -1,4 +1,6 @@
-"""A finer matrix of the same camera, where the one at hand is known to be the error that counts."""
+"""Other matrices in place of the one at hand: a finer one of the same camera, where its own error
+is known to count; that of a camera that was fitted.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import PlenoError
+from plenocli.base.errors import NumericsError, PlenoError
 from plenocli.base.progress import note
 from plenocli.forward.accuracy.dial import plan_pif, seconds_here
+from plenocli.forward.camera.model import Camera
+from plenocli.forward.propagation.plan import PifPlan
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
 
@@ -28,31 +32,57 @@ def finer_matrix(system: LensletMatrix) -> LensletMatrix | None:
     origin, record = system.origin, system.accuracy
     if origin is None or record is None or record.model == "exact" or not record.model_error:
         return None
-    reach = 2 * np.abs(system.offsets).max(axis=0) + 1
     try:
-        plan = plan_pif(
-            origin.camera,
-            wavelengths=origin.wavelengths,
-            superpixels=(int(reach[0]), int(reach[1])),
-            coherent_ring=origin.coherent_ring,
-            accuracy=max(record.estimated or 0.0, FINEST),
-            model="exact",
-            dtype=np.float64,
-        )
+        plan = _plan(system, origin.camera, origin.wavelengths, "exact")
         if seconds_here(plan.chosen) > SECONDS or plan.memory > budget().memory / 2:
             return None
-        matrix = build_pif(origin.camera, plan)
+        finer = _built(system, origin.camera, plan, origin.weights)
     except PlenoError:  # the matrix at hand serves, with its error
-        return None
-    if matrix.A is None or not np.array_equal(matrix.lenslet_offset, system.offsets):
         return None
     note(
         f"the system matrix is off by {record.model_error:.2g} by its own record, more than the "
         f"noise: the exact one of the same camera is used instead (simulate-pif --model exact)"
     )
+    return finer
+
+
+def matrix_of(system: LensletMatrix, camera: Camera, model: str) -> LensletMatrix:
+    """The matrix of another camera in the place of `system`: as many neighbours, as accurate.
+
+    camera: with one wavelength.
+    model: of propagation, as simulate-pif takes it.
+
+    Raises UsageError or NumericsError where the request cannot be met.
+    """
+    return _built(system, camera, _plan(system, camera, camera.light.wavelengths, model), None)
+
+
+def _plan(
+    system: LensletMatrix, camera: Camera, wavelengths: tuple[float, ...], model: str
+) -> PifPlan:
+    rows, columns = (int(n) for n in 2 * np.abs(system.offsets).max(axis=0) + 1)
+    asked = None if system.accuracy is None else system.accuracy.estimated
+    return plan_pif(
+        camera,
+        wavelengths=wavelengths,
+        superpixels=(rows, columns),
+        coherent_ring="auto" if system.origin is None else system.origin.coherent_ring,
+        accuracy=max(asked or 0.0, FINEST),
+        model=model,
+        dtype=np.float64,
+    )
+
+
+def _built(
+    system: LensletMatrix, camera: Camera, plan: PifPlan, weights: np.ndarray | None
+) -> LensletMatrix:
+    matrix = build_pif(camera, plan)
+    if matrix.A is None:
+        raise NumericsError("the matrix does not fit the memory", fix="give more with --mem-limit")
     return replace(
         system,
-        blocks=gathered(matrix.A, origin.weights),
+        blocks=gathered(matrix.A, weights),
+        offsets=np.asarray(matrix.lenslet_offset, int),
         accuracy=plan.accuracy_record(),
         origin=None,
     )

@@ -1,0 +1,77 @@
+"""`reconstruct --fit`: the matrix of the camera that fits a capture, in the place of the pif's."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plenocli.base.errors import InputError, UsageError
+from plenocli.base.progress import bar, note
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.nuisances.clean import clean
+
+if TYPE_CHECKING:
+    from plenocli.inverse.fit.camera_fit import CameraFit
+    from plenocli.inverse.picture.lenslet_model import Superpixels
+
+
+def with_fitted_camera(
+    estimators: Estimators, data: Superpixels, where: Any
+) -> tuple[Estimators, CameraFit]:
+    """(the same by the matrix of the camera that fits the capture, the fit); those at hand where no
+    camera near the described one explains it, which a note says.
+
+    data: the capture.
+    where: its path, for messages.
+
+    Raises UsageError where the pif does not say what camera it was made for, or the camera is of a
+    kind that is not fitted; InputError where the noise is not known.
+    """
+    from plenocli.inverse.fit.fit import STEPS, CapturedLenslets, expected_seconds, fit_camera
+    from plenocli.inverse.picture.trust.finer import matrix_of
+
+    system, options = estimators.system, estimators.options
+    if system.origin is None:
+        raise UsageError(
+            "the pif does not say what camera it was made for", "--fit", "make it anew, or without"
+        )
+    sigma = options.noise_sigma or data.sigma
+    if not sigma:
+        raise InputError("does not say how strong its noise is", where, "give --noise-sigma")
+    camera = system.origin.camera
+    model = "auto"
+    if data.accuracy is not None and data.accuracy.model in ("fresnel", "exact"):
+        model = data.accuracy.model
+    seconds = expected_seconds(camera)
+    if seconds > 20:
+        note(f"--fit takes about {seconds:.0f} s of one core, up to four times that at worst")
+    y = np.where(np.isfinite(data.y), data.y, 0)
+    bare = clean(estimators, data).data.y if np.any(y != data.y) or data.saturated is not None else y
+    with bar(None, STEPS, "steps of the fit") as progress:
+        fit = fit_camera(
+            camera,
+            [CapturedLenslets(bare, float(sigma))],
+            estimators.prior.pictures(data.scene),
+            model=model,
+            seed=options.seed,
+            progress=progress.update,
+        )
+    if not fit.accepted:
+        note(f"--fit: the best {fit.why}; the matrix of the camera as described is used")
+        return estimators, fit
+    moved = [p.name for p in fit.parameters if p.measured and abs(p.value - p.described) > p.sigma]
+    note(
+        f"--fit: {fit.why} (as described {fit.noise_ratio_before:.3g} times); "
+        f"other than described: {', '.join(moved) or 'nothing'}"
+    )
+    fitted = Estimators(
+        matrix_of(system, fit.camera, model),
+        options,
+        estimators.read_pictures,
+        None if estimators.read_dictionary is None else lambda: estimators.learnt,
+        threads=estimators.threads,
+    )
+    fitted.prior.pictures_of = estimators.prior.pictures_of
+    fitted.prior.statistics = estimators.prior.statistics
+    return fitted, fit

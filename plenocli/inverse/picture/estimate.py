@@ -127,7 +127,8 @@ def estimate(
         _tell(belief, model_error, coupled=estimators.coupled and estimators.overlap == 3)
         rows = belief.lmmse.whitening()
         looked_through, joint = estimators.seen_through(rows), None
-        data = replace(data, y=data.y @ rows.T)
+        data = replace(data, y=belief.cleared(data.y) @ rows.T)
+        settled = replace(settled, own=belief.cleared(settled.own))
     truth = None if truth is None else truth / unit
     found = method.reconstruct(looked_through, data, truth, joint=joint)
     if found.sigma is not None and not belief.right:

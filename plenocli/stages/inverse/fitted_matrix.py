@@ -47,7 +47,9 @@ def with_fitted_camera(
     if seconds > 20:
         note(f"--fit takes about {seconds:.0f} s of one core, up to four times that at worst")
     y = np.where(np.isfinite(data.y), data.y, 0)
-    bare = clean(estimators, data).data.y if np.any(y != data.y) or data.saturated is not None else y
+    bare = (
+        clean(estimators, data).data.y if np.any(y != data.y) or data.saturated is not None else y
+    )
     with bar(None, STEPS, "steps of the fit") as progress:
         fit = fit_camera(
             camera,

@@ -21,7 +21,7 @@ from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
-from plenocli.inverse.picture.trust.excess import with_excess
+from plenocli.inverse.picture.trust.excess import even_light, with_excess
 
 SHAPE, COUNT = (20, 20), 5
 HALF = (("[40, 40]", "[20, 20]"), ("[52, 52]", "[26, 26]"), ('"2 um"', '"4 um"'))
@@ -214,6 +214,22 @@ def test_excess_is_found_where_it_is():
     assert np.all(noise[weak[6:-6]] < 5 * added**2)
     far = np.setdiff1d(np.argsort(-lmmse.power), np.argsort(-lmmse.power)[90:140])
     assert np.mean(noise[far] == data.sigma**2) > 0.9
+
+
+def test_what_even_light_makes_beside_the_matrix_is_found():
+    """A pattern in proportion to each lenslet's brightness, against the photographs' own detail."""
+    rng, shared = np.random.default_rng(8), estimators()
+    data = captured(matrix())
+    lmmse = shared.prior.lmmse(data.sigma, None)
+    stacked = data.y.reshape(COUNT**2, -1).T
+    weak = np.argsort(-lmmse.power)[60:160]
+    added = lmmse.analysis[weak].T @ (30 * data.sigma * rng.standard_normal(100))
+    bright = lmmse.brightness(stacked)
+    found = even_light(lmmse, stacked + np.outer(added, bright))
+    clear = even_light(lmmse, stacked)
+    assert np.linalg.norm(found - clear - added) < 0.1 * np.linalg.norm(added)
+    kept = lmmse.analysis[weak] @ clear
+    assert np.linalg.norm(kept) < 0.1 * np.linalg.norm(added)
 
 
 def test_looking_through_whitened_rows_is_lmmse_with_that_noise():

@@ -25,7 +25,7 @@ from plenocli.inverse.picture.trust.continuity import (
     pieces,
     relative_factor,
 )
-from plenocli.inverse.picture.trust.excess import with_excess
+from plenocli.inverse.picture.trust.excess import even_light, with_excess
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 
 CONTINUOUS = 0.6
@@ -53,6 +53,8 @@ class Belief:
         anything was raised; None where there are too few lenslets.
     reference: factor of these photographs, for what is made with the noise that is believed.
     raised: root mean square over the coordinates in use of the noise over that of a pixel.
+    pattern: (pixel,) what even light of brightness 1 makes beside what the matrix says, None where
+        it is believed.
     """
 
     level: NoiseLevel
@@ -61,6 +63,14 @@ class Belief:
     continuity: float | None = None
     reference: float | None = None
     raised: float = 1.0
+    pattern: np.ndarray | None = None
+
+    def cleared(self, y: np.ndarray) -> np.ndarray:
+        """Superpixels y (.., pixel) without the pattern."""
+        if self.pattern is None:
+            return y
+        bright = self.lmmse.brightness(y.reshape(-1, y.shape[-1]).T)
+        return y - bright.reshape(*y.shape[:-1], 1) * self.pattern
 
 
 def believe(
@@ -96,6 +106,10 @@ def believe(
             continuity=None if first is None else first.relative,
             reference=None if first is None else first.reference,
         )
+    pattern = even_light(lmmse, stacked)
+    y = y - lmmse.brightness(stacked).reshape(*y.shape[:-1], 1) * pattern
+    stacked = y.reshape(-1, y.shape[-1]).T
+    judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
     raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
     now = None if judge is None else judge.of_lmmse(raised)
@@ -112,6 +126,7 @@ def believe(
         continuity=None if first is None else first.relative,
         reference=None if now is None else now.reference,
         raised=float(np.sqrt(power)) / level.sigma,
+        pattern=pattern,
     )
 
 

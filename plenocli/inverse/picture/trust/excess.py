@@ -20,6 +20,8 @@ TOGETHER = 9
 TIMES = 1.5
 """Times what is expected, from which on there is an excess: photographs differ so much."""
 ROUNDS = 4
+SURE = 1.0
+"""Variances of chance by which a pattern of even light is drawn towards nothing."""
 
 
 def with_excess(lmmse: Lmmse, y: np.ndarray, floor: float) -> np.ndarray:
@@ -41,6 +43,25 @@ def with_excess(lmmse: Lmmse, y: np.ndarray, floor: float) -> np.ndarray:
         noise = noise + np.where(ratio > TIMES, ratio - 1, 0) * expected
         used = order
     return noise
+
+
+def even_light(lmmse: Lmmse, y: np.ndarray) -> np.ndarray:
+    """(pixel,) what even light makes in a superpixel beside what the matrix says, for a brightness
+    of 1.
+
+    Photographs have no detail that goes with the brightness of lenslets in all of them; an error of
+    the matrix has, and leaves the same pattern in every bright one. By least squares over the
+    lenslets, each coordinate drawn towards nothing by what chance makes of it.
+
+    y: (pixel, signal) superpixels.
+    """
+    w, bright = lmmse.coordinates(y), lmmse.brightness(y)
+    power = max(float(bright @ bright), np.finfo(float).tiny)
+    found = w @ bright / power
+    rest = w - np.outer(found, bright)
+    variance = rest**2 @ bright**2 / power**2
+    sure = 1 - SURE * variance / np.maximum(found**2, np.finfo(float).tiny)
+    return lmmse.analysis.T @ (np.maximum(sure, 0) * found)
 
 
 def _contrasts(power: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarray:

@@ -446,11 +446,12 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     )
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
-    limits = _limits(estimators, data)
+    fitted = False
     if settings.fit:
-        estimators, _ = with_fitted_camera(estimators, data, capture)
-        limits = _limits(estimators, data)
-    if look and limits is not None and limits.limited_by == "model":
+        estimators, fit = with_fitted_camera(estimators, data, capture)
+        fitted = fit.accepted
+    limits = _limits(estimators, data)
+    if look and not fitted and limits is not None and limits.limited_by == "model":
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)
     off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error

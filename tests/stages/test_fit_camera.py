@@ -128,3 +128,36 @@ def test_refusals(folder, monkeypatch, capsys, words, code, said):
     assert run(command) == code
     assert said in capsys.readouterr().err
     assert not (folder / "refused.toml").exists()
+
+
+def test_reconstruct_fits_the_camera_first(folder, capsys):
+    """By the pif of the camera as described: told what is wrong, and with --fit as by the right
+    one.
+    """
+    described = ["simulate-pif", str(folder / "camera.toml"), *ALONE]
+    assert run([*described, "-o", str(folder / "described.h5")]) == 0
+
+    def psnr(pif, *options):
+        out, capture = str(folder / "picture.h5"), str(folder / "capture.h5")
+        command = ["reconstruct", capture, "--pif", str(folder / pif), *options]
+        assert run([*command, "-o", out, "--overwrite"]) == 0
+        found = read_artefact(folder / "picture.h5", "image").data["image/value"]
+        truth = read_artefact(folder / "capture.h5", "capture").data["capture/scene"][0]
+        return -10 * np.log10(np.mean((found - truth) ** 2))
+
+    floor, right = psnr("real.h5", "--method", "block-mean"), psnr("real.h5", "--method", "lmmse")
+    capsys.readouterr()
+    doubted = psnr("described.h5", "--method", "lmmse")
+    said = capsys.readouterr().err
+    assert "is not quite this camera's" in said and "alone explains most" in said
+    assert doubted > floor - 0.2
+    fitted = psnr("described.h5", "--method", "lmmse", "--fit")
+    assert "--fit: explains the captures" in capsys.readouterr().err
+    assert fitted > max(right - 0.5, doubted + 1)
+
+
+def test_a_fit_needs_a_matrix(folder, capsys):
+    command = ["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "real.h5")]
+    command += ["--method", "block-mean", "--fit", "-o", str(folder / "no.h5")]
+    assert run(command) == 2 and "--fit" in capsys.readouterr().err
+    assert not (folder / "no.h5").exists()

@@ -112,10 +112,10 @@ def fit_camera(
     docs/model.md, "A camera that fits itself".
     """
     require_fittable(camera)
-    family = _family(camera, parameters)
-    told = _matrix(family)
-    middle = [_middle(c) for c in captures]
-    data = [_scaled(c, told) for c in middle]
+    family = camera_family(camera, parameters)
+    told = matrix_as_described(family)
+    middle = [middle_of(c) for c in captures]
+    data = [in_units_of_photographs(c, told) for c in middle]
     prior = photograph_prior(pictures, family.geometry.object_shape, seed)
     sigma = min(c.sigma for c in data)
     evidence = Evidence(data, prior.seen(told, HIDDEN * sigma))
@@ -143,7 +143,7 @@ def fit_camera(
 
 def described_matrix(camera: Camera) -> np.ndarray:
     """The matrix (pixel, point) of one lenslet of a camera as described, where fits start."""
-    return _matrix(_family(camera, None))
+    return matrix_as_described(camera_family(camera, None))
 
 
 def expected_seconds(camera: Camera) -> float:
@@ -153,13 +153,13 @@ def expected_seconds(camera: Camera) -> float:
     return SECONDS * pixels * points
 
 
-def _family(camera: Camera, parameters: Sequence[Parameter] | None) -> CameraFamily:
+def camera_family(camera: Camera, parameters: Sequence[Parameter] | None) -> CameraFamily:
     shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
     known = tuple(all_parameters(camera) if parameters is None else parameters)
     return CameraFamily(camera, geometry(camera, camera.light.wavelengths[0], shift), known)
 
 
-def _matrix(family: CameraFamily) -> np.ndarray:
+def matrix_as_described(family: CameraFamily) -> np.ndarray:
     return LensletFamily(family, tolerance=1e-4).at(family.start).matrix
 
 
@@ -174,13 +174,12 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
 
 
-def _middle(capture: CapturedLenslets) -> CapturedLenslets:
-    """The lenslets in the middle of a capture."""
+def middle_of(capture: CapturedLenslets, most: int = MOST_LENSLETS) -> CapturedLenslets:
+    """The lenslets in the middle of a capture, `most` a side."""
     rows, columns = capture.y.shape[:2]
-    r, c = (max(0, (n - MOST_LENSLETS) // 2) for n in (rows, columns))
+    r, c = (max(0, (n - most) // 2) for n in (rows, columns))
     return CapturedLenslets(
-        np.asarray(capture.y, float)[r : r + MOST_LENSLETS, c : c + MOST_LENSLETS],
-        float(capture.sigma),
+        np.asarray(capture.y, float)[r : r + most, c : c + most], float(capture.sigma)
     )
 
 
@@ -189,7 +188,7 @@ def _used(capture: CapturedLenslets) -> np.ndarray:
     return np.isfinite(capture.y).all(axis=2) & (capture.y != 0).any(axis=2)
 
 
-def _scaled(capture: CapturedLenslets, told: np.ndarray) -> Lenslets:
+def in_units_of_photographs(capture: CapturedLenslets, told: np.ndarray) -> Lenslets:
     """The lenslets as bright as photographs are; told: matrix (pixel, point) as described."""
     y = capture.y[_used(capture)].T
     if y.size == 0 or not float(y.sum()) > 0:

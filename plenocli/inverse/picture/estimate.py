@@ -8,6 +8,7 @@ on across the borders of lenslets.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,10 @@ MISFIT = 1.5
 """What the joint estimate leaves over, in terms of the noise, from which on it counts: light from
 beyond the array is in it.
 """
+
+
+Explain = Callable[[np.ndarray, float, str | None], str | None]
+"""(superpixels (lenslet_row, lenslet_column, pixel), their noise, scene) -> what may be wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,12 +101,14 @@ def estimate(
     truth: np.ndarray | None = None,
     *,
     model_error: float = 0.0,
+    explain: Explain | None = None,
 ) -> tuple[Reconstruction, Seen | None]:
     """The picture behind a capture by a method, and what of the objects can be seen.
 
     data: the capture.
     truth: (lenslet_row, lenslet_column, point) chooses the weight with hindsight.
     model_error: of the matrix against this capture by their records, relative.
+    explain: says what is likely to be wrong with the camera, where the matrix is not believed.
 
     Raises NumericsError where the noise is not known and cannot be found.
     docs/model.md, "Spatial reconstruction".
@@ -124,7 +131,9 @@ def estimate(
     data = replace(data, noise=Noise.of_sigma(belief.level.sigma))
     looked_through = estimators
     if not belief.right:
-        _tell(belief, model_error, coupled=estimators.coupled and estimators.overlap == 3)
+        cause = None if explain is None else explain(settled.own, belief.level.sigma, data.scene)
+        taken_away = estimators.coupled and estimators.overlap == 3
+        _tell(belief, model_error, cause, coupled=taken_away)
         rows = belief.lmmse.whitening()
         looked_through, joint = estimators.seen_through(rows), None
         data = replace(data, y=belief.cleared(data.y) @ rows.T)
@@ -207,10 +216,12 @@ def _settle(
     return _Settled(belief=belief, own=own, joint=joint)
 
 
-def _tell(belief: Belief, model_error: float, *, coupled: bool) -> None:
-    """A note of what speaks against the matrix, and what was done about it."""
-    level, against, advice = belief.level, [], "plenocli fit-camera finds the camera that fits"
-    if not coupled:
+def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: bool) -> None:
+    """A note of what speaks against the matrix, what may be the cause, and what was done."""
+    level, against, advice = belief.level, [], "--fit finds the camera that fits"
+    if cause is not None:
+        advice = f"{cause}; {advice}"
+    elif not coupled:
         advice += "; neighbours' light takes a pif of --superpixels 3x3 and --overlap 3"
     if level.found is not None and level.found > level.sigma:
         against.append(f"what it cannot produce is {level.found / level.sigma:.3g} times the noise")
@@ -223,6 +234,6 @@ def _tell(belief: Belief, model_error: float, *, coupled: bool) -> None:
         against.append(f"its own record says it is off by {model_error:.2g}")
     note(
         f"the system matrix is not quite this camera's ({'; '.join(against)}): where that does "
-        f"harm the noise is taken {belief.raised:.3g} times as large, at the cost of detail. "
+        f"harm the noise is taken {belief.raised:.3g} times as large, at the cost of detail; "
         + advice
     )

@@ -1,4 +1,6 @@
-"""`reconstruct --fit`: the matrix of the camera that fits a capture, in the place of the pif's."""
+"""`reconstruct --fit`: the matrix of the camera that fits a capture, in the place of the pif's; and
+what a pif that does not fit is likely to have wrong.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import InputError, UsageError
+from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.nuisances.clean import clean
@@ -77,3 +79,29 @@ def with_fitted_camera(
     fitted.prior.pictures_of = estimators.prior.pictures_of
     fitted.prior.statistics = estimators.prior.statistics
     return fitted, fit
+
+
+def likely_cause(
+    estimators: Estimators, y: np.ndarray, sigma: float, scene: str | None
+) -> str | None:
+    """What is likely to be wrong with the camera of a pif, a sentence; None where that is not known
+    or the camera is of a kind that is not fitted.
+
+    y: (lenslet_row, lenslet_column, pixel); sigma: their noise; scene: that training leaves out.
+    """
+    from plenocli.inverse.fit.causes import likeliest_cause
+    from plenocli.inverse.fit.fit import CapturedLenslets
+
+    origin = estimators.system.origin
+    if origin is None:
+        return None
+    try:
+        cause = likeliest_cause(
+            origin.camera,
+            CapturedLenslets(y, sigma),
+            estimators.prior.pictures(scene),
+            seed=estimators.options.seed,
+        )
+    except PlenoError:  # a hint, and nothing that a picture depends on
+        return None
+    return None if cause is None else cause.sentence

@@ -30,7 +30,7 @@ from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
-from plenocli.stages.inverse.fitted_matrix import with_fitted_camera
+from plenocli.stages.inverse.fitted_matrix import likely_cause, with_fitted_camera
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -455,7 +455,9 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)
     off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
-    found, seen = estimate(estimators, method, data, truth, model_error=off)
+    found, seen = estimate(
+        estimators, method, data, truth, model_error=off, explain=partial(likely_cause, estimators)
+    )
     return _solved(
         found.as_picture(system.object_shape),
         settings,

@@ -84,5 +84,5 @@ def _built(
         blocks=gathered(matrix.A, weights),
         offsets=np.asarray(matrix.lenslet_offset, int),
         accuracy=plan.accuracy_record(),
-        origin=None,
+        origin=None if system.origin is None else replace(system.origin, camera=camera),
     )

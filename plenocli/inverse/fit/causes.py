@@ -1,0 +1,123 @@
+"""What is likely to be wrong with a camera's description: a glance, where a fit is a search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.inverse.fit.ascent import Ascent, Point
+from plenocli.inverse.fit.evidence import Evidence
+from plenocli.inverse.fit.fit import (
+    HIDDEN,
+    LOST,
+    CapturedLenslets,
+    camera_family,
+    in_units_of_photographs,
+    matrix_as_described,
+    middle_of,
+)
+from plenocli.inverse.fit.optics import require_fittable
+from plenocli.inverse.fit.prior import photograph_prior
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+
+LENSLETS = 4
+"""Lenslets a side that are looked at."""
+LOOKED_AT = 3
+"""Parameters, by what the slopes promise, for which the way is tried."""
+FAR = 1.0
+"""Most tolerances that a parameter is moved."""
+EITHER_WAY = (("focus", 0.25), ("shift, rows", 1 / 3), ("shift, columns", 1 / 3))
+"""Parameters that are tried both ways, and how many tolerances: slopes vanish in focus, and mislead
+where light is off by more than its finest detail.
+"""
+HELPS = 0.9
+"""Times the noise that was likely before: a cause must explain so much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """One parameter, moved alone, that explains a capture better than the description does.
+
+    name: of the parameter; unit: of its values, "m" or "px".
+    described, value: before and after.
+    noise_ratio, noise_ratio_before: most likely noise over the noise told.
+    """
+
+    name: str
+    unit: str
+    described: float
+    value: float
+    noise_ratio: float
+    noise_ratio_before: float
+
+    @property
+    def sentence(self) -> str:
+        """What it explains, for a person."""
+        found = f"{self.value - self.described:+.2g} px"
+        if self.unit == "m":
+            size = max(abs(self.described), abs(self.value))
+            units = (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+            name, unit = next((n, u) for n, u in units if size >= u or n == "nm")
+            found = f"{self.value / unit:.5g} {name} for {self.described / unit:.5g} {name}"
+        return (
+            f"of its parameters the {self.name} alone explains most ({found}: what is left over is "
+            f"{self.noise_ratio:.2g} times the noise instead of {self.noise_ratio_before:.2g})"
+        )
+
+
+def likeliest_cause(
+    camera: Camera, capture: CapturedLenslets, pictures: Sequence[np.ndarray], *, seed: int = 0
+) -> Cause | None:
+    """The parameter that alone explains most of what the described camera does not.
+
+    By the slopes of the evidence and Fisher's matrix at the description, and one step along the
+    parameters that promise most; some are tried either way. A hint and no measurement: paraxial,
+    of the LENSLETS x LENSLETS lenslets in the middle.
+
+    camera, capture, pictures, seed: as in fit_camera.
+
+    Returns None where no parameter helps.
+    Raises as fit_camera does.
+    """
+    require_fittable(camera)
+    family = camera_family(camera, None)
+    told = matrix_as_described(family)
+    data = [in_units_of_photographs(middle_of(capture, LENSLETS), told)]
+    prior = photograph_prior(pictures, family.geometry.object_shape, seed)
+    sigma = data[0].sigma
+    signal = float(np.sqrt(np.mean(data[0].y ** 2)))
+    lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
+    ascent = Ascent(family, Evidence(data, prior.seen(told, HIDDEN * sigma)), tolerance=lost)
+    start = ascent.point(np.zeros(len(family.parameters)), slopes=True)
+    rise = start.paraxial.back(start.evidence.by_matrix(start.factor)) * family.tolerance
+    fisher = ascent.information(start)
+    step = np.clip(rise / np.diag(fisher), -FAR, FAR)
+    promise = rise * step - 0.5 * np.diag(fisher) * step**2
+    tries = [(int(k), float(step[k])) for k in np.argsort(-promise)[:LOOKED_AT]]
+    for name, length in EITHER_WAY:
+        if family.has(name):
+            tries += [(family.place(name), side * length) for side in (-1, 1)]
+    best: tuple[Point, int] = (start, -1)
+    for place, length in tries:
+        x = np.zeros(len(family.parameters))
+        x[place] = length
+        found = ascent.point(x)
+        if found.factor < best[0].factor:
+            best = (found, place)
+    at, place = best
+    if place < 0 or at.factor > HELPS * start.factor:
+        return None
+    parameter = family.parameters[place]
+    return Cause(
+        name=parameter.name,
+        unit=parameter.unit,
+        described=float(family.start[place]),
+        value=float(ascent.values(at.x)[place]),
+        noise_ratio=at.factor,
+        noise_ratio_before=start.factor,
+    )

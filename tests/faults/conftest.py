@@ -68,6 +68,9 @@ def make_all(folder, runner):
     for name, (arguments, result) in _steps().items():
         outcome = runner.run([*arguments, "-o", result], folder, limit=120)
         assert outcome.code == 0, (name, outcome.text)
+    fit = ["fit-camera", "capture.h5", "--camera", "camera.toml", "--details", "fit.h5"]
+    outcome = runner.run([*fit, "-o", "fitted.toml"], folder, limit=120)
+    assert outcome.code == 0, outcome.text
     write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
     (folder / "done").touch()
 

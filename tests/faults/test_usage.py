@@ -147,6 +147,7 @@ def test_every_option_has_a_type_that_refuses_something():
     }
     assert free <= {
         "--scheduler",
+        "--fix",
         "--patches",
         "--illuminant",
         "--scene",

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -64,9 +64,11 @@ class Estimators:
 
     elsewhere: set to send batches of lenslets to other processes, see `in_batches`.
     trials: PSNR (dB) of each method that was tried, kept for captures to come.
+    through: (rows, what `seen_through` made of them last), for batches to come.
     """
 
     elsewhere: Elsewhere | None = None
+    through: tuple[np.ndarray, Estimators] | None = None
 
     def __init__(
         self,
@@ -126,7 +128,7 @@ class Estimators:
 
     def seen_through(self, rows: np.ndarray) -> Estimators:
         """The same for superpixels of which only `rows` (row, pixel) are looked at: their noise is
-        white then. Batches stay in this process.
+        white then.
         """
         blocks = np.stack([rows @ block for block in self.system.blocks])
         other = Estimators(
@@ -138,6 +140,8 @@ class Estimators:
         )
         other.prior.pictures_of = self.prior.pictures_of
         other.prior.statistics = self.prior.statistics
+        if self.elsewhere is not None:
+            other.elsewhere = partial(_elsewhere_through, self.elsewhere, rows)
         return other
 
     def sensor(self, count: tuple[int, int]) -> BlockToeplitz:
@@ -173,6 +177,33 @@ class Estimators:
             solve(self, batch, *options)
             for batch in bar(batches, len(batches), "batches of lenslets")
         ]
+
+
+def _elsewhere_through(
+    elsewhere: Elsewhere,
+    rows: np.ndarray,
+    solve: Callable[..., Any],
+    batches: list[np.ndarray],
+    options: tuple[Any, ...],
+) -> list[Any]:
+    """What each batch gives elsewhere, where superpixels are looked at through `rows` too."""
+    return elsewhere(solve_through, batches, (rows, solve, *options))
+
+
+def solve_through(
+    estimators: Estimators,
+    batch: np.ndarray,
+    rows: np.ndarray,
+    solve: Callable[..., _Solved],
+    *options: Any,
+) -> _Solved:
+    """What `solve` gives for a batch of superpixels that are looked at through `rows` (row,
+    pixel); what that takes is kept for the next batch.
+    """
+    known = estimators.through
+    if known is None or not np.array_equal(known[0], rows):
+        known = estimators.through = rows, estimators.seen_through(rows)
+    return solve(known[1], batch, *options)
 
 
 def root_mean_square(values: np.ndarray) -> float:

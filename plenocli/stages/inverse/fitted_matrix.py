@@ -38,6 +38,10 @@ def with_fitted_camera(
         raise UsageError(
             "the pif does not say what camera it was made for", "--fit", "make it anew, or without"
         )
+    if estimators.coupled:
+        raise UsageError(
+            "a fit knows no neighbours' light", "--fit", "give a pif of --superpixels 1x1"
+        )
     sigma = options.noise_sigma or data.sigma
     if not sigma:
         raise InputError("does not say how strong its noise is", where, "give --noise-sigma")
@@ -93,7 +97,7 @@ def likely_cause(
     from plenocli.inverse.fit.fit import CapturedLenslets
 
     origin = estimators.system.origin
-    if origin is None:
+    if origin is None or estimators.coupled:
         return None
     try:
         cause = likeliest_cause(

@@ -18,6 +18,7 @@ from plenocli.base.random_streams import stream
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.solvers.lmmse import Lmmse
 from plenocli.inverse.picture.trust.continuity import (
+    LEAST_REFERENCE,
     Jumps,
     detail_jumps,
     group_factors,
@@ -37,6 +38,8 @@ NOTHING_OUTSIDE = 1.03
 """Noise found over the capture's own up to which nothing is found; more where few lenslets leave
 more to chance.
 """
+CHANCE = 1.0
+"""Standard deviation of chance that a factor is allowed, times."""
 LEAST_PAIRS = 8
 """Borders between lenslets that it takes to judge continuity."""
 ROUNDS = 2
@@ -99,7 +102,7 @@ def believe(
     chance = _chance(estimators, stacked.shape[1])
     found = level.found is not None and level.found > level.sigma * (misfit + chance)
     suspect = found or model_error * loud > level.sigma
-    if not suspect and (first is None or first.relative >= CONTINUOUS):
+    if not suspect and (first is None or first.most >= CONTINUOUS):
         return Belief(
             level=level,
             lmmse=lmmse,
@@ -141,6 +144,12 @@ class _Verdict:
     @property
     def relative(self) -> float:
         return relative_factor(self.found, self.right)
+
+    @property
+    def most(self) -> float:
+        """What the relative factor may be but for chance."""
+        right = max(self.right.factor, LEAST_REFERENCE)
+        return self.relative + CHANCE * self.found.deviation / right
 
     @property
     def reference(self) -> float:

@@ -41,10 +41,12 @@ class Jumps:
 
     level: (pair,) of the lenslets' brightness.
     detail: (pair, group) of what coordinates of each group add to it.
+    along: points along a border: so many pairs in a row are of the same one.
     """
 
     level: np.ndarray
     detail: np.ndarray
+    along: int = 1
 
     @property
     def factor(self) -> float:
@@ -52,6 +54,19 @@ class Jumps:
         whole = self.detail.sum(axis=1)
         power = float(whole @ whole)
         return -float(self.level @ whole) / power if power > 0 else 1.0
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the factor by chance of the borders, which may differ as much as
+        they do.
+        """
+        whole = self.detail.sum(axis=1)
+        power = float(whole @ whole)
+        if not power > 0:
+            return 0.0
+        pull = (self.level + self.factor * whole) * whole
+        each = np.add.reduceat(pull, np.arange(0, len(pull), self.along))
+        return float(np.sqrt(np.sum(each**2))) / power
 
 
 def jumps(x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -86,7 +101,7 @@ def detail_jumps(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> Jumps:
         return jumps(x.T.reshape(*y.shape[:-1], -1), shape)
 
     parts = [of(lmmse.gain[:, group] @ shrunk[group]) for group in groups(lmmse.power)]
-    return Jumps(level=of(level), detail=np.stack(parts, axis=1))
+    return Jumps(level=of(level), detail=np.stack(parts, axis=1), along=min(shape))
 
 
 def pieces(

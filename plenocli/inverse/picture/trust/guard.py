@@ -10,7 +10,7 @@ import numpy as np
 
 from plenocli.inverse.picture.error_bars import about
 from plenocli.inverse.picture.reconstruction import Reconstruction
-from plenocli.inverse.picture.trust.believe import CONTINUOUS, Belief
+from plenocli.inverse.picture.trust.believe import CHANCE, CONTINUOUS, Belief
 from plenocli.inverse.picture.trust.continuity import LEAST_REFERENCE, Jumps, jumps
 
 
@@ -27,10 +27,13 @@ def detail_kept(
     """
     if belief.reference is None:
         return 1.0
-    found = Jumps(level=jumps(mean, shape), detail=jumps(value - mean, shape)[:, None])
+    found = Jumps(
+        level=jumps(mean, shape), detail=jumps(value - mean, shape)[:, None], along=min(shape)
+    )
     # where the matrix is believed chance and unusual scenes are given the benefit of the doubt
     least = max(belief.reference, LEAST_REFERENCE) * (CONTINUOUS if belief.right else 1.0)
-    return float(np.clip(found.factor / least, 0, 1))
+    most = found.factor + (CHANCE * found.deviation if belief.right else 0.0)
+    return float(np.clip(most / least, 0, 1))
 
 
 def guarded(

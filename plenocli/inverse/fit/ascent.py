@@ -5,7 +5,7 @@ evidence rises, with noise that starts as large as the captures' misfit makes it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,16 +16,41 @@ from plenocli.inverse.fit.optics import CameraFamily
 
 GAIN = 0.3
 """A step that makes the captures less than this more likely (log) is the last one."""
+ENOUGH = 3.0
+"""So is one that gains less than this where Fisher's matrix promised no more: what is left to gain
+is below what the parameters' standard deviations stand for, and there are valleys to creep along.
+"""
 LONGER = 2.5
 """By how much a step that helped is lengthened, again and again."""
 FAR = 20.0
 """No step is longer, in tolerances, before it has shown that it helps."""
 NODES = 2
 """Of a pixel along each side, where a finer model makes up for what they miss."""
+CHANGED = 0.1
+"""Of the noise: what the difference of a finer model may have changed by at the end of a climb."""
+KEPT = 4
+"""Steps that Fisher's matrix is kept for, where they help."""
+STALE = 1.5
+"""By how much the noise may fall meanwhile."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
 LOUD = 0.7
 """Fisher's matrix is made of patterns only that stand out of so much of the noise."""
+
+
+@dataclass(frozen=True)
+class _Fisher:
+    """Fisher's matrix (parameter, parameter), the noise factor where it was made, and how many
+    steps it was used for since.
+    """
+
+    matrix: np.ndarray
+    factor: float
+    age: int = 1
+
+    def serves(self, at: Point) -> bool:
+        """Whether a step from a point may still be made on it."""
+        return self.age < KEPT and self.factor < STALE * at.factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +91,8 @@ class Ascent:
         progress: Callable[[], object] | None = None,
     ) -> None:
         """tolerance: root energy of the spread function that may be lost; model: finer than the
-        paraxial one, whose difference from it is brought up to date `rounds` times; progress:
-        called at every step.
+        paraxial one, whose difference from it is brought up to date `rounds` times at the most;
+        progress: called at every step.
         """
         self.family, self.evidence, self._progress = family, evidence, progress
         self._model, self._rounds = model, rounds
@@ -75,6 +100,8 @@ class Ascent:
         self.lenslets = LensletFamily(family, tolerance=tolerance, pixel_nodes=nodes)
         self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=1)
         sigma = min(c.sigma for c in evidence.captures)
+        self._quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in evidence.captures)
+        self._state: tuple[MatrixAt, list[np.ndarray]] | None = None
         told = self._coarse.at(family.start).matrix
         self._loud = Evidence(evidence.captures, evidence.prior.seen(told, LOUD * sigma))
 
@@ -125,17 +152,26 @@ class Ascent:
         parameters in tolerances).
         """
         values = self.values(at.x)
-        state = self._coarse.at(values, slopes=True)
-        slopes = [state.slope(place) for place in range(len(self.family.optics(values)))]
-        return state, slopes, self.family.jacobian(values) * self.family.tolerance
+        if self._state is None or not np.array_equal(self._state[0].values, values):
+            state = self._coarse.at(values, slopes=True)
+            slopes = [state.slope(place) for place in range(len(self.family.optics(values)))]
+            self._state = state, slopes
+        return *self._state, self.family.jacobian(values) * self.family.tolerance
 
     def settle(self, x: np.ndarray, steps: int) -> Point:
-        """The Point where climbs from x end whose matrix is the finer model's there: first
-        paraxially, then with the difference of the models where the climb before ended.
+        """The Point where climbs from x end whose matrix is the finer model's there: each with the
+        difference of the models where the climb before ended, until that changes no more.
         """
-        at = self.climb(x, steps)
+        at = self.climb(x, steps, self.difference(x))
         for _ in range(self._rounds):
-            at = self.climb(at.x, steps, self.difference(at.x))
+            finer = self.difference(at.x)
+            if finer is None or at.finer is None:
+                break
+            # relative to the matrix as the noise is to the captures
+            changed = np.linalg.norm(finer - at.finer) / np.linalg.norm(at.matrix)
+            if changed * self._quiet < CHANGED:
+                break
+            at = self.climb(at.x, steps, finer)
         return at
 
     def difference(self, x: np.ndarray) -> np.ndarray | None:
@@ -150,28 +186,38 @@ class Ascent:
         finer: as in Point, kept.
         """
         at, damping = self.point(x, slopes=True, finer=finer), 1e-3
+        fisher = _Fisher(np.eye(len(x)), np.inf)
         for step in range(steps):
             if self._progress is not None:
                 self._progress()
             rise = at.paraxial.back(at.evidence.by_matrix(at.factor)) * self.family.tolerance - at.x
-            best, damping = self._step(at, rise, damping)
+            best = at
+            if fisher.serves(at):
+                best, damping = self._step(at, fisher.matrix, rise, damping, 1)
+                fisher = replace(fisher, age=fisher.age + 1)
+            if best is at:
+                fisher = _Fisher(self.information(at), at.factor)
+                best, damping = self._step(at, fisher.matrix, rise, damping, 6)
             if at.factor > MISFIT and step % 3 == 2:
                 best = max([best, *self._mirrored(best)], key=lambda p: p.height)
             if best is at:
                 break
             gain = best.height - at.height
+            promised = 0.5 * float(rise @ np.linalg.solve(fisher.matrix, rise))
             at = self.point(best.x, slopes=True, finer=best.finer)
-            if gain < GAIN:
+            if gain < GAIN or max(gain, promised) < ENOUGH:
                 break
         return at
 
-    def _step(self, at: Point, rise: np.ndarray, damping: float) -> tuple[Point, float]:
+    def _step(
+        self, at: Point, fisher: np.ndarray, rise: np.ndarray, damping: float, tries: int
+    ) -> tuple[Point, float]:
         """(the Point after one step, `at` itself where none rises; damping for the next).
 
-        rise: (parameter,) derivatives of the height.
+        fisher: (parameter, parameter); rise: (parameter,) derivatives of the height; tries: how
+        often the damping is raised.
         """
-        fisher = self.information(at)
-        for _ in range(6):
+        for _ in range(tries):
             way = _damped(fisher, damping, rise)
             while np.linalg.norm(way) > FAR:
                 damping *= 3

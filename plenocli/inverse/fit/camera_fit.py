@@ -55,7 +55,7 @@ class CameraFit:
     model_error: relative root mean square error of the fitted matrix that is still expected;
     turned: squared steps over the borders of lenslets under the mirrored camera, whose objects
         are turned by 180 degrees, over those under this one; None where no two lenslets touch;
-    matrix: (pixel, point) of the fitted camera;
+    matrix: (pixel, point) of `camera`;
     lenslets: how many were looked at.
     """
 

@@ -67,7 +67,7 @@ above all the sensor distance.
 """
 LEFT_OVER = 0.03
 """By how much of what a fit leaves over, beyond the noise, the variances grow."""
-SECONDS = 3e-5
+SECONDS = 2e-5
 """A fit takes on one core for each pixel and point of a lenslet, about."""
 MOST_LENSLETS = 16
 """Lenslets looked at along each side of a capture, from its middle."""
@@ -130,7 +130,7 @@ def fit_camera(
         progress=progress,
     )
     start = np.zeros(len(family.parameters))
-    before = ascent.point(start, finer=ascent.difference(start)).evidence.noise_factor()
+    begun = ascent.point(start, finer=ascent.difference(start))
     limits = accepted_ratios(sum(c.y.size for c in data), signal / sigma)
     best = _highest(ascent, limits[0])
     turned = None
@@ -138,7 +138,7 @@ def fit_camera(
         best, turned = _told_apart(ascent, best, middle)
     # what is left over beyond the noise is believed of fine objects only where pictures go on
     sure = turned is not None and turned >= CLEAR
-    return _described(ascent, best, limits[1] if sure else limits[0], before, turned)
+    return _described(ascent, best, limits[1] if sure else limits[0], begun, turned)
 
 
 def described_matrix(camera: Camera) -> np.ndarray:
@@ -287,9 +287,9 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
 
 
 def _described(
-    ascent: Ascent, at: Point, limit: float, before: float, turned: float | None
+    ascent: Ascent, at: Point, limit: float, begun: Point, turned: float | None
 ) -> CameraFit:
-    """The CameraFit of the point where a fit ended."""
+    """The CameraFit of the point where a fit ended; begun: the described camera."""
     family, ratio = ascent.family, at.evidence.noise_factor()
     sigma, correlation, error = _uncertainty(ascent, at, ratio)
     values = ascent.values(at.x)
@@ -322,9 +322,9 @@ def _described(
         accepted=accepted,
         why=why,
         noise_ratio=ratio,
-        noise_ratio_before=before,
+        noise_ratio_before=begun.evidence.noise_factor(),
         model_error=error,
         turned=turned,
-        matrix=np.asarray(at.matrix, float),
+        matrix=np.asarray(at.matrix if accepted else begun.matrix, float),
         lenslets=ascent.evidence.lenslets,
     )

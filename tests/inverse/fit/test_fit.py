@@ -106,6 +106,8 @@ def test_a_fit_that_cannot_be_says_so_and_changes_nothing():
     fit = fit_camera(CAMERA, [noise], TRAINING, parameters=all_parameters(CAMERA)[:3])
     assert not fit.accepted
     assert fit.camera == CAMERA
+    described = exact(tuple(FAMILY.start), 1, "exact")
+    assert np.linalg.norm(fit.matrix - described) < 0.02 * np.linalg.norm(described)
     assert "noise" in fit.why
 
 

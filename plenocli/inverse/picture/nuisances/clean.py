@@ -76,7 +76,9 @@ class Cleaned:
                 note(finding.sentence)
 
 
-def clean(estimators: Estimators, data: Superpixels, *, look: bool = True) -> Cleaned:
+def clean(
+    estimators: Estimators, data: Superpixels, *, look: bool = True, veil: bool = True
+) -> Cleaned:
     """A capture without defective and saturated pixels and without a veil.
 
     The pixels go by what LMMSE of their lenslet tells of them from all others, so that LMMSE is as
@@ -86,6 +88,7 @@ def clean(estimators: Estimators, data: Superpixels, *, look: bool = True) -> Cl
     data: pixels that are not finite count for nothing; a lenslet with fewer than BLIND of its
         pixels is dark.
     look: for nuisances; otherwise pixels that count for nothing go by their lenslet's brightness.
+    veil: whether one is looked for.
     """
     y = data.y.reshape(-1, data.y.shape[2])
     unknown = ~np.isfinite(y)
@@ -113,6 +116,7 @@ def clean(estimators: Estimators, data: Superpixels, *, look: bool = True) -> Cl
         inner=_inner(data.y.shape[:2]),
         clipped=clipped & ~unknown,
         declared=declared,
+        veil=veil,
     )
     found = task.solve(filled.y, filled.y)
     if estimators.coupled and any(finding.found for finding in found.findings):
@@ -187,6 +191,7 @@ class _Task:
     unknown, clipped: (lenslet, pixel).
     blind, inner: (lenslet,), those given up, and those that have all their neighbours.
     declared: whether the capture says where its sensor saturates.
+    veil: whether one is looked for.
     """
 
     estimators: Estimators
@@ -197,6 +202,7 @@ class _Task:
     inner: np.ndarray
     clipped: np.ndarray
     declared: bool
+    veil: bool = True
 
     def solve(self, y: np.ndarray, guess: np.ndarray) -> _Found:
         """Find and clean.
@@ -267,6 +273,8 @@ class _Task:
         sure = ~guessed & self.inner[~self.blind] if coupled else ~guessed
         if np.count_nonzero(sure) < min(4, len(sure)):
             sure = np.ones(len(sure), bool)
+        if not self.veil:
+            return None, np.zeros(y.shape[1])
         veil, light = find_veil(self.model, y[:, sure], unsure=STRAY_UNSURE * stray)
         common = veil.level if veil is not None and veil.removed else 0.0
         every = np.full(y.shape[1], common)

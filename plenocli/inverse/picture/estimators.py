@@ -126,13 +126,12 @@ class Estimators:
         other.svd, other.prior = self.svd, self.prior
         return other
 
-    def seen_through(self, rows: np.ndarray) -> Estimators:
-        """The same for superpixels of which only `rows` (row, pixel) are looked at: their noise is
-        white then.
+    def with_matrix(self, system: LensletMatrix) -> Estimators:
+        """The same with another matrix of the same objects: what photographs are like is shared,
+        both ways. Batches stay in this process.
         """
-        blocks = np.stack([rows @ block for block in self.system.blocks])
         other = Estimators(
-            replace(self.system, blocks=blocks, pixel_shape=(len(rows), 1)),
+            system,
             self.options,
             self.read_pictures,
             None if self.read_dictionary is None else lambda: self.learnt,
@@ -140,6 +139,14 @@ class Estimators:
         )
         other.prior.pictures_of = self.prior.pictures_of
         other.prior.statistics = self.prior.statistics
+        return other
+
+    def seen_through(self, rows: np.ndarray) -> Estimators:
+        """The same for superpixels of which only `rows` (row, pixel) are looked at: their noise is
+        white then.
+        """
+        blocks = np.stack([rows @ block for block in self.system.blocks])
+        other = self.with_matrix(replace(self.system, blocks=blocks, pixel_shape=(len(rows), 1)))
         if self.elsewhere is not None:
             other.elsewhere = partial(_elsewhere_through, self.elsewhere, rows)
         return other

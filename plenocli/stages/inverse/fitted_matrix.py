@@ -73,16 +73,7 @@ def with_fitted_camera(
         f"--fit: {fit.why} (as described {fit.noise_ratio_before:.3g} times); "
         f"other than described: {', '.join(moved) or 'nothing'}"
     )
-    fitted = Estimators(
-        matrix_of(system, fit.camera, model),
-        options,
-        estimators.read_pictures,
-        None if estimators.read_dictionary is None else lambda: estimators.learnt,
-        threads=estimators.threads,
-    )
-    fitted.prior.pictures_of = estimators.prior.pictures_of
-    fitted.prior.statistics = estimators.prior.statistics
-    return fitted, fit
+    return estimators.with_matrix(matrix_of(system, fit.camera, model)), fit
 
 
 def likely_cause(

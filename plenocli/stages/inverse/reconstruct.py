@@ -343,10 +343,7 @@ def _finer(recipe: Recipe) -> Estimators | None:
 
     rough = _estimators(recipe)
     system = finer_matrix(rough.system)
-    if system is None:
-        return None
-    learnt = None if rough.read_dictionary is None else lambda: rough.learnt
-    return Estimators(system, rough.options, rough.read_pictures, learnt, threads=rough.threads)
+    return None if system is None else rough.with_matrix(system)
 
 
 def _solve_in_pool(

@@ -19,11 +19,6 @@ from plenocli.inverse.picture.solvers.least_squares import Svd
 SCALES = np.geomspace(1e-3, 30, 60)
 """Scales of the covariance that are tried."""
 
-IMPLAUSIBLE = 5
-"""Scale that a whole picture does not have: 2.2 times the contrast of the average photograph in
-every lenslet. By 22 photographs (docs/model.md).
-"""
-
 ROUNDS = 10
 """Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
@@ -112,12 +107,6 @@ class Lmmse:
     def common_scale(self, y: np.ndarray) -> float:
         """The one of SCALES that makes all signals y (pixel, signal) together most likely."""
         return float(SCALES[np.argmax(self._likelihood(self.coordinates(y)).sum(axis=1))])
-
-    def implausible(self, y: np.ndarray) -> bool:
-        """Whether the signals y (pixel, signal) together would need more contrast than a
-        photograph has: a scale of IMPLAUSIBLE or more.
-        """
-        return len(self.power) > 0 and self.common_scale(y) >= IMPLAUSIBLE
 
     def _likelihood(self, w: np.ndarray) -> np.ndarray:
         """Logarithm of the likelihood of coordinates w (k, signal) at each scale, (scale,

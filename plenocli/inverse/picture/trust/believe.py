@@ -26,7 +26,7 @@ from plenocli.inverse.picture.trust.continuity import (
     pieces,
     relative_factor,
 )
-from plenocli.inverse.picture.trust.excess import even_light, with_excess
+from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 
 CONTINUOUS = 0.5
@@ -71,10 +71,7 @@ class Belief:
 
     def cleared(self, y: np.ndarray) -> np.ndarray:
         """Superpixels y (.., pixel) without the pattern."""
-        if self.pattern is None:
-            return y
-        bright = self.lmmse.brightness(y.reshape(-1, y.shape[-1]).T)
-        return y - bright.reshape(*y.shape[:-1], 1) * self.pattern
+        return y if self.pattern is None else without_pattern(self.lmmse, y, self.pattern)
 
 
 def believe(
@@ -111,7 +108,7 @@ def believe(
             reference=None if first is None else first.reference,
         )
     pattern = even_light(lmmse, stacked)
-    y = y - lmmse.brightness(stacked).reshape(*y.shape[:-1], 1) * pattern
+    y = without_pattern(lmmse, y, pattern)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2

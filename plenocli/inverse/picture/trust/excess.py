@@ -64,6 +64,14 @@ def even_light(lmmse: Lmmse, y: np.ndarray) -> np.ndarray:
     return lmmse.analysis.T @ (np.maximum(sure, 0) * found)
 
 
+def without_pattern(lmmse: Lmmse, y: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Superpixels y (.., pixel) without `pattern` (pixel,), as `even_light` gives it, times the
+    brightness of each.
+    """
+    bright = lmmse.brightness(y.reshape(-1, y.shape[-1]).T)
+    return y - bright.reshape(*y.shape[:-1], 1) * pattern
+
+
 def _contrasts(power: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarray:
     """(signal,) most likely scale of each, on the whole, of coordinates w (k, signal)."""
     expected = np.outer(SCALES, power) + noise

@@ -65,18 +65,20 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
     Raises NumericsError where the noise is not known.
     """
     recorded, unit = _weights(estimators, light.data), _unit(estimators, light.y)
-    y, weight = np.where(recorded > 0, light.y, 0) / unit, recorded * unit**2
+    y, weight = np.where(recorded > 0, light.y, 0) / unit, _rounded(recorded * unit**2)
     solver = _prepare(estimators, light.data, weight)
     misfit = np.ones((*y.shape[:2], 1))
     for _ in range(ROUNDS):
-        scale = solver.contrasts(y, weight / misfit**2)
-        made = solver.apply(y, weight / misfit**2, scale, only_superpixels=True).superpixels
+        lighter = _rounded(weight / misfit**2)
+        scale = _rounded(solver.contrasts(y, lighter))
+        made = solver.apply(y, lighter, scale, only_superpixels=True).superpixels
         misfit = np.maximum(misfit, _left_over(solver, y, weight, made))
-    scale = solver.contrasts(y, weight / misfit**2)
-    found = solver.apply(y, weight / misfit**2, scale)
+    lighter = _rounded(weight / misfit**2)
+    scale = _rounded(solver.contrasts(y, lighter))
+    found = solver.apply(y, lighter, scale)
 
     def predict(kept: np.ndarray) -> np.ndarray:
-        weight = kept * (unit / misfit) ** 2
+        weight = _rounded(kept * (unit / misfit) ** 2)
         return solver.apply(y, weight, scale, only_superpixels=True).superpixels * unit
 
     share = estimators.options.hold_out
@@ -106,6 +108,13 @@ def _unit(estimators: Estimators, y: np.ndarray) -> float:
     return float(np.sqrt(np.mean(levels**2))) / BRIGHTNESS or 1.0
 
 
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """To single precision, which noise and contrast are not known to: that a unit's last digits do
+    not make other systems of equations, whose solutions differ by more.
+    """
+    return np.asarray(values, np.float32).astype(float)
+
+
 def _weights(estimators: Estimators, data: Superpixels) -> np.ndarray:
     """One over the variance of every pixel, with that of the matrix by its own record; 0 where it
     counts for nothing.
@@ -131,7 +140,7 @@ def _prepare(estimators: Estimators, data: Superpixels, weight: np.ndarray) -> W
     return prepare_weighted(
         system,
         covariance,
-        1 / np.sqrt(np.maximum(typical, least)),
+        _rounded(1 / np.sqrt(np.maximum(typical, least))),
         estimators.prior.bands(),
     )
 

@@ -60,7 +60,8 @@ def matrix_figures(matrix: StoredMatrix, points: Sequence[Place] | None = None) 
         matrix.column_energy,
         matrix.wavelengths,
         matrix.object_shape,
-        matrix.rank,
+        labels=matrix.told_apart(),
+        resolution=matrix.resolution,
     )
     return [
         (

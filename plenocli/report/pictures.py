@@ -289,7 +289,9 @@ def matrix_summary(
     column_energy: np.ndarray,
     wavelengths: np.ndarray,
     object_shape: Shape,
-    ranks: np.ndarray | None = None,
+    *,
+    labels: Sequence[str] | None = None,
+    resolution: np.ndarray | None = None,
 ) -> bytes:
     """Singular values of A relative to the largest, one line a band, and the share of light kept by
     object point.
@@ -298,15 +300,14 @@ def matrix_summary(
     column_energy: (band, point).
     wavelengths: (band,) m; of many bands six are drawn.
     object_shape: (rows, columns) of an object block.
-    ranks: (band,) or None.
+    labels: what to say of each band beside its wavelength, or None.
+    resolution: (band,) share of the largest below which values are rounding, or None.
 
     Returns PNG.
     """
     values = None if singular_values is None else np.atleast_2d(singular_values)
     with drawing(9.4, 3.6) as made:
         left, right = made.figure.subplots(1, 2, width_ratios=(1.55, 1))
-        if ranks is not None:
-            ranks = np.broadcast_to(np.ravel(ranks), len(wavelengths))
         chosen = np.unique(
             np.round(np.linspace(0, len(wavelengths) - 1, min(len(wavelengths), 6))).astype(int)
         )
@@ -315,14 +316,21 @@ def matrix_summary(
                 break
             one = values[min(band, len(values) - 1)]
             kept = one[one > 0]
-            rank = "" if ranks is None else f", rank {int(ranks[band])} of {len(one)}"
+            words = "" if labels is None or not labels[band] else f", {labels[band]}"
             if len(kept):
                 left.semilogy(
                     np.arange(1, len(kept) + 1),
                     kept / kept[0],
                     color=COLOURS[number],
-                    label=nanometres(wavelengths[band]) + rank,
+                    label=nanometres(wavelengths[band]) + words,
                 )
+                if resolution is not None:
+                    left.axhline(
+                        resolution[band],
+                        color=COLOURS[number],
+                        linestyle=":",
+                        label="below: rounding" if number == len(chosen) - 1 else None,
+                    )
         left.set(xlabel="number", ylabel="singular value, relative to the largest")
         left.grid(True)
         if values is not None:

@@ -162,8 +162,6 @@ def add_capture(page: Page, run: RunFolder, file: RunFile) -> None:
 
 
 FACTS = (
-    ("rank", "numerical rank"),
-    ("condition", "condition number"),
     ("symmetry_defect", "symmetry defect (0: half of the object is invisible)"),
     ("coherent_ring", "rings of neighbours added coherently"),
     ("kappa", "kappa [1/m]"),
@@ -181,7 +179,8 @@ def _add_matrix(page: Page, file: RunFile) -> None:
         (
             "bands x superpixels x pixels x object points",
             " x ".join(str(n) for n in matrix.blocks.shape),
-        )
+        ),
+        ("what is told apart", "; ".join(dict.fromkeys(matrix.told_apart()))),
     ]
     facts += [
         (label, cell_text(matrix.facts.get(name))) for name, label in FACTS if name in matrix.facts

@@ -123,7 +123,12 @@ DRAWN = {
         np.ones((1, 20, 1)), (5, 4), (1, 1), np.zeros((1, 2), int)
     ),
     "matrix": lambda: pictures.matrix_summary(
-        np.array([[1.0, 0.1, 0]]), np.ones((1, 6)), [550e-9], (2, 3), [2]
+        np.array([[1.0, 0.1, 0]]),
+        np.ones((1, 6)),
+        [550e-9],
+        (2, 3),
+        labels=["rank 2 of 6"],
+        resolution=np.array([1e-9]),
     ),
     "matrix without singular values": lambda: pictures.matrix_summary(
         None, np.ones((2, 6)), [450e-9, 550e-9], (2, 3)

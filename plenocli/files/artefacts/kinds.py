@@ -49,9 +49,25 @@ _PIF_FIELDS = (
     ),
 )
 _PIF_ATTRS = (
-    attribute("rank", "number", "1", "numerical rank, one a band"),
+    attribute("rank", "number", "1", "singular values above the resolution, one a band"),
     attribute(
-        "condition", "number", "1", "largest over smallest singular value, one a band", finite=False
+        "condition",
+        "number",
+        "1",
+        (
+            "largest over smallest singular value, one a band; a lower bound where it is the "
+            "inverse of the resolution"
+        ),
+        finite=False,
+    ),
+    attribute(
+        "resolution",
+        "number",
+        "1",
+        (
+            "share of the largest singular value below which others are rounding of the numbers "
+            "that A is stored in, one a band"
+        ),
     ),
     attribute(
         "symmetry_defect",

@@ -7,21 +7,18 @@ the object is invisible (docs/model.md).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg.lapack import dtpqrt
 
 from plenocli.forward.propagation.symmetry import superpixel_orbits
 
 if TYPE_CHECKING:
     from plenocli.forward.propagation.system_matrix import SystemMatrix
 
-RANK_THRESHOLD = 1e-6
-"""Singular values below this share of the largest do not count towards the rank: the rounding of
-a single-precision A.
-"""
 NOISE_THRESHOLD = 1e-3
 """Singular values above this share stand out of noise at 60 dB."""
 SYMMETRY_WARNING = 1e-3
@@ -30,9 +27,9 @@ object is all but lost.
 """
 LARGEST = 4000
 """Above this many object points singular values are left out: they would take minutes."""
-_DIRECT = 400
 _ROWS = 1024
-_RESOLUTION = 3e-8
+_PANEL = 64
+"""Columns that the orthogonal reduction takes at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +38,13 @@ class Diagnosis:
 
     energy_min, energy_max: of the columns;
     symmetry_defect: of the object's own superpixel, None where only some points were computed;
-    singular_values: (band, value) descending, None (as the next three) above 4000 points;
-    rank: singular values above RANK_THRESHOLD of the largest;
-    rank_60db: those above NOISE_THRESHOLD of it;
-    condition: largest over smallest, a lower bound where the smallest is under 3e-8 of it;
+    singular_values: (band, value) descending, None (as the next four) above 4000 points;
+    resolution: share of the largest below which they are rounding, of the numbers that A is stored
+        in or of the decomposition;
+    rank: singular values above the resolution;
+    rank_60db: those above NOISE_THRESHOLD of the largest;
+    condition: largest over smallest, or the inverse of the resolution where the smallest is below
+        it, which is then a lower bound;
     warnings: a sentence each.
     """
 
@@ -52,70 +52,136 @@ class Diagnosis:
     energy_max: list[float]
     symmetry_defect: list[float] | None = None
     singular_values: np.ndarray | None = None
+    resolution: list[float] | None = None
     rank: list[int] | None = None
     rank_60db: list[int] | None = None
     condition: list[float] | None = None
     warnings: tuple[str, ...] = ()
 
+    @property
+    def condition_is_bound(self) -> list[bool] | None:
+        """Whether a condition is only a lower bound, by band."""
+        if self.condition is None or self.resolution is None:
+            return None
+        return [is_bound(c, r) for c, r in zip(self.condition, self.resolution)]
+
+
+def is_bound(condition: float, resolution: float) -> bool:
+    """Whether a condition is as large as the resolution of singular values lets it be, and so a
+    lower bound only.
+    """
+    return condition * resolution >= 1 - 1e-9
+
 
 class Spectrum:
-    """Singular values of a matrix that comes in pieces of rows, through A^T A in double precision.
+    """Singular values of a matrix that comes in pieces of rows, each piece reduced to a triangle
+    with those before by orthogonal transformations: to the rounding of double precision, which
+    A^T A would keep half the digits of.
 
     object_shape: (rows, columns) of points;
-    flips: (rows, columns) whether turning the object over changes the whole matrix by a permutation
-        of its rows only: A^T A then falls into blocks for points even and odd in that direction.
+    symmetry: (flip rows, flip columns, exchange both) of the points, each of which changes the
+        whole matrix by a permutation of its rows only: it then falls into blocks of patterns that
+        are even and odd.
     """
 
     def __init__(
-        self, object_shape: tuple[int, int], flips: Sequence[bool] = (False, False)
+        self, object_shape: tuple[int, int], symmetry: Sequence[bool] = (False, False, False)
     ) -> None:
-        self._shape, self._flips = tuple(object_shape), flips
-        self._grams: list[np.ndarray] = []
+        self._shape = tuple(object_shape)
+        self._flips = tuple(symmetry[:2])
+        self._turn = bool(symmetry[2]) and symmetry[0] == symmetry[1]
+        self._triangles: list[np.ndarray] = []
+        self._rows, self._longest, self._squares = 0, 0.0, np.zeros(self._shape)
+        self._unit = 0.0
 
-    def add(self, part: np.ndarray, times: int = 1, turned: int = 0) -> None:
+    def add(self, part: np.ndarray, times: int = 1) -> None:
         """Add rows of the matrix.
 
         part: (..., point);
-        times: how often;
-        turned: how often with rows and columns of points exchanged.
+        times: how many rows of the whole each stands for, in all orientations together.
         """
+        self._unit = float(np.finfo(part.dtype).eps) / 2
         part = part.reshape(-1, *self._shape)
-        grams: list[np.ndarray] = []
+        self._rows += times * len(part)
         for start in range(0, len(part), _ROWS):
-            blocks = [part[start : start + _ROWS].astype(float)]
-            for axis, flip in enumerate(self._flips, 1):
-                blocks = (
-                    [half for block in blocks for half in _parities(block, axis)]
-                    if flip
-                    else blocks
-                )
-            shapes = [block.shape[1:] for block in blocks]
-            blocks = [block.reshape(len(block), -1) for block in blocks]
-            grams = _added(grams, [block.T @ block for block in blocks])
-        # exchanging rows and columns exchanges even-odd with odd-even
-        pairs = [0, 2, 1, 3] if len(grams) == 4 else range(len(grams))
-        total = [times * gram for gram in grams]
-        if turned:
-            total = _added(total, [turned * _exchanged(grams[k], shapes[k]) for k in pairs])
-        self._grams = _added(self._grams, total)
+            rows = part[start : start + _ROWS].astype(float)
+            squares = rows**2
+            self._squares += times * squares.sum(axis=0)
+            self._longest = max(self._longest, float(squares.sum(axis=(1, 2)).max()))
+            blocks = [block * np.sqrt(times) for block in self._blocks(rows)]
+            if not self._triangles:
+                self._triangles = [np.zeros((b.shape[1],) * 2, order="F") for b in blocks]
+            self._triangles = [_reduced(r, b) for r, b in zip(self._triangles, blocks)]
 
     def values(self) -> np.ndarray:
-        """Singular values, descending; those under 3e-8 of the largest are
-        reported as that bound.
+        """Singular values, descending: as many as the matrix has rows or points, what is less."""
+        found = [np.linalg.svd(t, compute_uv=False) for t in self._triangles]
+        if self._turn and all(self._flips):
+            found.append(found[2])  # patterns even in rows and odd in columns, and the other way
+        return np.sort(np.concatenate(found))[::-1][: self._rows]
+
+    def resolution(self, largest: float) -> float:
+        """Singular values (absolute) below this are not known.
+
+        largest: singular value.
+
+        Rounding of the numbers of A, independent and even within half a unit in the last place,
+        has a spectral norm of at most about the longest column and the longest row of standard
+        deviations together [BH]; LAPACK's own rounding is taken as numpy.linalg.matrix_rank does.
         """
-        values = np.sort(np.concatenate([np.linalg.eigvalsh(gram) for gram in self._grams]))[::-1]
-        return np.sqrt(np.maximum(values, _RESOLUTION**2 * max(values[0], 0)))
+        squares = self._squares
+        for axis, flip in enumerate(self._flips):
+            squares = (squares + np.flip(squares, axis)) / 2 if flip else squares
+        squares = (squares + squares.T) / 2 if self._turn else squares
+        stored = self._unit / np.sqrt(3) * (np.sqrt(squares.max()) + np.sqrt(self._longest))
+        computed = max(self._rows, squares.size) * np.finfo(float).eps * largest
+        return float(max(stored, computed))
+
+    def _blocks(self, rows: np.ndarray) -> Iterator[np.ndarray]:
+        """The parts (row, coordinate) of rows (row, point row, point column) that do not mix."""
+        blocks = [rows]
+        for axis, flip in enumerate(self._flips, 1):
+            if flip:
+                blocks = [half for block in blocks for half in _parities(block, axis)]
+        if not self._turn:
+            yield from (block.reshape(len(block), -1) for block in blocks)
+            return
+        if len(blocks) == 1:
+            yield from _turn_parities(blocks[0])
+            return
+        even, mixed, other, odd = blocks
+        yield from _turn_parities(even)
+        both = np.concatenate([mixed, other.transpose(0, 2, 1)]) * np.sqrt(0.5)
+        yield both.reshape(len(both), -1)
+        yield from _turn_parities(odd)
 
 
-def _added(total: list[np.ndarray], parts: list[np.ndarray]) -> list[np.ndarray]:
-    """Sums of arrays, where there is something to add to already."""
-    return [old + new for old, new in zip(total, parts)] if total else parts
+def _reduced(triangle: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The triangular factor R (value, value) of an upper triangle with rows (row, value) below."""
+    if not triangle.size:
+        return triangle
+    reduced, *_, info = dtpqrt(
+        0,
+        min(_PANEL, len(triangle)),
+        triangle,
+        np.asfortranarray(rows),
+        overwrite_a=True,
+        overwrite_b=True,
+    )
+    if info:
+        raise ValueError(f"dtpqrt refuses its argument {-info}")
+    return reduced
 
 
-def _exchanged(gram: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """The Gram matrix of points (rows, columns) as one of points (columns, rows)."""
-    rows, columns = shape
-    return gram.reshape(rows, columns, rows, columns).transpose(1, 0, 3, 2).reshape(gram.shape)
+def _turn_parities(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parts (row, coordinate) of squares (row, n, n) even and odd under exchange of their axes, in
+    orthonormal coordinates.
+    """
+    upper, lower = np.triu_indices(values.shape[1], 1)
+    diagonal = np.arange(values.shape[1])
+    one, other = values[:, upper, lower], values[:, lower, upper]
+    even = np.concatenate([(one + other) * np.sqrt(0.5), values[:, diagonal, diagonal]], axis=1)
+    return even, (one - other) * np.sqrt(0.5)
 
 
 def _parities(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -127,21 +193,6 @@ def _parities(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([(first + mirrored) * np.sqrt(0.5), middle], axis), (
         first - mirrored
     ) * np.sqrt(0.5)
-
-
-def singular_values(matrix: np.ndarray) -> np.ndarray:
-    """Singular values (descending, float64) of one band, (..., point): rows may have
-    any leading shape.
-
-    Small matrices by LAPACK; larger ones as Spectrum does it, which resolves values down to
-    3e-8 of the largest.
-    """
-    matrix = matrix.reshape(-1, matrix.shape[-1])
-    if matrix.shape[1] <= _DIRECT or len(matrix) < matrix.shape[1]:
-        return np.linalg.svd(matrix.astype(float), compute_uv=False)
-    spectrum = Spectrum((1, matrix.shape[1]))
-    spectrum.add(matrix)
-    return spectrum.values()
 
 
 def symmetry_defect(own: np.ndarray) -> float:
@@ -183,10 +234,9 @@ class PiecewiseDiagnosis:
         )
         self._own = int(np.flatnonzero((np.asarray(offsets) == 0).all(axis=1))[0])
         self._times = {
-            first: (sum(not how[0] for _, how in members), sum(how[0] for _, how in members))
-            for first, members in superpixel_orbits(offsets, symmetry)
+            first: len(members) for first, members in superpixel_orbits(offsets, symmetry)
         }
-        self._spectra = [Spectrum(object_shape, symmetry[:2]) for _ in range(bands)]
+        self._spectra = [Spectrum(object_shape, symmetry) for _ in range(bands)]
         self._defects = [0.0] * bands
         self._few = int(np.prod(object_shape)) <= LARGEST
 
@@ -204,15 +254,12 @@ class PiecewiseDiagnosis:
                 for n, mirrors in zip(self._pixel_shape, self._mirrors[superpixel])
             )
             part = slab.reshape(*self._pixel_shape, -1)[:rows, :columns]
-            self._spectra[band].add(
-                part,
-                *(n * 2 ** int(self._mirrors[superpixel].sum()) for n in self._times[superpixel]),
-            )
+            times = self._times[superpixel] * 2 ** int(self._mirrors[superpixel].sum())
+            self._spectra[band].add(part, times)
 
     def result(self, energy: np.ndarray) -> Diagnosis:
         """What was found, for column energies (band, point)."""
-        values = np.array([spectrum.values() for spectrum in self._spectra]) if self._few else None
-        return _diagnosis(energy, self._defects, values)
+        return _diagnosis(energy, self._defects, self._spectra if self._few else None)
 
 
 def describe(matrix: SystemMatrix) -> Diagnosis:
@@ -220,8 +267,7 @@ def describe(matrix: SystemMatrix) -> Diagnosis:
     if matrix.A is None:
         raise ValueError("a matrix in pieces is diagnosed by PiecewiseDiagnosis")
     points = matrix.A.shape[-1]
-    whole = points == int(np.prod(matrix.object_shape))
-    if whole and points > _DIRECT:
+    if points == int(np.prod(matrix.object_shape)):
         diagnosis = PiecewiseDiagnosis(
             len(matrix.A),
             matrix.lenslet_offset,
@@ -233,19 +279,20 @@ def describe(matrix: SystemMatrix) -> Diagnosis:
             for superpixel, slab in enumerate(of_band):
                 diagnosis.add(band, superpixel, slab)
         return diagnosis.result(matrix.column_energy)
-    own = int(np.flatnonzero((np.asarray(matrix.lenslet_offset) == 0).all(axis=1))[0])
-    return _diagnosis(
-        matrix.column_energy,
-        [symmetry_defect(band[own]) for band in matrix.A] if whole else None,
-        np.array([singular_values(band) for band in matrix.A]) if points <= LARGEST else None,
-    )
+    if points > LARGEST:
+        return _diagnosis(matrix.column_energy, None, None)
+    spectra = []
+    for of_band in matrix.A:
+        spectra.append(Spectrum((1, points)))
+        spectra[-1].add(of_band)
+    return _diagnosis(matrix.column_energy, None, spectra)
 
 
 def _diagnosis(
-    energy: np.ndarray, defects: list[float] | None, values: np.ndarray | None
+    energy: np.ndarray, defects: list[float] | None, spectra: Sequence[Spectrum] | None
 ) -> Diagnosis:
-    """The Diagnosis of column energies (band, point), symmetry defects by band and singular
-    values (band, value).
+    """The Diagnosis of column energies (band, point), symmetry defects by band and the singular
+    values of each band.
     """
     found = Diagnosis(
         energy_min=energy.min(axis=1).tolist(),
@@ -253,17 +300,18 @@ def _diagnosis(
         symmetry_defect=defects,
         warnings=_warnings(energy, defects),
     )
-    if values is None:
+    if spectra is None:
         return found
-    top = np.maximum(values[:, :1], np.finfo(float).tiny)
-    with np.errstate(divide="ignore"):
-        condition = [float(c) for c in top[:, 0] / values[:, -1]]
+    values = np.array([spectrum.values() for spectrum in spectra])
+    top = np.maximum(values[:, 0], np.finfo(float).tiny)
+    floor = np.array([one.resolution(t) for one, t in zip(spectra, top)])
     return replace(
         found,
         singular_values=values,
-        rank=[int(n) for n in (values > RANK_THRESHOLD * top).sum(axis=1)],
-        rank_60db=[int(n) for n in (values > NOISE_THRESHOLD * top).sum(axis=1)],
-        condition=condition,
+        resolution=(floor / top).tolist(),
+        rank=(values > floor[:, None]).sum(axis=1).tolist(),
+        rank_60db=(values > NOISE_THRESHOLD * top[:, None]).sum(axis=1).tolist(),
+        condition=(top / np.maximum(values[:, -1], floor)).tolist(),
     )
 
 

@@ -88,6 +88,7 @@ class PifSummary:
     pixels, points: of a superpixel and of the object under one lenslet;
     wavelengths: (band,) m;
     kappa, eps: 1/m;
+    dtype: that A is stored in;
     nominal_seconds: of one core at nominal rates, as planned.
     """
 
@@ -105,6 +106,7 @@ class PifSummary:
     kappa: float
     eps: float
     bytes: int
+    dtype: str
     nominal_seconds: float
     quartic_phase_rad: float
     warnings: list[str]
@@ -117,6 +119,8 @@ class PifSummary:
             "rank": found.rank,
             "rank_60db": found.rank_60db,
             "condition": found.condition,
+            "condition_is_bound": found.condition_is_bound,
+            "resolution": found.resolution,
             "symmetry_defect": found.symmetry_defect,
             "energy_min": found.energy_min,
             "energy_max": found.energy_max,
@@ -136,11 +140,23 @@ class PifSummary:
         if not (found.rank is None or found.rank_60db is None or found.condition is None):
             text += (
                 f"; rank {min(found.rank)} ({min(found.rank_60db)} above 60 dB noise), "
-                f"condition {max(found.condition):.1e}"
+                f"condition {_condition(found, self.dtype)}"
             )
         if found.symmetry_defect is not None:
             text += f"; symmetry defect {min(found.symmetry_defect):.1e}"
         return f"{text}; {self.rung}, estimated error {self.estimated_accuracy:.1g}"
+
+
+def _condition(found: Diagnosis, dtype: str) -> str:
+    """The worst condition of all bands, and why it is a bound where it is one."""
+    assert found.condition is not None and found.condition_is_bound is not None
+    worst = max(range(len(found.condition)), key=found.condition.__getitem__)
+    if not found.condition_is_bound[worst]:
+        return f"{found.condition[worst]:.1e}"
+    return (
+        f"at least {found.condition[worst]:.1e} (smaller singular values are the rounding "
+        f"of {dtype})"
+    )
 
 
 def _named(summary: PlanSummary | PifSummary) -> dict[str, Any]:
@@ -356,6 +372,7 @@ def _contents(
         "notes": notes.as_json(),
         "rank": found.rank,
         "condition": found.condition,
+        "resolution": found.resolution,
         "symmetry_defect": found.symmetry_defect,
         "lattice": lattice,
     }
@@ -382,6 +399,7 @@ def _summary(output: str, matrix: SystemMatrix, found: Diagnosis, plan: PifPlan)
         kappa=matrix.notes.kappa,
         eps=matrix.notes.eps,
         bytes=plan.bytes,
+        dtype=plan.dtype,
         nominal_seconds=plan.chosen.seconds(),
         quartic_phase_rad=matrix.notes.quartic_phase_rad,
         warnings=[*plan.warnings, *found.warnings],

@@ -1,13 +1,16 @@
 """Singular values through pieces and symmetry, against LAPACK on the whole matrix."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from plenocli.forward.accuracy.dial import system_matrix
-from plenocli.forward.propagation import diagnosis as diagnose
 from plenocli.forward.propagation.diagnosis import PiecewiseDiagnosis, Spectrum, describe
 from plenocli.forward.propagation.symmetry import superpixel_orbits
 from tests.forward.propagation.cameras import small_camera
+
+ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
 
 
 @pytest.mark.parametrize(
@@ -21,7 +24,7 @@ from tests.forward.propagation.cameras import small_camera
     ],
     ids=str,
 )
-def test_orbits_and_parities_give_the_values_of_the_whole(change, monkeypatch):
+def test_orbits_and_parities_give_the_values_of_the_whole(change):
     pif = system_matrix(
         small_camera(**change),
         superpixels=(3, 3),
@@ -37,21 +40,60 @@ def test_orbits_and_parities_give_the_values_of_the_whole(change, monkeypatch):
     for superpixel, slab in enumerate(pif.A[0]):
         found.add(0, superpixel, slab)
     values = found.result(pif.column_energy).singular_values[0]
-    assert (
-        np.abs(values - exact).max() < 1e-7 * exact[0]
-        and np.abs(values / exact - 1)[exact > 1e-3 * exact[0]].max() < 1e-9
-    )
-    monkeypatch.setattr(diagnose, "_DIRECT", 3)
-    assert np.abs(describe(pif).singular_values[0] - exact).max() < 1e-7 * exact[0]
+    assert np.abs(values - exact).max() < 1e-14 * exact[0]
+    assert np.abs(values / exact - 1)[exact > 1e-12 * exact[0]].max() < 1e-3
 
 
-def test_without_symmetry_the_gram_matrix_is_whole():
+def test_pieces_without_symmetry_give_the_values_of_the_whole():
     rng = np.random.default_rng(2)
     matrix = rng.normal(size=(3000, 30))
     spectrum = Spectrum((5, 6))
     spectrum.add(matrix[:1000])
     spectrum.add(matrix[1000:])
-    assert spectrum.values() == pytest.approx(np.linalg.svd(matrix, compute_uv=False), rel=1e-10)
+    assert spectrum.values() == pytest.approx(np.linalg.svd(matrix, compute_uv=False), rel=1e-12)
+
+
+def test_values_are_resolved_to_double_precision():
+    """Thirteen decades, of which A^T A would keep seven and a half."""
+    rng = np.random.default_rng(1)
+    told = np.logspace(0, -13, 60)
+    matrix = np.linalg.qr(rng.normal(size=(300, 60)))[0] * told
+    matrix = matrix @ np.linalg.qr(rng.normal(size=(60, 60)))[0]
+    spectrum = Spectrum((1, 60))
+    spectrum.add(matrix)
+    assert spectrum.values() == pytest.approx(told, rel=5e-2)
+    assert spectrum.values()[:40] == pytest.approx(told[:40], rel=1e-5)
+
+
+def test_fewer_pixels_than_points_have_as_many_values_as_pixels():
+    matrix = np.random.default_rng(3).random((20, 30))
+    spectrum = Spectrum((5, 6))
+    spectrum.add(matrix)
+    exact = np.linalg.svd(matrix, compute_uv=False)
+    assert spectrum.values() == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_rank_and_condition_are_those_of_the_file(dtype):
+    """Against numpy on the stored numbers, and single precision against the same matrix in double:
+    no singular value changes by more than the resolution, and the resolution is not ten times what
+    some do.
+    """
+    camera = small_camera(object__samples_per_lenslet=(16, 16))
+    fine = system_matrix(camera, dtype=np.float64, accuracy=1e-8, **ISOLATED)
+    matrix = replace(fine, A=fine.A.astype(dtype))
+    found = describe(matrix)
+    values = np.linalg.svd(matrix.A[0, 0].astype(float), compute_uv=False)
+    floor = found.resolution[0] * values[0]
+    assert np.abs(found.singular_values[0] - values).max() < 1e-14 * values[0]
+    assert found.rank == [int((values > floor).sum())]
+    if dtype == "float64":
+        assert found.rank == [np.linalg.matrix_rank(fine.A[0, 0])]
+    else:
+        changed = np.abs(values - np.linalg.svd(fine.A[0, 0], compute_uv=False)).max()
+        assert floor / 10 < changed < floor
+    assert found.condition_is_bound == [bool(values[-1] <= floor)]
+    assert found.condition[0] == pytest.approx(values[0] / max(values[-1], floor), rel=1e-6)
 
 
 def test_orbits_of_superpixels():

@@ -9,7 +9,7 @@ from scipy.special import j1, roots_legendre, sici
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.explain import explain
 from plenocli.forward.propagation import system_matrix as pif_module
-from plenocli.forward.propagation.diagnosis import describe, singular_values
+from plenocli.forward.propagation.diagnosis import describe
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import (
     WAVELENGTH,
@@ -184,11 +184,13 @@ def test_published_configuration():
     )
     assert energy.min() == pytest.approx(energy[0, 0], rel=1e-9)
     found = describe(pif)
-    # 106 above 60 dB and 1495 in all at a pupil distance of 52 mm, where one lenslet holds
+    # 106 above 60 dB and 1495 above 120 dB at a pupil distance of 52 mm, where one lenslet holds
     # slightly more cells
-    assert found.rank_60db[0] == pytest.approx(105, abs=8) and found.rank[0] == pytest.approx(
-        1490, abs=40
-    )
+    values = found.singular_values[0]
+    assert found.rank_60db[0] == pytest.approx(105, abs=8)
+    assert (values > 1e-6 * values[0]).sum() == pytest.approx(1490, abs=40)
+    # double precision resolves the others too
+    assert found.rank == [1600] and 1e10 < found.condition[0] < 1e12
     assert found.symmetry_defect[0] == pytest.approx(0.24, abs=0.05)
     builder = pif_builder(camera, WAVELENGTH, superpixels=(3, 3), coherent_ring=1, accuracy=1e-4)
     corner, middle = builder.columns([0, 820]).sum(axis=(0, 1))
@@ -367,20 +369,6 @@ def test_plan_says_why_and_refuses_what_cannot_be():
     assert any("fresnel model" in warning for warning in fast.warnings)
     drifting = plan_pif(small_camera(lenslet_array__pitch=26e-6))
     assert any("apart" in warning for warning in drifting.warnings)
-
-
-def test_singular_values_through_the_gram_matrix(monkeypatch):
-    from plenocli.forward.propagation import diagnosis as diagnose
-
-    rng = np.random.default_rng(1)
-    matrix = (
-        rng.normal(size=(300, 60))
-        @ np.diag(np.logspace(0, -6, 60))
-        @ np.linalg.qr(rng.normal(size=(60, 60)))[0]
-    )
-    exact = np.linalg.svd(matrix, compute_uv=False)
-    monkeypatch.setattr(diagnose, "_DIRECT", 10)
-    assert singular_values(matrix.reshape(3, 100, 60)) == pytest.approx(exact, rel=1e-3)
 
 
 def test_progress_counts_every_column():

@@ -22,7 +22,7 @@ PLANNING = {
     "field_features",
     "valid_for",
     "error_bound",
-    "fresnel_model_error",
+    "paraxial_error",
     "exact_band",
     "size_band",
     "_chord_counts",

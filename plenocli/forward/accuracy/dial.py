@@ -14,9 +14,10 @@ import numpy as np
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.machine_rate import product_rate
 from plenocli.forward.accuracy.scene_needs import seen_wavelengths, sensor_noise, visible_accuracy
+from plenocli.forward.camera.geometry import chief_ray, corner_ray, lenslet_shift
 from plenocli.forward.camera.geometry import geometry as geometry_of
-from plenocli.forward.camera.geometry import lenslet_shift
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
+from plenocli.forward.propagation.fresnel.paraxial_error import oblique_error
 from plenocli.forward.propagation.models import MODELS
 from plenocli.forward.propagation.plan import Candidate, PifPlan
 from plenocli.forward.propagation.sampling import (
@@ -156,8 +157,10 @@ class _Request:
             self.left_out.append(
                 f"{len(dropped)} wavelength(s) without light in the scene: no error"
             )
-        self.pixel_shift, self.off_axis = _place(camera, lenslet)
-        self.geometries = [geometry_of(camera, w, self.pixel_shift) for w in kept]
+        self.pixel_shift, self.chief = _place(camera, lenslet)
+        self.geometries = [geometry_of(camera, w, self.pixel_shift, self.chief) for w in kept]
+        # one matrix for all lenslets is that of the one on the axis
+        self.corner = None if lenslet is not None else corner_ray(camera)
         # a band goes by its centre
         self.band = (
             camera.light.band
@@ -237,13 +240,13 @@ class _Request:
 
 def _place(
     camera: Camera, lenslet: tuple[int, int] | None
-) -> tuple[tuple[float, float] | None, bool]:
-    """(pixel_shift, whether it is off the axis) of lenslet (row, column) of the array; for the one
-    on the axis the shift that a fit found, or None.
+) -> tuple[tuple[float, float] | None, tuple[float, float]]:
+    """(pixel_shift, chief) of lenslet (row, column) of the array; for the one on the axis the shift
+    that a fit found, or None.
     """
     if lenslet is None:
         shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
-        return (shift if any(shift) else None), False
+        return (shift if any(shift) else None), (0.0, 0.0)
     count = camera.lenslet_array.count
     if not all(0 <= n < m for n, m in zip(lenslet, count)):
         raise UsageError(
@@ -251,7 +254,7 @@ def _place(
             "lenslet",
             "count rows and columns from 0",
         )
-    return lenslet_shift(camera, *lenslet)[2], any(2 * n != m - 1 for n, m in zip(lenslet, count))
+    return lenslet_shift(camera, *lenslet)[2], chief_ray(camera, *lenslet)
 
 
 def _consider(request: _Request, model: Model) -> Candidate:
@@ -261,10 +264,6 @@ def _consider(request: _Request, model: Model) -> Candidate:
     reason = next(
         (r for r in (model.valid_for(request.camera, v) for v in request.geometries) if r), None
     )
-    if request.off_axis and model.kind == "exact":
-        reason = (
-            reason or "a lenslet off the axis sees an oblique cone, which this rung does not follow"
-        )
     if reason:
         return Candidate(name=model.name, model=model.kind, why=reason)
     fixed = {
@@ -384,7 +383,10 @@ def _finest(request: _Request, nodes: int) -> list[Geometry]:
         return request.geometries
     return [
         geometry_of(
-            request.camera, float(spectral_nodes(request.band, nodes)[0].min()), request.pixel_shift
+            request.camera,
+            float(spectral_nodes(request.band, nodes)[0].min()),
+            request.pixel_shift,
+            request.chief,
         )
     ]
 
@@ -518,6 +520,9 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
                 f"lenslets beyond the coherent window change columns by about {window:.1g}, "
                 f"more than the accuracy {request.accuracy:g}"
             )
+    field_error, said = _over_the_field(request)
+    if said:
+        (warnings if field_error > request.accuracy else request.left_out).append(said)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
     return PifPlan(
         model=best.model,
@@ -535,12 +540,14 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         estimated=best.error,
         split=best.sources,
         model_error=_model_error(request, best),
+        field_error=field_error,
         dtype=request.dtype.name,
         reasons=tuple(request.reasons),
         left_out=tuple(request.left_out),
         warnings=tuple(warnings),
         candidates=table,
         pixel_shift=request.pixel_shift,
+        chief=request.chief,
         band_nodes=best.band_nodes,
     )
 
@@ -550,6 +557,24 @@ def _model_error(request: _Request, best: Candidate) -> float:
     error = max(model.error_bound(request.camera, v) for v in request.geometries)
     fitted = request.camera.fitted
     return error if fitted is None else math.hypot(error, fitted.model_error)
+
+
+def _over_the_field(request: _Request) -> tuple[float, str | None]:
+    """(error of one matrix where it serves the lenslet at the array's corner, a sentence about it);
+    nothing of a matrix that is for one lenslet.
+    """
+    if request.corner is None:
+        return 0.0, None
+    there = [replace(v, chief=request.corner) for v in request.geometries]
+    parabolic = request.camera.lenslet_array.profile == "parabolic"
+    error = max(oblique_error(v, parabolic) for v in there)
+    if error < BEST_ACCURACY:
+        return 0.0, None
+    angle = math.degrees(there[0].obliquity)
+    return error, (
+        f"one matrix for all lenslets: at the array's corner, {angle:.2g} degrees off the axis, "
+        f"columns differ by about {error:.1g} (--lenslet ROW,COLUMN is for one there)"
+    )
 
 
 def seconds_here(candidate: Candidate) -> float:

@@ -58,7 +58,7 @@ def what_limits(
             f"capture simulated by the {capture.model} model, explained by the {matrix.model} one"
         )
     else:
-        error = math.hypot(matrix.estimated, matrix.model_error or 0.0)
+        error = math.hypot(matrix.estimated, matrix.model_error or 0.0, matrix.field_error or 0.0)
         reason = "a real capture, against the finest model"
     return Limits(
         noise=float(noise),

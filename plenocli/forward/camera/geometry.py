@@ -47,7 +47,9 @@ class Geometry:
         the sensor's raster lies: (rows, columns) in pixels from a superpixel's centre to the
         middle of its window;
     ray_reach: farthest that a ray of an aberrated pupil lands on the array from the image point
-        along either axis, None without wavefront error.
+        along either axis, None without wavefront error;
+    chief: where the object's own lenslet stands from the optical axis, (rows, columns) m on the
+        array.
 
     Berkner et al. 2013, section 2-3-1.
     """
@@ -69,6 +71,7 @@ class Geometry:
     lenslet_shape: str = "square"
     pixel_shift: tuple[float, float] | None = None
     ray_reach: float | None = None
+    chief: tuple[float, float] = (0.0, 0.0)
 
     @property
     def k(self) -> float:
@@ -93,6 +96,11 @@ class Geometry:
     def magnification(self) -> float:
         """Size of the image on the array over that of the object, z2/z1; the image is inverted."""
         return self.z2 / self.z1
+
+    @property
+    def obliquity(self) -> float:
+        """Angle (rad) at which the chief ray comes to the object's own lenslet."""
+        return math.atan(math.hypot(*self.chief) / self.z2)
 
     @property
     def superpixel_pitch(self) -> float:
@@ -264,13 +272,18 @@ def hexagonal_rows(window: int) -> int:
 
 
 def geometry(
-    camera: Camera, wavelength: float, pixel_shift: tuple[float, float] | None = None
+    camera: Camera,
+    wavelength: float,
+    pixel_shift: tuple[float, float] | None = None,
+    chief: tuple[float, float] = (0.0, 0.0),
 ) -> Geometry:
     """The Geometry of a camera, with the focal lengths of its glasses at one wavelength.
 
     wavelength: m;
     pixel_shift: (rows, columns) as lenslet_shift gives it, for pixels on the sensor's own raster;
-        None: centred on chief rays.
+        None: centred on chief rays;
+    chief: (rows, columns) m from the optical axis to the object's own lenslet, as chief_ray gives
+        it.
     """
     camera = at_wavelength(camera, wavelength)
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
@@ -298,6 +311,7 @@ def geometry(
         lenslet_shape=array.aperture_shape,
         pixel_shift=pixel_shift,
         ray_reach=ray_reach(lens, 1 / z1 + 1 / z2 - 1 / f1, z2),
+        chief=chief,
     )
 
 
@@ -324,6 +338,24 @@ def array_position(camera: Camera, row: int, column: int) -> tuple[float, float]
     return (row - middle) * ROW_SPACING, column - array.count[1] // 2 + (row % 2 - middle % 2) / 2
 
 
+def chief_ray(camera: Camera, row: int, column: int) -> tuple[float, float]:
+    """Where the chief ray of a lenslet of the array meets it.
+
+    row, column: counted from the array's first lenslet.
+
+    Returns (rows, columns) m from the optical axis. Raises ConfigError outside of the array.
+    """
+    y, x = array_position(camera, row, column)
+    return y * camera.lenslet_array.pitch, x * camera.lenslet_array.pitch
+
+
+def corner_ray(camera: Camera) -> tuple[float, float]:
+    """As chief_ray, of the lenslet that stands farthest from the axis."""
+    rows, columns = (n - 1 for n in camera.lenslet_array.count)
+    corners = [chief_ray(camera, r, c) for r in {0, rows} for c in {0, columns}]
+    return max(corners, key=lambda at: (math.hypot(*at), at))
+
+
 def lenslet_shift(camera: Camera, row: int, column: int) -> tuple[int, int, tuple[float, float]]:
     """The window of a lenslet of the array on the sensor's raster.
 
@@ -334,7 +366,7 @@ def lenslet_shift(camera: Camera, row: int, column: int) -> tuple[int, int, tupl
     superpixel, may reach beyond it. pixel_shift (rows, columns), at most half a pixel: from the
     superpixel's centre, where the chief ray lands, to the middle of the window. In the paraxial
     model an off-axis lenslet differs from the central one by this shift alone: where it is zero, A
-    serves unchanged.
+    serves unchanged. What the angle changes beside is docs/model.md, "Exact propagation".
     Raises ConfigError outside of the array.
     """
     sensor, first, shift = camera.sensor, [], []

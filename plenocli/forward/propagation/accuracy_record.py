@@ -16,6 +16,7 @@ class AccuracyRecord:
     model: the kind of propagation, "ray", "fresnel" or "exact";
     rung: the name of the model, such as "fresnel, low rank";
     model_error: of the model itself against the finest one, whether asked for by name or not;
+    field_error: of one matrix for all lenslets at the array's corner, 0 where it is for one only;
     reasons, left_out: a sentence each.
     """
 
@@ -25,6 +26,7 @@ class AccuracyRecord:
     by_source: Mapping[str, float] | None = None
     model: str | None = None
     model_error: float | None = None
+    field_error: float | None = None
     rung: str | None = None
     reasons: tuple[str, ...] | None = None
     left_out: tuple[str, ...] | None = None
@@ -38,6 +40,7 @@ class AccuracyRecord:
             "by_source": None if self.by_source is None else dict(self.by_source),
             "model": self.model,
             "model_error": self.model_error,
+            "field_error": self.field_error,
             "rung": self.rung,
             "reasons": None if self.reasons is None else list(self.reasons),
             "left_out": None if self.left_out is None else list(self.left_out),

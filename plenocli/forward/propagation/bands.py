@@ -207,7 +207,7 @@ def band_fields(
         [
             model.fields(
                 camera,
-                geometry_of(camera, w, geometry.pixel_shift),
+                geometry_of(camera, w, geometry.pixel_shift, geometry.chief),
                 plan,
                 replace(band, wavelength=w),
             )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
-from plenocli.forward.propagation.fresnel import shaped, square_cost
+from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
 from plenocli.forward.propagation.lenslet_fields import LensletFields
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
@@ -106,8 +106,12 @@ def _square_only(camera: Camera, geometry: Geometry) -> str | None:
     return None
 
 
+def _parabolic(camera: Camera) -> bool:
+    return camera.lenslet_array.profile == "parabolic"
+
+
 def _paraxial_error(camera: Camera, geometry: Geometry) -> float:
-    return exact.fresnel_model_error(geometry, camera.lenslet_array.profile == "parabolic")
+    return paraxial_error.paraxial_error(geometry, _parabolic(camera))
 
 
 class Rays(Model):

@@ -107,11 +107,14 @@ class PifPlan:
     memory: bytes with the work;
     estimated: relative L2 error of the worst column, of which `split` names the parts by source;
     model_error: of the model itself against the finest one, whether asked for by name or not;
+    field_error: of the matrix where it serves the lenslet at the array's corner, 0 where it is for
+        one lenslet only;
     dtype: of the stored matrix;
     reasons, left_out, warnings: a sentence each;
     candidates: the models considered;
     pixel_shift: of an off-axis lenslet on the sensor's own raster
         (plenocli.forward.camera.geometry.lenslet_shift), None where windows are centred;
+    chief: where that lenslet stands from the axis, m (rows, columns);
     band_nodes: wavelengths that stand for the camera's band of light, 0 for lines.
     """
 
@@ -130,12 +133,14 @@ class PifPlan:
     estimated: float
     split: dict[str, float]
     model_error: float
+    field_error: float = 0.0
     dtype: str = "float32"
     reasons: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     pixel_shift: tuple[float, float] | None = None
+    chief: tuple[float, float] = (0.0, 0.0)
     band_nodes: int = 0
 
     @property
@@ -152,6 +157,7 @@ class PifPlan:
             by_source=self.split,
             model=self.model,
             model_error=self.model_error,
+            field_error=self.field_error,
             rung=self.rung,
             reasons=(*self.reasons, *self.warnings),
             left_out=tuple(self.left_out),

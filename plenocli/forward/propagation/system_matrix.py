@@ -154,7 +154,7 @@ class PifBuilder:
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = (
             plan,
-            geometry(camera, wavelength, plan.pixel_shift),
+            geometry(camera, wavelength, plan.pixel_shift, plan.chief),
             np.dtype(dtype),
         )
         camera = at_wavelength(camera, wavelength)

@@ -46,6 +46,7 @@ def test_a_record_comes_back_from_json_as_it_went():
         "by_source",
         "model",
         "model_error",
+        "field_error",
         "rung",
         "reasons",
         "left_out",

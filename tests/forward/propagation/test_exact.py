@@ -14,8 +14,8 @@ from plenocli.forward.propagation.bands import spectral_nodes
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact import low_rank_product as product
 from plenocli.forward.propagation.exact import term_counts
-from plenocli.forward.propagation.exact.lenslets import fresnel_model_error
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
+from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.reference.fresnel import sensor_nodes
@@ -429,9 +429,7 @@ def test_law_of_the_paraxial_error(change):
         for model in ("fresnel", "exact")
     ]
     worst = (np.linalg.norm(both[0] - both[1], axis=0) / np.linalg.norm(both[1], axis=0)).max()
-    law = fresnel_model_error(
-        geometry(camera, WAVELENGTH), camera.lenslet_array.profile == "parabolic"
-    )
+    law = paraxial_error(geometry(camera, WAVELENGTH), camera.lenslet_array.profile == "parabolic")
     assert 0.8 * worst < law < 3 * worst
 
 

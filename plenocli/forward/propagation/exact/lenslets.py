@@ -137,38 +137,9 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
             "the sensor lies within ten wavelengths of the lenslets, where "
             "evanescent waves reach it"
         )
+    if geometry.chief != (0.0, 0.0):
+        return "a lenslet off the axis sees an oblique cone, which this rung does not follow"
     return None
-
-
-def fresnel_model_error(geometry: Geometry, parabolic: bool) -> float:
-    """Estimated relative L2 error of the worst column of the paraxial model against the exact one.
-
-    Rays tell where paraxial optics sends light amiss. With T = D1/(2 z2) at the pupil's rim and P =
-    D2/(2 f2) at the lenslet's, a hyperbolic lenslet sends the ray through both 3/2 z3 T P (T + P)
-    from where paraxial optics has it, a parabolic one z3 P^3/2 more; sine against tangent at the
-    main lens is a part of it. That is a share `moved` of the pupil image's half width z3 T. A disc
-    moved by it changes along its rim, which is one pixel or one diffraction cell wide: over the
-    disc's norm that is about moved sqrt(disc's width/rim's width). Points beside lenslets that
-    leave gaps are dim, and what is moved weighs more in their columns.
-
-    parabolic: profile of the lenslets, else hyperbolic.
-
-    Returns a number between 0.9 and 2.5 times the error found on 24 cameras (f/1.5 to f/64, 50 to
-    500 um, 0.4 to 10 um, 3 to 52 pixels, both profiles).
-    docs/model.md, "Exact propagation".
-    """
-    # where a lenslet has few cells, diffraction spreads light further than the pupil does
-    spread = geometry.wavelength / (2 * geometry.D2)
-    pupil, lenslet = (
-        math.hypot(geometry.D1 / (2 * geometry.z2), spread),
-        math.hypot(geometry.D2 / (2 * geometry.f2), spread),
-    )
-    moved = 1.5 * lenslet * (pupil + lenslet) + (lenslet**3 / (2 * pupil) if parabolic else 0.0)
-    across = 2 * geometry.z3 * pupil / geometry.pixel_pitch
-    dim = 1 + 5 * (1 - geometry.lenslet_width / geometry.D2)
-    return min(
-        1.0, 0.5 * moved * math.sqrt(max(1.0, min(across, geometry.diffraction_cells))) * dim
-    )
 
 
 class ExactSquareLenslets(LensletFields):

@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -90,6 +90,9 @@ tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brut
 
 sweep: $(READY) ## a design space in one command: the examples of sample_configs/sweeps, tables and fronts in runs/sweep
 	$(PIPELINE) pipelines/sweep.mk RUN=$(RUNS)/sweep WORKERS=$(CORES)
+
+trade: $(READY) ## what model, accuracy, neighbours, method and steps buy and cost, captures simulated finer: runs/trade/trade.html
+	$(PIPELINE) pipelines/trade.mk RUN=$(RUNS)/trade WORKERS=$(CORES)
 
 dictionary: $(READY) ## Algorithm 1 at the paper's size, 20 iterations: a line for each, the history as a plot
 	$(PIPELINE) pipelines/dictionary.mk RUN=$(RUNS)/dictionary

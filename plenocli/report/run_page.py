@@ -100,6 +100,8 @@ def _add_refocused(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str
 
 def _add_designs(page: Page, run: RunFolder) -> str | None:
     """The section about sweeps; returns its name, or None where there are none."""
+    from plenocli.files.results.measured_seconds import read_measured
+    from plenocli.report.costs import COSTS, cost_figures, cost_rows
     from plenocli.report.front import front_figures, front_rows
 
     found = run.of_kind("sweep")
@@ -118,6 +120,10 @@ def _add_designs(page: Page, run: RunFolder) -> str | None:
         if table.ahead.any():
             page.figures(front_figures(table))
             page.table(*front_rows(table), text=True)
+            measured = read_measured(file.path, len(table.status))
+            if measured is not None:
+                page.figures(cost_figures(table, measured))
+                page.table(*cost_rows(table, measured), caption=COSTS, text=True)
         else:
             page.warning(
                 f"{file.name}: no design has all figures of the front; `plenocli "

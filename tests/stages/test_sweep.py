@@ -576,3 +576,100 @@ def test_points_of_a_lost_worker_are_told_and_the_others_kept(tmp_path):
     ):
         task = chain.Task(chain="spatial", camera="", settings={})
         store.evaluate([DesignPoint(number=0, values={}, task=task, key="a", matrix="m")], Pool())
+
+
+FOREIGN = (
+    SMALL.replace("[vary]\n", '[vary]\n"reconstruct.method" = ["tikhonov", "lmmse"]\n')
+    .replace('"main_lens.f_number" = [6, 8]\n', '"simulate-pif.accuracy" = [1e-1, 1e-2]\n')
+    .replace('"sensor.pixels_per_lenslet" = [[7, 7], [9, 9]]\n', "")
+    .replace("accuracy = 1e-2\n[cap", "[cap")
+    .replace('["30 dB", "50 dB"]', '["50 dB"]')
+    .replace('"skimage:coins"', '"skimage:coins"\nmodel = "exact"\nrefine = 2\naccuracy = 1e-3')
+)
+"""One capture by the exact model, finer than it is inverted; two matrices; two methods."""
+
+
+def test_a_capture_by_another_matrix_is_made_once_and_inverted_in_many_ways(tmp_path, monkeypatch):
+    """Against the stages run by hand, one of the four points; the bytes do not depend on sharing,
+    nor on how many work.
+    """
+    from plenocli.cli.main import run
+    from plenocli.stages.forward import capture_sim
+
+    calls = []
+    real = capture_sim.run_capture_sim
+    monkeypatch.setattr(
+        capture_sim, "run_capture_sim", lambda *a, **k: calls.append(1) or real(*a, **k)
+    )
+    path = described(tmp_path, FOREIGN)
+    report = sweep(path, tmp_path / "one.h5")
+    assert report.computed == 4 and report.refused == 0 and len(calls) == 1
+    assert not list((tmp_path / "one.parts").rglob("*.h5")), "captures go when they have served"
+    sweep(path, tmp_path / "two.h5", workers=2)
+    assert same(tmp_path / "one.h5", tmp_path / "two.h5")
+    by_hand = [
+        "simulate-pif camera.toml --model fresnel --superpixels 1x1 --coherent-ring 0 "
+        "--accuracy 1e-2 -o pif.h5",
+        "capture-sim camera.toml --scene skimage:coins --snr 50dB --model exact --refine 2 "
+        "--accuracy 1e-3 -o capture.h5",
+        "reconstruct capture.h5 --pif pif.h5 --method lmmse -o image.h5",
+        "score image.h5 --truth capture.h5 -o score.json",
+    ]
+    monkeypatch.chdir(tmp_path)
+    assert not any(run(["--quiet", *line.split()]) for line in by_hand)
+    score = json.loads((tmp_path / "score.json").read_text())["results"][0]["metrics"]
+    with open(tmp_path / "one.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    row = next(
+        r
+        for r in rows
+        if r["reconstruct.method"] == "lmmse" and float(r["simulate-pif.accuracy"]) == 1e-2
+    )
+    assert float(row["psnr_db"]) == pytest.approx(score["psnr_db"], abs=1e-9)
+
+
+def test_a_foreign_capture_that_is_refused_refuses_its_points(tmp_path):
+    text = FOREIGN.replace('"skimage:coins"', '"nowhere.png"')
+    with pytest.raises(InputError, match=r"none of 4 points could be computed"):
+        sweep(described(tmp_path, text), tmp_path / "out.h5")
+    assert read_artefact(tmp_path / "out.h5", "sweep").data["sweep/status"].tolist() == [3] * 4
+
+
+def test_seconds_are_measured_for_every_stage_and_stand_beside_the_table(whole, tmp_path):
+    from plenocli.files.results.measured_seconds import inversion_seconds, read_measured
+
+    measured = read_measured(whole[1], 8)
+    assert set(measured) == {
+        f"{stage} cpu_s" for stage in ("simulate-pif", "capture-sim", "reconstruct", "score")
+    }
+    assert all((seconds > 0).all() for seconds in measured.values())
+    np.testing.assert_allclose(
+        inversion_seconds(measured), measured["simulate-pif cpu_s"] + measured["reconstruct cpu_s"]
+    )
+    with pytest.raises(InputError, match="not of this table"):
+        read_measured(whole[1], 7)
+
+
+def test_depth_is_told_of_a_plane_that_was_captured_by_waves(tmp_path):
+    text = """
+camera = "camera.toml"
+chain = "depth"
+[set]
+"lenslet_array.count" = [15, 15]
+[vary]
+"object.distance" = ["530 mm", "550 mm"]
+"refocus.planes" = [5, 13]
+[capture-sim]
+scene = "skimage:coins"
+snr = "40 dB"
+model = "fresnel"
+accuracy = 1e-1
+"""
+    sweep(described(tmp_path, text), tmp_path / "out.h5")
+    with open(tmp_path / "out.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [r["status"] for r in rows] == ["0"] * 4
+    # thin lens at 50 mm, lenslets at 55 mm: that they see 550 mm sharply needs no program
+    focused = [abs(float(r["depth_slope"])) for r in rows if r["object.distance"] == "550 mm"]
+    assert max(focused) < 1e-6
+    assert all(float(r["depth_slope_error"]) < 1 for r in rows), "within the geometric limit"

@@ -37,6 +37,7 @@ STAGES = (
     "simulate-response",
     "calibrate",
     "demux",
+    "refocus",
     "score",
 )
 """Stages whose options may be set and varied."""
@@ -129,7 +130,7 @@ class Sweep(Section):
     camera: the file that all points start from, relative to this one.
     chain: "spatial" (simulate-pif, capture-sim, reconstruct, score) or "spectral" (simulate-pif,
         capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
-        has a filter array.
+        has a filter array. "depth" (capture-sim, refocus, score) only where it is named.
     design: how points are chosen.
     samples: how many points a Latin hypercube has.
     vary: key -> values or range.
@@ -141,7 +142,7 @@ class Sweep(Section):
     """
 
     camera: FileName
-    chain: Literal["spatial", "spectral"] | None = None
+    chain: Literal["spatial", "spectral", "depth"] | None = None
     design: Literal["grid", "latin-hypercube", "list"] = "grid"
     samples: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
     vary: dict[str, Any] = {}

@@ -16,6 +16,7 @@ from plenocli.stages.sweep.task import (
     CHAINS,
     PointResult,
     Task,
+    capture_key,
     digest_of,
     matrix_key,
     point_key,
@@ -42,7 +43,7 @@ class DesignPoint:
     number: its place in the table.
     values: by key, as they would stand in the sweep file.
     task: None where no such camera can be.
-    key, matrix: what point and matrix are known by.
+    key, matrix, capture: what point, matrix and a capture by another matrix are known by.
     result: None until it is there.
     """
 
@@ -51,6 +52,7 @@ class DesignPoint:
     task: Task | None = None
     key: str = ""
     matrix: str = ""
+    capture: str = ""
     result: PointResult | None = None
 
 
@@ -59,7 +61,7 @@ class Space:
     """A sweep file with all that it names.
 
     path: of the file, `sweep` what it says, `axes` what varies freely.
-    chain: "spatial" or "spectral".
+    chain: of CHAINS.
     base: the camera it starts from, as its TOML says, from camera_path.
     read_options: (stage, values) -> option -> value, as the command line reads them.
     files: path -> SHA-256 of the files named so far.
@@ -108,6 +110,7 @@ class Space:
             task=task,
             key=point_key(task, self.files),
             matrix=matrix_key(task, camera, self.files),
+            capture=capture_key(task, self.files),
         )
 
     def _camera(self, data: dict[str, Any]) -> Camera:
@@ -184,10 +187,7 @@ def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Sp
             raise ConfigError(
                 f"{stage} is no stage of the {chain} chain ({', '.join(CHAINS[chain])})",
                 path,
-                (
-                    "leave it out, or set chain = "
-                    f'"{"spatial" if chain == "spectral" else "spectral"}"'
-                ),
+                f'leave it out, or set chain = "{_chain_with(stage)}"',
             )
     return Space(
         path=path,
@@ -199,3 +199,8 @@ def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Sp
         read_options=read_options,
         seed=seed,
     )
+
+
+def _chain_with(stage: str) -> str:
+    """The first chain that has a stage."""
+    return next(chain for chain, stages in CHAINS.items() if stage in stages)

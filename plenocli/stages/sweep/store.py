@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +18,15 @@ from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost, Pool
-from plenocli.stages.sweep.point import run_matrix, run_point
+from plenocli.files.results.measured_seconds import measured_path
+from plenocli.stages.sweep.point import run_capture, run_matrix, run_point
 from plenocli.stages.sweep.task import (
     Job,
+    MadeCapture,
     MadeMatrix,
     MatrixCost,
     PointResult,
+    SharedCapture,
     SharedMatrix,
     refused,
 )
@@ -31,6 +34,8 @@ from plenocli.stages.sweep.task import (
 if TYPE_CHECKING:
     from plenocli.stages.sweep.space import DesignPoint
 
+SHARED = ("matrices", "captures")
+"""Folders of what points share, while it is needed."""
 LACKED_MEMORY = 5
 """Exit code of a point that may have a result within another budget of memory."""
 
@@ -53,7 +58,8 @@ def open_store(
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".h5",))
     folder = output.with_suffix(".parts")
     again = overwrite or folder.is_dir()  # what an unfinished run left is ours
-    check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs)
+    for beside in (output.with_suffix(".csv"), measured_path(output)):
+        check_output(beside, overwrite=again, inputs=inputs)
     if plot is not None:
         if find_spec("matplotlib") is None:
             raise UsageError(
@@ -71,7 +77,7 @@ def open_store(
 
 class Store:
     """Results by content key in the folder beside OUT: points.jsonl, and while they are needed
-    the matrices that points share.
+    the matrices and captures that points share.
     """
 
     def __init__(
@@ -99,7 +105,7 @@ class Store:
             folder.mkdir(exist_ok=True)
             self.journal = Journal(folder / "points.jsonl")
             shutil.rmtree(folder / "scratch", ignore_errors=True)
-            for name in ("scratch", "matrices"):
+            for name in ("scratch", *SHARED):
                 (folder / name).mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(
@@ -122,8 +128,9 @@ class Store:
     ) -> int:
         """Give every point its result, from the journal or through a pool.
 
-        points: those of one content key are computed once, a matrix that several need is computed
-            once, before them. What was refused within another budget of memory is tried again.
+        points: those of one content key are computed once, a matrix or a capture that several
+            need is computed once, before them. What was refused within another budget of memory is
+            tried again.
         pool: of plenocli.execution.pool.
         files: what tasks read.
         label: of the progress bar.
@@ -163,15 +170,31 @@ class Store:
 
 @dataclass(frozen=True, eq=False)
 class _Token:
-    """What a job in a pool is for: the matrix of a group, or one point of it."""
+    """What a job in a pool is for: the matrix of a group, a capture, or one point of a group."""
 
-    group: str
+    group: str = ""
     point: DesignPoint | None = None
+    capture: str = ""
+
+
+@dataclass(eq=False)
+class _Shared:
+    """A capture that several points need.
+
+    left: points that still need it.
+    made: the capture, or why there is none; None before it is there.
+    waiting: jobs that wait for it.
+    """
+
+    left: int
+    made: SharedCapture | PlenoError | Lost | None = None
+    waiting: list[tuple[_Token, Job]] = field(default_factory=list)
+    under_way: bool = False
 
 
 class _Work:
-    """Points through a pool, those of one matrix after it; at most as many matrices lie on the
-    disk as are in use.
+    """Points through a pool, those of one matrix or capture after it; at most as many matrices lie
+    on the disk as are in use.
     """
 
     def __init__(
@@ -185,6 +208,8 @@ class _Work:
         self.store, self.pool, self.files, self.scratch = store, pool, files, scratch
         self.groups = {key: list(points) for key, points in groups.items()}
         self.left = {key: len(points) for key, points in groups.items()}
+        uses = Counter(p.capture for points in groups.values() for p in points if p.capture)
+        self.captures = {key: _Shared(left=count) for key, count in uses.items() if count > 1}
         self.waiting = deque(groups)
         self.ready: deque[tuple[_Token, Callable[[Job], Any], Job]] = deque()
         self.lost: list[Lost] = []
@@ -196,16 +221,19 @@ class _Work:
             while self.pool.room and (self.ready or self.waiting):
                 if not self.ready:
                     self._open(self.waiting.popleft())
+                    continue  # its points may wait for a capture
                 self.pool.submit(*self.ready.popleft())
                 self.running += 1
             if not self.running:
                 return self.lost
             token, result = self.pool.next()
             self.running -= 1
-            if isinstance(result, Lost):
+            if isinstance(result, Lost) and not token.capture:
                 self.lost += [result] * (1 if token.point else len(self.groups[token.group]))
             elif isinstance(result, OutputError):
                 raise result
+            elif token.capture:
+                progress.update(self._keep_capture(token.capture, result))
             elif token.point is None:
                 progress.update(self._keep_matrix(token.group, result))
             else:
@@ -226,14 +254,74 @@ class _Work:
             self._open_points(
                 group, SharedMatrix(str(path.resolve()), MatrixCost.from_json(record))
             )
-        elif len(points) > 1:
+        elif group and len(points) > 1:
             self.ready.append((_Token(group), run_matrix, self._job(points[0])))
         else:
             self._open_points(group, None)
 
     def _open_points(self, group: str, matrix: SharedMatrix | None) -> None:
         for point in self.groups[group]:
-            self.ready.append((_Token(group, point), run_point, self._job(point, matrix)))
+            token, job = _Token(group, point), self._job(point, matrix)
+            shared = self.captures.get(point.capture)
+            if shared is None:
+                self.ready.append((token, run_point, job))
+                continue
+            shared.waiting.append((token, job))
+            if shared.made is None and not shared.under_way:
+                self._open_capture(point, shared)
+            self._release(shared)
+
+    def _open_capture(self, point: DesignPoint, shared: _Shared) -> None:
+        """Find a capture that lies there already, or make its job ready."""
+        record = self.store.journal.records.get(f"capture {point.capture}")
+        paths = self._capture_paths(point.capture, 0 if record is None else record["files"])
+        if record is not None and all(path.is_file() for path in paths):
+            shared.made = _located(paths, tuple(record["notes"]), record["cpu_seconds"])
+            return
+        shared.under_way = True
+        self.ready.append((_Token(capture=point.capture), run_capture, self._job(point)))
+
+    def _release(self, shared: _Shared) -> int:
+        """Make the jobs that wait for a capture ready, or refuse them; returns how many were
+        refused.
+        """
+        if shared.made is None:
+            return 0
+        waiting, shared.waiting = shared.waiting, []
+        refusals = 0
+        for token, job in waiting:
+            assert token.point is not None  # only points wait
+            if isinstance(shared.made, SharedCapture):
+                self.ready.append((token, run_point, replace(job, capture=shared.made)))
+            elif isinstance(shared.made, Lost):
+                self.lost.append(shared.made)
+            else:
+                self._keep(token.group, token.point, shared.made)
+                refusals += 1
+        return refusals
+
+    def _keep_capture(self, key: str, result: MadeCapture | PlenoError | Lost) -> int:
+        """Keep a capture and make the points that wait for it ready; returns how many were
+        refused.
+        """
+        from plenocli.files.atomic import publish
+
+        shared = self.captures[key]
+        shared.under_way = False
+        if isinstance(result, MadeCapture):
+            paths = self._capture_paths(key, len(result.contents))
+            for path, content in zip(paths, result.contents):
+                publish(path, content, overwrite=True)
+            record = {
+                "files": len(paths),
+                "notes": result.notes,
+                "cpu_seconds": result.cpu_seconds,
+            }
+            self.store.journal.add(f"capture {key}", record)
+            shared.made = _located(paths, result.notes, result.cpu_seconds)
+        else:
+            shared.made = result
+        return self._release(shared)
 
     def _keep_matrix(self, group: str, result: MadeMatrix | PlenoError) -> int:
         """Keep a matrix and make its points ready, or refuse them all; returns how many were
@@ -257,6 +345,19 @@ class _Work:
         self.left[group] -= 1
         if not self.left[group]:
             self._path(group).unlink(missing_ok=True)
+        shared = self.captures.get(point.capture)
+        if shared is not None:
+            shared.left -= 1
+            if not shared.left and isinstance(shared.made, SharedCapture):
+                for path in shared.made.paths:
+                    Path(path).unlink(missing_ok=True)
 
     def _path(self, group: str) -> Path:
         return self.store.folder / "matrices" / f"{group}.h5"
+
+    def _capture_paths(self, key: str, count: int) -> list[Path]:
+        return [self.store.folder / "captures" / f"{key}-{i}.h5" for i in range(count)]
+
+
+def _located(paths: Sequence[Path], notes: tuple[str, ...], seconds: float) -> SharedCapture:
+    return SharedCapture(tuple(str(path.resolve()) for path in paths), tuple(notes), seconds)

@@ -18,6 +18,8 @@ from plenocli.base.errors import ConfigError, InputError, NumericsError
 from plenocli.base.progress import note
 from plenocli.base.text import json_value
 from plenocli.evaluation.designs import DesignTable, Metric, Parameter
+from plenocli.files.results.measured_seconds import measured_path
+from plenocli.stages.sweep.store import SHARED
 from plenocli.stages.sweep.task import DESIGN, PointResult
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 FRONTS = {
     "spatial": {"psnr_db": "max", "sensor_pixels": "min"},
     "spectral": {"six_patch_rmse": "min", "lenslet_field_m": "min"},
+    "depth": {"depth_slope_error": "min", "sensor_pixels": "min"},
 }
 """What counts as better where the file does not say."""
 MOST_SHOWN = 20
@@ -75,11 +78,11 @@ class SweepSummary:
 
 def _definitions() -> dict[str, str]:
     """What the figures of a point mean."""
-    from plenocli.evaluation.metrics import classify, quality, snr, spectral
+    from plenocli.evaluation.metrics import classify, depth, quality, snr, spectral
 
     return {
         name: text
-        for module in (quality, spectral, snr, classify)
+        for module in (quality, spectral, snr, classify, depth)
         for name, text in module.DEFINITIONS.items()
     } | DESIGN
 
@@ -225,6 +228,7 @@ def finish(
         _csv(points, table).encode(),
         overwrite=store.again,
     )
+    publish(measured_path(store.output), _measured(points).encode(), overwrite=store.again)
     if store.plot is not None and not table.ahead.any():
         note("no point has all figures of the front: there is nothing to draw")
     elif store.plot is not None:
@@ -232,7 +236,8 @@ def finish(
 
         publish(store.plot, front_picture(table), overwrite=store.again)
     write_artefact(store.output, design_artefact(table, provenance), overwrite=store.overwrite)
-    shutil.rmtree(store.folder / "matrices", ignore_errors=True)
+    for shared in SHARED:
+        shutil.rmtree(store.folder / shared, ignore_errors=True)
     results = [result_of(point) for point in points]
     if not (table.status == 0).any():
         worst = max(result.status for result in results)
@@ -321,6 +326,18 @@ def _csv(points: Sequence[DesignPoint], table: DesignTable) -> str:
                 " ".join(result.reason.split()),
             ]
         )
+    return out.getvalue()
+
+
+def _measured(points: Sequence[DesignPoint]) -> str:
+    """Processor seconds of each stage of each point, as they were measured when it was computed."""
+    stages = list(dict.fromkeys(s for point in points for s in result_of(point).stages))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["point", *(f"{stage} cpu_s" for stage in stages)])
+    for point in points:
+        spent = result_of(point).stages
+        writer.writerow([point.number, *(f"{spent[s]:.4g}" if s in spent else "" for s in stages)])
     return out.getvalue()
 
 

@@ -20,8 +20,20 @@ Options = Mapping[str, Any]
 CHAINS = {
     "spatial": ("simulate-pif", "capture-sim", "reconstruct", "score"),
     "spectral": ("simulate-pif", "capture-sim", "simulate-response", "calibrate", "demux", "score"),
+    "depth": ("capture-sim", "refocus", "score"),
 }
 """Stages of each chain, whose options may be set."""
+
+OWN_MATRIX = {
+    "refine",
+    "bandwidth",
+    "spectral_step",
+    "superpixels",
+    "coherent_ring",
+    "accuracy",
+    "model",
+}
+"""Options of capture-sim with which it computes a matrix of its own."""
 
 DESIGN = {
     "matrix_seconds": (
@@ -43,7 +55,7 @@ DESIGN = {
 class Task:
     """One point, as everything that its figures depend on.
 
-    chain: "spatial" or "spectral".
+    chain: of CHAINS.
     camera: resolved description, TOML text.
     settings: stage -> its options.
     """
@@ -56,6 +68,16 @@ class Task:
         """Those of one stage; empty where it has none."""
         return self.settings.get(stage, {})
 
+    @property
+    def foreign_capture(self) -> bool:
+        """Whether another matrix makes the capture than inverts it."""
+        return self.chain == "depth" or bool(OWN_MATRIX & self.options("capture-sim").keys())
+
+    @property
+    def needs_matrix(self) -> bool:
+        """Whether something is captured, or inverted, with the matrix of simulate-pif."""
+        return self.chain == "spatial" or not self.foreign_capture
+
     def as_json(self) -> dict[str, Any]:
         """What the point is known by."""
         return {"chain": self.chain, "camera": self.camera, "settings": self.settings}
@@ -67,11 +89,13 @@ class MatrixCost:
 
     matrix_seconds: on one core at nominal speed, as planned.
     matrix_bytes: of its file.
+    cpu_seconds: of the processor that it took, measured.
     """
 
     matrix_seconds: float
     matrix_bytes: int
     notes: tuple[str, ...] = ()
+    cpu_seconds: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
         """As the journal keeps it."""
@@ -79,6 +103,7 @@ class MatrixCost:
             "matrix_seconds": self.matrix_seconds,
             "matrix_bytes": self.matrix_bytes,
             "notes": list(self.notes),
+            "cpu_seconds": self.cpu_seconds,
         }
 
     @classmethod
@@ -88,6 +113,7 @@ class MatrixCost:
             matrix_seconds=record.get("matrix_seconds", 0.0),
             matrix_bytes=record.get("matrix_bytes", 0),
             notes=tuple(record.get("notes", ())),
+            cpu_seconds=record.get("cpu_seconds", 0.0),
         )
 
 
@@ -107,17 +133,39 @@ class MadeMatrix:
     cost: MatrixCost
 
 
+@dataclass(frozen=True)
+class SharedCapture:
+    """Captures that lie there already: their files, what was said of them, the seconds they
+    took.
+    """
+
+    paths: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    cpu_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class MadeCapture:
+    """Captures as bytes of their artefacts, what was said of them, the seconds they took."""
+
+    contents: tuple[bytes, ...]
+    notes: tuple[str, ...]
+    cpu_seconds: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
     """A task with where it finds things.
 
     matrix: that points share, None where the point computes its own.
+    capture: the same.
     files: what else is read.
     scratch: folder for files while the task lasts, None for the system's.
     """
 
     task: Task
     matrix: SharedMatrix | None = None
+    capture: SharedCapture | None = None
     files: tuple[str, ...] = ()
     scratch: str | None = None
 
@@ -130,7 +178,8 @@ class PointResult:
     reason: why a stage refused it.
     metrics: name -> figure; empty for a refused one.
     notes: what the stages said.
-    seconds: of the processor.
+    seconds: of the processor, for all that was done for this point alone.
+    stages: seconds of the processor of each stage, measured; of what is shared, those it took.
     """
 
     status: int = 0
@@ -138,6 +187,7 @@ class PointResult:
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
+    stages: Mapping[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """As the journal keeps it."""
@@ -147,6 +197,7 @@ class PointResult:
             "metrics": dict(self.metrics),
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "stages": dict(self.stages),
         }
 
     @classmethod
@@ -158,6 +209,7 @@ class PointResult:
             metrics=record.get("metrics", {}),
             notes=tuple(record.get("notes", ())),
             seconds=record.get("seconds", 0.0),
+            stages=record.get("stages", {}),
         )
 
 
@@ -177,7 +229,7 @@ def task_of(chain: str, camera: Camera, options: Mapping[str, Options], seed: in
     capture: dict[str, Any] = {"seed": seed}
     if not options.get("capture-sim", {}).keys() & {"scene", "target"}:
         capture |= (
-            {"scene": "skimage:astronaut"} if chain == "spatial" else {"target": "colorchecker"}
+            {"target": "colorchecker"} if chain == "spectral" else {"scene": "skimage:astronaut"}
         )
     banded = chain == "spectral" and "wavelengths" not in options.get("simulate-pif", {})
     supposed: dict[str, Options] = {
@@ -202,12 +254,25 @@ def point_key(task: Task, files: Mapping[str, str]) -> str:
     return digest_of(task.as_json(), files)
 
 
-def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
-    """What the matrix of a point is known by: of the camera only what A depends on, so that points
-    share it.
+def capture_key(task: Task, files: Mapping[str, str]) -> str:
+    """What the capture of a point is known by, where another matrix makes it than inverts it:
+    points that differ only in how they invert share it. "" where the point's own matrix makes it.
 
     files: path -> SHA-256 of the files it names.
     """
+    options = task.options("capture-sim")
+    asked = {"chain": task.chain, "camera": task.camera, "capture": options}
+    return digest_of(asked, files) if task.foreign_capture else ""
+
+
+def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
+    """What the matrix of a point is known by: of the camera only what A depends on, so that points
+    share it. "" where the chain needs none.
+
+    files: path -> SHA-256 of the files it names.
+    """
+    if not task.needs_matrix:
+        return ""
     settings = task.options("simulate-pif")
     kept = camera.model_dump(mode="json")
     # without an accuracy asked for, the sensor's noise decides how exact the matrix is

@@ -36,9 +36,9 @@ def command(
     as_json: bool,
 ) -> None:
     """Carry every point of a design space through simulate-pif, capture-sim, reconstruct (or
-    simulate-response or calibrate, and demux; or refocus) and score. SWEEP.toml names a camera, the keys of it
-    and of the stages' options that vary (a grid, a Latin hypercube or a list), and
-    what counts as better.
+    simulate-response or calibrate, and demux; or refocus) and score. SWEEP.toml names a camera, the
+    keys of it and of the stages' options that vary (a grid, a Latin hypercube or a list), and what
+    counts as better.
 
     OUT is a table (.h5), with the same as .csv beside it and the points that no other beats marked;
     OUT's .measured.csv has the processor seconds of each stage, which differ from run to run.

@@ -101,8 +101,7 @@ def _add_refocused(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str
 def _add_designs(page: Page, run: RunFolder) -> str | None:
     """The section about sweeps; returns its name, or None where there are none."""
     from plenocli.files.results.measured_seconds import read_measured
-    from plenocli.report.costs import COSTS, cost_figures, cost_rows
-    from plenocli.report.front import front_figures, front_rows
+    from plenocli.report.front import COSTS, cost_figures, cost_rows, front_figures, front_rows
 
     found = run.of_kind("sweep")
     if not found:

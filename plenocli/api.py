@@ -133,7 +133,8 @@ def plan(
 
     wavelengths: m (default: the camera's).
     superpixels: kept, odd (rows, columns), or "auto".
-    coherent_ring: rings of lenslets whose fields add, 0 for isolated ones, or "auto".
+    coherent_ring: rings of lenslets beyond the superpixels kept and the blur whose fields add
+        too, 0 for isolated ones, or "auto".
     accuracy: relative L2 error of the worst column; None: what the sensor's noise lets be seen.
     model: "auto", "ray", "fresnel" or "exact".
     dtype: of the matrix, float32, float64 or "auto".

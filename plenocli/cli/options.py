@@ -317,7 +317,10 @@ coherent_ring = click.option(
     type=Ring(),
     default="auto",
     show_default=True,
-    help="Rings of neighbour lenslets whose fields are summed; 0 is the paper's isolated lenslet.",
+    help=(
+        "Rings of lenslets, beyond those of the superpixels kept and those under the blur, whose "
+        "fields are summed too, all on every superpixel; 0 is the paper's isolated lenslet."
+    ),
 )
 
 

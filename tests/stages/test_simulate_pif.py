@@ -383,3 +383,37 @@ def test_memory_limit_is_kept(tmp_path, superpixels):
     )
     assert int(done.stdout.split("PEAK")[1]) < 512 * 1024
     assert (len(list(tmp_path.glob("pif.*.h5"))) > 1) == (superpixels == "5x5")
+
+
+@pytest.mark.parametrize(
+    "was, wrong, meant",
+    [
+        ('focal_length = "50 mm"', 'focal_length = "1 nm"', "main_lens.focal_length is 1 nm"),
+        ('"26 um"', '"55 nm"', "superpixel_pitch is 55 nm: was 55 um meant?"),
+        ('distance = "55 mm"', 'distance = "55 m"', "is 55 m: was 55 mm meant?"),
+    ],
+)
+def test_lengths_that_belong_to_no_camera_are_refused_alike(tmp_path, capsys, was, wrong, meant):
+    """Before anything is planned, with the length that is wrong, in the plan and in the run."""
+    camera, output = tmp_path / "camera.toml", tmp_path / "pif.h5"
+    camera.write_text(TINY.read_text().replace(was, wrong))
+    told = []
+    for more in (["--explain"], ["-o", str(output)]):
+        assert run(["simulate-pif", str(camera), *more]) == 2
+        told.append(capsys.readouterr().err)
+    assert told[0] == told[1] and meant in told[0] and not output.exists()
+
+
+def test_a_plan_that_would_be_refused_says_so(capsys):
+    command = ["simulate-pif", str(TINY), "--superpixels", "41x41", "--explain"]
+    assert run([*command, "--coherent-ring", "1", "--mem-limit", "64MiB"]) == 0
+    assert "! would be refused" in capsys.readouterr().out
+
+
+def test_a_matrix_without_light_is_not_written(tmp_path, capsys, monkeypatch):
+    from plenocli.stages.forward import simulate_pif
+
+    monkeypatch.setattr(simulate_pif, "DARK", 2.0)  # no point has so much light
+    output = tmp_path / "pif.h5"
+    assert run(["simulate-pif", str(TINY), "--accuracy", "0.1", "-o", str(output)]) == 5
+    assert "of any point's light lands" in capsys.readouterr().err and not output.exists()

@@ -82,7 +82,10 @@ _PIF_ATTRS = (
         "coherent_ring",
         "number",
         "1",
-        "rings of neighbour lenslets whose fields are summed; 0: isolated lenslet",
+        (
+            "rings of lenslets beyond the superpixels kept and the blur whose fields are summed "
+            "too; 0: isolated lenslet"
+        ),
     ),
     attribute(
         "kappa",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.budget import budget
+from plenocli.base.errors import NumericsError
 from plenocli.files.artefacts.container import READING
 
 if TYPE_CHECKING:
@@ -73,6 +74,15 @@ def layout(plan: PifPlan, where: object) -> Layout:
             for start in range(0, superpixels, size)
         ),
     )
+
+
+def refusal(plan: PifPlan, where: object) -> str | None:
+    """What `layout` would say of a plan that does not fit, None for one that does."""
+    try:
+        layout(plan, where)
+    except NumericsError as error:
+        return str(error)
+    return None
 
 
 def stream_pif(

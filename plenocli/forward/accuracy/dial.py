@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import NumericsError, UsageError
+from plenocli.base.units import format_length
 from plenocli.forward.accuracy.machine_rate import product_rate
 from plenocli.forward.accuracy.scene_needs import seen_wavelengths, sensor_noise, visible_accuracy
 from plenocli.forward.camera.geometry import chief_ray, corner_ray, lenslet_shift
@@ -158,6 +159,13 @@ class _Request:
                 f"{len(dropped)} wavelength(s) without light in the scene: no error"
             )
         self.pixel_shift, self.chief = _place(camera, lenslet)
+        if camera.lenslet_array.pitch < max(kept):
+            raise UsageError(
+                f"wavelength {format_length(max(kept))} is longer than lenslets are wide, "
+                f"{format_length(camera.lenslet_array.pitch)}: such openings are no lenses",
+                "wavelengths",
+                "check its unit, or that of lenslet_array.pitch",
+            )
         self.geometries = [geometry_of(camera, w, self.pixel_shift, self.chief) for w in kept]
         # one matrix for all lenslets is that of the one on the axis
         self.corner = None if lenslet is not None else corner_ray(camera)

@@ -30,6 +30,7 @@ from plenocli.base.quantities import (
 from plenocli.base.text import by
 from plenocli.base.toml import violations
 from plenocli.base.units import format_length
+from plenocli.forward.camera.plausible import Lengths, implausible
 
 ROW_SPACING = math.sqrt(3) / 2
 """Spacing of the rows of a hexagonal lattice, in units of its pitch."""
@@ -350,6 +351,9 @@ class Camera(Section):
     @model_validator(mode="after")
     def _resolve(self) -> Self:
         lens, array, light = self.main_lens, self.lenslet_array, self.light
+        trouble = implausible(self._lengths())
+        if trouble:
+            raise ValueError(trouble)
         if lens.aperture_diameter is None:
             width = {"aperture_diameter": array.distance / lens.f_number, "f_number": None}
             self.__dict__.update(main_lens=lens.model_copy(update=width))
@@ -366,6 +370,29 @@ class Camera(Section):
         if self.filter_array is not None:
             self.__dict__.update(filter_array=self._fitting(self.filter_array))
         return self
+
+    def _lengths(self) -> Lengths:
+        """The lengths as they are given, before any is derived from others."""
+        lens, array, sensor = self.main_lens, self.lenslet_array, self.sensor
+        given = {
+            "main_lens.focal_length": lens.focal_length,
+            "main_lens.aperture_diameter": lens.aperture_diameter,
+            "object.distance": self.object.distance,
+            "lenslet_array.distance": array.distance,
+            "lenslet_array.pitch": array.pitch,
+            "lenslet_array.superpixel_pitch": array.superpixel_pitch,
+            "lenslet_array.focal_length": array.focal_length,
+            "sensor.distance": sensor.distance,
+            "sensor.pixel_pitch": sensor.pixel_pitch,
+            "filter_array.size": None if self.filter_array is None else self.filter_array.size,
+        }
+        wavelengths = self.light.wavelengths
+        return Lengths(
+            by_key={key: value for key, value in given.items() if value is not None},
+            f_number=lens.f_number,
+            pixels=max(sensor.pixels_per_lenslet),
+            wavelengths=(min(wavelengths), max(wavelengths)),
+        )
 
     def _fitting(self, cells: FilterArray) -> FilterArray:
         """The filter array with its size; ValueError where it does not fit into the pupil."""

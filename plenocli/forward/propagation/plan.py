@@ -97,7 +97,8 @@ class PifPlan:
     model: kind of propagation, "ray", "fresnel" or "exact";
     rung: name of the model, one of models.MODELS;
     superpixels: (rows, columns), odd numbers;
-    coherent_ring: rings of neighbours whose fields add, 0 for isolated lenslets;
+    coherent_ring: rings of lenslets beyond the superpixels kept and the blur whose fields add, too
+        (sampling.coherent_window), 0 for isolated lenslets;
     accuracy: as asked or found, by `asked_by`;
     tolerance: root-energy cut of the spread function;
     double: precision of the fields;

@@ -59,7 +59,7 @@ class MatrixNotes:
     """How a system matrix was made, beside its AccuracyRecord.
 
     model: "ray", "fresnel" or "exact";
-    coherent_ring: rings of neighbours whose fields add;
+    coherent_ring: rings of lenslets whose fields add, as PifPlan has it;
     superpixels: (rows, columns) kept;
     precision: "single" or "double", of the fields;
     nodes: per axis across a "lenslet", a "pixel" and the spread function ("psf"), by band;

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from plenocli.base.errors import UsageError
+from plenocli.base.errors import NumericsError, UsageError
 from plenocli.base.progress import bar, note
 
 if TYPE_CHECKING:
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.diagnosis import Diagnosis
     from plenocli.forward.propagation.plan import PifPlan
     from plenocli.forward.propagation.system_matrix import LensletWindow, SystemMatrix
+
+
+DARK = 1e-9
+"""Share of a point's light below which a matrix has none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +139,7 @@ class PifSummary:
         text = (
             f"{Path(self.output)}: A of {self.bands} band(s), {rows}x{columns} superpixels, "
             f"{self.pixels} pixels, {self.points} points; column energy "
-            f"{min(found.energy_min):.3f} to {max(found.energy_max):.3f}"
+            f"{_share(min(found.energy_min))} to {_share(max(found.energy_max))}"
         )
         if not (found.rank is None or found.rank_60db is None or found.condition is None):
             text += (
@@ -145,6 +149,10 @@ class PifSummary:
         if found.symmetry_defect is not None:
             text += f"; symmetry defect {min(found.symmetry_defect):.1e}"
         return f"{text}; {self.rung}, estimated error {self.estimated_accuracy:.1g}"
+
+
+def _share(energy: float) -> str:
+    return f"{energy:.3f}" if energy >= 0.001 else f"{energy:.1e}"
 
 
 def _condition(found: Diagnosis, dtype: str) -> str:
@@ -197,7 +205,7 @@ def run_simulate_pif(
     camera = read_camera(camera_path)
     plan = _planned(camera, settings)
     if explain:
-        return _explained(plan, pif_pieces.cost(plan)[1])
+        return _explained(plan, pif_pieces.cost(plan)[1], pif_pieces.refusal(plan, camera_path))
     assert output is not None  # _require_output
     chosen = pif_pieces.layout(plan, camera_path)
     _announce(plan, pif_pieces.cost(plan)[1])
@@ -286,10 +294,12 @@ def _provenance(
     )
 
 
-def _explained(plan: PifPlan, memory: int) -> PlanSummary:
+def _explained(plan: PifPlan, memory: int, refusal: str | None) -> PlanSummary:
     from plenocli.forward.accuracy.dial import seconds_here
     from plenocli.forward.accuracy.explain import candidates, explain
 
+    if refusal:
+        plan = replace(plan, warnings=(*plan.warnings, f"would be refused: {refusal}"))
     return PlanSummary(
         plan=explain(plan, memory),
         memory=memory,
@@ -341,6 +351,13 @@ def _artefact(
 ) -> Artefact:
     from plenocli.files.artefacts.container import Artefact
 
+    if not max(found.energy_max) > DARK:
+        raise NumericsError(
+            f"no more than {max(found.energy_max):.1g} of any point's light lands on the "
+            "superpixels kept",
+            "the matrix",
+            "keep more superpixels, or mend the distances, apertures and pixels of the camera",
+        )
     if settings.lenslet is not None:
         window = _window(camera, settings.lenslet)
         matrix = replace(matrix, notes=replace(matrix.notes, window=window))

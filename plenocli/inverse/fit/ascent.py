@@ -4,6 +4,7 @@ evidence rises, with noise that starts as large as the captures' misfit makes it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from plenocli.inverse.fit.evidence import Evidence, EvidenceAt
 from plenocli.inverse.fit.finer import FinerModel
-from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt
+from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt, fringes_a_pixel
 from plenocli.inverse.fit.optics import CameraFamily
 
 GAIN = 0.3
@@ -34,8 +35,8 @@ STALE = 1.5
 """By how much the noise may fall meanwhile."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
-LOUD = 0.7
-"""Fisher's matrix is made of patterns only that stand out of so much of the noise."""
+COARSE = 2.0
+"""Quadrature nodes a period of the finest fringes of what Fisher's matrix is made of."""
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,9 @@ class Ascent:
         self._model, self._rounds = model, rounds
         nodes = None if model is None else NODES
         self.lenslets = LensletFamily(family, tolerance=tolerance, pixel_nodes=nodes)
-        self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=1)
-        sigma = min(c.sigma for c in evidence.captures)
-        self._quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in evidence.captures)
+        few = max(1, math.ceil(COARSE * fringes_a_pixel(family)))
+        self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=few)
         self._state: tuple[MatrixAt, list[np.ndarray]] | None = None
-        told = self._coarse.at(family.start).matrix
-        self._loud = Evidence(evidence.captures, evidence.prior.seen(told, LOUD * sigma))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """(parameter,) in their units, of x in tolerances."""
@@ -137,7 +135,7 @@ class Ascent:
         """
         state, slopes, turn = self._slopes(at)
         counts = at.evidence.contrasts(at.factor)
-        by_optics = self._loud.at(state.matrix).fisher(slopes, at.factor, counts)
+        by_optics = self.evidence.at(state.matrix).fisher(slopes, at.factor, counts)
         return turn.T @ by_optics @ turn + np.eye(len(at.x))
 
     def products(self, at: Point) -> np.ndarray:
@@ -169,7 +167,7 @@ class Ascent:
                 break
             # relative to the matrix as the noise is to the captures
             changed = np.linalg.norm(finer - at.finer) / np.linalg.norm(at.matrix)
-            if changed * self._quiet < CHANGED:
+            if changed * self.evidence.quiet < CHANGED:
                 break
             at = self.climb(at.x, steps, finer)
         return at

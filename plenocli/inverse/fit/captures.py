@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.inverse.fit.fit import CapturedLenslets, described_matrix
+from plenocli.inverse.fit.problem import CapturedLenslets, described_matrix
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.superpixels import superpixels
 

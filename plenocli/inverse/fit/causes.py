@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.inverse.fit.ascent import Ascent, Point
-from plenocli.inverse.fit.evidence import Evidence
-from plenocli.inverse.fit.fit import (
-    HIDDEN,
-    LOST,
-    CapturedLenslets,
-    camera_family,
-    in_units_of_photographs,
-    matrix_as_described,
-    middle_of,
-)
-from plenocli.inverse.fit.optics import require_fittable
-from plenocli.inverse.fit.prior import photograph_prior
+from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -84,15 +73,9 @@ def likeliest_cause(
     Returns None where no parameter helps.
     Raises as fit_camera does.
     """
-    require_fittable(camera)
-    family = camera_family(camera, None)
-    told = matrix_as_described(family)
-    data = [in_units_of_photographs(middle_of(capture, LENSLETS), told)]
-    prior = photograph_prior(pictures, family.geometry.object_shape, seed)
-    sigma = data[0].sigma
-    signal = float(np.sqrt(np.mean(data[0].y ** 2)))
-    lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
-    ascent = Ascent(family, Evidence(data, prior.seen(told, HIDDEN * sigma)), tolerance=lost)
+    problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
+    family = problem.family
+    ascent = Ascent(family, problem.evidence, tolerance=problem.tolerance)
     start = ascent.point(np.zeros(len(family.parameters)), slopes=True)
     rise = start.paraxial.back(start.evidence.by_matrix(start.factor)) * family.tolerance
     fisher = ascent.information(start)

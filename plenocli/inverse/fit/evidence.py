@@ -50,6 +50,16 @@ class Evidence:
         """How many of them there are in all captures."""
         return sum(c.y.shape[1] for c in self.captures)
 
+    @property
+    def values(self) -> int:
+        """How many pixels there are in all captures."""
+        return sum(c.y.size for c in self.captures)
+
+    @property
+    def quiet(self) -> float:
+        """Root mean square of the quietest capture over its noise."""
+        return max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in self.captures)
+
     def at(self, A: np.ndarray) -> EvidenceAt:
         """The evidence under a matrix A (pixel, point)."""
         return EvidenceAt(self, A)

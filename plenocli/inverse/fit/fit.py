@@ -5,26 +5,17 @@ are most likely, whatever their objects are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.errors import ConfigError, InputError
-from plenocli.forward.camera.geometry import geometry
+from plenocli.base.errors import ConfigError
 from plenocli.inverse.fit.ascent import Ascent, Point
 from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
-from plenocli.inverse.fit.evidence import Evidence, Lenslets
 from plenocli.inverse.fit.finer import FinerModel
-from plenocli.inverse.fit.lenslet import LensletFamily
-from plenocli.inverse.fit.optics import (
-    ZERNIKES,
-    CameraFamily,
-    Parameter,
-    all_parameters,
-    require_fittable,
-)
-from plenocli.inverse.fit.prior import BRIGHTNESS, photograph_prior
+from plenocli.inverse.fit.optics import ZERNIKES, Parameter
+from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -41,11 +32,7 @@ STARTS = (
 explains the captures: in focus a camera and its mirror image are alike, and the evidence has a
 saddle.
 """
-HIDDEN = 0.15
-"""Patterns of photographs that all together stay below so much of the noise are left out."""
-LOST = 0.01
-"""Of the noise: what may be cut from the spread function."""
-SLACK, DEVIATIONS = 0.025, 4.0
+SLACK, DEVIATIONS = 0.01, 3.0
 """Noise over the noise told, less one, up to which a fit explains its captures: photographs are
 not quite what the prior says, and the noise of few pixels is known so well only.
 """
@@ -56,9 +43,9 @@ CLEAR = 4.0
 """Steps over lenslet borders under the mirrored camera, over those under the found one, from which
 on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
 """
-INFLATION = 2.5
+INFLATION = 1.8
 """By how much the standard deviations exceed Fisher's: draws of cameras were this much farther."""
-MATRIX_INFLATION = 2.0
+MATRIX_INFLATION = 1.6
 """The same for the error of the matrix, to which errors of parameters add up less."""
 FINER, FINER_IN_MATRIX = 3e-3, 2e-3
 """What objects finer than the points of a lenslet add to the noise, of a capture's root mean
@@ -71,19 +58,6 @@ SECONDS = 2e-5
 """A fit takes on one core for each pixel and point of a lenslet, about."""
 MOST_LENSLETS = 16
 """Lenslets looked at along each side of a capture, from its middle."""
-
-
-@dataclass(frozen=True)
-class CapturedLenslets:
-    """Superpixels of one capture.
-
-    y: (lenslet_row, lenslet_column, pixel) in any units of A x; lenslets with values that are not
-        finite, or all 0, are left out.
-    sigma: standard deviation of their noise, in these units.
-    """
-
-    y: np.ndarray
-    sigma: float
 
 
 def fit_camera(
@@ -111,39 +85,28 @@ def fit_camera(
     Raises UsageError for other cameras, InputError for captures that hold nothing.
     docs/model.md, "A camera that fits itself".
     """
-    require_fittable(camera)
-    family = camera_family(camera, parameters)
-    told = matrix_as_described(family)
-    middle = [middle_of(c) for c in captures]
-    data = [in_units_of_photographs(c, told) for c in middle]
-    prior = photograph_prior(pictures, family.geometry.object_shape, seed)
-    sigma = min(c.sigma for c in data)
-    evidence = Evidence(data, prior.seen(told, HIDDEN * sigma))
-    signal = max(float(np.sqrt(np.mean(c.y**2))) for c in data)
-    lost = min(max(LOST * sigma / signal, 1e-6), 1e-4)
+    problem = fit_problem(
+        camera, captures, pictures, parameters=parameters, lenslets=MOST_LENSLETS, seed=seed
+    )
+    family = problem.family
     ascent = Ascent(
         family,
-        evidence,
-        tolerance=lost,
+        problem.evidence,
+        tolerance=problem.tolerance,
         model=FinerModel(family, model),
         rounds=1 if model == "fresnel" else ROUNDS,
         progress=progress,
     )
     start = np.zeros(len(family.parameters))
     begun = ascent.point(start, finer=ascent.difference(start))
-    limits = accepted_ratios(sum(c.y.size for c in data), signal / sigma)
+    limits = accepted_ratios(problem.evidence.values, problem.evidence.quiet)
     best = _highest(ascent, limits[0])
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
-        best, turned = _told_apart(ascent, best, middle)
+        best, turned = _told_apart(ascent, best, problem.captures)
     # what is left over beyond the noise is believed of fine objects only where pictures go on
     sure = turned is not None and turned >= CLEAR
     return _described(ascent, best, limits[1] if sure else limits[0], begun, turned)
-
-
-def described_matrix(camera: Camera) -> np.ndarray:
-    """The matrix (pixel, point) of one lenslet of a camera as described, where fits start."""
-    return matrix_as_described(camera_family(camera, None))
 
 
 def expected_seconds(camera: Camera) -> float:
@@ -151,16 +114,6 @@ def expected_seconds(camera: Camera) -> float:
     pixels = float(np.prod(camera.sensor.pixels_per_lenslet))
     points = float(np.prod(camera.object.samples_per_lenslet))
     return SECONDS * pixels * points
-
-
-def camera_family(camera: Camera, parameters: Sequence[Parameter] | None) -> CameraFamily:
-    shift = (0.0, 0.0) if camera.fitted is None else camera.fitted.pixel_shift
-    known = tuple(all_parameters(camera) if parameters is None else parameters)
-    return CameraFamily(camera, geometry(camera, camera.light.wavelengths[0], shift), known)
-
-
-def matrix_as_described(family: CameraFamily) -> np.ndarray:
-    return LensletFamily(family, tolerance=1e-4).at(family.start).matrix
 
 
 def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
@@ -172,32 +125,6 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     """
     sure = DEVIATIONS / float(np.sqrt(2 * values))
     return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
-
-
-def middle_of(capture: CapturedLenslets, most: int = MOST_LENSLETS) -> CapturedLenslets:
-    """The lenslets in the middle of a capture, `most` a side."""
-    rows, columns = capture.y.shape[:2]
-    r, c = (max(0, (n - most) // 2) for n in (rows, columns))
-    return CapturedLenslets(
-        np.asarray(capture.y, float)[r : r + most, c : c + most], float(capture.sigma)
-    )
-
-
-def _used(capture: CapturedLenslets) -> np.ndarray:
-    """(lenslet_row, lenslet_column) whether a lenslet holds light."""
-    return np.isfinite(capture.y).all(axis=2) & (capture.y != 0).any(axis=2)
-
-
-def in_units_of_photographs(capture: CapturedLenslets, told: np.ndarray) -> Lenslets:
-    """The lenslets as bright as photographs are; told: matrix (pixel, point) as described."""
-    y = capture.y[_used(capture)].T
-    if y.size == 0 or not float(y.sum()) > 0:
-        raise InputError("holds no light that a fit could look at")
-    if not capture.sigma > 0:
-        raise InputError("does not say how strong its noise is", fix="give --noise-sigma")
-    level = y.sum(axis=0) / float(told.sum())
-    unit = float(np.sqrt(np.mean(level**2))) / BRIGHTNESS
-    return Lenslets(y / unit, capture.sigma / unit)
 
 
 def _highest(ascent: Ascent, limit: float) -> Point:
@@ -251,7 +178,7 @@ def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets
     """
     shape, total, count = ascent.family.geometry.object_shape, 0.0, 0
     for index, capture in enumerate(captures):
-        used = _used(capture)
+        used = capture.used
         objects = np.full((*used.shape, *shape), np.nan)
         objects[used] = at.evidence.objects(index, at.factor).T.reshape(-1, *shape)
         for steps in (
@@ -268,9 +195,7 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
     """(standard deviations (parameter,) in tolerances, correlations (parameter, parameter),
     relative error of the matrix) at the end of a fit that leaves `ratio` times the noise.
     """
-    captures = ascent.evidence.captures
-    values = sum(c.y.size for c in captures)
-    quiet = max(float(np.sqrt(np.mean(c.y**2))) / c.sigma for c in captures)
+    values, quiet = ascent.evidence.values, ascent.evidence.quiet
     excess = max(0.0, ratio**2 - 1 - 2 * float(np.sqrt(2 / values))) * values
 
     def covariance(finer: float) -> np.ndarray:

@@ -19,6 +19,15 @@ PIXEL_ERROR = 1e-4
 """Of the integral over a pixel of the finest fringes, which hold next to no light."""
 
 
+def fringes_a_pixel(family: CameraFamily) -> float:
+    """How many of the finest fringes that a lenslet of the described camera makes fall on what is
+    sensitive of a pixel.
+    """
+    g = family.geometry
+    relay = abs(float(family.optics(family.start)[RELAY]))
+    return relay * g.pixel_active * g.lenslet_width / g.D2
+
+
 class LensletFamily:
     """Matrices A (pixel, point) of one lenslet of a family of cameras.
 
@@ -49,7 +58,7 @@ class LensletFamily:
         window = max(g.pixel_shape) * g.pixel_pitch / 2
         relay, curve = (abs(family.optics(family.start)[place]) for place in (RELAY, CURVATURE))
         fill = g.lenslet_width / g.D2
-        fringe = 2 * np.pi * relay * g.pixel_active / 2 * fill
+        fringe = np.pi * fringes_a_pixel(family)
         self.pixel_nodes = pixel_nodes or max(2, smooth_nodes(fringe, PIXEL_ERROR) - 1)
         phase = np.pi * fill * (relay * window + g.D1 * g.D2 / (2 * g.wavelength * g.z2))
         t, w = gauss(smooth_nodes(1.1 * (phase + np.pi * curve * fill**2 / 2), 1e-8) + 2)

@@ -13,8 +13,14 @@ from plenocli.base.errors import NumericsError, UsageError
 if TYPE_CHECKING:
     import numpy as np
 
+    from plenocli.forward.camera.model import Camera
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
+    from plenocli.inverse.fit.optics import Parameter
+    from plenocli.inverse.fit.problem import CapturedLenslets
+
+TOLD = 20.0
+"""Time (s) from which on a fit says before how long it takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,30 +82,16 @@ def run_fit_camera(
     Raises UsageError, InputError, OutputError; NumericsError where no camera near the described one
     explains the captures: then nothing is written.
     """
-    from plenocli.base.progress import bar, note
-    from plenocli.files.artefacts.container import write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output, publish
+    from plenocli.files.atomic import publish
     from plenocli.files.images.mosaic import read_capture
-    from plenocli.files.read.cameras import camera_files, read_camera
     from plenocli.files.read.captures import read_white
     from plenocli.files.read.training import files_of
-    from plenocli.files.results.camera_fits import fit_artefact
     from plenocli.inverse.fit.captures import believed_model, captured_lenslets
-    from plenocli.inverse.fit.fit import STEPS, expected_seconds, fit_camera
-    from plenocli.inverse.fit.optics import parameters_without, require_fittable
+    from plenocli.inverse.fit.optics import parameters_without
 
-    output, inputs = Path(output), [*captures, camera, calibration, *(files_of(training) or ())]
-    check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".toml",))
-    if details is not None:
-        check_output(details, overwrite=overwrite, inputs=[*inputs, output], suffixes=(".h5",))
-    described = read_camera(camera)
-    require_fittable(described)
-    named = camera_files(camera, described)
-    if len(named) > 1 and output.resolve().parent != Path(camera).resolve().parent:
-        raise UsageError(
-            f"names files beside {Path(camera).name}", output, "write OUT into the folder of CAMERA"
-        )
+    inputs = [*captures, camera, calibration, *(files_of(training) or ())]
+    _check_outputs(output := Path(output), details, inputs, overwrite=overwrite)
+    described, named = _described(camera, output)
     parameters = parameters_without(described, fixed)
     grid = None if calibration is None else read_white(calibration)
     read = [read_capture(path) for path in captures]
@@ -107,20 +99,16 @@ def run_fit_camera(
         captured_lenslets(one, described, grid, noise_sigma=noise_sigma, where=calibration)
         for one in read
     ]
-    scaled = _photographs(training, read, described.object.samples_per_lenslet)
-    seconds = expected_seconds(described)
-    if seconds > 20:
-        note(f"the fit takes about {seconds:.0f} s of one core, up to four times that at worst")
-    with bar(None, STEPS, "steps of the fit") as progress:
-        fit = fit_camera(
-            described,
-            lenslets,
-            scaled,
-            parameters=parameters,
-            model=believed_model(model, read),
-            seed=seed,
-            progress=progress.update,
-        )
+    pictures = _photographs(training, read, described.object.samples_per_lenslet)
+    fit = fitted(
+        described,
+        lenslets,
+        pictures,
+        name="the fit",
+        parameters=parameters,
+        model=believed_model(model, read),
+        seed=seed,
+    )
     if not fit.accepted:
         raise NumericsError(
             f"no camera near the described one explains the captures: the best {fit.why}",
@@ -128,11 +116,85 @@ def run_fit_camera(
             "check its distances, the calibration and --noise-sigma, or give more captures",
         )
     if details is not None:
-        origin = describe_inputs({**named, "capture": captures, "calibration": calibration})
-        provenance = Provenance(command=command, inputs=origin, seed=seed)
-        write_artefact(details, fit_artefact(fit, provenance), overwrite=overwrite)
+        origin = {**named, "capture": captures, "calibration": calibration}
+        _write_details(fit, details, origin, command=command, seed=seed, overwrite=overwrite)
     publish(output, fitted_toml(fit, camera, captures).encode(), overwrite=overwrite)
     return CameraFitSummary(output=str(output), captures=len(captures), fit=fit)
+
+
+def fitted(
+    camera: Camera,
+    captures: Sequence[CapturedLenslets],
+    pictures: Sequence[np.ndarray],
+    *,
+    name: str,
+    parameters: Sequence[Parameter] | None = None,
+    model: str,
+    seed: int,
+) -> CameraFit:
+    """The CameraFit of fit_camera, its time told before and its steps shown; name: of what takes
+    the time.
+    """
+    from plenocli.base.progress import bar, note
+    from plenocli.inverse.fit.fit import STEPS, expected_seconds, fit_camera
+
+    seconds = expected_seconds(camera)
+    if seconds > TOLD:
+        note(f"{name} takes about {seconds:.0f} s of one core, up to four times that at worst")
+    with bar(None, STEPS, "steps of the fit") as progress:
+        return fit_camera(
+            camera,
+            captures,
+            pictures,
+            parameters=parameters,
+            model=model,
+            seed=seed,
+            progress=progress.update,
+        )
+
+
+def _check_outputs(
+    output: Path, details: Path | None, inputs: Sequence[Any], *, overwrite: bool
+) -> None:
+    from plenocli.files.atomic import check_output
+
+    check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".toml",))
+    if details is not None:
+        check_output(details, overwrite=overwrite, inputs=[*inputs, output], suffixes=(".h5",))
+
+
+def _described(camera: Path, output: Path) -> tuple[Camera, dict[str, Any]]:
+    """(the camera to start from, files that describe it); UsageError where it is not fitted, or
+    its fitted description would not find the files that it names.
+    """
+    from plenocli.files.read.cameras import camera_files, read_camera
+    from plenocli.inverse.fit.optics import require_fittable
+
+    described = read_camera(camera)
+    require_fittable(described)
+    named = camera_files(camera, described)
+    if len(named) > 1 and output.resolve().parent != Path(camera).resolve().parent:
+        raise UsageError(
+            f"names files beside {Path(camera).name}", output, "write OUT into the folder of CAMERA"
+        )
+    return described, dict(named)
+
+
+def _write_details(
+    fit: CameraFit,
+    details: Path,
+    origin: dict[str, Any],
+    *,
+    command: str,
+    seed: int,
+    overwrite: bool,
+) -> None:
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.results.camera_fits import fit_artefact
+
+    provenance = Provenance(command=command, inputs=describe_inputs(origin), seed=seed)
+    write_artefact(details, fit_artefact(fit, provenance), overwrite=overwrite)
 
 
 def _photographs(

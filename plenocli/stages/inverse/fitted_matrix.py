@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
-from plenocli.base.progress import bar, note
+from plenocli.base.progress import note
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.nuisances.clean import clean
+from plenocli.stages.inverse.fit_camera import fitted
+
+WHOLE = 0.5
+"""Share of the lenslets that must be wholly measured for a fit to look at these alone."""
 
 if TYPE_CHECKING:
     from plenocli.inverse.fit.camera_fit import CameraFit
@@ -30,7 +34,7 @@ def with_fitted_camera(
     Raises UsageError where the pif does not say what camera it was made for, or the camera is of a
     kind that is not fitted; InputError where the noise is not known.
     """
-    from plenocli.inverse.fit.fit import STEPS, CapturedLenslets, expected_seconds, fit_camera
+    from plenocli.inverse.fit.problem import CapturedLenslets
     from plenocli.inverse.picture.trust.finer import matrix_of
 
     system, options = estimators.system, estimators.options
@@ -45,26 +49,17 @@ def with_fitted_camera(
     sigma = options.noise_sigma or data.sigma
     if not sigma:
         raise InputError("does not say how strong its noise is", where, "give --noise-sigma")
-    camera = system.origin.camera
     model = "auto"
     if data.accuracy is not None and data.accuracy.model in ("fresnel", "exact"):
         model = data.accuracy.model
-    seconds = expected_seconds(camera)
-    if seconds > 20:
-        note(f"--fit takes about {seconds:.0f} s of one core, up to four times that at worst")
-    y = np.where(np.isfinite(data.y), data.y, 0)
-    bare = (
-        clean(estimators, data).data.y if np.any(y != data.y) or data.saturated is not None else y
+    fit = fitted(
+        system.origin.camera,
+        [CapturedLenslets(_measured(estimators, data), float(sigma))],
+        estimators.prior.pictures(data.scene),
+        name="--fit",
+        model=model,
+        seed=options.seed,
     )
-    with bar(None, STEPS, "steps of the fit") as progress:
-        fit = fit_camera(
-            camera,
-            [CapturedLenslets(bare, float(sigma))],
-            estimators.prior.pictures(data.scene),
-            model=model,
-            seed=options.seed,
-            progress=progress.update,
-        )
     if not fit.accepted:
         note(f"--fit: the best {fit.why}; the matrix of the camera as described is used")
         return estimators, fit
@@ -76,6 +71,19 @@ def with_fitted_camera(
     return estimators.with_matrix(matrix_of(system, fit.camera, model)), fit
 
 
+def _measured(estimators: Estimators, data: Superpixels) -> np.ndarray:
+    """Superpixels (lenslet_row, lenslet_column, pixel) that a fit may look at: NaN in lenslets that
+    are not wholly measured, or, where too few are, all of them as the matrix at hand fills them in.
+    """
+    missing = ~np.isfinite(data.y)
+    if data.saturated is not None:
+        missing |= data.saturated
+    whole = ~missing.any(axis=2)
+    if np.count_nonzero(whole) >= WHOLE * whole.size:
+        return np.where(whole[..., None], data.y, np.nan)
+    return clean(estimators, data).data.y
+
+
 def likely_cause(
     estimators: Estimators, y: np.ndarray, sigma: float, scene: str | None
 ) -> str | None:
@@ -85,7 +93,7 @@ def likely_cause(
     y: (lenslet_row, lenslet_column, pixel); sigma: their noise; scene: that training leaves out.
     """
     from plenocli.inverse.fit.causes import likeliest_cause
-    from plenocli.inverse.fit.fit import CapturedLenslets
+    from plenocli.inverse.fit.problem import CapturedLenslets
 
     origin = estimators.system.origin
     if origin is None or estimators.coupled:

@@ -23,6 +23,10 @@ is below what the parameters' standard deviations stand for, and there are valle
 """
 LONGER = 2.5
 """By how much a step that helped is lengthened, again and again."""
+SURPRISE = 1.4
+"""Of the gain that was promised: a step that gains less is not lengthened. Of a parabola with a
+promised and another curvature, LONGER steps are higher only where the first gains more.
+"""
 FAR = 20.0
 """No step is longer, in tolerances, before it has shown that it helps."""
 NODES = 2
@@ -220,15 +224,15 @@ class Ascent:
             while np.linalg.norm(way) > FAR:
                 damping *= 3
                 way = _damped(fisher, damping, rise)
-            best = self._along(at, way)
+            best = self._along(at, way, float(rise @ way - 0.5 * way @ fisher @ way))
             if best is not at:
                 return best, max(damping / 5, 1e-5)
             damping = max(damping * 10, 1e-2)
         return at, damping
 
-    def _along(self, at: Point, way: np.ndarray) -> Point:
+    def _along(self, at: Point, way: np.ndarray, promised: float) -> Point:
         """The highest of the points at + way, at + LONGER way, ... as far as they rise; `at`
-        itself where none does.
+        itself where none does. Where the first gains about what was promised it is near the top.
         """
         best, length = at, 1.0
         while length < 400:
@@ -236,6 +240,8 @@ class Ascent:
             if not found.height > best.height:
                 break
             best, length = found, length * LONGER
+            if found.height - at.height < SURPRISE * promised:
+                break
         return best
 
     def _mirrored(self, at: Point) -> list[Point]:

@@ -81,20 +81,20 @@ class EvidenceAt:
         self._of = evidence
         self._seen = np.asarray(A @ evidence.prior.patterns.astype(A.dtype), float)
         self._whole = [self._with_veil(c) for c in evidence.captures]
-        self._spectra = [
-            [self._spectrum(m, c, scale) for scale in evidence.scales]
-            for m, c in zip(self._whole, evidence.captures)
-        ]
+        self._spectra = [self._by_contrast(m, c) for m, c in zip(self._whole, evidence.captures)]
 
     def _with_veil(self, capture: Lenslets) -> np.ndarray:
         veil = np.full((len(self._seen), 1), VEIL * float(np.mean(capture.y)))
         return np.hstack([self._seen, veil])
 
-    @staticmethod
-    def _spectrum(whole: np.ndarray, capture: Lenslets, scale: np.ndarray) -> _Spectrum:
-        m = whole * scale
-        values, vectors = np.linalg.eigh(m.T @ m)
-        return _Spectrum(np.maximum(values, 0), vectors, vectors.T @ (m.T @ capture.y))
+    def _by_contrast(self, whole: np.ndarray, capture: Lenslets) -> list[_Spectrum]:
+        gram, seen = whole.T @ whole, whole.T @ capture.y
+        found = []
+        for scale in self._of.scales:
+            values, vectors = np.linalg.eigh(scale[:, None] * gram * scale)
+            u = vectors.T @ (scale[:, None] * seen)
+            found.append(_Spectrum(np.maximum(values, 0), vectors, u))
+        return found
 
     def _likelihood(self, index: int, factor: float) -> np.ndarray:
         """log p(y | contrast), (contrast, lenslet), of one capture."""

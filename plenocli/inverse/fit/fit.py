@@ -52,7 +52,7 @@ FINER, FINER_IN_MATRIX = 3e-3, 2e-3
 square, where standard deviations and the error of the matrix are worked out: such objects shift
 above all the sensor distance.
 """
-LEFT_OVER = 0.03
+LEFT_OVER = 0.01
 """By how much of what a fit leaves over, beyond the noise, the variances grow."""
 SECONDS = 2e-5
 """A fit takes on one core for each pixel and point of a lenslet, about."""

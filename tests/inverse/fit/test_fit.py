@@ -42,13 +42,14 @@ def exact(values, finer, model="fresnel"):
     return np.asarray(build_pif(camera, replace(plan, pixel_shift=shift)).A[0, 0], float)
 
 
-def captured(values, count=6, scale=1.0, model="fresnel"):
-    """Superpixels of a photograph twice as fine as it is modelled."""
-    picture = np.asarray(data.coffee(), float).mean(axis=2)[60:, 150:] / 255
-    scene = to_blocks(picture[: 20 * count, : 20 * count], (20, 20))
-    y = scene @ exact(tuple(values), 2, model).T / 4
+def captured(values, count=6, scale=1.0, model="fresnel", corner=(60, 150), finer=2, seed=3):
+    """Superpixels of a part of a photograph `finer` times as fine as it is modelled."""
+    picture = np.asarray(data.coffee(), float).mean(axis=2)[corner[0] :, corner[1] :] / 255
+    side = 10 * finer
+    scene = to_blocks(picture[: side * count, : side * count], (side, side))
+    y = scene @ exact(tuple(values), finer, model).T / finer**2
     sigma = np.sqrt(np.mean(y**2)) * 10 ** (-SNR / 20)
-    noise = np.random.default_rng(3).standard_normal(y.shape)
+    noise = np.random.default_rng(seed).standard_normal(y.shape)
     return CapturedLenslets(scale * (y + sigma * noise), scale * sigma)
 
 
@@ -99,6 +100,23 @@ def test_the_fitted_camera_is_a_camera_file_like_any_other():
     )
     bare = float(np.hypot(plain.model_error, fit.model_error))
     assert abs(found.accuracy.model_error - bare) < 0.05 * bare
+
+
+def test_several_captures_tell_more_than_one():
+    """Standard deviations fall about as with the root of the number, and the truth stays within."""
+    truth, _ = fitted("all")
+    corners = ((60, 150), (120, 150), (60, 210))
+    captures = [captured(truth, corner=c, finer=1, seed=k) for k, c in enumerate(corners)]
+    one, three = (
+        fit_camera(CAMERA, c, TRAINING, model="fresnel") for c in (captures[:1], captures)
+    )
+    assert three.accepted and three.lenslets == 3 * one.lenslets == 108
+    measured = [i for i, p in enumerate(one.parameters) if p.sigma < 0.1 * p.tolerance]
+    ratio = [three.parameters[i].sigma / one.parameters[i].sigma for i in measured]
+    assert len(measured) > 6 and 0.4 < np.mean(ratio) < 0.8 and max(ratio) < 1
+    assert np.abs([(p.value - t) / p.sigma for p, t in zip(three.parameters, truth)]).max() < 4
+    right = exact(tuple(truth), 1)
+    assert np.linalg.norm(three.matrix - right) < np.linalg.norm(one.matrix - right)
 
 
 def test_a_fit_that_cannot_be_says_so_and_changes_nothing():

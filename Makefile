@@ -16,7 +16,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test lint extremes faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env demo test lint extremes honesty faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ lint: $(READY) ## layout, lint and types of the code
 extremes: $(READY) ## errors of the solvers against the condition of the matrix; cameras and captures at the edges
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/inverse/test_extremes.py tests/faults/test_cameras.py
+
+honesty: $(READY) ## 2,000 random cameras of all shapes at random accuracies, against sums that share no code with the models (an hour or two)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "" tests/forward/propagation/test_foreign_cameras.py
 
 faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults

@@ -146,7 +146,7 @@ def expected(case: Case, counts: Mapping[str, float]) -> tuple[float, ...]:
     view = geometry(camera, plan.bands[0].wavelength, plan.pixel_shift)
     if case.model != EXACT:
         phase = view.k * view.D1 / 2 * plan.bands[0].half / view.z2
-        return (SpreadLaw(**counts).terms(phase, plan.tolerance),)
+        return (SpreadLaw(**counts).terms(phase, plan.bands[0].spread_cut),)
     assert isinstance(plan.bands[0], ExactBand)
     return cost_law.expected_counts(camera, view, plan.bands[0], plan.shape, TermLaw(**counts))
 

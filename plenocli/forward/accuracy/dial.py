@@ -352,19 +352,24 @@ def _sized(
         why = f"{worst} error {split[worst]:.1g}"
         room = max(rest, BEST_ACCURACY)
     sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
-    double = request.dtype == np.float64 or sampling < SINGLE_LIMIT
     try:
         bands = tuple(
-            model.size(v, request.superpixels, ring, sampling, sampling / 2)
+            model.size(request.camera, v, request.superpixels, ring, sampling, sampling / 2)
             for v in _finest(request, nodes)
         )
+        # single precision's rounding is of the size of the brightest points' light
+        faintest = min(b.faintest for b in bands)
+        double = request.dtype == np.float64 or sampling * faintest < SINGLE_LIMIT
+        rounding = ROUNDING[double] / (1 if double else faintest)
         costs = [
             model.cost(request.camera, v, b, request.shape, double)
             for v, b in zip(request.geometries, bands)
         ]
     except NumericsError as error:
         return Candidate(name=model.name, model=model.kind, why=error.what)
-    split = split | {"sampling": max(max(b.sampling for b in bands), ROUNDING[double])}
+    split = split | {"sampling": max(max(b.sampling for b in bands), rounding)}
+    if why is None and rounding > request.accuracy:
+        why = f"the dimmest point has {faintest**2:.1g} of the light: rounding error {rounding:.1g}"
     if nodes and request.band is not None:
         bands = (replace(bands[0], wavelength=request.band.center),)
     size = int(np.prod(request.shape)) * request.dtype.itemsize
@@ -539,7 +544,6 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         coherent_ring=best.ring,
         accuracy=request.accuracy,
         asked_by=request.asked_by,
-        tolerance=best.sampling / 2,
         double=best.double,
         bands=best.bands,
         shape=request.shape,

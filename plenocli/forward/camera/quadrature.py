@@ -209,3 +209,43 @@ def _panel(low: float, high: float, ends: Callable, radius: float | None, slope:
         theta = (a + b) / 2 + (b - a) / 2 * t
         y, wy = radius * np.sin(theta), (b - a) / 2 * w * radius * np.cos(theta)
     return y, wy, *ends(y)
+
+
+@lru_cache(maxsize=16)
+def opening_weights(shape: str, count: int) -> np.ndarray:
+    """Weights W with sum W_ij F(y_i, x_j) the integral of F over a lenslet's opening, for functions
+    that the Gauss-Legendre nodes of the rectangle around it interpolate.
+
+    shape: "square", "circle" or "hexagon", with two flat sides facing +-x; the rectangle around it
+        is scaled to [-1, 1]^2;
+    count: nodes along each axis.
+
+    Returns (row node, column node), read-only.
+    """
+    t, w = gauss(count)
+    if shape == "square":
+        found = np.outer(w, w)
+    else:
+        if shape == "circle":
+            theta = (np.arange(2 * count + 16) + 0.5) * np.pi / (2 * count + 16) - np.pi / 2
+            y, half = np.sin(theta), np.cos(theta)
+            rows = np.pi / len(theta) * half
+        else:
+            s, ws = gauss(count + 4)
+            panels = ((-1.0, -0.5), (-0.5, 0.5), (0.5, 1.0))
+            y = np.concatenate([(a + b) / 2 + (b - a) / 2 * s for a, b in panels])
+            rows = np.concatenate([(b - a) / 2 * ws for a, b in panels])
+            half = np.minimum(1.0, 2 * (1 - np.abs(y)))
+        degrees = np.arange(count)
+        ends = np.polynomial.legendre.legvander(half, count)
+        chords = np.zeros((len(y), count))
+        chords[:, 0] = 2 * half
+        # from one end of a chord to the other: nothing for odd degrees
+        chords[:, 2::2] = (
+            2 * (ends[:, 3::2] - ends[:, 1:-2:2])[:, : len(degrees[2::2])] / (2 * degrees[2::2] + 1)
+        )
+        series = np.polynomial.legendre.legvander(t, count - 1).T * w * (degrees + 0.5)[:, None]
+        across = np.polynomial.legendre.legvander(y, count - 1) @ series
+        found = across.T @ (rows[:, None] * (chords @ series))
+    found.flags.writeable = False
+    return found

@@ -55,6 +55,7 @@ class Model(ABC):
     @abstractmethod
     def size(
         self,
+        camera: Camera,
         geometry: Geometry,
         superpixels: tuple[int, int],
         ring: int,

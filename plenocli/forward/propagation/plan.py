@@ -29,7 +29,9 @@ class BandPlan:
     half: half width (m) of that interval;
     sampling: estimated relative error of the worst column from these counts;
     pixel_rule: which rule the pixels' nodes follow (quadrature.band_rule);
-    beside: nodes and rule on superpixels beside the object's own, where these are fewer.
+    beside: nodes and rule on superpixels beside the object's own, where these are fewer;
+    spread_cut: root energy that may be cut from the spread function;
+    faintest: root of the dimmest point's light, over that of lenslets without gaps.
     """
 
     wavelength: float
@@ -42,6 +44,8 @@ class BandPlan:
     sampling: float = 0.0
     pixel_rule: int = 0
     beside: tuple[int, int] | None = None
+    spread_cut: float = 1e-5
+    faintest: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +104,6 @@ class PifPlan:
     coherent_ring: rings of lenslets beyond the superpixels kept and the blur whose fields add, too
         (sampling.coherent_window), 0 for isolated lenslets;
     accuracy: as asked or found, by `asked_by`;
-    tolerance: root-energy cut of the spread function;
     double: precision of the fields;
     bands: node counts by wavelength;
     shape: (band, superpixel, pixel, point) of the matrix;
@@ -125,7 +128,6 @@ class PifPlan:
     coherent_ring: int
     accuracy: float
     asked_by: str
-    tolerance: float
     double: bool
     bands: tuple[BandPlan, ...]
     shape: tuple[int, int, int, int]

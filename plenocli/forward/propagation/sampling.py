@@ -6,17 +6,19 @@ Chosen before any work (plenocli.forward.accuracy).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
+from plenocli.forward.propagation.fresnel.trial_columns import trial_columns
 from plenocli.forward.propagation.plan import BandPlan
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ LATE = 8.0
 """How much more lenslets that a blurred point lights interfere in such pixels than FRINGES has
 it: up to the end of their band.
 """
+MOST_NODES = 200
+"""Nodes of a pixel per axis that are out of reach."""
 RULES, MAX_RULE = 8, 20
 """Steps of quadrature.band_rule that are tried, and the most nodes for which they are."""
 MANY = 512
@@ -51,6 +55,18 @@ MANY = 512
 PSF_CUT_EFFECT = 0.3
 """Effect of the spread function's cut on a column, over the cut's root energy
 (measured, worst column).
+"""
+TOUCHING = 0.999
+"""Width of square lenslets over their pitch from which on no point lies in a gap."""
+BRIGHT = 0.25
+"""Light of the dimmest point of square lenslets that touch: a corner's, which four share."""
+UNTRIED, UNTRIED_WEIGHT = 1e-6, 21.0
+"""Light that the dimmest point is expected to have where columns are too large to be tried, and by
+how much finer pixels are then sampled.
+"""
+OTHERS = 1.2, 3.0
+"""By how much other columns are worse than those tried, the latter where a pixel takes in many
+fringes (measured: at most 1.3, 4.6).
 """
 NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
@@ -147,6 +163,7 @@ def _half_phase(geometry: Geometry, far: float) -> float:
 
 
 def size_band(
+    camera: Camera,
     geometry: Geometry,
     superpixels: tuple[int, int],
     ring: int,
@@ -174,28 +191,40 @@ def size_band(
     joint = (1 if window is None else 2 * lit + 1) * geometry.D2 * active
     half = geometry.field_half(superpixels, window)
     count = psf_nodes(geometry, half)
-    terms = expected_terms(geometry.k * geometry.D1 / 2 * half / geometry.z2, tolerance)
-    # a point between lenslets that do not touch is dim, and what is missed weighs
-    # more in its column
-    faint = 1 + min(20.0, 80 * (1 - geometry.lenslet_width / geometry.D2))
     light = own, joint, geometry.diffraction_cells, geometry.blur / geometry.D2
-    nodes, rule = pixel_nodes(accuracy / faint, *light)
-    errors, beside = [PSF_CUT_EFFECT * tolerance, faint * pixel_error(nodes, rule, *light)], None
-    sharp = geometry.blur == 0 and geometry.diffraction_cells > BESIDE_CELLS
-    if dim and sharp and window is not None:
-        fewer = pixel_nodes(accuracy / faint, *light, BESIDE)
+    errors, beside = [PSF_CUT_EFFECT * tolerance], None
+    if geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2:
+        faintest = BRIGHT
+        nodes, rule = pixel_nodes(accuracy, *light)
+        errors.append(pixel_error(nodes, rule, *light))
+        sharp = geometry.blur == 0 and geometry.diffraction_cells > BESIDE_CELLS
+        fewer = pixel_nodes(accuracy, *light, BESIDE) if dim and sharp and window else (nodes, 0)
         if fewer[0] < nodes:
             beside = fewer
             # a point at a corner lights two of them
-            errors.append(math.sqrt(2) * faint * pixel_error(*fewer, *light, BESIDE))
+            errors.append(math.sqrt(2) * pixel_error(*fewer, *light, BESIDE))
+    else:
+        camera = at_wavelength(camera, geometry.wavelength)
+        trial = trial_columns(camera, geometry, superpixels, window, is_symmetric(camera))
+        faintest = UNTRIED if trial is None else trial.faintest
+        # a point between lenslets is dim, and what is missed weighs more in its column
+        if trial is None:
+            weight, error = UNTRIED_WEIGHT, lambda n, step: pixel_error(n, step, *light)
+        else:
+            weight, error = 1.0 if trial.whole else OTHERS[own > FEW_FRINGES[0]], trial.error
+        nodes, rule = _required(_fewest(error, accuracy / weight), joint)
+        errors.append(weight * error(nodes, rule))
+    root = min(1.0, math.sqrt(faintest / BRIGHT))
     return BandPlan(
         wavelength=geometry.wavelength,
         window=window,
         lenslet_nodes=nodes_for(_half_phase(geometry, far)),
         pixel_nodes=nodes,
         psf_nodes=count,
-        terms=terms,
+        terms=expected_terms(geometry.k * geometry.D1 / 2 * half / geometry.z2, root * tolerance),
         half=half,
+        spread_cut=root * tolerance,
+        faintest=root,
         sampling=math.hypot(*errors),
         pixel_rule=rule,
         beside=beside,
@@ -285,21 +314,34 @@ def pixel_nodes(
     Returns (nodes, step of quadrature.band_rule).
     """
     light = own, joint, cells, blur, shares
-    count = next((n for n in range(2, 200) if pixel_error(n, 0, *light) <= accuracy / 1.5), None)
-    if count is None:
+    found = _fewest(lambda count, rule: pixel_error(count, rule, *light), accuracy)
+    return _required(found, joint)
+
+
+def _required(found: tuple[int, int] | None, joint: float) -> tuple[int, int]:
+    if found is None:
         raise NumericsError(
             f"{joint:.0f} interference fringes a pixel cannot be integrated",
             "sensor.pixel_pitch",
             "use smaller pixels",
         )
+    return found
+
+
+def _fewest(error: Callable[[int, int], float], accuracy: float) -> tuple[int, int] | None:
+    """As pixel_nodes, of any estimate error(nodes, step of quadrature.band_rule); None where
+    MOST_NODES are too few.
+    """
+    count = next((n for n in range(2, MOST_NODES) if error(n, 0) <= accuracy / 1.5), None)
+    if count is None:
+        return None
     best = count, 0
     # rules made for a band of frequencies need fewer nodes than Gauss-Legendre's
     while 2 < best[0] <= MAX_RULE:
-        fewer = best[0] - 1
-        rule = min(range(RULES), key=lambda step: pixel_error(fewer, step, *light))
-        if pixel_error(fewer, rule, *light) > accuracy / 2:
+        errors = [error(best[0] - 1, step) for step in range(RULES)]
+        if min(errors) > accuracy / 2:
             break
-        best = fewer, rule
+        best = best[0] - 1, errors.index(min(errors))
     return best
 
 

@@ -131,7 +131,7 @@ def estimates():
                     key = f"{name}, {model.name}, {side}x{side}, ring {ring}, {accuracy:g}"
                     shape = (1, side * side, int(pixels), int(points))
                     try:
-                        band = model.size(view, (side, side), ring, accuracy, accuracy / 2)
+                        band = model.size(camera, view, (side, side), ring, accuracy, accuracy / 2)
                         cost = model.cost(camera, view, band, shape, double)
                         found[key] = [float(cost.operations), float(cost.seconds), cost.bytes]
                     except NumericsError as error:

@@ -35,10 +35,10 @@ class FakeModel:
     def error_bound(self, camera, geometry):
         return self.error
 
-    def size(self, geometry, superpixels, ring, accuracy, tolerance):
+    def size(self, camera, geometry, superpixels, ring, accuracy, tolerance):
         if accuracy < self.least:
             raise NumericsError("a million terms", "model", "ask for less")
-        return size_band(geometry, superpixels, ring, accuracy, tolerance)
+        return size_band(camera, geometry, superpixels, ring, accuracy, tolerance)
 
     def cost(self, camera, geometry, band, shape, double):
         return Cost(self.operations * (2 if double else 1), 0.0, 1000)

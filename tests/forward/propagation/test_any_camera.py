@@ -56,8 +56,15 @@ def error_over_asked(camera, pixels, accuracy, **request):
         plan,
         replace(
             plan,
-            tolerance=plan.tolerance / 10,
-            bands=(replace(band, pixel_nodes=many, pixel_rule=0, beside=None),),
+            bands=(
+                replace(
+                    band,
+                    pixel_nodes=many,
+                    pixel_rule=0,
+                    beside=None,
+                    spread_cut=band.spread_cut / 10,
+                ),
+            ),
         ),
     ):
         builder = PifBuilder(camera, band.wavelength, each)

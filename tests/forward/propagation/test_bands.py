@@ -103,7 +103,9 @@ def test_bands_too_wide_are_refused():
 def planned(camera, nodes):
     shortest = geometry(camera, spectral_nodes(camera.light.band, nodes)[0][0])
     plan = plan_pif(camera, accuracy=1e-4, model="fresnel", superpixels=(3, 3), coherent_ring=1)
-    sized = size_band(shortest, plan.superpixels, plan.coherent_ring, 1e-4, plan.tolerance)
+    sized = size_band(
+        camera, shortest, plan.superpixels, plan.coherent_ring, 1e-4, plan.bands[0].spread_cut
+    )
     return replace(plan, bands=(replace(sized, wavelength=550e-9),))
 
 

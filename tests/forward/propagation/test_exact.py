@@ -730,4 +730,6 @@ def test_a_shut_filter_lets_no_light_through(superpixels):
 def test_a_field_of_too_many_terms_is_refused_before_it_is_computed(monkeypatch):
     monkeypatch.setattr(term_counts, "MAX_SKETCH", 9)
     with pytest.raises(NumericsError, match="about .* separable terms, more than"):
-        exact.exact_band(geometry(small_camera(), WAVELENGTH), (1, 1), 0, 1e-4, 1e-4)
+        exact.exact_band(
+            small_camera(), geometry(small_camera(), WAVELENGTH), (1, 1), 0, 1e-4, 1e-4
+        )

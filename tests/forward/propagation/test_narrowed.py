@@ -39,8 +39,15 @@ def test_columns_hold_beside_the_whole_factors(config, superpixels, changes, acc
     assert superpixels > 3 or band.beside and band.beside[0] < band.pixel_nodes
     fine = replace(
         plan,
-        tolerance=plan.tolerance / 10,
-        bands=(replace(band, pixel_nodes=band.pixel_nodes + 3, pixel_rule=0, beside=None),),
+        bands=(
+            replace(
+                band,
+                pixel_nodes=band.pixel_nodes + 3,
+                pixel_rule=0,
+                beside=None,
+                spread_cut=band.spread_cut / 10,
+            ),
+        ),
     )
     found = []
     for each in (plan, fine):

@@ -28,7 +28,7 @@ def ray_image(camera, point, grid=3, ring=1, wavelength=WAVELENGTH):
         camera,
         view,
         SimpleNamespace(superpixels=(grid, grid)),
-        size_band(view, (grid, grid), ring, 1e-2, 1e-2),
+        size_band(camera, view, (grid, grid), ring, 1e-2, 1e-2),
     )
     rows, columns = view.pixel_shape
     out = np.empty((1, grid, grid, rows, columns))

@@ -73,7 +73,12 @@ GAPS = 3.0
 
 
 def exact_band(
-    geometry: Geometry, superpixels: tuple[int, int], ring: int, accuracy: float, tolerance: float
+    camera: Camera,
+    geometry: Geometry,
+    superpixels: tuple[int, int],
+    ring: int,
+    accuracy: float,
+    tolerance: float,
 ) -> ExactBand:
     """As Model.size: node counts of the exact model at one wavelength, and the cut of its fields.
 
@@ -82,7 +87,7 @@ def exact_band(
     # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of
     # what was asked from 3e-3 to 5e-2, on 3 cameras
     finer = 1 + SIDES * min(1.0, max(0.0, math.log10(accuracy / 1e-3))) if ring else 1.0
-    base = size_band(geometry, superpixels, ring, accuracy / finer, tolerance)
+    base = size_band(camera, geometry, superpixels, ring, accuracy / finer, tolerance)
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse
     # cuts hurt corners more
     share = min(1.0, 4 / math.pi * (geometry.D2 / max(geometry.blur, geometry.D2)) ** 2)

@@ -138,14 +138,14 @@ class ShapedLenslets(LensletFields):
             band.pixel_rule,
             np.complex128 if plan.double else np.complex64,
         )
-        self.field = separable_field(camera, geometry, band.half, plan.tolerance)
+        self.field = separable_field(camera, geometry, band.half, band.spread_cut)
         self.symmetry = self.field.symmetry
         self.notes = FieldNotes(separable_terms=self.field.terms, field_tail=self.field.tail)
         self.cut = chords(
             geometry.lenslet_shape,
             geometry.lenslet_width,
             _slope(camera, geometry, plan.superpixels, band.window),
-            plan.tolerance / 30,
+            band.spread_cut / 30,
         )
         self.shared_axis = 1 - self.cut.axis
         self._sites = geometry.places(plan.superpixels)
@@ -518,7 +518,7 @@ def features(
         geometry.lenslet_shape,
         geometry.lenslet_width,
         _slope(camera, geometry, grid, band.window),
-        band.sampling / 60 or 1e-7,
+        band.spread_cut / 30,
     )
     products = [([0.0], [0.0])] if band.window is None else geometry.neighbourhood(band.window)
     nodes = [n * band.pixel_nodes for n in geometry.pixel_shape]

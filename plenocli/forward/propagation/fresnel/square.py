@@ -56,13 +56,13 @@ class SquareLenslets(LensletFields):
         )
         # off the sensor's own raster every superpixel has its pixels around its centre
         self._centred = geometry.pixel_shift is None
-        field = separable_field(camera, geometry, band.half, plan.tolerance)
+        field = separable_field(camera, geometry, band.half, band.spread_cut)
         self.symmetry = field.symmetry
         self.notes = FieldNotes(separable_terms=field.terms, field_tail=field.tail)
         self._x, self._w, self._basis = self._lenslet_nodes()
         self._kernels: dict[tuple, np.ndarray] = {}
         self._cut = (
-            plan.tolerance if narrows(geometry, band, plan.superpixels, plan.double) else None
+            band.spread_cut if narrows(geometry, band, plan.superpixels, plan.double) else None
         )
         rules = self._rules()
         high, down = self._tables(field, 0, rules)

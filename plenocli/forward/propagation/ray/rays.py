@@ -71,7 +71,12 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
 
 
 def size_band(
-    geometry: Geometry, superpixels: tuple[int, int], ring: int, accuracy: float, tolerance: float
+    camera: Camera,
+    geometry: Geometry,
+    superpixels: tuple[int, int],
+    ring: int,
+    accuracy: float,
+    tolerance: float,
 ) -> BandPlan:
     """As Model.size: no quadrature; every lenslet under the blur of every superpixel kept counts
     (ring 0: its own only).

@@ -1,0 +1,253 @@
+"""A few columns computed while a matrix is planned: how much light the dimmest points have, and
+what the rules of a pixel's nodes make of their fringes.
+
+Where lenslets leave gaps, or are round, points between them have as little as 1e-8 of the brightest
+one's light, and their columns are edges and fringes alone: no law for evenly lit lenslets tells
+what these need. Their fields are summed over the openings as they are, on nodes that resolve
+everything, without separable terms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.forward.camera.quadrature import band_rule, gauss, nodes_for, opening_weights
+from plenocli.forward.propagation.fresnel.array_to_sensor import lenslet_kernel
+from plenocli.forward.propagation.fresnel.spread_function import legendre, sampled_field
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+
+CHEAP, AFFORDED = 5e8, 1e9
+"""Complex multiplications that a trial may take, and one of few points."""
+FEW, LINES = 3, 8
+"""Points that a trial should have, and the most lines of points along an axis."""
+VALUES = 1 << 22
+"""Values of the spread function, or on the sensor, that it may hold."""
+KEPT = 16
+"""Trials that are kept for the next plan of the same camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialColumns:
+    """Columns of a few points of a camera.
+
+    light: (column,) share of a point's light that enters the lenslets;
+    fringes: (column, degree, degree) Gram matrices, over all pixels and over the column's squared
+        norm, of the Legendre coefficients of the light within a pixel, both axes together;
+    whole: whether they are all columns that symmetry does not give.
+    """
+
+    light: np.ndarray
+    fringes: np.ndarray
+    whole: bool
+
+    @property
+    def faintest(self) -> float:
+        """Least light of a point."""
+        return float(self.light.min())
+
+    def error(self, count: int, rule: int) -> float:
+        """Relative error of the worst column by a rule for the nodes of a pixel.
+
+        count: nodes per axis;
+        rule: step of quadrature.band_rule.
+        """
+        t, w = band_rule(count, rule)
+        missed = legendre(t, self.fringes.shape[1], 1).T @ w
+        missed[0] -= 2
+        return float(np.sqrt(np.maximum(missed @ self.fringes @ missed, 0).max()))
+
+
+def trial_columns(
+    camera: Camera,
+    geometry: Geometry,
+    grid: tuple[int, int],
+    window: int | None,
+    symmetric: bool,
+) -> TrialColumns | None:
+    """The TrialColumns of a camera, None where they would take too long.
+
+    camera: at the wavelength of `geometry`;
+    grid: (rows, columns) of superpixels kept;
+    window: coherent lenslets on either side, None for isolated ones;
+    symmetric: whether pupil and wavefront are mirrored by both axes.
+    """
+    lens = camera.main_lens
+    return _tried(
+        _Hashed(camera, (lens.samples("aperture_image"), lens.samples("wavefront"))),
+        geometry,
+        grid,
+        window,
+        symmetric,
+    )
+
+
+class _Hashed:
+    """A camera with what its files hold, as a key."""
+
+    def __init__(self, camera: Camera, samples: tuple) -> None:
+        self.camera = camera
+        self._key = (
+            camera.model_dump_json(),
+            *(None if values is None else values.tobytes() for values in samples),
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Hashed) and self._key == other._key
+
+
+@lru_cache(maxsize=KEPT)
+def _tried(
+    hashed: _Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+) -> TrialColumns | None:
+    # lenslets farther off bring little light
+    for near in [None] if window is None else range(window, 0, -1):
+        trial = _Trial(geometry, grid, near, symmetric)
+        points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
+        if points and trial.values <= VALUES:
+            light, fringes = trial.columns(hashed.camera, points)
+            whole = near == window and len(points) == len(trial.points) and trial.whole
+            return TrialColumns(light=light, fringes=fringes, whole=whole)
+    return None
+
+
+def _lines(count: int, symmetric: bool) -> list[int]:
+    """Lines of points that are tried, of so many."""
+    last = (count - 1) // 2 if symmetric else count - 1
+    return np.unique(np.linspace(0, last, LINES).round().astype(int)).tolist()
+
+
+class _Trial:
+    """Nodes on lenslets and pixels of one trial."""
+
+    def __init__(
+        self, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+    ) -> None:
+        g = geometry
+        self.geometry, self.places = g, list(g.places(grid))
+        self.products = None if window is None else g.neighbourhood(window)
+        lit = 0.0 if window is None else max(g.reach(grid, window))
+        away = 0.0 if window is None else lit + max(g.reach(grid))
+        reach = (max(g.pixel_shape) + 1) * g.pixel_pitch / 2 + away * g.superpixel_pitch
+        half = max(g.lenslet_extent)
+        slope = g.k * (reach / g.z3 + g.D1 / 2 / g.z2 + abs(g.kappa) * half)
+        # fields are interpolated, not only integrated
+        self.count = nodes_for(2 * slope * half)
+        cycles = 2 * (half + lit * g.D2) * g.pixel_active / (g.wavelength * g.z3)
+        # coarse rules miss what has many degrees
+        self.degrees = nodes_for(2 * np.pi * cycles) + 2
+        self.whole = all((n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape)
+        # the farthest from the middle first
+        self.points: list[tuple[int, int]] = sorted(
+            product(_lines(g.object_shape[0], symmetric), _lines(g.object_shape[1], symmetric)),
+            key=lambda p: -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, g.object_shape)),
+        )
+
+    @property
+    def _lenslets(self) -> list[tuple[int, int]]:
+        """Rows and columns of each product of lenslets."""
+        if self.products is None:
+            return [(1, 1)]
+        return [(len(rows), len(columns)) for rows, columns in self.products]
+
+    @property
+    def values(self) -> int:
+        """Of the spread function and on the sensor, in memory at a time."""
+        pixels = int(np.prod(self.geometry.pixel_shape)) * self.degrees**2
+        return max(pixels, *(r * c * self.count**2 for r, c in self._lenslets))
+
+    @property
+    def cost(self) -> float:
+        """Complex multiplications for a column."""
+        v, u = (n * self.degrees for n in self.geometry.pixel_shape)
+        each = sum(v * c * self.count * (r * self.count + u) for r, c in self._lenslets)
+        return float(len(self.places) * each)
+
+    def columns(
+        self, camera: Camera, points: list[tuple[int, int]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(light, fringes) of points, as TrialColumns has them."""
+        g, m = self.geometry, self.degrees
+        at = [(g.points(0)[i], g.points(1)[j]) for i, j in points]
+        light, norm, gram = np.zeros(len(at)), np.zeros(len(at)), np.zeros((len(at), m, m))
+        entered = None
+        kernels: dict[tuple, np.ndarray] = {}
+        # from the light at a pixel's nodes, weights included, to Legendre coefficients over half of
+        # the pixel
+        onto = legendre(gauss(m)[0], m, 1).T * (np.arange(m) + 0.5)[:, None]
+        for place in self.places:
+            products = self.products or [(np.array([place[0]]), np.array([place[1]]))]
+            if entered is None or self.products is None:
+                entered = [self._entering(camera, lenslets, at) for lenslets in products]
+                light += sum(share for _, share in entered)
+            for n in range(len(at)):
+                field: np.ndarray | int = 0
+                for lenslets, (fields, _) in zip(products, entered):
+                    down, across = (
+                        self._kernel(kernels, axis, lenslets[axis], place[axis]) for axis in (0, 1)
+                    )
+                    field = field + down @ fields[n] @ across.T
+                field = np.asarray(field)
+                energy = (field.real**2 + field.imag**2).reshape(
+                    g.pixel_shape[0], m, g.pixel_shape[1], m
+                )
+                series = onto @ energy.sum(axis=3).transpose(1, 0, 2).reshape(m, -1)
+                series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
+                gram[n] += series @ series.T
+                norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
+        return light, gram / norm[:, None, None]
+
+    def _entering(
+        self, camera: Camera, lenslets: tuple, points: list[tuple[float, float]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Fields (point, row, column) at the nodes of the lenslets of a product, weights included,
+        and their light (point,).
+        """
+        g = self.geometry
+        t, _ = gauss(self.count)
+        nodes = [
+            (np.asarray(places)[:, None] * g.D2 + extent * t).ravel()
+            for places, extent in zip(lenslets, g.lenslet_extent)
+        ]
+        lines, which = zip(
+            *(np.unique([point[axis] for point in points], return_inverse=True) for axis in (0, 1))
+        )
+        dy, dx = ((x - at[:, None]).ravel() for x, at in zip(nodes, lines))
+        h = sampled_field(camera, g, dy, dx).reshape(
+            len(lines[0]), len(nodes[0]), len(lines[1]), len(nodes[1])
+        )
+        weight = np.tile(
+            opening_weights(g.lenslet_shape, self.count)
+            * (g.lenslet_extent[0] * g.lenslet_extent[1]),
+            (len(lenslets[0]), len(lenslets[1])),
+        )
+        fields = np.stack([h[i, :, j] for i, j in zip(*which)])
+        light = (weight * (fields.real**2 + fields.imag**2)).sum(axis=(1, 2))
+        return fields * weight, light
+
+    def _kernel(
+        self, kept: dict[tuple, np.ndarray], axis: int, positions: np.ndarray, place: float
+    ) -> np.ndarray:
+        """The kernel of an axis from lenslets at `positions` to the nodes of the superpixel at
+        `place`.
+        """
+        key = axis, place, *positions
+        if key not in kept:
+            g = self.geometry
+            t, w = gauss(self.degrees)
+            half = g.pixel_active / 2
+            middle = g.pixels(axis) + g.window_shift(axis, place)
+            v, wv = (middle[:, None] + half * t).ravel(), np.tile(half * w, len(middle))
+            x = g.lenslet_extent[axis] * gauss(self.count)[0]
+            kept[key] = np.hstack([lenslet_kernel(g, n - place, v, wv, x) for n in positions])
+        return kept[key]

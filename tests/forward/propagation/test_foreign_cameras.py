@@ -1,0 +1,136 @@
+"""Cameras that nobody tuned anything on: what is asked for holds, or is refused with a number."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.forward.propagation import foreign
+from tests.forward.propagation.cameras import plan_pif, small_camera, system_matrix
+from tests.reference import tensor
+from tests.reference.fresnel import pixel_energies
+
+SAMPLE, PART, PARTS = 16, 50, 40
+"""Cameras of the default tests; of each part of a campaign, and its parts: 2000 in all."""
+
+
+def summed(cases, count):
+    """Count and check cases: all hold or are refused with a number."""
+    done = [c for c in cases if c.true is not None]
+    count(
+        "foreign cameras",
+        asked=len(cases),
+        refused=len(cases) - len(done),
+        held=sum(c.ratio <= 1 for c in done),
+        told=sum(c.told for c in done),
+        slower=sum(c.slow for c in cases),
+        slower_refused=sum(c.slow for c in cases if c.true is None),
+    )
+    missed = [f"{c.number}: {c.ratio:.2f} of {c.asked:.1e}, {c.what}" for c in done if c.ratio > 1]
+    bright = [f"{c.number}: {c.excess:.5f}, {c.what}" for c in done if c.excess > 1.001]
+    vague = [c.refused for c in cases if c.refused and not any(d.isdigit() for d in c.refused)]
+    assert not missed and not bright and not vague, "\n".join([*missed, *bright, *vague])
+    return done
+
+
+def test_a_sample_of_foreign_cameras_holds(count):
+    cases = [c for c in (foreign.answer(0, n, "fresnel") for n in range(SAMPLE)) if c]
+    done = summed(cases, count)
+    assert len(done) > 0.6 * SAMPLE
+    assert sum(c.told for c in done) > 0.8 * len(done)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(PARTS))
+def test_foreign_cameras_hold(part, count):
+    numbers = range(part * PART, (part + 1) * PART)
+    summed([c for c in (foreign.answer(1, n) for n in numbers) if c], count)
+
+
+DIM = small_camera(
+    main_lens__aperture_diameter=4.58775397e-3,
+    main_lens__aperture_shape="square",
+    main_lens__aberrations=({"noll": 5, "coefficient": 342.031288e-9},),
+    object__samples_per_lenslet=(3, 7),
+    lenslet_array__pitch=304.41067e-6 / (1 + 4196.8194e-6 / 55e-3),
+    lenslet_array__focal_length=3649.40817e-6,
+    lenslet_array__aperture_shape="circle",
+    lenslet_array__fill_factor=0.435839,
+    sensor__distance=4196.8194e-6,
+    sensor__pixel_pitch=9.51283343e-6,
+    sensor__pixels_per_lenslet=(32, 32),
+    light__wavelengths=(637.509992e-9,),
+)
+"""Points between its lenslets have a millionth of the light."""
+
+
+@pytest.mark.parametrize("asked", [1e-2, 1e-5, 1e-8])
+def test_points_between_small_openings_hold(asked):
+    matrix = system_matrix(
+        DIM, superpixels=(1, 1), coherent_ring=0, accuracy=asked, dtype=np.float64
+    )
+    found = matrix.A[0, 0].T
+    true = tensor.paraxial(DIM, foreign.points_of(DIM), None, [(0, 0)]).reshape(found.shape)
+    assert true.sum(axis=1).min() < 2e-6
+    errors = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
+    assert errors.max() < asked
+    assert 0.1 < matrix.accuracy.estimated / errors.max() < 10
+
+
+def test_precision_is_of_the_dimmest_point():
+    """Single precision serves 1e-5 of bright columns, not of those of a millionth of the light."""
+    request = dict(superpixels=(1, 1), coherent_ring=0, accuracy=1e-5)
+    assert plan_pif(DIM, **request).double
+    assert not plan_pif(DIM.replace(**{"lenslet_array.fill_factor": 1.0}), **request).double
+
+
+# the oracle
+
+
+@pytest.mark.parametrize("shape", ["square", "circle", "hexagon"])
+def test_weights_of_an_opening_integrate_waves(shape):
+    t = np.polynomial.legendre.leggauss(40)[0]
+    y, x = np.meshgrid(np.linspace(-1, 1, 1201), np.linspace(-1, 1, 1201), indexing="ij")
+    inside = {
+        "square": y > -2,
+        "circle": y * y + x * x < 1,
+        "hexagon": (np.abs(x) < 1) & (np.abs(y) + np.abs(x) / 2 < 1),
+    }[shape]
+    wave = lambda y, x: np.exp(1j * (7 * y - 4 * x))
+    # a sum over a fine grid, by which the weights are right to its steps
+    plain = (inside * wave(y, x)).mean() * 4
+    found = (tensor.weights(shape, 40) * wave(t[:, None], t)).sum()
+    assert abs(found - plain) < 5e-3
+
+
+@pytest.mark.parametrize("shape, lattice", [("circle", "square"), ("hexagon", "hexagonal")])
+def test_the_oracle_agrees_with_a_plainer_one(shape, lattice):
+    camera = small_camera(
+        main_lens__aperture_diameter=2.5e-3,
+        lenslet_array__aperture_shape=shape,
+        lenslet_array__lattice=lattice,
+        lenslet_array__fill_factor=0.6,
+        object__distance=0.52,
+    )
+    point, lenslets = (4e-6, -7e-6), foreign.lenslets_of(camera, 1)
+    found = tensor.paraxial(camera, [point], lenslets, [(0, 0)])[0, 0]
+    plain = pixel_energies(
+        camera,
+        550e-9,
+        point,
+        lenslets,
+        (0, 0),
+        pupil_nodes=(30, 80),
+        lenslet_nodes=24,
+        pixel_nodes=8,
+    )
+    assert np.linalg.norm(found - plain) < 1e-9 * np.linalg.norm(plain)
+
+
+def test_zernike_of_the_oracle_is_orthonormal():
+    n = 60
+    t = np.polynomial.legendre.leggauss(n)[0]
+    weight = tensor.weights("circle", n) / math.pi
+    terms = np.array([tensor.zernike(j, t[:, None], t) for j in range(1, 16)])
+    gram = np.einsum("ayx,byx,yx->ab", terms, terms, weight)
+    assert np.abs(gram - np.eye(len(terms))).max() < 1e-10

@@ -49,16 +49,29 @@ from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact.term_counts import ExactBand, TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.spread_terms import SpreadLaw
+from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
 EXACT, SPREAD = "exact, low rank", "spread function"
+HARMONICS = "exact, harmonics"
+SHAPES: dict[str, dict[str, object]] = {
+    ", round": {"lenslet_array.aperture_shape": "circle"},
+    ", hexagonal": {
+        "lenslet_array.aperture_shape": "hexagon",
+        "lenslet_array.lattice": "hexagonal",
+    },
+}
+"""What follows the name of a camera that is given other lenslets than square ones, for a model that
+is for these.
+"""
 FEATURES: dict[str, tuple[str, Callable[..., Features]]] = {
     "rays": ("ray", rays.features),
     "fresnel, low rank": ("fresnel", square_cost.features),
     "fresnel, triple product": ("fresnel", shaped.features),
     EXACT: ("exact", cost_law.features),
+    HARMONICS: ("exact", harmonic_cost.features),
 }
 """Name of a model in the file: name in a request, what counts its features."""
 SAMPLES = ("hexagonal", "demo_spatial", "demo_spectral", "dslr", "tiny")
@@ -107,10 +120,14 @@ class Measured:
 @cache
 def camera_named(name: str) -> Camera:
     """A camera of the table or a sample, of its first wavelength alone."""
-    if name in CAMERAS:
-        camera = camera_of(name)
+    shape = next((end for end in SHAPES if name.endswith(end)), "")
+    plain = name.removesuffix(shape)
+    if plain in CAMERAS:
+        camera = camera_of(plain)
     else:
-        camera = load_camera(ROOT / "sample_configs" / f"{name}.toml")
+        camera = load_camera(ROOT / "sample_configs" / f"{plain}.toml")
+    if shape:
+        camera = camera.replace(**SHAPES[shape])
     return camera.replace(**{"light.wavelengths": camera.light.wavelengths[:1]})
 
 
@@ -125,10 +142,10 @@ def plan_of(case: Case) -> dial.PifPlan:
             accuracy=case.accuracy,
             **request_of(FEATURES[case.model][0], case.scope),
         )
+    except ValueError as error:  # a candidate that cannot be sized has no error by source
+        raise NumericsError(f"{case.model} does not serve {case.camera}", "model", "") from error
     finally:
         dial._cheapest = cheapest
-    if not plan.bands:
-        raise NumericsError(f"{case.model} does not serve {case.camera}", "model", "")
     return plan
 
 
@@ -178,7 +195,9 @@ def drawn(most: float, seed: int) -> Iterator[Case]:
     chance, groups = random.Random(seed), []
     for model in FEATURES:
         for scope in SCOPES:
-            group = [Case(model, scope, c, a) for c in (*CAMERAS, *SAMPLES) for a in ACCURACIES]
+            ends = SHAPES if model == HARMONICS else [""]
+            names = [camera + end for camera in (*CAMERAS, *SAMPLES) for end in ends]
+            group = [Case(model, scope, c, a) for c in names for a in ACCURACIES]
             chance.shuffle(group)
             groups.append(group)
     laws = costs.read(costs.FITTED)

@@ -104,9 +104,9 @@ def field_on_array(camera, wavelength, image_point, y, x, directions):
 
 
 def main_lens_field(camera, reach):
-    """The field on the array of a round or square pupil as a function of (image point, y, x), up to
-    `reach` (m) from the image point: the sum over direction cosines of field_on_array with weights
-    that part the axes, for many nodes.
+    """The field on the array of a round, ring-shaped or square pupil as a function of (image point,
+    y, x), up to `reach` (m) from the image point: the sum over direction cosines of field_on_array
+    with weights that part the axes, for many nodes.
     """
     lens, z = camera.main_lens, camera.lenslet_array.distance
     k, radius = 2 * np.pi / camera.light.wavelengths[0], lens.aperture_diameter / 2
@@ -115,8 +115,11 @@ def main_lens_field(camera, reach):
     count = int(1.1 * k * rim * (reach + abs(eps) * lens.aperture_diameter * z) + 60)
     t, w = roots_legendre(count)
     weight = rim**2 * (
-        _disc(count, 1.0, t, w) if lens.aperture_shape == "circle" else np.outer(w, w)
+        np.outer(w, w) if lens.aperture_shape == "square" else _disc(count, 1.0, t, w)
     )
+    if lens.aperture_shape == "annulus":
+        inner = lens.obscuration * radius
+        weight -= rim**2 * _disc(count, inner / np.hypot(z, inner) / rim, t, w)
     s2 = rim**2 * (t[:, None] ** 2 + t**2)
     weight, shape = weight.astype(complex), amplitude(lens.apodisation, s2)
     norm = np.sqrt((weight.real * shape**2).sum())
@@ -129,19 +132,14 @@ def main_lens_field(camera, reach):
         )
     weight = weight * shape / norm
 
-    def field(point, y, x):
-        down, right = (
-            np.exp(-1j * k * rim * np.outer(y - point[0], t)),
-            np.exp(-1j * k * rim * np.outer(t, x - point[1])),
-        )
-        return (
-            down
-            @ weight
-            @ right
-            * k
-            / (2 * np.pi)
-            * np.exp(0.5j * k / z * (y[:, None] ** 2 + x**2))
-        )
+    def field(point, y, x, paired=False):
+        """On the grid of y and x, or `paired` at the places (y, x)."""
+        lines, of = np.unique(y, return_inverse=True)
+        down = np.exp(-1j * k * rim * np.outer(lines - point[0], t)) @ weight
+        right = np.exp(-1j * k * rim * np.outer(x - point[1], t))
+        sent = np.einsum("nt,nt->n", down[of], right) if paired else down[of] @ right.T
+        y = y if paired else y[:, None]
+        return sent * k / (2 * np.pi) * np.exp(0.5j * k / z * (y**2 + x**2))
 
     return field
 
@@ -246,6 +244,59 @@ def column_energies(
             ]
         total += rayleigh_sum(np.array(fields) * lens, y + cy, x + cx, v, u, z, k)
     energy = np.abs(total) ** 2 * wv[:, None] * wu
+    return energy.reshape(
+        len(image_points), -1, pixel_nodes, sensor.pixels_per_lenslet[1], pixel_nodes
+    ).sum(axis=(2, 4))
+
+
+def opening_nodes(shape, width, count):
+    """Quadrature of a lenslet's opening by chords along x: y, x, weight (nodes,).
+
+    shape: "circle", or "hexagon" of `width` across the flat sides that face +-x;
+    count: nodes of a chord; about twice as many chords.
+    """
+    t, w = roots_legendre(count)
+    if shape == "circle":
+        # equidistant angles, as the integrand is periodic in them
+        turn = (np.arange(2 * count) + 0.5) * np.pi / (2 * count) - np.pi / 2
+        y, half = width / 2 * np.sin(turn), width / 2 * np.cos(turn)
+        wy = np.pi / (2 * count) * half
+    else:
+        side, panels, (t2, w2) = width / np.sqrt(3), [], roots_legendre(int(0.6 * count) + 10)
+        for low, high in ((-side, -side / 2), (-side / 2, side / 2), (side / 2, side)):
+            panels.append(((low + high) / 2 + (high - low) / 2 * t2, (high - low) / 2 * w2))
+        y, wy = (np.concatenate(parts) for parts in zip(*panels))
+        half = np.minimum(width / 2, np.sqrt(3) * (side - np.abs(y)))
+    return np.repeat(y, count), np.outer(half, t).ravel(), np.outer(wy * half, w).ravel()
+
+
+def energies_behind_opening(camera, image_points, places, *, rows, pixel_nodes=6, centre=(0, 0)):
+    """As column_energies, of one lenslet of any shape on the axis, node by node.
+
+    places: (y, x, weight) of quadrature nodes of its opening, m;
+    rows: of pixels;
+    centre: of the superpixel, m.
+    """
+    k, array, sensor = 2 * np.pi / camera.light.wavelengths[0], camera.lenslet_array, camera.sensor
+    (v, wv), (u, wu) = sensor_nodes(
+        centre,
+        sensor.pixels_per_lenslet,
+        sensor.pixel_pitch,
+        sensor.pixel_pitch * np.sqrt(sensor.pixel_fill_factor),
+        pixel_nodes,
+    )
+    chosen = (np.asarray(rows)[:, None] * pixel_nodes + np.arange(pixel_nodes)).ravel()
+    v, wv, (y, x, weight) = v[chosen], wv[chosen], places
+    wave, f, r2 = main_lens_field(camera, 1.3 * array.pitch), array.focal_length, y * y + x * x
+    bend = r2 / (2 * f) if array.profile == "parabolic" else np.sqrt(f * f + r2) - f
+    fields = np.array([wave(point, y, x, paired=True) for point in image_points])
+    fields = (fields * weight * np.exp(-1j * k * bend)).T
+    total = np.empty((len(v), len(u), len(image_points)), complex)
+    for i, at in enumerate(v):
+        for start in range(0, len(u), BLOCK):
+            q = (at - y) ** 2 + (u[start : start + BLOCK, None] - x) ** 2
+            total[i, start : start + BLOCK] = (_fast_wave or _wave)(q, sensor.distance, k) @ fields
+    energy = np.abs(total.transpose(2, 0, 1) * k / (2 * np.pi)) ** 2 * wv[:, None] * wu
     return energy.reshape(
         len(image_points), -1, pixel_nodes, sensor.pixels_per_lenslet[1], pixel_nodes
     ).sum(axis=(2, 4))

@@ -17,6 +17,9 @@ from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
+from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
+from plenocli.forward.propagation.harmonics import lenslets as harmonics
+from plenocli.forward.propagation.harmonics import sizing as harmonic_sizing
 from plenocli.forward.propagation.lenslet_fields import LensletFields
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
 from plenocli.forward.propagation.ray import rays
@@ -165,7 +168,27 @@ class ExactLowRank(Model):
         return 0.0
 
 
-MODELS: tuple[Model, ...] = (Rays(), FresnelLowRank(), FresnelTripleProduct(), ExactLowRank())
+class ExactHarmonics(Model):
+    """Scalar waves without the paraxial approximation, through round and hexagonal lenslets."""
+
+    name, kind, lenslets = "exact, harmonics", "exact", harmonics.CentredLenslets
+    libraries = ("scipy.fft", "scipy.sparse")
+    valid_for = staticmethod(harmonics.valid_for)
+    size = staticmethod(harmonic_sizing.harmonic_band)
+    cost = staticmethod(harmonic_cost.cost)
+
+    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+        """None: it is what the others are measured by."""
+        return 0.0
+
+
+MODELS: tuple[Model, ...] = (
+    Rays(),
+    FresnelLowRank(),
+    FresnelTripleProduct(),
+    ExactLowRank(),
+    ExactHarmonics(),
+)
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""
 
 

@@ -49,7 +49,7 @@ def changed(code, copy, file, old, new):
             "total += 1.1 * weight * part",
             NAMES,
         ),
-        (f"{PROPAGATION}/sampling.py", "NARROWING_LOSS = 2.0", "NARROWING_LOSS = 20.0", NAMES),
+        (f"{PROPAGATION}/sampling.py", "NARROWING_LOSS = 2.0", "NARROWING_LOSS = 20.0", NAMES[:4]),
         (
             f"{PROPAGATION}/fresnel/square.py",
             "TERM_VALUES = 1 << 21",
@@ -57,8 +57,10 @@ def changed(code, copy, file, old, new):
             NAMES[1:2],
         ),
         (f"{PROPAGATION}/fresnel/shaped.py", "PIECES = 6", "PIECES = 7", NAMES[2:3]),
-        (f"{PROPAGATION}/exact/lenslets.py", "GAPS = 3.0", "GAPS = 4.0", NAMES[3:]),
-        (f"{PROPAGATION}/exact/prolate.py", "return ", "return 2 * ", NAMES[3:]),
+        (f"{PROPAGATION}/exact/lenslets.py", "GAPS = 3.0", "GAPS = 4.0", NAMES[3:4]),
+        (f"{PROPAGATION}/exact/prolate.py", "return ", "return 2 * ", NAMES[3:4]),
+        (f"{PROPAGATION}/exact/debye.py", "return ", "return 2 * ", NAMES[3:]),
+        (f"{PROPAGATION}/harmonics/pixels.py", "return ", "return 2 * ", NAMES[4:]),
         (f"{PROPAGATION}/ray/rays.py", "FOCUSED = 1e-9", "FOCUSED = 1e-8", NAMES[:1]),
         ("plenocli/forward/camera/quadrature.py", "return ", "return 2 * ", NAMES),
     ],
@@ -84,7 +86,8 @@ def test_what_does_not_compute_changes_nothing(code, copy, file, old, new):
 
 def test_a_model_is_computed_by_its_own_modules_and_what_they_share(code):
     found = {name: code.modules_of(name, ROOT) for name in NAMES}
-    for name, own in zip(NAMES, ("ray.rays", "fresnel.square", "fresnel.shaped", "exact.lenslets")):
+    names = "ray.rays", "fresnel.square", "fresnel.shaped", "exact.lenslets", "harmonics.lenslets"
+    for name, own in zip(NAMES, names, strict=True):
         of = [n for n in NAMES if f"plenocli.forward.propagation.{own}" in found[n]]
         assert of == [name]
         assert "plenocli.forward.propagation.system_matrix" in found[name]

@@ -72,6 +72,19 @@ def spherical_field(
 
 def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
     """As radial.profile, for a spherical exit wave."""
+    g, outer = geometry, camera.main_lens.aperture_diameter / 2
+    sines, weight = radial_waves(camera, geometry, reach)
+    return hankel_series(g.k * reach * sines, weight, g.k * reach * outer / math.hypot(outer, g.z2))
+
+
+def radial_waves(camera: Camera, geometry: Geometry, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """The spread function of a radial pupil as a sum of Bessel functions, h(d) = sum of weight
+    J0(k s |d|).
+
+    reach: largest distance |d|, m.
+
+    Returns (direction sines s (node,), weights (node,) 1/m, complex).
+    """
     g, lens = geometry, camera.main_lens
     outer = lens.aperture_diameter / 2
     inner = outer * (lens.obscuration or 0.0)
@@ -91,10 +104,8 @@ def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.nd
         / g.z2**2
         * np.exp(1j * phase)
     )
-    sines = rho * np.sqrt(cos2) / g.z2
-    return hankel_series(rate * sines, weight, rate * outer / math.hypot(outer, g.z2)) * (
-        2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
-    )
+    norm = 2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
+    return rho * np.sqrt(cos2) / g.z2, norm * weight
 
 
 def defocus_path(geometry: Geometry, r2: np.ndarray) -> np.ndarray:

@@ -133,10 +133,7 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """As Model.valid_for: square lenslets, and no evanescent waves on the sensor."""
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
-        return (
-            "exact propagation is built for square lenslets on a square lattice, not for "
-            f"{array.aperture_shape} ones on a {array.lattice} lattice"
-        )
+        return f"{array.aperture_shape} lenslets on a {array.lattice} lattice are not separable"
     if geometry.z3 < 10 * geometry.wavelength:
         return (
             "the sensor lies within ten wavelengths of the lenslets, where "

@@ -417,3 +417,74 @@ def test_a_matrix_without_light_is_not_written(tmp_path, capsys, monkeypatch):
     output = tmp_path / "pif.h5"
     assert run(["simulate-pif", str(TINY), "--accuracy", "0.1", "-o", str(output)]) == 5
     assert "of any point's light lands" in capsys.readouterr().err and not output.exists()
+
+
+def scene(folder, near, far):
+    path = folder / "scene.toml"
+    path.write_text(f'depth = ["{near}", "{far}"]\n')
+    return str(path)
+
+
+def test_a_scene_with_depth_is_stored_as_planes_between_which_one_interpolates(tmp_path, capsys):
+    """capture-sim at a distance between the planes records what a camera focused there records."""
+    index, depth = tmp_path / "stack.h5", scene(tmp_path, "540 mm", "560 mm")
+    command = ["simulate-pif", str(TINY), "--scene", depth, "--accuracy", "0.02", "--json"]
+    model = ["--model", "fresnel", "--superpixels", "3x3"]
+    assert run([*command, *model, "--explain"]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert run([*command, *model, "-o", str(index)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["distances"] == [plane["distance"] for plane in planned["planes"]]
+    assert report["distances"][0] == 0.54 and report["distances"][-1] == 0.56
+    assert 0 < report["interpolation_error"] <= 0.01
+    sizes = [read_artefact(p, "pif").data["pif/A"].nbytes for p in tmp_path.glob("stack.0*.h5")]
+    assert len(sizes) == len(report["distances"]) and sum(sizes) == planned["bytes"]
+    assert 0.02 > report["planes"][0]["estimated_accuracy"] > report["interpolation_error"]
+
+    between = tmp_path / "between.toml"
+    between.write_text(TINY.read_text().replace("550 mm", "543 mm"))
+    capture = ["capture-sim", str(between), "--scene", "skimage:coffee", "--snr", "200dB"]
+    assert run([*capture, "--pif", str(index), "-o", str(tmp_path / "a.h5")]) == 0
+    capture += ["--model", "fresnel", "--superpixels", "3x3", "--accuracy", "1e-4"]
+    assert run([*capture, "-o", str(tmp_path / "b.h5")]) == 0
+    mixed, own = (
+        read_artefact(tmp_path / name, "capture").data["capture/mosaic"]
+        for name in ("a.h5", "b.h5")
+    )
+    assert 1e-6 < np.linalg.norm(mixed - own) / np.linalg.norm(own) < 0.02
+
+    capsys.readouterr()
+    assert run(["reconstruct", "a.h5", "--pif", str(index), "-o", "c.h5"]) == 3
+    (tmp_path / "stack.001.h5").write_bytes((tmp_path / "stack.002.h5").read_bytes())
+    assert run([*capture[:6], "--pif", str(index), "-o", str(tmp_path / "d.h5")]) == 3
+    assert "is not the file that stack.h5 was written with" in capsys.readouterr().err
+
+
+def test_a_scene_in_one_plane_costs_one_matrix_at_its_distance(tmp_path, capsys):
+    """And no more superpixels than the blur of that plane needs."""
+    output = tmp_path / "pif.h5"
+    command = ["simulate-pif", str(TINY), "--accuracy", "0.05", "--json", "-o", str(output)]
+    assert run([*command, "--scene", scene(tmp_path, "540 mm", "540 mm")]) == 0
+    one = json.loads(capsys.readouterr().out)
+    own = tmp_path / "own.toml"
+    own.write_text(TINY.read_text().replace("550 mm", "540 mm"))
+    command[1], command[-1] = str(own), str(tmp_path / "own.h5")
+    assert run(command) == 0
+    assert one["superpixels"] == json.loads(capsys.readouterr().out)["superpixels"] == [3, 3]
+    assert sorted(p.name for p in tmp_path.glob("*.h5")) == ["own.h5", "pif.h5"]
+    stored, focused = (read_artefact(tmp_path / n, "pif") for n in ("pif.h5", "own.h5"))
+    assert np.array_equal(stored.data["pif/A"], focused.data["pif/A"])
+    assert stored.provenance.config == focused.provenance.config
+
+
+def test_planes_that_fail_leave_no_file(tmp_path, capsys, monkeypatch):
+    from plenocli.files.artefacts import shards
+
+    def full(*args, **options):
+        raise OSError(28, "No space left on device", "stack.h5")
+
+    monkeypatch.setattr(shards, "write_planes", full)
+    depth = scene(tmp_path, "548 mm", "552 mm")
+    command = ["simulate-pif", str(TINY), "--scene", depth, "--accuracy", "0.1"]
+    assert run([*command, "--model", "ray", "-o", str(tmp_path / "stack.h5")]) == 4
+    assert not list(tmp_path.glob("*.h5"))

@@ -72,7 +72,8 @@ class _Step(click.ParamType):
     metavar="SCENE",
     help=(
         "Model only what this scene requires: a scene .toml (depth, spectrum, lenslets, snr), a "
-        "photograph or a spectral EXR."
+        "photograph or a spectral EXR. Depth makes a matrix for each of the fewest planes that "
+        "serve, in numbered files beside OUT."
     ),
 )
 @click.option(

@@ -147,6 +147,32 @@ PIF_INDEX = Schema(
     default=("pif",),
 )
 
+PIF_PLANES = Schema(
+    kind="pif-planes",
+    version=1,
+    doc=(
+        "System matrices of a scene's depth: one file of kind pif (or pif-index) a plane beside "
+        "it, each with its own superpixels; between planes they are interpolated in 1/distance."
+    ),
+    fields=(
+        dataset(
+            "planes/distance",
+            "plane",
+            "f",
+            "m",
+            "distance of each plane to the main lens",
+            minimum=0,
+            ascending=True,
+        ),
+    ),
+    attrs={
+        "planes": (
+            attribute("files", "json", "", "name and SHA-256 of each plane's file"),
+            attribute("error", "number", "1", "relative L2 error of the worst column in between"),
+        )
+    },
+)
+
 CAPTURE = Schema(
     kind="capture",
     version=1,
@@ -806,6 +832,7 @@ SCHEMAS = {
     for schema in (
         PIF,
         PIF_INDEX,
+        PIF_PLANES,
         CAPTURE,
         CALIBRATION,
         SPECTRA,

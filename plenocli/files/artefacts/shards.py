@@ -1,5 +1,6 @@
 """A system matrix in one file or in several: numbered artefacts of kind pif, each some
-superpixels, and an index of kind pif-index.
+superpixels, and an index of kind pif-index; or each a plane of a scene's depth, and an index of
+kind pif-planes.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,11 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
-from plenocli.files.artefacts.provenance import file_digest
+from plenocli.files.artefacts.provenance import Provenance, file_digest
 from plenocli.files.artefacts.stream import streamed_artefact
 from plenocli.files.atomic import check_output
+from plenocli.files.config.camera_file import parse_camera, to_toml
+from plenocli.forward.accuracy.depth_planes import plane_weights
 
 
 def shard_path(index: str | os.PathLike, number: int) -> Path:
@@ -98,7 +102,7 @@ class PifWriter:
             attrs = {
                 name: value
                 for name, value in artefact.attrs["pif"].items()
-                if name not in ("rank", "condition", "symmetry_defect")
+                if name not in ("rank", "condition", "resolution", "symmetry_defect")
             }
             stream.close(Artefact("pif", data, {"pif": attrs}, artefact.provenance))
         self._index = artefact
@@ -152,12 +156,17 @@ def writing_pif(
         raise
 
 
-def read_pif(path: str | os.PathLike) -> Artefact:
-    """The Artefact of kind pif at `path`; that of an index with its shards put together.
+def read_pif(path: str | os.PathLike, distance: float | None = None) -> Artefact:
+    """The Artefact of kind pif at `path`; that of an index with its shards put together, that of
+    planes interpolated.
+
+    distance: of the plane, m, which counts among planes only.
 
     Errors as read_artefact.
     """
-    artefact = read_artefact(path, ("pif", "pif-index"))
+    artefact = read_artefact(path, ("pif", "pif-index", "pif-planes"))
+    if artefact.kind == "pif-planes":
+        return _between_planes(Path(path), artefact, distance)
     if artefact.kind == "pif":
         return artefact
     A = None
@@ -187,7 +196,88 @@ def pif_parts(
         yield np.arange(artefact.data["pif/A"].shape[1]), artefact.data["pif/A"]
         return
     home, offsets = artefact.data["pif/shard"], artefact.data["pif/lenslet_offset"]
-    listed = artefact.attrs.get("pif", {}).get("shards")
+    listed = _named(path, artefact.attrs.get("pif", {}).get("shards"), int(home.max()) + 1)
+    for number, entry in enumerate(listed):
+        lenslets = np.flatnonzero(home == number)
+        file = _same_file(path, entry)
+        part = read_artefact(file, "pif")
+        if not np.array_equal(part.data["pif/lenslet_offset"], offsets[lenslets]):
+            raise InputError(
+                f"holds other superpixels than {path.name} says", file, "make both again"
+            )
+        yield lenslets, part.data["pif/A"]
+
+
+def write_planes(
+    path: str | os.PathLike,
+    distances: Sequence[float],
+    error: float,
+    provenance: Provenance,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write the index of planes whose files stand at shard_path(path, 0), 1, ... already.
+
+    distances: m, nearest first;
+    error: relative, of a column in between.
+
+    Errors as write_artefact.
+    """
+    files = [shard_path(path, number) for number in range(len(distances))]
+    named = [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    write_artefact(
+        path,
+        Artefact(
+            "pif-planes",
+            {"planes/distance": np.asarray(distances, float)},
+            {"planes": {"files": named, "error": error}},
+            provenance,
+        ),
+        overwrite=overwrite,
+    )
+
+
+def _between_planes(path: Path, artefact: Artefact, distance: float | None) -> Artefact:
+    """The Artefact of kind pif at a distance (m) between the planes of an index."""
+    distances = artefact.data["planes/distance"]
+    listed = _named(path, artefact.attrs.get("planes", {}).get("files"), len(distances))
+    near, far = float(distances[0]), float(distances[-1])
+    if distance is None or not near * (1 - 1e-9) <= distance <= far * (1 + 1e-9):
+        raise InputError(
+            f"holds the matrices of {len(distances)} planes from {near:.4g} to {far:.4g} m",
+            path,
+            "name the file of one of them, such as "
+            f"{listed[0]['name']}, or a camera focused among them where a camera is named",
+        )
+    used, weights = plane_weights(distances, distance)
+    parts = [read_pif(_same_file(path, listed[number])) for number in used]
+    offsets = np.unique(np.concatenate([p.data["pif/lenslet_offset"] for p in parts]), axis=0)
+    first = parts[int(np.argmax(weights))]
+    shape = first.data["pif/A"].shape
+    A = np.zeros((shape[0], len(offsets), *shape[2:]), first.data["pif/A"].dtype)
+    places = {tuple(offset): number for number, offset in enumerate(offsets.tolist())}
+    for part, weight in zip(parts, weights):
+        home = [places[tuple(offset)] for offset in part.data["pif/lenslet_offset"].tolist()]
+        A[:, home] += weight * part.data["pif/A"]
+    np.maximum(A, 0, out=A)
+    data = first.data | {
+        "pif/A": A,
+        "pif/lenslet_offset": offsets.astype(np.int32),
+        "pif/column_energy": A.sum(axis=(1, 2), dtype=float),
+    }
+    attrs = {
+        name: value
+        for name, value in first.attrs["pif"].items()
+        if name not in ("rank", "condition", "resolution", "symmetry_defect", "eps")
+    }
+    data.pop("pif/singular_values", None)
+    camera = parse_camera(first.provenance.config, path)
+    config = to_toml(camera.replace(**{"object.distance": distance}))
+    return Artefact("pif", data, {"pif": attrs}, replace(first.provenance, config=config))
+
+
+def _named(path: Path, listed: Any, count: int) -> list[dict[str, str]]:
+    """The list of files that an index holds, `count` of them at least, each a name and a digest."""
     if (
         not isinstance(listed, list)
         or not all(
@@ -196,19 +286,19 @@ def pif_parts(
             and re.fullmatch(r"[^/\0]{1,255}", e["name"])
             for e in listed
         )
-        or home.max() >= len(listed)
+        or count > len(listed)
     ):
         raise InputError("does not name the files that hold its superpixels", path, "make it again")
-    for number, entry in enumerate(listed):
-        lenslets = np.flatnonzero(home == number)
-        file = path.with_name(Path(entry["name"]).name)
-        if file_digest(file) != entry.get("sha256"):
-            raise InputError(
-                f"is not the file that {path.name} was written with", file, "make both again"
-            )
-        part = read_artefact(file, "pif")
-        if not np.array_equal(part.data["pif/lenslet_offset"], offsets[lenslets]):
-            raise InputError(
-                f"holds other superpixels than {path.name} says", file, "make both again"
-            )
-        yield lenslets, part.data["pif/A"]
+    return listed
+
+
+def _same_file(path: Path, entry: dict[str, str]) -> Path:
+    """The file that an entry of an index names, beside the index; InputError where it is not the
+    one that was written.
+    """
+    file = path.with_name(Path(entry["name"]).name)
+    if file_digest(file) != entry.get("sha256"):
+        raise InputError(
+            f"is not the file that {path.name} was written with", file, "make both again"
+        )
+    return file

@@ -20,7 +20,7 @@ class Scene(Section):
     """A scene as the accuracy dial sees it; what is left out is not narrowed.
 
     picture: photograph or spectral EXR, relative to this file, whose extent and bands count too;
-    depth: nearest and farthest distance to the main lens;
+    depth: nearest and farthest distance to the main lens, stored as the fewest planes that serve;
     spectrum: shortest and longest wavelength with light;
     lenslets: rows and columns of lenslets around the centre that see light;
     snr: amplitude ratio of a bright pixel to its noise.

@@ -92,7 +92,7 @@ def plan_pif(
     model: "auto", "ray", "fresnel" or "exact";
     dtype: "auto", float32 or float64 of the stored matrix;
     points: slice of flat point indices;
-    needs: what is known of the scene, which narrows the request;
+    needs: what is known of the scene, which narrows the request; its depth is for depth_planes;
     lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster.
 
     Returns the plan.
@@ -182,8 +182,7 @@ class _Request:
             if isinstance(dtype, str) and dtype == "auto"
             else dtype
         )
-        self.depths = self._depths()
-        self.superpixels = _superpixels(superpixels, self.depths, self.accuracy, self.reasons)
+        self.superpixels = _superpixels(superpixels, self.geometries, self.accuracy, self.reasons)
         self.rings = self._rings(coherent_ring)
         if needs is not None and needs.lenslets is not None:
             total, lit = int(np.prod(camera.lenslet_array.count)), int(np.prod(needs.lenslets))
@@ -212,19 +211,6 @@ class _Request:
             )
             return seen, who
         return asked, "request"
-
-    def _depths(self) -> list[Geometry]:
-        """The geometries that size the neighbourhood: those of the camera, or at both ends of
-        the scene's depth.
-        """
-        if self.needs is None or self.needs.depth is None:
-            return self.geometries
-        ends = [replace(geometry, z1=z) for geometry in self.geometries for z in self.needs.depth]
-        self.reasons.append(
-            f"depth {self.needs.depth[0]:.4g} to {self.needs.depth[1]:.4g} m: neighbourhood sized "
-            "for the blur at both ends"
-        )
-        return ends
 
     def _rings(self, asked: int | str) -> tuple[int, ...]:
         if asked != "auto":
@@ -285,7 +271,7 @@ def _consider(request: _Request, model: Model) -> Candidate:
         outside = (
             0.0
             if model.kind == "ray"
-            else max(window_error(v, request.superpixels, ring) for v in request.depths)
+            else max(window_error(v, request.superpixels, ring) for v in request.geometries)
         )
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, model, ring)
@@ -523,7 +509,7 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         for c in found
     )
     warnings = [*request.warnings, *_warnings(request, best)]
-    window = max(window_error(v, request.superpixels, best.ring) for v in request.depths)
+    window = max(window_error(v, request.superpixels, best.ring) for v in request.geometries)
     if best.ring and best.model != "ray":
         request.left_out.append(
             f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {window:.1g}"
@@ -644,7 +630,7 @@ def _warnings(request: _Request, best: Candidate) -> list[str]:
                 f"accuracy {request.accuracy:.1g} holds within the {best.model} model as asked; "
                 f"that model is off by about {error:.1g} itself"
             )
-    if max(v.blur / (2 * v.D2) for v in request.depths) > (min(superpixels) - 1) // 2 + 1e-9:
+    if max(v.blur / (2 * v.D2) for v in request.geometries) > (min(superpixels) - 1) // 2 + 1e-9:
         found.append(
             "the geometric blur reaches beyond the superpixels kept: their light is "
             "missing from the columns"

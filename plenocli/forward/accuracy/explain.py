@@ -14,6 +14,8 @@ from plenocli.forward.accuracy.dial import seconds_here
 if TYPE_CHECKING:
     from plenocli.forward.propagation.plan import PifPlan
 
+ENDS = 5
+"""Planes told at either end of a long list."""
 LONG = 20.0
 """Seconds at nominal speed from which on a plan is told before the work starts."""
 
@@ -94,6 +96,36 @@ class Considered:
     def as_json(self) -> dict[str, Any]:
         """The fields by name."""
         return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneCost:
+    """One plane of a scene's depth.
+
+    distance: m from the main lens;
+    superpixels: (rows, columns) kept;
+    seconds: of one core of this machine;
+    bytes, memory: of the result, and at work.
+    """
+
+    distance: float
+    superpixels: tuple[int, int]
+    seconds: float
+    bytes: int
+    memory: int
+
+
+def planes_table(planes: list[PlaneCost]) -> list[str]:
+    """Planes as lines of text, of many the first and the last ones, and their sum."""
+    lines = [
+        f"{p.distance:10.4g} m  {p.superpixels[0]}x{p.superpixels[1]} superpixels  "
+        f"{_duration(p.seconds)}  {_size(p.bytes)}"
+        for p in planes
+    ]
+    if len(lines) > 2 * ENDS + 1:
+        lines[ENDS:-ENDS] = ["       ..."]
+    seconds, size = sum(p.seconds for p in planes), sum(p.bytes for p in planes)
+    return [*lines, f"in all {_duration(seconds)}, {_size(size)}"]
 
 
 def candidates(plan: PifPlan) -> list[Considered]:

@@ -23,7 +23,7 @@ total: it cannot be seen.
 class SceneNeeds:
     """What is known of a scene; None where it is not.
 
-    depth: nearest and farthest distance (m) to the main lens;
+    depth: nearest and farthest distance (m) to the main lens, for depth_planes;
     spectrum: lowest and highest wavelength (m) with light;
     lenslets: (rows, columns) that see light;
     noise: relative noise of a pixel at the brightest;

@@ -330,7 +330,7 @@ def _read_pif(
     from plenocli.files.config.camera_file import parse_camera
     from plenocli.files.read.cameras import require_same_files
 
-    artefact = read_pif(path)
+    artefact = read_pif(path, camera.object.distance)
     if settings.refine != 1:
         raise UsageError(
             "--refine computes its own finer system matrix and cannot take --pif",

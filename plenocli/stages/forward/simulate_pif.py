@@ -4,7 +4,7 @@ and cannot resolve.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +16,9 @@ from plenocli.base.progress import bar, note
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance
-    from plenocli.forward.accuracy.explain import Considered
+    from plenocli.forward.accuracy.depth_planes import DepthPlanes
+    from plenocli.forward.accuracy.explain import Considered, PlaneCost
+    from plenocli.forward.accuracy.scene_needs import SceneNeeds
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
     from plenocli.forward.propagation.diagnosis import Diagnosis
@@ -60,7 +62,9 @@ class PlanSummary:
 
     plan: several lines of text;
     memory, bytes: at work, and of the result;
-    seconds: of one core of this machine.
+    seconds: of one core of this machine;
+    planes: of a scene's depth, where it takes several: `memory` is that of the dearest, `bytes` and
+        `seconds` are those of all, the rest tells of the one that takes longest.
     """
 
     plan: str
@@ -72,12 +76,14 @@ class PlanSummary:
     superpixels: tuple[int, int]
     coherent_ring: int
     estimated_accuracy: float
+    planes: list[PlaneCost] = field(default_factory=list)
 
     def as_json(self) -> dict[str, Any]:
         """The fields by name."""
         return _named(self) | {
             "accuracy": self.accuracy.as_json(),
             "considered": [c.as_json() for c in self.considered],
+            "planes": [asdict(p) for p in self.planes],
         }
 
     def line(self) -> str:
@@ -151,6 +157,40 @@ class PifSummary:
         return f"{text}; {self.rung}, estimated error {self.estimated_accuracy:.1g}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanesSummary:
+    """What was computed and written for a scene's depth.
+
+    distances: of the planes, m;
+    interpolation_error: relative, of the worst column in between.
+    """
+
+    output: str
+    distances: tuple[float, ...]
+    interpolation_error: float
+    planes: list[PifSummary]
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {
+            "output": self.output,
+            "distances": list(self.distances),
+            "interpolation_error": self.interpolation_error,
+            "planes": [plane.as_json() for plane in self.planes],
+        }
+
+    def line(self) -> str:
+        """One sentence for people."""
+        sizes = [plane.superpixels[0] for plane in self.planes]
+        return (
+            f"{Path(self.output)}: A of {len(self.planes)} planes from {self.distances[0]:.4g} to "
+            f"{self.distances[-1]:.4g} m, each in a file beside it, of {min(sizes)}x{min(sizes)} "
+            f"to {max(sizes)}x{max(sizes)} superpixels; estimated error "
+            f"{max(plane.estimated_accuracy for plane in self.planes):.1g}, interpolation between "
+            f"planes ({self.interpolation_error:.1g}) included"
+        )
+
+
 def _share(energy: float) -> str:
     return f"{energy:.3f}" if energy >= 0.001 else f"{energy:.1e}"
 
@@ -180,8 +220,8 @@ def run_simulate_pif(
     overwrite: bool = False,
     workers: int = 1,
     command: str = "",
-) -> PifSummary | PlanSummary:
-    """Compute A and write it as a pif artefact.
+) -> PifSummary | PlanesSummary | PlanSummary:
+    """Compute A and write it as a pif artefact; of a scene with depth, one a plane and an index.
 
     camera_path: camera description (.toml);
     output: file to write (.h5), not needed with `explain`;
@@ -193,31 +233,98 @@ def run_simulate_pif(
     Raises InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
-    from plenocli.base.budget import budget, one_thread, within
-    from plenocli.files.artefacts import pif_pieces
-    from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.read.cameras import read_camera
-    from plenocli.forward.propagation.diagnosis import describe
-    from plenocli.forward.propagation.system_matrix import build_pif
+    from plenocli.files.read.scene_needs import read_needs
 
     if not explain:
         _require_output(camera_path, output, overwrite)
     camera = read_camera(camera_path)
-    plan = _planned(camera, settings)
+    needs = read_needs(settings.scene, camera) if settings.scene else None
+    planes = _planes(camera, settings, needs)
+    jobs = _jobs(camera, settings, needs, planes)
     if explain:
-        return _explained(plan, pif_pieces.cost(plan)[1], pif_pieces.refusal(plan, camera_path))
+        return _explained(jobs, planes, camera_path)
     assert output is not None  # _require_output
-    chosen = pif_pieces.layout(plan, camera_path)
+    task = _Task(
+        camera_path=camera_path,
+        settings=settings,
+        overwrite=overwrite,
+        workers=workers,
+        command=command,
+    )
+    if planes is None or len(jobs) == 1:
+        return _write(task, jobs[0], output)
+    return _write_planes(task, jobs, planes, output)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One matrix: the camera focused on its own plane, and the plan."""
+
+    camera: Camera
+    plan: PifPlan
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """What all matrices of one command have in common, as run_simulate_pif takes it."""
+
+    camera_path: Path | str
+    settings: Settings
+    overwrite: bool
+    workers: int
+    command: str
+
+
+def _planes(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> DepthPlanes | None:
+    """The planes that stand for the depth of a scene; None where it says nothing of depth."""
+    from plenocli.forward.accuracy.depth_planes import depth_planes, plane_camera
+
+    if needs is None or needs.depth is None:
+        return None
+    near, far = needs.depth
+    middle = _planned(plane_camera(camera, 2 / (1 / near + 1 / far)), settings, needs)
+    wavelength = min(band.wavelength for band in middle.bands)
+    return depth_planes(camera, wavelength, needs.depth, middle.accuracy)
+
+
+def _jobs(
+    camera: Camera, settings: Settings, needs: SceneNeeds | None, planes: DepthPlanes | None
+) -> list[_Job]:
+    """The matrices to compute: one, or one a plane, each with a neighbourhood of its own."""
+    from plenocli.forward.accuracy.depth_planes import left_for_planes, plane_camera
+
+    if planes is None:
+        return [_Job(camera, _planned(camera, settings, needs))]
+    if planes.error and settings.accuracy is not None:
+        settings = replace(settings, accuracy=left_for_planes(settings.accuracy))
+    found = []
+    for distance in planes.distances:
+        own = plane_camera(camera, distance)
+        found.append(_Job(own, planes.told(_planned(own, settings, needs))))
+    return found
+
+
+def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
+    """Compute one matrix into its file."""
+    from plenocli.base.budget import budget, one_thread, within
+    from plenocli.files.artefacts import pif_pieces
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.forward.propagation.diagnosis import describe
+    from plenocli.forward.propagation.system_matrix import build_pif
+
+    camera, plan = job.camera, job.plan
+    chosen = pif_pieces.layout(plan, task.camera_path)
     _announce(plan, pif_pieces.cost(plan)[1])
-    provenance = _provenance(camera_path, camera, settings, plan, command)
+    provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
-        return _artefact(camera, settings, matrix, found, provenance)
+        return _artefact(camera, task.settings, matrix, found, provenance)
 
     # the diagnosis too: its singular values must not depend on the cores of a machine
     with (
         one_thread(),
-        within(replace(budget(), threads=workers)),
+        within(replace(budget(), threads=task.workers)),
         bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown,
     ):
 
@@ -226,7 +333,7 @@ def run_simulate_pif(
 
         if chosen.streamed:
             matrix, found = pif_pieces.stream_pif(
-                camera, plan, output, chosen, finish, overwrite=overwrite, progress=progress
+                camera, plan, output, chosen, finish, overwrite=task.overwrite, progress=progress
             )
         else:
             matrix = build_pif(camera, plan, progress=progress)
@@ -234,8 +341,43 @@ def run_simulate_pif(
     for warning in found.warnings:
         note(warning)
     if not chosen.streamed:
-        write_artefact(output, finish(matrix, found), overwrite=overwrite)
+        write_artefact(output, finish(matrix, found), overwrite=task.overwrite)
     return _summary(str(output), matrix, found, plan)
+
+
+def _write_planes(
+    task: _Task, jobs: list[_Job], planes: DepthPlanes, output: Path | str
+) -> PlanesSummary:
+    """Compute the matrices of all planes into files of their own, then the index; of a failure no
+    new file is left.
+    """
+    from plenocli.files.artefacts import pif_pieces
+    from plenocli.files.artefacts.shards import shard_path, write_planes
+    from plenocli.files.atomic import check_output
+
+    files = [shard_path(output, number) for number in range(len(jobs))]
+    for job, file in zip(jobs, files):
+        check_output(file, overwrite=task.overwrite, inputs=[task.camera_path], suffixes=(".h5",))
+        pif_pieces.layout(job.plan, task.camera_path)  # refused before the first is computed
+    before = {file for file in files if file.exists()}
+    note(planes.line())
+    try:
+        made = [_write(task, job, file) for job, file in zip(jobs, files)]
+        provenance = _provenance(
+            task.camera_path, jobs[0].camera, task.settings, jobs[0].plan, task.command
+        )
+        write_planes(output, planes.distances, planes.error, provenance, overwrite=task.overwrite)
+    except BaseException:
+        for file in files:
+            if file not in before:
+                file.unlink(missing_ok=True)
+        raise
+    return PlanesSummary(
+        output=str(output),
+        distances=planes.distances,
+        interpolation_error=planes.error,
+        planes=made,
+    )
 
 
 def _require_output(camera_path: Path | str, output: Path | str | None, overwrite: bool) -> None:
@@ -251,8 +393,7 @@ def _require_output(camera_path: Path | str, output: Path | str | None, overwrit
     check_output(output, overwrite=overwrite, inputs=[camera_path], suffixes=(".h5",))
 
 
-def _planned(camera: Camera, settings: Settings) -> PifPlan:
-    from plenocli.files.read.scene_needs import read_needs
+def _planned(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> PifPlan:
     from plenocli.forward.accuracy.dial import plan_pif
 
     return plan_pif(
@@ -263,7 +404,7 @@ def _planned(camera: Camera, settings: Settings) -> PifPlan:
         accuracy=settings.accuracy,
         model=settings.model,
         dtype=settings.dtype,
-        needs=read_needs(settings.scene, camera) if settings.scene else None,
+        needs=needs,
         lenslet=settings.lenslet,
     )
 
@@ -294,22 +435,43 @@ def _provenance(
     )
 
 
-def _explained(plan: PifPlan, memory: int, refusal: str | None) -> PlanSummary:
+def _explained(
+    jobs: list[_Job], planes: DepthPlanes | None, camera_path: Path | str
+) -> PlanSummary:
+    """The plan of all matrices; in detail that of the dearest one."""
+    from plenocli.files.artefacts import pif_pieces
     from plenocli.forward.accuracy.dial import seconds_here
-    from plenocli.forward.accuracy.explain import candidates, explain
+    from plenocli.forward.accuracy.explain import PlaneCost, candidates, explain, planes_table
 
+    costs = [
+        PlaneCost(
+            distance=job.camera.object.distance,
+            superpixels=job.plan.superpixels,
+            seconds=seconds_here(job.plan.chosen),
+            bytes=job.plan.bytes,
+            memory=pif_pieces.cost(job.plan)[1],
+        )
+        for job in jobs
+    ]
+    dearest = max(range(len(jobs)), key=lambda n: costs[n].seconds)
+    plan = jobs[dearest].plan
+    refusal = pif_pieces.refusal(plan, camera_path)
     if refusal:
         plan = replace(plan, warnings=(*plan.warnings, f"would be refused: {refusal}"))
+    text = explain(plan, costs[dearest].memory)
+    if planes is not None and len(jobs) > 1:
+        text = "\n".join([planes.line(), *planes_table(costs), "", "the dearest:", text])
     return PlanSummary(
-        plan=explain(plan, memory),
-        memory=memory,
+        plan=text,
+        memory=max(cost.memory for cost in costs),
         accuracy=plan.accuracy_record(),
         considered=candidates(plan),
-        seconds=seconds_here(plan.chosen),
-        bytes=plan.bytes,
+        seconds=sum(cost.seconds for cost in costs),
+        bytes=sum(cost.bytes for cost in costs),
         superpixels=plan.superpixels,
         coherent_ring=plan.coherent_ring,
         estimated_accuracy=plan.estimated,
+        planes=costs if len(jobs) > 1 else [],
     )
 
 

@@ -186,13 +186,11 @@ def test_a_scene_narrows_the_model(ladder):
     assert any("1 wavelength" in text for text in plan.left_out) and any(
         "7 of 9 lenslets" in text for text in plan.left_out
     )
-    near = plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(depth=(0.45, 0.55)))
+    # depth is a matter of several plans, each with the neighbourhood of its own distance
     assert (
-        near.superpixels
-        == plan_pif(camera.replace(**{"object.distance": 0.45}), accuracy=1e-2).superpixels
-        > plan.superpixels
+        plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(depth=(0.45, 0.55))).superpixels
+        == plan_pif(camera, accuracy=1e-2).superpixels
     )
-    assert near.bands[0].window >= max(near.superpixels) // 2 + 1
     # light outside the camera's wavelengths changes nothing
     assert (
         len(plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(spectrum=(900e-9, 1e-6))).bands) == 3

@@ -10,8 +10,11 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from plenocli.forward.accuracy.dial import seconds_here
+from plenocli.forward.propagation.costs import law
+from plenocli.forward.propagation.diagnosis import seconds as diagnosis_seconds
 
 if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.plan import PifPlan
 
 ENDS = 5
@@ -20,11 +23,56 @@ LONG = 20.0
 """Seconds at nominal speed from which on a plan is told before the work starts."""
 
 
-def explain(plan: PifPlan, memory: int | None = None) -> str:
+@dataclass(frozen=True, kw_only=True)
+class CommandSeconds:
+    """What a command takes on one core of this machine, s.
+
+    matrix, diagnosis: to compute A, and its singular values;
+    writing: to write the file;
+    start: of the command, once for all its matrices.
+    """
+
+    matrix: float
+    diagnosis: float
+    writing: float
+    start: float
+
+    @property
+    def beside(self) -> float:
+        """All but the matrix."""
+        return self.diagnosis + self.writing + self.start
+
+    @property
+    def together(self) -> float:
+        """All of it."""
+        return self.matrix + self.beside
+
+    def line(self) -> str:
+        """One line for people."""
+        return (
+            f"time: about {_duration(self.together)} on one core: {_duration(self.matrix)} the "
+            f"matrix, {_duration(self.diagnosis)} rank and condition, "
+            f"{_duration(self.writing + self.start)} to start and to write"
+        )
+
+
+def command_seconds(camera: Camera, plan: PifPlan) -> CommandSeconds:
+    """What simulate-pif takes for one matrix."""
+    each = law("whole command").seconds
+    return CommandSeconds(
+        matrix=seconds_here(plan.chosen),
+        diagnosis=diagnosis_seconds(camera, plan),
+        writing=each["written"] * plan.bytes,
+        start=each["start"],
+    )
+
+
+def explain(plan: PifPlan, memory: int | None = None, took: CommandSeconds | None = None) -> str:
     """A plan as several lines of text: the models considered, the error by source, what was left
     out, warnings.
 
-    memory: bytes that the chosen one takes as it is written, None where that is not known.
+    memory: bytes that the chosen one takes as it is written, None where that is not known;
+    took: what the whole command takes, None where that is not known.
     """
     rows, columns = plan.superpixels
     head = [
@@ -46,6 +94,7 @@ def explain(plan: PifPlan, memory: int | None = None) -> str:
                 + (", written in pieces" if memory < plan.bytes else "")
             ]
         ),
+        *([] if took is None else [took.line()]),
         "error by source: "
         + ", ".join(f"{name} {value:.1g}" for name, value in plan.split.items())
         + f"; together {plan.estimated:.1g}",
@@ -149,19 +198,22 @@ def candidates(plan: PifPlan) -> list[Considered]:
     return found
 
 
-def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str | None:
+def expectation(
+    plan: PifPlan, memory: int | None = None, times: int = 1, beside: float = 0.0
+) -> str | None:
     """One line about work that takes long, and the model that would take much less.
 
     memory: bytes, None where they are not known;
-    times: how often such a plan is carried out.
+    times: how often such a plan is carried out;
+    beside: seconds that go with it whatever the model.
 
     Returns None where the work does not take long.
     """
     chosen = plan.chosen
-    if times * chosen.seconds() < LONG:
+    if times * chosen.seconds() + beside < LONG:
         return None
     text = (
-        f"about {_duration(times * seconds_here(chosen))} on one core"
+        f"about {_duration(times * seconds_here(chosen) + beside)} on one core"
         + ("" if memory is None else f" and {_size(memory)} of memory")
         + f" ({chosen.name}, error {chosen.error:.1g})"
     )
@@ -177,8 +229,8 @@ def expectation(plan: PifPlan, memory: int | None = None, times: int = 1) -> str
         return text
     other = min(quicker, key=lambda c: (c.error, c.seconds()))
     return (
-        f"{text}; --model {other.model} takes {_duration(times * seconds_here(other))} at an error "
-        f"of {other.error:.1g}"
+        f"{text}; --model {other.model} takes {_duration(times * seconds_here(other) + beside)} at "
+        f"an error of {other.error:.1g}"
     )
 
 

@@ -14,9 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dtpqrt
 
+from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.propagation.costs import law, priced
+from plenocli.forward.propagation.sampling import expected_symmetry
 from plenocli.forward.propagation.symmetry import superpixel_orbits
 
 if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import PifPlan
     from plenocli.forward.propagation.system_matrix import SystemMatrix
 
 NOISE_THRESHOLD = 1e-3
@@ -204,6 +209,49 @@ def symmetry_defect(own: np.ndarray) -> float:
     return float(np.abs(own[:, :half] - own[:, ::-1][:, :half]).max() / peak) if peak > 0 else 0.0
 
 
+def seconds(camera: Camera, plan: PifPlan) -> float:
+    """Seconds of one core that the diagnosis of a planned matrix takes."""
+    return len(plan.bands) * priced(law("diagnosis").seconds, features(camera, plan))
+
+
+def features(camera: Camera, plan: PifPlan) -> dict[str, float]:
+    """What the diagnosis of one band of a planned matrix consists of, for costs.toml: `values` that
+    are looked at, `reduced` operations of orthogonal reductions, `decomposed` cubes of the sides of
+    triangles.
+    """
+    at = geometry(camera, plan.bands[0].wavelength, plan.pixel_shift)
+    symmetry = expected_symmetry(camera, at, plan.shape)
+    _, _, pixels, points = plan.shape
+    ry, rx = ((n - 1) // 2 for n in plan.superpixels)
+    offsets = np.array([(r, c) for r in range(-ry, ry + 1) for c in range(-rx, rx + 1)])
+    mirrors = _own_mirrors(offsets, symmetry, at.pixel_shape)
+    rows = sum(
+        pixels / 2 ** int(mirrors[index].sum()) for index, _ in superpixel_orbits(offsets, symmetry)
+    )
+    found = {"values": rows * points}
+    if points <= LARGEST:
+        flips = 2 ** (bool(symmetry[0]) + bool(symmetry[1]))
+        widths = [points / flips] * flips
+        if symmetry[2]:  # even and odd under exchange; of four parts two are exchanged for one
+            split = [points / flips / 2] * 2
+            widths = [*split, *split, points / flips] if flips == 4 else split
+        found |= {
+            "reduced": sum(2 * rows * n**2 for n in widths)
+            + (2 * rows * widths[-1] ** 2 if len(widths) == 5 else 0),
+            "decomposed": sum(n**3 for n in widths),
+        }
+    return found
+
+
+def _own_mirrors(
+    offsets: np.ndarray, symmetry: Sequence[bool], pixel_shape: tuple[int, ...]
+) -> np.ndarray:
+    """(superpixel, 2): whether a superpixel mirrors itself in rows and columns, so that half of its
+    pixels tell all.
+    """
+    return (np.asarray(offsets) == 0) & np.array(symmetry[:2]) & (np.array(pixel_shape) % 2 == 0)
+
+
 class PiecewiseDiagnosis:
     """The Diagnosis of a matrix that comes superpixel by superpixel.
 
@@ -227,11 +275,7 @@ class PiecewiseDiagnosis:
         symmetry: of A, as PifBuilder has it.
         """
         self._pixel_shape = tuple(pixel_shape)
-        self._mirrors = (
-            (np.asarray(offsets) == 0)
-            & np.array(symmetry[:2])
-            & (np.array(self._pixel_shape) % 2 == 0)
-        )
+        self._mirrors = _own_mirrors(offsets, symmetry, self._pixel_shape)
         self._own = int(np.flatnonzero((np.asarray(offsets) == 0).all(axis=1))[0])
         self._times = {
             first: len(members) for first, members in superpixel_orbits(offsets, symmetry)

@@ -259,16 +259,17 @@ def superpixels_of(count: int) -> tuple[int, int]:
     return (side, side) if side * side == count else (1, count)
 
 
-def distinct(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> tuple[int, int]:
-    """What symmetry leaves to compute of a matrix.
+def expected_symmetry(
+    camera: Camera, geometry: Geometry, shape: tuple[int, ...]
+) -> tuple[bool, bool, bool]:
+    """(flip rows, flip columns, exchange both) of the points that map columns of a matrix onto
+    columns.
 
     shape: (band, superpixel, pixel, point).
-
-    Returns (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
     """
     superpixels, (rows, columns) = superpixels_of(shape[1]), geometry.object_shape
     if shape[3] < rows * columns or not is_symmetric(camera):
-        return shape[3], shape[1] * shape[3]
+        return False, False, False
     flip_rows, flip_columns, turn = geometry.mirrors(superpixels)
     turn = (
         turn
@@ -277,6 +278,20 @@ def distinct(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> tupl
         and geometry.pixel_shape[0] == geometry.pixel_shape[1]
         and superpixels[0] == superpixels[1]
     )
+    return flip_rows, flip_columns, turn
+
+
+def distinct(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> tuple[int, int]:
+    """What symmetry leaves to compute of a matrix.
+
+    shape: (band, superpixel, pixel, point).
+
+    Returns (points whose columns it needs on every superpixel, pairs of a superpixel and a point).
+    """
+    superpixels, (rows, columns) = superpixels_of(shape[1]), geometry.object_shape
+    flip_rows, flip_columns, turn = expected_symmetry(camera, geometry, shape)
+    if not (flip_rows or flip_columns or turn):
+        return shape[3], shape[1] * shape[3]
 
     def lines(flip: bool, points: int, superpixels: int) -> tuple[int, int]:
         """Of all superpixels of an axis and of the object's own: lines of points to compute."""

@@ -62,7 +62,7 @@ class PlanSummary:
 
     plan: several lines of text;
     memory, bytes: at work, and of the result;
-    seconds: of one core of this machine;
+    seconds: of one core of this machine, diagnosis, start and writing included;
     planes: of a scene's depth, where it takes several: `memory` is that of the dearest, `bytes` and
         `seconds` are those of all, the rest tells of the one that takes longest.
     """
@@ -315,7 +315,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
 
     camera, plan = job.camera, job.plan
     chosen = pif_pieces.layout(plan, task.camera_path)
-    _announce(plan, pif_pieces.cost(plan)[1])
+    _announce(camera, plan, pif_pieces.cost(plan)[1])
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
@@ -409,11 +409,12 @@ def _planned(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> Pi
     )
 
 
-def _announce(plan: PifPlan, memory: int) -> None:
+def _announce(camera: Camera, plan: PifPlan, memory: int) -> None:
     """Tell the warnings of a plan, and that the work takes long where it does."""
-    from plenocli.forward.accuracy.explain import expectation
+    from plenocli.forward.accuracy.explain import command_seconds, expectation
 
-    for line in (*plan.warnings, expectation(plan, memory)):
+    beside = command_seconds(camera, plan).beside
+    for line in (*plan.warnings, expectation(plan, memory, beside=beside)):
         if line:
             note(line)
 
@@ -440,25 +441,31 @@ def _explained(
 ) -> PlanSummary:
     """The plan of all matrices; in detail that of the dearest one."""
     from plenocli.files.artefacts import pif_pieces
-    from plenocli.forward.accuracy.dial import seconds_here
-    from plenocli.forward.accuracy.explain import PlaneCost, candidates, explain, planes_table
+    from plenocli.forward.accuracy.explain import (
+        PlaneCost,
+        candidates,
+        command_seconds,
+        explain,
+        planes_table,
+    )
 
+    took = [command_seconds(job.camera, job.plan) for job in jobs]
     costs = [
         PlaneCost(
             distance=job.camera.object.distance,
             superpixels=job.plan.superpixels,
-            seconds=seconds_here(job.plan.chosen),
+            seconds=times.together - times.start,
             bytes=job.plan.bytes,
             memory=pif_pieces.cost(job.plan)[1],
         )
-        for job in jobs
+        for job, times in zip(jobs, took)
     ]
     dearest = max(range(len(jobs)), key=lambda n: costs[n].seconds)
     plan = jobs[dearest].plan
     refusal = pif_pieces.refusal(plan, camera_path)
     if refusal:
         plan = replace(plan, warnings=(*plan.warnings, f"would be refused: {refusal}"))
-    text = explain(plan, costs[dearest].memory)
+    text = explain(plan, costs[dearest].memory, took[dearest])
     if planes is not None and len(jobs) > 1:
         text = "\n".join([planes.line(), *planes_table(costs), "", "the dearest:", text])
     return PlanSummary(
@@ -466,7 +473,7 @@ def _explained(
         memory=max(cost.memory for cost in costs),
         accuracy=plan.accuracy_record(),
         considered=candidates(plan),
-        seconds=sum(cost.seconds for cost in costs),
+        seconds=took[0].start + sum(cost.seconds for cost in costs),
         bytes=sum(cost.bytes for cost in costs),
         superpixels=plan.superpixels,
         coherent_ring=plan.coherent_ring,

@@ -157,6 +157,7 @@ def test_laws_in_a_file_say_what_they_said_in_the_code():
 def test_every_model_has_a_law_without_names_that_nothing_counts():
     laws = costs.read(costs.FITTED)
     assert laws.pop("spread function").counts
+    assert laws.pop("diagnosis").seconds and laws.pop("whole command").seconds
     assert list(laws) == [model.name for model in MODELS]
     for law in laws.values():
         numbers = [*law.operations.values(), *law.seconds.values(), *law.bytes.values()]

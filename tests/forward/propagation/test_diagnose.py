@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plenocli.forward.accuracy.dial import system_matrix
+from plenocli.forward.accuracy.dial import plan_pif, system_matrix
+from plenocli.forward.propagation import diagnosis as diagnose
 from plenocli.forward.propagation.diagnosis import PiecewiseDiagnosis, Spectrum, describe
 from plenocli.forward.propagation.symmetry import superpixel_orbits
+from plenocli.forward.propagation.system_matrix import build_pif
 from tests.forward.propagation.cameras import small_camera
 
 ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
@@ -109,3 +111,33 @@ def test_orbits_of_superpixels():
     )
     assert len(superpixel_orbits(offsets, (False, False, True))) == 6
     assert len(superpixel_orbits(offsets, (True, False, True))) == 6
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"object__samples_per_lenslet": (8, 6)},
+        {
+            "main_lens__aberrations": (
+                dict(noll=8, coefficient=50e-9),
+                dict(noll=7, coefficient=3e-8),
+            )
+        },
+        {"sensor__pixels_per_lenslet": (12, 12)},
+    ],
+    ids=str,
+)
+def test_what_the_diagnosis_costs_is_counted_as_it_is_done(change, monkeypatch):
+    camera = small_camera(**change)
+    plan = plan_pif(camera, superpixels=(3, 3), model="fresnel", accuracy=1e-2, coherent_ring=1)
+    operations, reduced = [], diagnose._reduced
+
+    def counting(triangle, rows):
+        operations.append(2 * rows.shape[0] * rows.shape[1] ** 2)
+        return reduced(triangle, rows)
+
+    monkeypatch.setattr(diagnose, "_reduced", counting)
+    found = describe(build_pif(camera, plan))
+    assert sum(operations) == pytest.approx(diagnose.features(camera, plan)["reduced"], rel=0.05)
+    assert found.rank is not None and diagnose.seconds(camera, plan) > 0

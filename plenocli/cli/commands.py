@@ -13,6 +13,7 @@ COMMANDS = {
     "demux": "inverse",
     "learn-dict": "inverse",
     "fit-camera": "inverse",
+    "plan": "inverse",
     "reconstruct": "inverse",
     "refocus": "inverse",
     "score": "evaluation",

@@ -93,6 +93,9 @@ WAVELENGTH = _Quantity("length", parse_wavelength, show=LENGTH.show)
 DECIBEL = _Quantity(
     "decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0)
 )
+LOSS = _Quantity(
+    "decibel", parse_decibel, 0.0, exclusive=True, show=DECIBEL.show, limits=(1e-3, 100.0)
+)
 BYTES = _Quantity("bytes", parse_bytes, 0, exclusive=True)
 DURATION = _Quantity(
     "duration",

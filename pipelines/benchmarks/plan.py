@@ -53,6 +53,8 @@ SCENES = {
 }
 SIZED = (("demo_spatial.toml", (12, 12)),)
 """Cameras, with lenslets, by which --fit sees how costs grow."""
+FIRST = {"fit": 0, "judge": 6}
+"""Number of the first case: six of the judgement's own were looked at while `plan` was made."""
 ALLOWED = (0.1, 0.3, 1.0)
 """dB of --quality-loss that are judged."""
 HOPELESS = 4.0
@@ -349,7 +351,7 @@ def main():
     kind = "fit" if args.fit else "judge"
     args.run.mkdir(parents=True, exist_ok=True)
     records = []
-    for number in range(args.cases):
+    for number in range(FIRST[kind], FIRST[kind] + args.cases):
         path = args.run / f"{kind}-{number}.json"
         if not path.is_file():
             with one_thread(), collected_notes():

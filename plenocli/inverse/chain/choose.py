@@ -19,9 +19,9 @@ MARGIN, PART = 0.04, 0.25
 FAR = 2.0
 """dB beyond what is allowed from which on matrices without neighbours are not looked at further."""
 DOUBT = 0.25
-"""dB by which a coarser matrix does better than the finest from which on a rehearsal says nothing of
-matrices: what it shows then is how reconstruct takes a right matrix for a wrong one, which another
-capture may not repeat.
+"""dB by which a coarser matrix does better than the finest from which on a rehearsal says nothing
+of matrices: what it shows then is how reconstruct takes a right matrix for a wrong one, which
+another capture may not repeat.
 """
 SLACK = 0.3
 """dB by which the sum of both losses may be mistaken: chains within it are rehearsed themselves."""
@@ -69,8 +69,8 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
 
     Every method is rehearsed with the finest matrix, and every matrix by one method; losses of
     matrix and method add up to what a chain is expected to lose. From the cheapest on, those that
-    may serve are then rehearsed themselves until one does. The best chain serves always; where a coarser matrix does better than the
-    finest, it is the best of the finest.
+    may serve are then rehearsed themselves until one does. The best chain serves always; where a
+    coarser matrix does better than the finest, it is the best of the finest.
     """
     matrices = list(dict.fromkeys(chain.matrix for chain in chains))
     finest = min(matrices, key=_fineness)

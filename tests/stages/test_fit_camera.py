@@ -6,11 +6,17 @@ import json
 
 import numpy as np
 import pytest
+from skimage import data
 
+from plenocli.base.tiling import to_blocks
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.config.camera_file import load_camera, to_toml
 from plenocli.files.read.system_matrices import read_lenslet_matrix
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture.estimators import Estimators, Options
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.stages.inverse.fitted_matrix import with_fitted_camera
 from tests.forward.propagation.cameras import small_camera
 
 KEYS = {
@@ -72,13 +78,13 @@ def test_what_is_left_open_goes_into_the_matrix(fitted):
     told = load_camera(fitted / "fitted.toml").fitted.model_error
     assert found.accuracy.model_error > told > 0
     assert error < 2 * told < 0.05
-    data, attrs = (
+    values, attrs = (
         getattr(read_artefact(fitted / "fit.h5", "fit"), part) for part in ("data", "attrs")
     )
     names = attrs["fit"]["names"]
     place = names.index("sensor distance")
-    assert abs(data["fit/value"][place] - DISTANCE) < 4 * data["fit/sigma"][place]
-    assert np.allclose(np.diag(data["fit/correlation"]), 1)
+    assert abs(values["fit/value"][place] - DISTANCE) < 4 * values["fit/sigma"][place]
+    assert np.allclose(np.diag(values["fit/correlation"]), 1)
     assert attrs["fit"]["model_error"] == told
 
 
@@ -161,3 +167,40 @@ def test_a_fit_needs_a_matrix(folder, capsys):
     command += ["--method", "block-mean", "--fit", "-o", str(folder / "no.h5")]
     assert run(command) == 2 and "--fit" in capsys.readouterr().err
     assert not (folder / "no.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("sigma", "said"), [("1e-4", "such captures are not fitted"), ("1", "the noise hides")]
+)
+def test_neighbours_light_is_told_against_the_noise(folder, capsys, sigma, said):
+    pif = folder / "three.h5"
+    if not pif.exists():
+        made = ["simulate-pif", str(folder / "camera.toml"), "--superpixels", "3x3"]
+        assert run([*made, "--model", "fresnel", "-o", str(pif)]) == 0
+    command = ["reconstruct", str(folder / "capture.h5"), "--pif", str(pif), "--fit"]
+    command += ["--noise-sigma", sigma, "-o", str(folder / "no.h5")]
+    assert run(command) == 2
+    told = capsys.readouterr().err
+    assert "neighbours' light" in told and "times the noise here" in told and said in told
+    assert not (folder / "no.h5").exists()
+
+
+def test_lenslets_that_are_not_wholly_measured_are_left_out_of_a_fit(folder):
+    """A quarter of them misses a pixel: the fit takes the others as they are."""
+    system = read_lenslet_matrix(folder / "real.h5")
+    pictures = [
+        (name, np.asarray(getattr(data, name)(), float) / 255) for name in ("moon", "brick")
+    ]
+    estimators = Estimators(system, Options(), lambda scene: pictures, threads=1)
+    picture = np.asarray(data.camera(), float)[100:160, 100:160] / 255
+    y = to_blocks(picture, (10, 10)) @ system.own.T
+    sigma = float(np.sqrt(np.mean(y**2))) / 300
+    y += sigma * np.random.default_rng(4).standard_normal(y.shape)
+    y[::2, ::2, 17] = np.nan
+    seen = Superpixels(y=y, noise=Noise.of_sigma(sigma), accuracy=system.accuracy)
+    _, fit = with_fitted_camera(estimators, seen, "capture")
+    assert fit.accepted and fit.lenslets == 27
+    y[:, ::2, 17] = np.nan
+    y[1::2, 1::2, 30] = np.nan
+    _, fit = with_fitted_camera(estimators, seen, "capture")
+    assert fit.lenslets == 36

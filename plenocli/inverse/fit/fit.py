@@ -54,7 +54,7 @@ above all the sensor distance.
 """
 LEFT_OVER = 0.01
 """By how much of what a fit leaves over, beyond the noise, the variances grow."""
-SECONDS = 2e-5
+SECONDS = 1e-5
 """A fit takes on one core for each pixel and point of a lenslet, about."""
 MOST_LENSLETS = 16
 """Lenslets looked at along each side of a capture, from its middle."""

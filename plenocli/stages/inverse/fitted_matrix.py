@@ -14,12 +14,14 @@ from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.nuisances.clean import clean
 from plenocli.stages.inverse.fit_camera import fitted
 
+HIDDEN = 0.2
+"""Neighbours' light over the noise up to which a fit does not see it."""
 WHOLE = 0.5
 """Share of the lenslets that must be wholly measured for a fit to look at these alone."""
 
 if TYPE_CHECKING:
     from plenocli.inverse.fit.camera_fit import CameraFit
-    from plenocli.inverse.picture.lenslet_model import Superpixels
+    from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
 
 def with_fitted_camera(
@@ -42,13 +44,11 @@ def with_fitted_camera(
         raise UsageError(
             "the pif does not say what camera it was made for", "--fit", "make it anew, or without"
         )
-    if estimators.coupled:
-        raise UsageError(
-            "a fit knows no neighbours' light", "--fit", "give a pif of --superpixels 1x1"
-        )
     sigma = options.noise_sigma or data.sigma
     if not sigma:
         raise InputError("does not say how strong its noise is", where, "give --noise-sigma")
+    if estimators.coupled:
+        raise _neighbours_count(system, data, float(sigma))
     model = "auto"
     if data.accuracy is not None and data.accuracy.model in ("fresnel", "exact"):
         model = data.accuracy.model
@@ -69,6 +69,23 @@ def with_fitted_camera(
         f"other than described: {', '.join(moved) or 'nothing'}"
     )
     return estimators.with_matrix(matrix_of(system, fit.camera, model)), fit
+
+
+def _neighbours_count(system: LensletMatrix, data: Superpixels, sigma: float) -> UsageError:
+    """The refusal of a matrix that knows neighbours: how strong their light is, by an even object,
+    and what to do; sigma: of the noise.
+    """
+    light = system.blocks.sum(axis=2)
+    stray = np.linalg.norm(light.sum(axis=0) - system.own.sum(axis=1)) / np.linalg.norm(light)
+    strength = float(stray * np.sqrt(np.nanmean(data.y**2)) / sigma)
+    advice = "give a pif of --superpixels 1x1: the noise hides their light"
+    if strength > HIDDEN:
+        advice = "leave it out: such captures are not fitted"
+    return UsageError(
+        f"a fit knows no neighbours' light, which is about {strength:.2g} times the noise here",
+        "--fit",
+        advice,
+    )
 
 
 def _measured(estimators: Estimators, data: Superpixels) -> np.ndarray:

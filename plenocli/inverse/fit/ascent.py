@@ -33,6 +33,8 @@ NODES = 2
 """Of a pixel along each side, where a finer model makes up for what they miss."""
 CHANGED = 0.1
 """Of the noise: what the difference of a finer model may have changed by at the end of a climb."""
+UNDAMPED = 1e-5
+"""Least damping of steps."""
 KEPT = 4
 """Steps that Fisher's matrix is kept for, where they help."""
 STALE = 1.5
@@ -188,7 +190,7 @@ class Ascent:
         finer: as in Point, kept.
         """
         at, damping = self.point(x, slopes=True, finer=finer), 1e-3
-        fisher = _Fisher(np.eye(len(x)), np.inf)
+        fisher, patient = _Fisher(np.eye(len(x)), np.inf), True
         for step in range(steps):
             if self._progress is not None:
                 self._progress()
@@ -202,13 +204,16 @@ class Ascent:
                 best, damping = self._step(at, fisher.matrix, rise, damping, 6)
             if at.factor > MISFIT and step % 3 == 2:
                 best = max([best, *self._mirrored(best)], key=lambda p: p.height)
-            if best is at:
-                break
             gain = best.height - at.height
             promised = 0.5 * float(rise @ np.linalg.solve(fisher.matrix, rise))
-            at = self.point(best.x, slopes=True, finer=best.finer)
-            if gain < GAIN or max(gain, promised) < ENOUGH:
+            if best is not at:
+                at = self.point(best.x, slopes=True, finer=best.finer)
+            if max(gain, promised) < ENOUGH or (gain < GAIN and not patient):
                 break
+            if gain < GAIN:
+                # damping goes with each parameter's own information: it stops steps along valleys
+                damping, patient = UNDAMPED, False
+                fisher = replace(fisher, age=KEPT)
         return at
 
     def _step(
@@ -226,7 +231,7 @@ class Ascent:
                 way = _damped(fisher, damping, rise)
             best = self._along(at, way, float(rise @ way - 0.5 * way @ fisher @ way))
             if best is not at:
-                return best, max(damping / 5, 1e-5)
+                return best, max(damping / 5, UNDAMPED)
             damping = max(damping * 10, 1e-2)
         return at, damping
 

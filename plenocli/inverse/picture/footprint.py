@@ -15,7 +15,7 @@ from plenocli.base.budget import budget
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.nuisances.pixel_model import CHUNK
-from plenocli.inverse.picture.solvers.joint_lmmse import MOST, WIDE
+from plenocli.inverse.picture.solvers.joint_lmmse import MOST
 from plenocli.inverse.picture.solvers.lmmse import SCALES
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
 
@@ -32,7 +32,7 @@ class Sizes:
     bands: of the object.
     offsets: superpixels that one object sends light to.
     reach: of them, in lenslets.
-    directions: singular vectors through which the joint estimate sees a superpixel.
+    directions: through which the joint estimate sees a superpixel.
     atoms: of the dictionary, 0 without one.
     """
 
@@ -116,16 +116,16 @@ def cleaned(phases: Phases) -> Phases:
 
 def joint_phases(n: Sizes) -> list[float]:
     """Of LMMSE over 3x3 lenslets."""
-    wide = 2 * n.reach + 1
-    footprints = (2 * wide**2 + (wide + 4) ** 2 + n.offsets + 18) * n.directions * n.points
+    side = 2 * n.reach + 1
+    around = (2 * side**2 + (side + 4) ** 2 + n.offsets + 67) * n.directions * n.points
     return [
         *lmmse_phases(n),
-        n.y + n.svd + n.block**2 + footprints + 268 * n.directions**2,
+        n.y + n.svd + n.block**2 + around + 511 * n.directions**2,
         n.svd
         + n.block**2
         + 18 * n.directions * n.points
-        + 243 * n.directions**2
-        + n.lenslets * (2 * n.pixels + 4 * n.points + 240 + 20 * n.directions),
+        + 268 * n.directions**2
+        + n.lenslets * (2 * n.pixels + 10 * n.points + 240 + 36 * n.directions),
     ]
 
 
@@ -149,13 +149,7 @@ def tv_phases(n: Sizes) -> list[float]:
 
 def pnp_phases(n: Sizes) -> list[float]:
     """Of plug and play, which starts from LMMSE, over 3x3 lenslets where noise is strong."""
-    side, directions = 2 * n.reach + 1, min(WIDE, n.least)
-    around = (2 * side**2 + (side + 4) ** 2 + n.offsets + 67) * directions * n.points
-    return [
-        *lmmse_phases(n),
-        n.y + n.svd + n.block**2 + around + 511 * directions**2,
-        n.svd + n.block**2 + n.lenslets * n.points * 137,
-    ]
+    return [*joint_phases(n), n.svd + n.block**2 + n.lenslets * n.points * 137]
 
 
 def reconstruction(n: Sizes, phases: Phases, *, joint: bool = False) -> float:

@@ -17,7 +17,7 @@ class JointEstimate:
     """LMMSE over 3x3 lenslets.
 
     value, sigma: (lenslet_row, lenslet_column, point), the picture and its standard deviation.
-    scale: factor of the photographs' covariance.
+    scale: factor of the photographs' covariance, geometric mean of the lenslets.
     """
 
     value: np.ndarray
@@ -26,25 +26,17 @@ class JointEstimate:
 
 
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
-    """LMMSE over 3x3 lenslets with scale x covariance, one scale a picture; steps of sqrt(2), so
-    that captures of one kind share what is worked out. sigma is what each lenslet's own light
+    """LMMSE over 3x3 lenslets, the contrast of each its own. sigma is what each lenslet's own light
     leaves open (docs/model.md, "Spatial reconstruction").
     """
     own = estimators.prior.lmmse(data.known_sigma, data.scene)
-    y = estimators.without_stray(data.y)
-    y = y[INNER] if min(y.shape[:2]) > 2 else y
-    scale = own.common_scale(y.reshape(-1, y.shape[2]).T)
-    # never above 1: light that the matrix does not produce passes for contrast, and
-    # would be amplified
-    scale = min(1.0, 2.0 ** (round(2 * np.log2(scale)) / 2))
-    joint = estimators.prior.joint(data.known_sigma / np.sqrt(scale), data.scene)
-    x, _ = joint.apply(data.y)
+    x, _, scale = estimators.prior.joint(data.known_sigma, data.scene).apply(data.y)
     y = own_light(estimators, data.y, x) if estimators.coupled else data.y
     apart, left = error_bars.posterior(own, y, estimators.system.object_shape)
     return JointEstimate(
         value=x,
         sigma=error_bars.JOINTLY * error_bars.about(x - apart, left),
-        scale=scale,
+        scale=float(np.exp(np.mean(np.log(scale)))),
     )
 
 

@@ -23,7 +23,7 @@ KEPT = 4
 ReadPictures = Callable[[str | None], list[TrainingPicture]]
 """Gives the training pictures without the scene of this name."""
 
-_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse)
+_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, np.ndarray)
 
 
 class ScenePrior:
@@ -43,7 +43,7 @@ class ScenePrior:
         self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
         self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
         self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
-        self._wide: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
+        self._heard: dict[tuple[float, str | None], np.ndarray] = {}
         self._lags: dict[str | None, tuple[float, np.ndarray]] = {}
 
     def pictures(self, scene: str | None, without: Collection[str] = ()) -> list[np.ndarray]:
@@ -87,38 +87,38 @@ class ScenePrior:
             lambda: lmmse.prepare(self.svd, mean, covariance, sigma, self.bands()),
         )
 
-    def joint(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
-        """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel."""
-        return _kept(self._joint, (sigma, scene), lambda: self._prepared(sigma, scene))
-
-    def wide(self, sigma: float, scene: str | None, most: int) -> joint_lmmse.JointLmmse | None:
-        """The same through the directions alone in which photographs matter at this noise; None
-        where these are more than `most`.
+    def heard(self, sigma: float, scene: str | None) -> np.ndarray:
+        """Directions of a superpixel, (pixel, k), in which photographs matter at noise `sigma` of
+        a pixel, the loudest last (joint_lmmse.loud_directions).
         """
         self.lmmse(sigma, scene)  # draws the patches
-        directions = joint_lmmse.loud_directions(
-            self.svd, self.statistics[scene][1], sigma, self.bands()
+        return _kept(
+            self._heard,
+            (sigma, scene),
+            lambda: joint_lmmse.loud_directions(
+                self.svd, self.statistics[scene][1], sigma, self.bands()
+            ),
         )
-        if directions.shape[1] > most:
-            return None
-        return _kept(self._wide, (sigma, scene), lambda: self._prepared(sigma, scene, directions))
 
-    def _prepared(
-        self, sigma: float, scene: str | None, directions: np.ndarray | None = None
-    ) -> joint_lmmse.JointLmmse:
+    def joint(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
+        """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel, through the loudest
+        directions.
+        """
+        return _kept(self._joint, (sigma, scene), lambda: self._prepared(sigma, scene))
+
+    def _prepared(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
         system = self.system
         if scene not in self._lags:
             reach = joint_lmmse.needed_reach(system.object_shape, system.offsets)
             self._lags[scene] = natural_images.autocovariance(self.pictures(scene), reach)
         return joint_lmmse.prepare_joint(
-            self.svd,
+            self.heard(sigma, scene)[:, -joint_lmmse.MOST :],
             system.blocks,
             system.offsets,
             system.object_shape,
             *self._lags[scene],
             sigma,
             self.bands(),
-            directions=directions,
         )
 
 

@@ -44,10 +44,11 @@ def test_what_is_measured_is_a_covariance(name):
 
 @pytest.mark.parametrize("snr_db", [20, 60, 120, 200])
 @pytest.mark.parametrize("name", ["photograph", "ramp", "disc", "point"])
-def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
-    """Matrices whose directions fade as those of cameras do; at 120 dB only what
+def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db, monkeypatch):
+    """Matrices whose directions fade as those of cameras do, for one contrast; at 120 dB only what
     rounding leaves is known.
     """
+    monkeypatch.setattr(joint_lmmse, "CONTRASTS", np.ones(1))
     rng = np.random.default_rng(6)
     blocks = (
         rng.random((9, 20, 12))
@@ -58,9 +59,9 @@ def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
         [picture(name)], reach := joint_lmmse.needed_reach(POINTS, RING)
     )
     sigma = float(np.sqrt(np.mean((mean * blocks.sum(axis=(0, 2))) ** 2)) * 10 ** (-snr_db / 20))
-    joint = joint_lmmse.prepare_joint(
-        linear.decompose(blocks[4]), blocks, RING, POINTS, mean, found, sigma
-    )
+    svd = linear.decompose(blocks[4])
+    seen = svd.u[:, : svd.rank()]
+    joint = joint_lmmse.prepare_joint(seen, blocks, RING, POINTS, mean, found, sigma)
     lenslet, (r, c) = (
         np.divmod(np.arange(25 * 12), 12)[0],
         np.divmod(np.arange(25 * 12) % 12, POINTS[1]),
@@ -81,7 +82,7 @@ def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
     own = np.s_[12 * 12 : 13 * 12]
     error, expected = np.empty((2, DRAWS, 12))
     for k in range(DRAWS):
-        estimate, spread = joint.apply(y[:, k].reshape(3, 3, 20))
+        estimate, spread, _ = joint.apply(y[:, k].reshape(3, 3, 20))
         error[k], expected[k] = estimate[1, 1] - x[own, k], spread[1, 1]
     assert (
         np.isfinite(error).all() and (expected <= np.sqrt(found[reach, reach]) * (1 + 1e-12)).all()
@@ -93,7 +94,7 @@ def test_joint_lmmse_with_measured_statistics_is_the_dense_one(name, snr_db):
         # light of the neighbours that the own block does not give is not looked at
         seen = np.kron(np.eye(9), joint.analysis)
         gain = np.linalg.solve(
-            seen @ matrix @ cover @ (seen @ matrix).T + sigma**2 * np.eye(len(seen)),
+            seen @ matrix @ cover @ (seen @ matrix).T + np.eye(len(seen)),  # of unit noise
             seen @ matrix @ cover[:, own],
         ).T
         np.testing.assert_allclose(
@@ -113,8 +114,8 @@ def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
         [picture("photograph")], reach := joint_lmmse.needed_reach(POINTS, own)
     )
     sigma = 0.05
-    svd = linear.decompose(block)
-    joint = joint_lmmse.prepare_joint(svd, block[None], own, POINTS, mean, found, sigma)
+    directions = linear.decompose(block).u
+    joint = joint_lmmse.prepare_joint(directions, block[None], own, POINTS, mean, found, sigma)
     lenslet, point = np.divmod(np.arange(9 * 12), 12)
     r = lenslet // 3 * POINTS[0] + point // POINTS[1]
     c = lenslet % 3 * POINTS[1] + point % POINTS[1]
@@ -122,7 +123,7 @@ def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
     bright = np.linalg.cholesky(cover + 1e-9 * np.eye(len(cover))) @ rng.standard_normal(108)
     x = (mean + bright.reshape(9, 12) * np.geomspace(0.3, 3, 9)[:, None]).reshape(3, 3, 12)
     y = x @ block.T + sigma * rng.standard_normal((3, 3, 20))
-    estimate, spread = joint.adaptive(y)
+    estimate, spread, contrast = joint.apply(y)
 
     scales, seen = joint_lmmse.CONTRASTS, joint.analysis
     z = (y - mean * block.sum(axis=1)) @ seen.T
@@ -133,7 +134,7 @@ def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
             points = np.concatenate([np.arange(12) + 12 * m for m in near])
             matrix = np.kron(np.eye(len(near)), seen @ block)
             prior = scale * cover[np.ix_(points, points)]
-            data = matrix @ prior @ matrix.T + sigma**2 * np.eye(len(matrix))
+            data = matrix @ prior @ matrix.T + np.eye(len(matrix))  # of unit noise
             told = z.reshape(9, -1)[near].ravel()
             log[k, n] = multivariate_normal(cov=data).logpdf(told)
             cross = scale * cover[12 * n : 12 * n + 12][:, points] @ matrix.T
@@ -149,6 +150,7 @@ def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
         middle = (weight := share.mean(axis=1)) @ logs
         width = max(np.sqrt(weight @ (logs - middle) ** 2), 0.5)
         prior = np.maximum(np.exp(-((logs - middle) ** 2) / 2 / width**2), 1e-30)
+    np.testing.assert_allclose(contrast.ravel(), np.exp(logs @ share), rtol=1e-6)
     for n in range(9):
         expected = sum(share[k, n] * values[k, n] for k in range(len(scales)))
         variance = sum(

@@ -16,7 +16,11 @@ from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.methods.per_lenslet import adaptive_lmmse
 from plenocli.inverse.picture.solvers import whole_sensor
-from plenocli.inverse.picture.solvers.joint_lmmse import WIDE
+
+LOUD = 80
+"""Directions of a superpixel in which photographs stand above the noise, up to which the start
+looks over 3x3 lenslets. With more the lenslet itself tells what its neighbours could, to 0.03 dB.
+"""
 
 Solve = Callable[
     [Estimators, whole_sensor.DataTerm, np.ndarray, float], tuple[np.ndarray, str, int]
@@ -85,11 +89,10 @@ def _from_lmmse(
         x, sigma = np.empty((2, *y.shape[:2], estimators.svd.vt.shape[1]))
     else:
         x, sigma = joint.value.copy(), joint.sigma.copy()
-    ring = None
-    if wide and estimators.options.overlap != 1:
-        ring = estimators.prior.wide(noise, light.data.scene, WIDE)
-    if ring is not None:
-        around = ring.adaptive(light.data.y)
+    prior, scene = estimators.prior, light.data.scene
+    wide = wide and estimators.options.overlap != 1 and prior.heard(noise, scene).shape[1] <= LOUD
+    if wide:
+        around = prior.joint(noise, scene).apply(light.data.y)
         x[inner], sigma[inner] = around[0][inner], around[1][inner]
     else:
         x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
@@ -107,9 +110,7 @@ def _from_lmmse(
         value=found,
         sigma=sigma,
         from_lmmse=root_mean_square(found - x),
-        stats=WholePictureStats(
-            expected_error=error, rounds=rounds, rule=rule, wide=ring is not None
-        ),
+        stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule, wide=wide),
     )
 
 

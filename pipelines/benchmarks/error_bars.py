@@ -4,8 +4,10 @@ seed_spatial at half its resolution (20x20 object points and 26x26 pixels a lens
 lenslets, the middle of a photograph that no training saw. What inverts the capture is its own
 matrix; with --finer the object is simulated with points three times finer, with --wrong the
 lenslets' focal length of the matrix is off by so much: what is left then passes for noise as far as
-reconstruct finds it. Photographs alternate between those that the constants of the error bars were
-fitted on (--fit prints these constants) and those that judge; both are told apart in the table.
+reconstruct finds it. With --fitted the matrix is that of the camera fitted to each capture, from a
+description that is off by --wrong (square lenslets). Photographs alternate between those that the
+constants of the error bars were fitted on (--fit prints these constants) and those that judge; both
+are told apart in the table.
 
 Writes RUN/error_bars.json and RUN/error_bars.md. Run from the project's root:
 python pipelines/benchmarks/error_bars.py --scene skimage:astronaut FOLDER/*.png
@@ -40,20 +42,22 @@ photograph is spread.
 """
 
 
-def matrix(shape, points, focal=1.0):
-    """(pixel, point) of an isolated lenslet, square or circular.
+LEARNT = {"atoms": 400, "batch": 1600, "lam": 5.6e-7, "delta": 1e-3, "snr_db": 60, "seed": 3}
+"""How the dictionary is learnt, in three iterations; lambda as learn-dict finds it."""
+
+
+def camera_of(shape, points, focal=1.0):
+    """seed_spatial at half its resolution, with square or circular lenslets.
 
     points: of the object, a side.
     focal: factor of the lenslets' focal length.
     """
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.forward.accuracy.dial import plan_pif
-    from plenocli.forward.propagation.system_matrix import build_pif
 
     camera = load_camera(ROOT / "sample_configs" / "seed_spatial.toml")
     lenslets, pitch = camera.lenslet_array, camera.sensor.pixel_pitch
     pitch *= camera.sensor.pixels_per_lenslet[0] / PIXELS
-    camera = camera.model_copy(
+    return camera.model_copy(
         update={
             "lenslet_array": lenslets.model_copy(
                 update={"aperture_shape": shape, "focal_length": focal * lenslets.focal_length}
@@ -64,8 +68,24 @@ def matrix(shape, points, focal=1.0):
             ),
         }
     )
+
+
+def matrix(shape, points, focal=1.0):
+    """(pixel, point) of an isolated lenslet of `camera_of`."""
+    from plenocli.forward.accuracy.dial import plan_pif
+    from plenocli.forward.propagation.system_matrix import build_pif
+
+    camera = camera_of(shape, points, focal)
     plan = plan_pif(camera, model="fresnel", superpixels=(1, 1), coherent_ring=0, accuracy=1e-5)
     return build_pif(camera, plan).A[0, 0].astype(float)
+
+
+def fitted_matrix(described, data, pictures):
+    """(matrix (pixel, point), its model error) of a camera fitted to a capture."""
+    from plenocli.inverse.fit.fit import CapturedLenslets, fit_camera
+
+    found = fit_camera(described, [CapturedLenslets(data.y, data.sigma)], pictures, model="fresnel")
+    return found.matrix, found.model_error if found.accepted else 0.0
 
 
 def captured(scene, capturing, snr, count, seed):
@@ -94,7 +114,6 @@ def captured(scene, capturing, snr, count, seed):
 
 def estimators_of(own, options, dictionary=None):
     """Estimators behind a matrix (pixel, point), trained on the photographs of scikit-image."""
-    from plenocli.files.read.dictionaries import read_dictionary
     from plenocli.files.read.training import read_training
     from plenocli.inverse.picture.estimators import Estimators, Options
     from plenocli.inverse.picture.lenslet_model import LensletMatrix
@@ -110,8 +129,29 @@ def estimators_of(own, options, dictionary=None):
         system,
         Options(**options),
         lambda scene: read_training((), system.object_shape, not_scene=scene),
-        dictionary and (lambda: read_dictionary(dictionary, system)),
+        dictionary and (lambda: dictionary),
         threads=1,
+    )
+
+
+def learnt(estimators):
+    """A dictionary for the matrix of `estimators`."""
+    from plenocli.inverse.sparse.dictionary import Dictionary, Learner, Settings
+
+    pictures = estimators.prior.pictures(None)
+    learner = Learner(
+        estimators.svd, (POINTS, POINTS), pictures, pictures, Settings(**LEARNT), workers=1
+    )
+    state = learner.start()
+    for _ in range(3):
+        state = learner.step(state)
+    return Dictionary(
+        atoms=state.atoms,
+        synthesis=learner.synthesis(state),
+        lam=LEARNT["lam"],
+        sigma=learner.sigma,
+        directions=len(learner.seen),
+        training=(),
     )
 
 
@@ -125,18 +165,26 @@ def judged(args):
         right = matrix(lenslets, POINTS)
         capturing = matrix(lenslets, FINER * POINTS) if args.finer else right
         own = matrix(lenslets, POINTS, 1 + args.wrong) if args.wrong else right
-        first = estimators_of(own, {})
+        described = camera_of(lenslets, POINTS, 1 + args.wrong)
+        nominal = estimators_of(own, {})
+        dictionary = learnt(nominal) if "dictionary" in args.methods else None
         for number, scene in enumerate(args.scene):
             for snr in args.snr:
                 data, truth = captured(scene, capturing, snr, args.count, number)
+                first, error = nominal, 0.0
+                if args.fitted:
+                    found, error = fitted_matrix(described, data, nominal.prior.pictures(None))
+                    first = estimators_of(found, {})
+                    first.prior.pictures_of = nominal.prior.pictures_of
+                    first.prior.statistics = nominal.prior.statistics
                 for method in args.methods:
-                    one = estimators_of(own, METHODS[method], args.dictionary)
+                    one = estimators_of(first.system.own, METHODS[method], dictionary)
                     one.svd, one.prior = first.svd, first.prior
                     by_name = BY_NAME[METHODS[method]["method"]]
                     found = (
                         by_name.reconstruct(one, data)
                         if args.alone
-                        else estimate(one, by_name, data)[0]
+                        else estimate(one, by_name, data, model_error=error)[0]
                     )
                     z = (found.value - truth) / found.sigma
                     rows.append(
@@ -252,7 +300,9 @@ def main():
     parser.add_argument(
         "--methods", nargs="+", choices=METHODS, default=[m for m in METHODS if m != "dictionary"]
     )
-    parser.add_argument("--dictionary", type=Path, help="of learn-dict, for this matrix")
+    parser.add_argument(
+        "--fitted", action="store_true", help="by the camera fitted to each capture"
+    )
     parser.add_argument("--finer", action="store_true", help="capture three times finer")
     parser.add_argument(
         "--wrong", type=float, default=0.0, help="relative error of the lenslets' focal length"

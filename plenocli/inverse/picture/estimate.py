@@ -17,7 +17,7 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
-from plenocli.inverse.picture.error_bars import posterior
+from plenocli.inverse.picture.error_bars import of_picture, posterior
 from plenocli.inverse.picture.estimators import INNER, Estimators
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
 from plenocli.inverse.picture.lenslet_model import Superpixels
@@ -147,6 +147,10 @@ def estimate(
         _, left = posterior(told, settled.own, estimators.system.object_shape)
         found = replace(found, sigma=np.maximum(found.sigma, left))
     found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
+    if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
+        # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found
+        sigma = of_picture(estimators, data, settled.own, found.value)
+        found = replace(found, sigma=sigma)
     if kept < 1:
         note(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "

@@ -6,6 +6,7 @@ import pytest
 from plenocli.base.tiling import to_blocks
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture import error_bars
+from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.registry import METHODS
@@ -175,6 +176,27 @@ def test_a_photograph_lies_in_the_intervals_of_every_method(photographed, snr_db
         found = METHODS[name].reconstruct(one, data)
         held = np.mean(np.abs(found.value - truth) < 1.96 * found.sigma)
         assert 0.90 < held < 0.99, (name, overlap, held)
+
+
+def test_a_picture_drawn_back_is_held_by_its_distance_from_lmmse(photographed):
+    """Stopped late, non-negative least squares paints noise, of which little is kept."""
+    own, truth, training = photographed
+    y = truth @ own.T
+    sigma = float(np.sqrt(np.mean(y**2)) * 0.1)
+    y = y + sigma * np.random.default_rng(3).standard_normal(y.shape)
+    data = Superpixels(y=y, noise=Noise.of_sigma(sigma), scene="astronaut")
+    system = LensletMatrix(
+        path="lens",
+        blocks=own[None],
+        offsets=np.zeros((1, 2), int),
+        pixel_shape=(16, 16),
+        object_shape=(12, 12),
+    )
+    estimators = Estimators(system, Options(nnls_iterations=1000), lambda scene: training)
+    found, _ = estimate(estimators, METHODS["nnls"], data)
+    told, z = found.as_json(), np.abs(found.value - truth) / found.sigma
+    assert told["matrix_believed"] and told["detail_kept"] < 0.7
+    assert 0.90 < np.mean(z < 1.96) < 0.985
 
 
 def test_detail_that_is_given_up_is_in_the_error_bars(lens):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation.exact import cost_law
 from plenocli.forward.propagation.exact import lenslets as exact
+from plenocli.forward.propagation.exact.oblique import neglected
 from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
 from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
@@ -164,8 +165,8 @@ class ExactLowRank(Model):
     cost = staticmethod(cost_law.cost)
 
     def error_bound(self, camera: Camera, geometry: Geometry) -> float:
-        """None: it is what the others are measured by."""
-        return 0.0
+        """None on the axis: it is what the others are measured by. Off it spherical waves are."""
+        return min(1.0, neglected(geometry))
 
 
 class ExactHarmonics(Model):

@@ -562,8 +562,6 @@ def test_refusals():
         accuracy.plan_pif(
             fast_camera(lenslet_array__aperture_shape="circle"), model="exact", accuracy=1e-3
         )
-    with pytest.raises(NumericsError, match="oblique"):
-        accuracy.plan_pif(fast_camera(), model="exact", accuracy=1e-3, lenslet=(0, 1))
 
 
 def full_camera(name, profile):

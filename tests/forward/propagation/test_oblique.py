@@ -96,14 +96,15 @@ def test_the_paraxial_model_s_error_contains_the_angle(f_number, pitch, profile)
 @pytest.mark.parametrize("asked", [0.5, 0.2, 1e-1, 1e-2, 1e-3])
 @pytest.mark.parametrize("f_number, pitch, half", [(16.0, 104e-6, 7.4), (22.0, 144e-6, 15.0)])
 def test_what_is_asked_off_the_axis_holds_or_is_refused(f_number, pitch, half, asked):
-    """Said with the estimate of the axis, 1e-2 was off by 4 and 16 %."""
+    """With the estimate of the axis 1e-2 was taken for met where columns were off by 4 and 16 %."""
     camera = wide_camera(f_number, pitch, half / math.sqrt(2))
     try:
         plan = plan_pif(camera, accuracy=asked, superpixels=(1, 1), coherent_ring=0, lenslet=(0, 0))
     except NumericsError as error:
         assert "cannot be reached: the best is about" in str(error)
-        assert asked < 0.5
+        assert asked < 1e-3
     else:
+        assert plan.model == "exact" or asked >= 0.1
         assert worst_error(camera, (0, 0), plan) <= min(asked, 1.5 * plan.estimated)
 
 
@@ -132,3 +133,98 @@ def test_chief_rays_meet_the_lenslets_centres():
     assert chief_ray(camera, middle, middle) == (0.0, 0.0)
     assert chief_ray(camera, middle - 3, middle + 2) == pytest.approx((-3 * pitch, 2 * pitch))
     assert array_position(camera, middle, middle + 1) == (0.0, 1.0)
+
+
+def exact_plan(camera, place, asked, *, ring=0, superpixels=(1, 1)):
+    return plan_pif(
+        camera,
+        model="exact",
+        accuracy=asked,
+        superpixels=superpixels,
+        coherent_ring=ring,
+        lenslet=place,
+    )
+
+
+@pytest.mark.parametrize(
+    "f_number, pitch, change",
+    [
+        (8.0, 40e-6, {}),
+        (2.5, 15e-6, {"lenslet_array__profile": "parabolic"}),
+        (4.4, 20e-6, {"main_lens__aperture_shape": "square", "lenslet_array__fill_factor": 0.7}),
+        (16.0, 60e-6, {"main_lens__apodisation": "uniform-pupil", "object__distance": 0.19}),
+        (5.0, 25e-6, {"main_lens__obscuration": 0.4, "main_lens__aperture_shape": "annulus"}),
+    ],
+    ids=str,
+)
+def test_exact_columns_off_the_axis(f_number, pitch, change):
+    """To the accuracy asked for, and no better than what is left out."""
+    camera = wide_camera(f_number, pitch, 15.0, **change)
+    last = camera.lenslet_array.count[0] - 1
+    for place in ((last // 2, last), (0, last), (last // 4, last)):
+        for asked in (1e-2, 1e-3, 1e-4):
+            plan = exact_plan(camera, place, asked)
+            assert worst_error(camera, place, plan, [0, 4, 20, 12]) <= asked
+            assert plan.model_error < 1e-3
+
+
+@pytest.mark.parametrize(
+    "beside, rings",
+    [((0, 0), 1), pytest.param((-1, 1), 2, marks=pytest.mark.slow)],
+    ids=str,
+)
+def test_coherent_neighbours_off_the_axis(beside, rings):
+    camera, points, rows = wide_camera(5.0, 14e-6, 12.0), [0, 14], [0, 6]
+    last = camera.lenslet_array.count[0] - 1
+    place, superpixels = (0, last - 3), (2 * rings - 1, 2 * rings - 1)
+    around = range(-rings, rings + 1)
+    how = {
+        "lenslets": [(r, c) for r in around for c in around],
+        "shift": lenslet_shift(camera, *place)[2],
+        "pixel_nodes": 10,
+    }
+    chief, images = chief_ray(camera, *place), image_points(camera, points)
+    truth = oblique_columns(camera, WAVELENGTH, chief, images, superpixel=beside, rows=rows, **how)
+    own = oblique_columns(camera, WAVELENGTH, chief, images, rows=rows, **how)
+    for asked in (1e-2, 1e-3):
+        plan = exact_plan(camera, place, asked, ring=1, superpixels=superpixels)
+        builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+        which = (superpixels[0] * superpixels[1]) // 2 + superpixels[1] * beside[0] + beside[1]
+        found = builder.columns(points)[which].T.reshape(-1, *builder.pixel_shape)[:, rows]
+        missed = np.sqrt(((found - truth) ** 2).sum(axis=(1, 2)) / (own**2).sum(axis=(1, 2)))
+        assert missed.max() <= asked
+
+
+def test_lenslets_that_mirror_each_other_have_mirrored_matrices():
+    camera = wide_camera(8.0, 40e-6, 12.0)
+    last = camera.lenslet_array.count[0] - 1
+
+    def matrix(row, column):
+        plan = exact_plan(camera, (row, column), 1e-4)
+        builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+        return builder.columns(slice(None))[0].reshape(10, 10, 5, 5), builder.symmetry
+
+    corner, turn = matrix(0, 0)
+    side, flip = matrix(0, last // 2)
+    assert turn == (False, False, True) and flip == (False, True, False)
+    size = np.linalg.norm(corner)
+    np.testing.assert_allclose(corner, corner.transpose(1, 0, 3, 2), atol=1e-5 * size)
+    np.testing.assert_allclose(side, side[:, ::-1, :, ::-1], atol=1e-5 * size)
+    other, _ = matrix(last, 0)
+    assert np.linalg.norm(other - corner[::-1, :, ::-1]) < 1e-4 * size
+    assert np.linalg.norm(other - corner) > 1e-2 * size
+
+
+def test_towards_the_axis_oblique_light_becomes_upright():
+    """Two routes to one matrix: direction cosines about a chief ray of 1e-6 rad, and about the
+    axis; they differ by what the latter leaves out of spherical waves.
+    """
+    camera = wide_camera(8.0, 40e-6, 1.0)
+    middle = camera.lenslet_array.count[0] // 2
+    plan = exact_plan(camera, (middle, middle), 1e-4)
+    upright, leaning = (
+        PifBuilder(camera, WAVELENGTH, each, dtype=np.float64).columns(slice(None))[0]
+        for each in (plan, replace(plan, chief=(0.0, 2e-8)))
+    )
+    apart = np.linalg.norm(upright - leaning, axis=0) / np.linalg.norm(upright, axis=0)
+    assert apart.max() < 3e-4

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation.costs import Cost, Features, law, summed
+from plenocli.forward.propagation.exact.oblique import ORDERS
 from plenocli.forward.propagation.exact.term_counts import (
     MANY_CELLS,
     ExactBand,
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.plan import BandPlan
 
+OBLIQUE_TERMS, OBLIQUE_NODES = 2.0, 0.07
+"""Terms of the main lens's field off the axis over those on it; what its sum over the pupil takes
+over bringing it into terms, for each node along an axis.
+"""
 CAUTION = 1.3
 """By how much more terms than expected a field is refused at once rather than after minutes."""
 
@@ -112,23 +117,29 @@ def features(
     ones.
     """
     n = numbers or term_law()
-    even, item = is_symmetric(camera), 16 if double else 8
+    oblique = geometry.chief != (0.0, 0.0)
+    even, item = is_symmetric(camera) and not oblique, 16 if double else 8
     sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), n)
-    written, columns = math.prod(shape[1:]), distinct(camera, geometry, shape)[1]
+    written, columns = math.prod(shape[1:]), _columns(camera, geometry, shape)
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
     mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
-    rows = sizes.lit * band.terms * sizes.rows
+    # terms that go with the point, too
+    terms = band.terms * (OBLIQUE_TERMS if oblique else 1)
+    rows = sizes.lit * terms * sizes.rows
     operations = {
         "interval_values": 4 * rows * sizes.across,
-        "interval_terms": 8 * rows * band.terms,
+        "interval_terms": 8 * rows * terms,
         "sensor": 8.0 * fine * mean * columns,
     }
     wide = item / 8  # what is twice as long takes twice the time
     seconds = {
         "process": 1.0,
-        "field_cubed": wide * band.psf_nodes**3 / (8 if even else 1),
+        "field_cubed": wide
+        * band.psf_nodes**3
+        * (1 + OBLIQUE_NODES * band.psf_nodes if oblique else 1 / 8 if even else 1),
         "spread_values": wide
-        * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * band.terms),
+        * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * terms)
+        * (ORDERS if oblique else 1),
         "columns": columns,
         "sensor_values_double" if double else "sensor_values_single": columns * fine,
         "written_double" if double else "written_single": written,
@@ -138,7 +149,7 @@ def features(
     own = _pupil_share(camera, n) * own_products(geometry, band, _parabolic(camera), n)
     held = {
         "own_coupling_isolated" if sizes.lit == 1 else "own_coupling_joined": item * own**2,
-        "field_squared": (band.psf_nodes / (2 if even else 1)) ** 2,
+        "field_squared": (band.psf_nodes / (2 if even else 1)) ** 2 * (ORDERS**2 if oblique else 1),
         "intervals": item
         * (sizes.beside + 1)
         * (sizes.lit * sizes.across * sizes.points)
@@ -171,6 +182,16 @@ def _parabolic(camera: Camera) -> bool:
     return camera.lenslet_array.profile == "parabolic"
 
 
+def _columns(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> int:
+    """Pairs of a superpixel and a point that symmetry leaves to compute: a lenslet off the axis has
+    one mirror at the most.
+    """
+    if geometry.chief == (0.0, 0.0):
+        return distinct(camera, geometry, (shape[0], shape[1], shape[2], shape[3]))[1]
+    mirror = 0.0 in geometry.chief or geometry.chief[0] == geometry.chief[1]
+    return math.ceil(shape[1] * shape[3] / (2 if mirror and is_symmetric(camera) else 1))
+
+
 def _pupil_share(camera: Camera, n: TermLaw) -> float:
     """Share of terms that the shape of the pupil leaves."""
     square = is_symmetric(camera) and camera.main_lens.aperture_shape == "square"
@@ -180,7 +201,8 @@ def _pupil_share(camera: Camera, n: TermLaw) -> float:
 def _sizes(
     camera: Camera, geometry: Geometry, band: ExactBand, grid: tuple[int, int], n: TermLaw
 ) -> _Sizes:
-    parabolic, even, plain = _parabolic(camera), is_symmetric(camera), _pupil_share(camera, n)
+    parabolic, plain = _parabolic(camera), _pupil_share(camera, n)
+    even = is_symmetric(camera) and geometry.chief == (0.0, 0.0)
     lit = 1 if band.window is None else 2 * band.window + 1
     points, lines = max(geometry.object_shape), band.pixel_nodes * max(geometry.pixel_shape)
     nodes = band.sensor_count or lines

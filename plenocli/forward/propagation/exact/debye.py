@@ -67,7 +67,7 @@ def spherical_field(
         weight = rows.weight * np.exp(1j * g.k * (defocus_path(g, r2) - g.eps * r2 / 2))
         weight *= APODISATION[lens.apodisation](cos2) * cos2**2 / g.z2**2
         total = total + _transform(rows.y, rows.x, weight, np.sqrt(cos2) * g.k / g.z2, dy, dx)
-    return np.asarray(total / (g.wavelength * math.sqrt(_aperture_norm(lens, g))))
+    return np.asarray(total / (g.wavelength * math.sqrt(aperture_norm(lens, g))))
 
 
 def spherical_profile(camera: Camera, geometry: Geometry, reach: float) -> np.ndarray:
@@ -104,7 +104,7 @@ def radial_waves(camera: Camera, geometry: Geometry, reach: float) -> tuple[np.n
         / g.z2**2
         * np.exp(1j * phase)
     )
-    norm = 2 * np.pi / (g.wavelength * math.sqrt(_aperture_norm(lens, g)))
+    norm = 2 * np.pi / (g.wavelength * math.sqrt(aperture_norm(lens, g)))
     return rho * np.sqrt(cos2) / g.z2, norm * weight
 
 
@@ -180,7 +180,7 @@ def _times_transposed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _aperture_norm(lens: MainLens, geometry: Geometry) -> float:
+def aperture_norm(lens: MainLens, geometry: Geometry) -> float:
     """Integral of a(s)^2 d^2 s over the open aperture P1, filters not counted."""
     radius, shade = lens.aperture_diameter / 2, APODISATION[lens.apodisation]
     t, w = gauss(64)

@@ -21,7 +21,8 @@ import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.low_rank_product import thin
-from plenocli.forward.propagation.exact.residual import Residual, path, split
+from plenocli.forward.propagation.exact.oblique import at_points, orders_of
+from plenocli.forward.propagation.exact.residual import ObliqueWave, Residual, path, split
 from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
 if TYPE_CHECKING:
@@ -101,7 +102,10 @@ class Interval:
         self.geometry, self.side, self.parabolic, self.dtype = geometry, side, parabolic, dtype
         g = geometry
         half = g.lenslet_width / 2
-        self.offset = s * g.superpixel_pitch - m * g.D2
+        # the chief ray goes on from the lenslet as it came
+        self.aside, self.across = (g.chief[n] * g.z3 / g.z2 for n in (axis, 1 - axis))
+        self.chief, self.chief_across = g.chief[axis], g.chief[1 - axis]
+        self.offset = s * g.superpixel_pitch - m * g.D2 + self.aside
         t, w = gauss(nodes_for(half * self._slope(m * g.D2, half)))
         self.x, self.w = half * t, half * w
         self.place = m * g.D2 + self.x
@@ -113,7 +117,8 @@ class Interval:
             min(m * g.D2 + reach, field.half),
             tolerance,
         )
-        values = self.terms.evaluate(self.place[:, None] - side.points) * side.emphasis[:, None]
+        values = self.terms.evaluate(self.place[:, None] - side.points, side.points)
+        values = values * side.emphasis[:, None]
         self.values = values.astype(dtype if np.iscomplexobj(values) else dtype.type().real.dtype)
 
     def _slope(self, middle: float, half: float) -> float:
@@ -123,22 +128,43 @@ class Interval:
         g, x = self.geometry, half * np.linspace(-1, 1, 17)
         d = self.offset + np.array([[self.side.u.min()], [self.side.u.max()]]) - x
         bend = x / g.f2 if self.parabolic else x / np.hypot(x, g.f2)
-        return g.k * (
-            np.abs(d / np.hypot(d, g.z3) + bend - (middle + x) / g.z2).max() + g.D1 / (2 * g.z2)
+        goes, comes = np.hypot(g.z3, self.across), self.chief + middle + x
+        come = (
+            comes / np.hypot(comes, np.hypot(g.z2, self.chief_across))
+            if g.chief != (0.0, 0.0)
+            else comes / g.z2
         )
+        return g.k * (np.abs(d / np.hypot(d, goes) + bend - come).max() + g.D1 / (2 * g.z2))
 
     def wave(self, other: float) -> np.ndarray:
         """W (u, x) towards superpixels displaced by `other` (m) along the other axis."""
         g, u = self.geometry, self.side.u
         phase = (
             path(self.offset + u[:, None] - self.x, g.z3, self.offset, other)
-            - path(u, g.z3)[:, None]
-            + self.place**2 / (2 * g.z2)
+            - path(self.aside + u, g.z3, self.aside, self.across)[:, None]
+            + self._incoming()
         )
         phase = phase - (self.x**2 / (2 * g.f2) if self.parabolic else path(self.x, g.f2))
-        return (self.side.root[:, None] * self.w / math.sqrt(g.wavelength * g.z3)) * np.exp(
-            1j * g.k * phase
-        )
+        size = self.w * self._nearer() / math.sqrt(g.wavelength * g.z3)
+        return (self.side.root[:, None] * size) * np.exp(1j * g.k * phase)
+
+    def _incoming(self) -> np.ndarray:
+        """Path (m) of the main lens's wave along this axis on the lenslet's nodes: off the axis of
+        the chief ray's sphere.
+        """
+        g = self.geometry
+        if g.chief == (0.0, 0.0):
+            return self.place**2 / (2 * g.z2)
+        return path(self.chief + self.place, g.z2, self.chief, self.chief_across)
+
+    def _nearer(self) -> np.ndarray | float:
+        """What of the main lens's wave is stronger on the lenslet's nodes than at its own lenslet's
+        centre, since they are nearer to the pupil: along this axis.
+        """
+        if self.geometry.chief == (0.0, 0.0):
+            return 1.0
+        far = self.geometry.z2**2 + self.chief_across**2
+        return (far + self.chief**2) / (far + (self.chief + self.place) ** 2)
 
     @cached_property
     def gram(self) -> np.ndarray:
@@ -146,7 +172,8 @@ class Interval:
         the separable part: (term, term).
         """
         sheet = _times(
-            self.side.carry(self.wave(0.0).astype(self.dtype)), self.values.reshape(len(self.x), -1)
+            self.side.carry(self.wave(self.across).astype(self.dtype)),
+            self.values.reshape(len(self.x), -1),
         ).reshape(-1, self.values.shape[2])
         gram = (sheet.conj().T @ sheet).astype(complex) / len(self.side.points)
         return gram if np.iscomplexobj(self.values) else gram.real
@@ -218,6 +245,7 @@ class Pair:
             None if self.row.parabolic else g.f2,
             min(0.5, tolerance / (3 * self.weight)) if self.weight else 0.5,
             self.symmetric,
+            self._come(),
         )
         power = np.outer(_norms(self.row, left), _norms(self.column, right))
         power, core = np.abs(field) ** 2 * power, np.abs(residual.core) ** 2
@@ -245,6 +273,14 @@ class Pair:
         (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 4)
         x, coupling = x[:, some], coupling[np.ix_(some, some)]
         return x, x if self.symmetric else y[:, some], coupling
+
+    def _come(self) -> ObliqueWave | None:
+        """What the main lens's wave does along both axes together; None on the axis."""
+        g, sides = self.row.geometry, (self.row, self.column)
+        if g.chief == (0.0, 0.0):
+            return None
+        y, x = (float(i.place[0] - i.x[0]) for i in sides)
+        return ObliqueWave(g.z2, g.chief, (g.chief[0] + y, g.chief[1] + x))
 
     def _terms(self, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(A, K, B): A K B^T are the terms S of the main lens's field, but for what does not
@@ -329,24 +365,32 @@ class LocalTerms:
         )
         t, w = gauss(count)
         root = np.sqrt(self.half * w)[:, None]
-        values = [root * field.evaluate(self.middle + self.half * t, a) for a in (0, 1)]
+        self.field, orders = field, orders_of(field)
+        values = [
+            _stacked(root * field.evaluate(self.middle + self.half * t, a), orders) for a in (0, 1)
+        ]
         # the partner of a term has the norm sqrt(s), which weighs it
         u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
         basis = u[:, : terms_within(s, tolerance)]
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
-        self._series = (legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]) @ (
-            basis / root
-        )
+        project = legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]
+        self._series = np.hstack([project @ (part / root) for part in np.split(basis, orders)])
 
     def coefficients(self, axis: int) -> np.ndarray:
         """(i, term): the terms of h along `axis` in this basis."""
         return self._mixing[axis]
 
-    def evaluate(self, d: np.ndarray) -> np.ndarray:
-        """e_i at d (m): d.shape + (i,), the same for both axes."""
+    def evaluate(self, d: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """e_i at d (m) from `points` (m, broadcasting): d.shape + (i,), the same for both axes."""
         t = (np.asarray(d, float).ravel() - self.middle) / self.half
-        return (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
+        values = (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
+        return at_points(self.field, values, points)
+
+
+def _stacked(values: np.ndarray, orders: int) -> np.ndarray:
+    """(place, order x term) as (order x place, term)."""
+    return values if orders == 1 else np.vstack(np.split(values, orders, axis=1))
 
 
 def field_norms(field: SeparableField, axis: int) -> np.ndarray:
@@ -358,9 +402,8 @@ def field_norms(field: SeparableField, axis: int) -> np.ndarray:
     """
     coefficients = field.columns if axis else field.rows
     degrees = np.arange(len(coefficients)) * (2 if field.even else 1)
-    return np.sqrt(
-        (np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half
-    )
+    power = (np.abs(coefficients) ** 2 * (2 / (2 * degrees + 1))[:, None]).sum(axis=0) * field.half
+    return np.sqrt(power.reshape(orders_of(field), -1).sum(axis=0))
 
 
 def _times(kernel: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, SensorSide
 from plenocli.forward.propagation.exact.low_rank_product import Product
+from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
     ExactBand,
@@ -139,8 +140,6 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
             "the sensor lies within ten wavelengths of the lenslets, where "
             "evanescent waves reach it"
         )
-    if geometry.chief != (0.0, 0.0):
-        return "a lenslet off the axis sees an oblique cone, which this rung does not follow"
     return None
 
 
@@ -178,7 +177,11 @@ class ExactSquareLenslets(LensletFields):
         g = self.geometry
         alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         while True:
-            self._field = separable_field(camera, g, self.band.half, tolerance, spherical_field)
+            self._field = (
+                separable_field(camera, g, self.band.half, tolerance, spherical_field)
+                if g.chief == (0.0, 0.0)
+                else oblique_field(camera, g, self.band.half, tolerance)
+            )
             flip_rows, flip_columns, turn = (
                 a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels))
             )
@@ -288,9 +291,8 @@ class ExactSquareLenslets(LensletFields):
         half = g.lenslet_width / 2
         t, w = gauss(psf_nodes(g, half))
         for m in lit_lenslets(self._reach(axis), self.band.window):
-            values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis).transpose(
-                0, 2, 1
-            )
+            values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis)
+            values = at_points(self._field, values, points[:, None]).transpose(0, 2, 1)
             total = total + (values * (half * w)) @ values.conj().transpose(0, 2, 1)
         gram = np.asarray(total)
         return np.concatenate([gram, gram[: len(g.points(axis)) - len(points)][::-1]])

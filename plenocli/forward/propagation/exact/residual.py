@@ -18,6 +18,7 @@ profile leaves an ell(y, x) of the same form. Their product on all displacements
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -58,14 +59,27 @@ def kappa(
 
     Returns complex numbers.
     """
+    r = np.sqrt(z * z + dy * dy + dx * dx)
+    together = np.exp(1j * k * cross_path(dy, dx, z, centre))
+    return together * (z / r) ** 2 * (1 + 1j / (k * r))
+
+
+def cross_path(dy: np.ndarray, dx: np.ndarray, z: float, centre: tuple[float, float]) -> np.ndarray:
+    """What of the path R the two axes do together, without cancellation.
+
+    dy, dx: displacements, m, broadcasting;
+    z: distance of the planes, m;
+    centre: displacement (rows, columns) about which it is taken, m.
+
+    Returns m: R less its values along the lines dy = cy and dx = cx, 0 on both.
+    """
     cy, cx = centre
     r, row, column, middle = (
         np.sqrt(z * z + a * a + b * b) for a, b in ((dy, dx), (dy, cx), (cy, dx), (cy, cx))
     )
     # (R - R(dy, cx)) - (R(cy, dx) - R(cy, cx)): differences of squares, and of two
     # numbers that differ much
-    psi = (dx * dx - cx * cx) * (1 / (r + row) - 1 / (column + middle))
-    return np.exp(1j * k * psi) * (z / r) ** 2 * (1 + 1j / (k * r))
+    return (dx * dx - cx * cx) * (1 / (r + row) - 1 / (column + middle))
 
 
 def ell(y: np.ndarray, x: np.ndarray, f: float, k: float) -> np.ndarray:
@@ -85,6 +99,26 @@ def ell(y: np.ndarray, x: np.ndarray, f: float, k: float) -> np.ndarray:
     return np.exp(-1j * k * psi)
 
 
+@dataclass(frozen=True)
+class ObliqueWave:
+    """The sphere of a chief ray that comes off the axis, on a lenslet.
+
+    z: distance of the pupil, m;
+    chief: where the ray meets the array, (rows, columns) m from the axis;
+    lenslet: the lenslet's centre, likewise.
+    """
+
+    z: float
+    chief: tuple[float, float]
+    lenslet: tuple[float, float]
+
+    def together(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Path (m) that the two axes have together at y, x (m, broadcasting) from the lenslet's
+        centre.
+        """
+        return cross_path(self.lenslet[0] + y, self.lenslet[1] + x, self.z, self.chief)
+
+
 class Residual:
     """kappa ell between a lenslet and the superpixel displaced by `centre` (rows,
     columns, m) from it.
@@ -92,7 +126,8 @@ class Residual:
     reach_u, reach_x: half widths (m) of superpixel and lenslet;
     f: focal length of a hyperbolic lens, or None for a parabolic one, which is separable;
     tolerance: root mean square of what may be left out;
-    symmetric: one set of functions for both axes, which takes a centre on the diagonal.
+    symmetric: one set of functions for both axes, which takes a centre on the diagonal;
+    come: the main lens's wave off the axis, whose axes do something together too; None on it.
     core: C.
     """
 
@@ -106,6 +141,7 @@ class Residual:
         f: float | None,
         tolerance: float,
         symmetric: bool = False,
+        come: ObliqueWave | None = None,
     ) -> None:
         self.centre, self.reach_u, self.reach_x = centre, reach_u, reach_x
         reach = reach_u + reach_x
@@ -119,7 +155,9 @@ class Residual:
             tolerance / 4,
             symmetric,
         )
-        lens_left, lens_core, lens_right, lens_slope = _lens_terms(reach_x, f, k, tolerance / 4)
+        lens_left, lens_core, lens_right, lens_slope = _lens_terms(
+            reach_x, f, k, tolerance / 4, come, symmetric
+        )
         self._grids = [
             (
                 gauss(_nodes(slope * reach_u / reach))[0],
@@ -188,11 +226,18 @@ def split(
 
 
 def _lens_terms(
-    reach_x: float, f: float | None, k: float, tolerance: float
+    reach_x: float,
+    f: float | None,
+    k: float,
+    tolerance: float,
+    come: ObliqueWave | None,
+    symmetric: bool,
 ) -> tuple[AxisFunctions, np.ndarray, AxisFunctions, float]:
     """The lens's functions of y and of x, their core, and the phase (rad) that they run
     through per half width.
     """
+    if come is not None:
+        return _oblique_lens_terms(reach_x, f, k, tolerance, come, symmetric)
     if f is None:
         one = np.ones((1, 1))
         return (lambda x: np.ones((len(x), 1))), one, (lambda x: np.ones((len(x), 1))), 0.0
@@ -207,6 +252,33 @@ def _lens_terms(
         return legendre(grid, len(t), 1) @ series
 
     return functions, core, functions, slope
+
+
+def _oblique_lens_terms(
+    reach_x: float,
+    f: float | None,
+    k: float,
+    tolerance: float,
+    come: ObliqueWave,
+    symmetric: bool,
+) -> tuple[AxisFunctions, np.ndarray, AxisFunctions, float]:
+    """As _lens_terms, with what the oblique wave of the chief ray does along both axes together."""
+    slope = 0.0 if f is None else k * f * (reach_x / f) ** 4 / 2
+    rim = reach_x * np.linspace(-1, 1, 5)
+    # a path that is all but a product is steepest at its corners
+    slope += k * 2 * np.ptp(come.together(rim[:, None], rim))
+    t, _ = gauss(_nodes(slope))
+    y, x = reach_x * t[:, None], reach_x * t
+    matrix = np.exp(1j * k * come.together(y, x)) / len(t)
+    if f is not None:
+        matrix = matrix * ell(y, x, f, k)
+    left, core, right = split(matrix, tolerance, symmetric)
+    series = [_series(t) @ (basis * np.sqrt(len(t))) for basis in (left, right)]
+
+    def functions(coefficients: np.ndarray) -> AxisFunctions:
+        return lambda grid: legendre(grid, len(t), 1) @ coefficients
+
+    return functions(series[0]), core, functions(series[1]), slope
 
 
 def _slope(own: float, other: float, reach: float, z: float, k: float) -> float:

@@ -5,7 +5,11 @@ The half-sized seed camera (20x20 points, 26x26 pixels, 6x6 lenslets), captured 
 differ from the one it is inverted with. Quantiles over all photographs of a folder. Statistics are
 from other photographs (those of scikit-image).
 
+With --scenes instead of a folder: scenes that are no photographs, by the right matrix, with square
+and circular lenslets and at f/4.4: what is lost against the same method with the matrix believed.
+
 python pipelines/benchmarks/belief.py FOLDER [--method lmmse ...] [--snr 60 40 20]
+python pipelines/benchmarks/belief.py --scenes [--method lmmse ...] [--snr 60 40 20]
 """
 
 import argparse
@@ -34,6 +38,13 @@ ROWS = {
     "sensor distance +0.5 %": (('distance = "832 um"', 'distance = "836.16 um"'),),
     "exact model, f/4.4": (("f_number = 8", "f_number = 4.4"),),
 }
+CAMERAS = {
+    "square lenslets": (),
+    "circular lenslets": (('aperture_shape = "square"', 'aperture_shape = "circle"'),),
+    "f/4.4": (("f_number = 8", "f_number = 4.4"),),
+}
+LOST = 0.1
+"""dB that a right matrix may lose."""
 
 
 def matrix(changes, model="fresnel"):
@@ -137,12 +148,63 @@ def gains(row, files, snr_db, method):
     return np.array(rows)
 
 
+def losses(camera, snr_db, method):
+    """Scene -> dB lost by not believing the right matrix."""
+    from unittest.mock import patch
+
+    from plenocli.base.progress import collected_notes
+    from plenocli.base.tiling import to_blocks
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.inverse.picture import estimate as module
+    from plenocli.inverse.picture.lenslet_model import Superpixels
+    from plenocli.inverse.picture.methods.registry import METHODS
+    from plenocli.inverse.picture.trust.believe import Belief
+    from tests.reference.scenes import scenes
+
+    def believing(estimators, y, level, scene, **rest):
+        return Belief(level=level, lmmse=estimators.prior.lmmse(level.sigma, scene), right=True)
+
+    a = matrix(CAMERAS[camera])
+    right, lost = estimators(a), {}
+    for number, (name, picture) in enumerate(scenes(SHAPE[0], COUNT).items()):
+        x = to_blocks(picture, SHAPE)
+        y = x @ a.T
+        sigma = float(np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20))
+        y = y + sigma * np.random.default_rng(number).standard_normal(y.shape)
+        data = Superpixels(y=y, noise=Noise.of_sigma(sigma))
+        with collected_notes():
+            found = module.estimate(right, METHODS[method], data)[0].value
+            with patch.object(module, "believe", believing):
+                believed = module.estimate(right, METHODS[method], data)[0].value
+        ratio = np.mean((found - x) ** 2) / np.mean((believed - x) ** 2)
+        lost[name] = 10 * np.log10(ratio)
+    return lost
+
+
+def main_scenes(methods, levels):
+    """The table of scenes that are no photographs."""
+    print("| SNR | method | camera | scenes | lost more than 0.1 dB |")
+    print("|---|---|---|---|---|")
+    for snr_db in levels:
+        for method in methods:
+            for camera in CAMERAS:
+                lost = losses(camera, snr_db, method)
+                told = ", ".join(f"{n} {v:.1f}" for n, v in lost.items() if v > LOST)
+                print(f"| {snr_db:.0f} | {method} | {camera} | {len(lost)} | {told or 'none'} |")
+                sys.stdout.flush()
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("folder", type=Path, nargs="?")
+    which.add_argument("--scenes", action="store_true")
     parser.add_argument("--method", nargs="+", default=["lmmse"])
     parser.add_argument("--snr", nargs="+", type=float, default=[60, 40, 20])
     asked = parser.parse_args()
+    if asked.scenes:
+        main_scenes(asked.method, asked.snr)
+        return
     files = sorted(p for p in asked.folder.rglob("*") if p.suffix in (".png", ".jpg", ".exr"))
     print(f"{len(files)} photographs; dB over the mean of each lenslet: least, median, most")
     print("| SNR | method | disturbed | as described | doubted | right matrix | doubt |")

@@ -7,6 +7,7 @@ keep leading axes out: x has exactly `domain.shape` and y exactly `range.shape`.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from math import prod
 from typing import Protocol
@@ -90,6 +91,7 @@ class BlockToeplitz:
         if len({tuple(o) for o in self.offsets.tolist()}) != len(self.offsets):
             raise ValueError("an offset appears twice")
         self.dtype = self.blocks.dtype
+        self.terms = list(zip(self.blocks, self.offsets))
         rows, columns = (int(n) for n in count)
         self.domain = Space(
             ("lenslet_row", "lenslet_column", "point"), (rows, columns, self.blocks.shape[2])
@@ -104,7 +106,7 @@ class BlockToeplitz:
         """
         x = _checked(x, self.domain)
         y = np.zeros(self.range.shape, np.result_type(self.dtype, x.dtype))
-        for block, offset in zip(self.blocks, self.offsets):
+        for block, offset in self.terms:
             source, target = _overlap(offset, self.domain.shape[:2])
             y[target] += x[source] @ block.T
         return y
@@ -115,15 +117,16 @@ class BlockToeplitz:
         """
         y = _checked(y, self.range)
         x = np.zeros(self.domain.shape, np.result_type(self.dtype, y.dtype))
-        for block, offset in zip(self.blocks, self.offsets):
+        for block, offset in self.terms:
             source, target = _overlap(offset, self.domain.shape[:2])
             x[source] += y[target] @ block
         return x
 
     def neighbours_only(self) -> BlockToeplitz:
         """The same map without the block's own superpixel: what the neighbours' light adds."""
-        keep = np.any(self.offsets != 0, axis=1)
-        return BlockToeplitz(self.blocks[keep], self.offsets[keep], self.domain.shape[:2])
+        other = copy(self)
+        other.terms = [(block, offset) for block, offset in self.terms if np.any(offset != 0)]
+        return other
 
 
 def adjoint_gap(op: LinearMap, seed: int = 0) -> float:

@@ -33,11 +33,6 @@ BRIGHTNESS = 0.2
 """Mean of the photographs that the statistics are from, about: captures are estimated at it."""
 DEFECTIVE = 0.1
 """What defective pixels may add to the brightness before it is settled anew."""
-MISFIT = 1.5
-"""What the joint estimate leaves over, in terms of the noise, from which on it counts: light from
-beyond the array is in it.
-"""
-
 
 Explain = Callable[[np.ndarray, float, str | None], str | None]
 """(superpixels (lenslet_row, lenslet_column, pixel), their noise, scene) -> what may be wrong."""
@@ -236,7 +231,7 @@ def _settle(
     level = replace(level, found=left)
     own = own_light(estimators, data.y, joint.value)
     inner = own[INNER] if min(own.shape[:2]) > 3 else own
-    belief = believe(estimators, inner, level, data.scene, model_error=model_error, misfit=MISFIT)
+    belief = believe(estimators, inner, level, data.scene, model_error=model_error, coupled=True)
     return _Settled(belief=belief, own=own, joint=joint)
 
 
@@ -256,8 +251,10 @@ def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: boo
         )
     if model_error > 0:
         against.append(f"its own record says it is off by {model_error:.2g}")
-    note(
-        f"the system matrix is not quite this camera's ({'; '.join(against)}): where that does "
-        f"harm the noise is taken {belief.raised:.3g} times as large, at the cost of detail; "
-        + advice
-    )
+    done = "what it leaves in proportion to the lenslets' brightness is taken out"
+    if belief.raised > 1.001:
+        done = (
+            f"where that does harm the noise is taken {belief.raised:.3g} times as large, at the "
+            "cost of detail"
+        )
+    note(f"the system matrix is not quite this camera's ({'; '.join(against)}): {done}; " + advice)

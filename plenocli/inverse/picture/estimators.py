@@ -161,8 +161,8 @@ class Estimators:
         """
         if not self.coupled:
             return y
-        even = np.repeat(self.system.levels(y), int(np.prod(self.system.object_shape)), axis=2)
-        return y - self.sensor(y.shape[:2]).neighbours_only().forward(even)
+        even = BlockToeplitz(self.system.even_blocks, self.system.offsets, y.shape[:2])
+        return y - even.neighbours_only().forward(self.system.levels(y))
 
     def in_batches(
         self, solve: Callable[..., _Solved], z: np.ndarray, size: int, *options: Any

@@ -61,9 +61,17 @@ class LensletMatrix:
         return self.blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]]
 
     @cached_property
+    def even_blocks(self) -> np.ndarray:
+        """The superpixels of an even object, (offset, pixel, band): what light of one band makes of
+        them.
+        """
+        bands = max(1, len(self.bands))
+        return self.blocks.reshape(*self.blocks.shape[:2], bands, -1).sum(axis=3)
+
+    @cached_property
     def even(self) -> np.ndarray:
-        """The superpixel of an even object, (pixel, band): what light of one band makes of it."""
-        return self.own.reshape(len(self.own), max(1, len(self.bands)), -1).sum(axis=2)
+        """The same of the superpixel behind the object itself, (pixel, band)."""
+        return self.even_blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]]
 
     def levels(self, y: np.ndarray) -> np.ndarray:
         """Brightness of each band, (.., band), behind superpixels y (.., pixel), by least squares

@@ -23,7 +23,9 @@ from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.solvers.least_squares import decompose
 from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
 from plenocli.inverse.picture.trust.excess import even_light, with_excess
+from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
 from plenocli.inverse.sparse.dictionary import Dictionary, Learner, Settings
+from tests.reference.scenes import scenes
 
 SHAPE, COUNT = (20, 20), 5
 HALF = (("[40, 40]", "[20, 20]"), ("[52, 52]", "[26, 26]"), ('"2 um"', '"4 um"'))
@@ -124,6 +126,92 @@ def test_the_right_matrix_is_believed(snr_db):
     assert told["matrix_believed"] and told["noise_raised"] == 1 and told["detail_kept"] == 1
     assert told["continuity"] > 0.6
     assert found.noise.sigma == pytest.approx(captured(matrix(), snr_db).sigma, rel=1e-12)
+
+
+ROUGH = (
+    "chessboard, squares of 4",
+    "chessboard, squares of 7",
+    "chessboard, squares of 10",
+    "turned chessboard",
+    "stripes of 1 lenslets",
+    "saw of a lenslet",
+    "letters",
+    "Siemens star",
+    "black and white noise",
+    "half black within lenslets",
+)
+
+
+@pytest.mark.parametrize("snr_db", [60, 30])
+def test_scenes_that_are_no_photographs_are_believed_by_the_right_matrix(snr_db):
+    """They jump at the borders of lenslets as photographs do by a wrong matrix."""
+    shared = estimators()
+    for name in ROUGH:
+        x = to_blocks(scenes(20, COUNT)[name], SHAPE)
+        y = x @ matrix().T
+        sigma = np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20)
+        y = y + sigma * np.random.default_rng(11).standard_normal(y.shape)
+        data = Superpixels(y=y, noise=Noise.of_sigma(sigma))
+
+        def error(found, x=x):
+            return 10 * np.log10(np.mean((found.value - x) ** 2))
+
+        believed = METHODS["lmmse"].reconstruct(shared, data)
+        assert error(made("lmmse", data, shared)) < error(believed) + 0.1, name
+
+
+def test_light_outside_the_range_that_goes_with_brightness_is_found_in_any_noise():
+    """In standard deviations: of noise as unequal as may be, and of an error of the matrix whose
+    energy is a twentieth of the noise's, against the closed form of its expectation.
+    """
+    rng, shared = np.random.default_rng(12), estimators()
+    svd, clear = shared.svd, scene().reshape(COUNT**2, -1) @ matrix().T
+    left = len(svd.u) - svd.rank(1e-6)
+    assert dark(svd) == left
+    sigma, found = 1e-9, []
+    for _ in range(60):
+        unequal = sigma * rng.uniform(0.2, 3, (COUNT**2, 1))
+        noise = unequal * rng.standard_normal(clear.shape)
+        found.append(steady_rest(svd, (clear + noise).T, sigma))
+    assert abs(np.mean(found)) < 0.4 and 0.7 < np.std(found) < 1.3
+    reached = svd.u[:, : svd.rank(1e-6)]
+    pattern = rng.standard_normal(clear.shape[1])
+    pattern -= reached @ (reached.T @ pattern)
+    bright = clear.sum(axis=1)
+    pattern *= 0.2 * sigma * np.sqrt(left) / np.linalg.norm(pattern) / np.sqrt(np.mean(bright**2))
+    noise = sigma * rng.standard_normal((20, *clear.shape))
+    found = [steady_rest(svd, (clear + n + np.outer(bright, pattern)).T, sigma) for n in noise]
+    pairs = np.sum(bright**2) ** 2 - np.sum(bright**4)
+    expected = (pattern @ pattern) * pairs / (sigma**2 * np.sqrt(2 * left * pairs))
+    assert np.mean(found) == pytest.approx(expected, rel=0.1) and expected > 10
+
+
+def test_what_a_matrix_spoils_is_told_from_what_a_scene_shows():
+    """A pattern as bright as its lenslet and negative light are the matrix's; the same pattern in
+    every lenslet may be the scene's.
+    """
+    rng, shared = np.random.default_rng(13), estimators()
+    lmmse = shared.prior.lmmse(1e-4, None)
+    bright = rng.uniform(0.05, 0.5, COUNT**2)
+    wave = 0.9 * np.sin(2 * np.pi * np.arange(400) / 20)
+    own = rng.permuted(np.tile(np.repeat([-0.9, 0.9], 200), (COUNT**2, 1)), axis=1)
+
+    def spoilt(x):
+        return spoilt_by_matrix(lmmse, matrix() @ x.T)
+
+    assert spoilt(bright[:, None] * (1 + wave))
+    assert not spoilt(0.25 * np.ones((COUNT**2, 1)) * (1 + wave))
+    assert not spoilt(bright[:, None] * (1 + own))
+    assert spoilt(0.25 * (1 + 6 * np.where(rng.random((COUNT**2, 1)) < 0.5, -1, 1) * wave))
+
+
+def test_light_that_goes_with_brightness_is_taken_out_and_costs_no_detail():
+    """A pitch off by a thousandth at 40 dB: hidden in the noise, but not in its sum."""
+    data, shared = captured(matrix(*DISTURBED["pitch"]), 40), estimators()
+    found = made("lmmse", data, shared)
+    told = found.as_json()
+    assert not told["matrix_believed"] and told["noise_raised"] == pytest.approx(1, abs=1e-9)
+    assert psnr(found) > psnr(METHODS["lmmse"].reconstruct(shared, data)) + 0.3
 
 
 def test_the_noise_of_a_wrong_matrix_says_how_wrong_it_is():

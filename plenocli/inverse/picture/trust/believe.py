@@ -16,6 +16,7 @@ import numpy as np
 
 from plenocli.base.random_streams import stream
 from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import Lmmse
 from plenocli.inverse.picture.trust.continuity import (
     LEAST_REFERENCE,
@@ -28,20 +29,35 @@ from plenocli.inverse.picture.trust.continuity import (
 )
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
+from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
 
 CONTINUOUS = 0.5
 """Factor relative to photographs under the right matrix from which on a picture is believed: of
 25 photographs at 60, 40 and 20 dB the right matrix has 0.62 and more; other crops have a little
 less.
 """
-NOTHING_OUTSIDE = 1.03
-"""Noise found over the capture's own up to which nothing is found; more where few lenslets leave
-more to chance.
+JUMPS, STRONGEST_JUMP = 0.2, 0.4
+"""The same factor below which the scene itself may be none that goes on across borders, and that of
+the strongest coordinates, which a wrong matrix hardly spoils.
+"""
+MISTOLD = 0.03
+"""What a capture may be off about its noise, relative."""
+MISFIT = 1.5
+"""What the joint estimate leaves over, in terms of the noise, where the matrix is right, at the
+most: light from beyond the array is in it.
+"""
+SURE, HINT = 4.0, 2.5
+"""Standard deviations of chance from which on noise found over the capture's own speaks against the
+matrix by itself, and from which on beside a picture that may not go on across borders.
 """
 CHANCE = 1.0
-"""Standard deviation of chance that a factor is allowed, times."""
+"""Standard deviation of chance that a factor is allowed, times, where nothing else is found."""
 LEAST_PAIRS = 8
 """Borders between lenslets that it takes to judge continuity."""
+ROOM = 0.25
+"""Directions that the matrix does not reach, over those that stand above the noise, from which on
+nothing found there tells something.
+"""
 ROUNDS = 2
 LEAST_FACTOR = 1e-3
 
@@ -55,7 +71,8 @@ class Belief:
     right: whether nothing speaks against the matrix; the noise is white then.
     continuity: factor of the picture relative to photographs under the right matrix, before
         anything was raised; None where there are too few lenslets.
-    reference: factor of these photographs, for what is made with the noise that is believed.
+    reference: factor of these photographs, for what is made with the noise that is believed; None
+        where it is no measure: too few lenslets, or a scene that jumps everywhere.
     raised: root mean square over the coordinates in use of the noise over that of a pixel.
     pattern: (pixel,) what even light of brightness 1 makes beside what the matrix says, None where
         it is believed.
@@ -81,38 +98,54 @@ def believe(
     scene: str | None,
     *,
     model_error: float = 0.0,
-    misfit: float = NOTHING_OUTSIDE,
+    coupled: bool = False,
 ) -> Belief:
     """What superpixels say of the matrix that explains them.
 
     y: (lenslet_row, lenslet_column, pixel), neighbours' light taken away.
-    level: their noise.
+    level: their noise; what it found is what an estimate over 3x3 lenslets leaves over, where they
+        are `coupled`.
     scene: that training leaves out.
     model_error: of the matrix by its own record, relative; an error above the noise is believed.
-    misfit: what `level` found over the noise from which on it speaks against the matrix.
+    coupled: whether neighbours' light was taken away: what is left of it is in y.
     """
     lmmse = estimators.prior.lmmse(level.sigma, scene)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = _Judge.of(estimators, lmmse, y, scene)
     first = None if judge is None else judge.of_lmmse(lmmse)
     loud = float(np.sqrt(np.mean(y**2)))
-    chance = _chance(estimators, stacked.shape[1])
-    found = level.found is not None and level.found > level.sigma * (misfit + chance)
-    suspect = found or model_error * loud > level.sigma
-    if not suspect and (first is None or first.most >= CONTINUOUS):
+    beyond = (
+        -np.inf if level.found is None else level.found / level.sigma - (MISFIT if coupled else 1)
+    )
+    chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
+    found = beyond > MISTOLD + SURE * chance or model_error * loud > level.sigma
+    steady = 0.0 if coupled else steady_rest(estimators.svd, stacked, level.sigma)
+    quiet = beyond <= HINT * chance
+    doubtful = not quiet or steady > HINT
+    least = None if first is None else first.relative if doubtful else first.most
+    continuous = least is None or least >= CONTINUOUS
+    rough = (
+        first is not None
+        and not continuous
+        and quiet
+        and _scene_jumps(estimators.svd, lmmse, stacked, level, first)
+    )
+    if not found and steady <= SURE and (continuous or rough):
         return Belief(
             level=level,
             lmmse=lmmse,
             right=True,
             continuity=None if first is None else first.relative,
-            reference=None if first is None else first.reference,
+            reference=None if first is None or rough else first.reference,
         )
     pattern = even_light(lmmse, stacked)
     y = without_pattern(lmmse, y, pattern)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
-    raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
+    raised = lmmse
+    if found or not continuous:
+        raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
     now = None if judge is None else judge.of_lmmse(raised)
     for _ in range(ROUNDS):
         if judge is None or now is None or now.relative >= CONTINUOUS or not len(raised.power):
@@ -151,6 +184,11 @@ class _Verdict:
     @property
     def reference(self) -> float:
         return self.right.factor
+
+    @property
+    def strongest(self) -> _Verdict:
+        """By the strongest coordinates alone."""
+        return _Verdict(found=self.found.strongest, right=self.right.strongest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,10 +242,21 @@ class _Judge:
         )
 
 
-def _chance(estimators: Estimators, signals: int) -> float:
-    """What chance may add to the noise where the matrix reaches nothing, relative."""
-    pixels = estimators.system.own.shape[0]
-    return 4 / np.sqrt(2 * max(signals * (pixels - estimators.svd.rank(1e-6)), 1))
+def _scene_jumps(
+    svd: Svd, lmmse: Lmmse, y: np.ndarray, level: NoiseLevel, verdict: _Verdict
+) -> bool:
+    """Whether the scene makes the jumps, and not the matrix, where nothing is found outside the
+    range: there is room enough for it; the strongest coordinates jump as well; and the estimate is
+    one that a scene can have. y: (pixel, signal).
+    """
+    loud = np.count_nonzero(lmmse.power > lmmse.sigma**2)
+    return (
+        level.found is not None
+        and bool(dark(svd) >= ROOM * loud)
+        and verdict.most < JUMPS
+        and verdict.strongest.most < STRONGEST_JUMP
+        and not spoilt_by_matrix(lmmse, y)
+    )
 
 
 def _calmer(lmmse: Lmmse, y: np.ndarray, verdict: _Verdict) -> Lmmse:

@@ -14,7 +14,7 @@ docs/model.md, "Spatial reconstruction".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,11 @@ class Jumps:
         return -float(self.level @ whole) / power if power > 0 else 1.0
 
     @property
+    def strongest(self) -> Jumps:
+        """With the first group of coordinates alone."""
+        return replace(self, detail=self.detail[:, :1])
+
+    @property
     def deviation(self) -> float:
         """Standard deviation of the factor by chance of the borders, which may differ as much as
         they do.
@@ -95,12 +100,14 @@ def detail_jumps(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> Jumps:
     """
     stacked = y.reshape(-1, y.shape[-1]).T
     shrunk = lmmse.shrunk(lmmse.coordinates(stacked), lmmse.scales(stacked))
-    level = lmmse.even @ (lmmse.levels @ stacked) + lmmse.mean[:, None]
+    level = lmmse.even @ (lmmse.levels @ stacked)
 
     def of(x: np.ndarray) -> np.ndarray:
         return jumps(x.T.reshape(*y.shape[:-1], -1), shape)
 
     parts = [of(lmmse.gain[:, group] @ shrunk[group]) for group in groups(lmmse.power)]
+    # what is expected of every field belongs to its detail
+    parts[0] = parts[0] + of(np.broadcast_to(lmmse.mean[:, None], level.shape))
     return Jumps(level=of(level), detail=np.stack(parts, axis=1), along=min(shape))
 
 

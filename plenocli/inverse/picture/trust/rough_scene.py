@@ -1,0 +1,76 @@
+"""Whether a picture that jumps at the borders of lenslets is one of a scene that jumps everywhere.
+
+A chessboard, letters, noise or stars are as discontinuous at borders as what a wrong matrix makes
+of a photograph. They are told apart by what a wrong matrix does and a scene does not: it leaves
+light where the matrix reaches nothing; it spoils weak coordinates before strong ones; it makes the
+same pattern in every lenslet, as bright as the lenslet; it makes light negative.
+
+docs/model.md, "Spatial reconstruction".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plenocli.inverse.picture.solvers.least_squares import Svd
+from plenocli.inverse.picture.solvers.lmmse import Lmmse
+
+EXPLAINED, MORE, FEW = 0.5, 0.03, 4
+"""Shares of the detail's energy from which on a pattern is the matrix's: what goes in proportion to
+brightness, and how much more that is than what all lenslets have in common; by so many bright
+lenslets at least.
+"""
+NEGATIVE = 0.2
+"""Share of negative light in the energy of the detail that no scene has: stars on black, which ring
+most, have 0.14.
+"""
+
+
+def dark(svd: Svd) -> int:
+    """Directions of a superpixel that no object reaches."""
+    return len(svd.u) - svd.rank(1e-6)
+
+
+def steady_rest(svd: Svd, y: np.ndarray, sigma: float) -> float:
+    """How far what no object gives goes with the brightness of lenslets, in standard deviations.
+
+    An error of the matrix leaves a like pattern in every lenslet, noise does not: only products of
+    two different lenslets are summed, whose mean is 0 whatever the noise of each. Directions in
+    which all that the capture shows would hide in the noise count as unreached, too.
+
+    svd: of the own block.
+    y: (pixel, signal) superpixels.
+    sigma: noise of a pixel.
+    """
+    bright = svd.s * svd.vt.sum(axis=1)
+    energy = float(np.sum(y**2)) / y.shape[1] / float(bright @ bright) * svd.vt.shape[1]
+    reached = svd.u[:, : min(svd.rank(1e-6), int(np.count_nonzero(svd.s**2 * energy > sigma**2)))]
+    rest = y - reached @ (reached.T @ y)
+    weighted = rest * y.sum(axis=0)
+    each = np.sum(weighted**2, axis=0)
+    total = weighted.sum(axis=1)
+    common = float(total @ total) - float(each.sum())
+    left = max(len(svd.u) - reached.shape[1], 1)
+    chance = 2 * (float(each.sum()) ** 2 - float(each @ each)) / left
+    return common / np.sqrt(chance) if chance > 0 else 0.0
+
+
+def spoilt_by_matrix(lmmse: Lmmse, y: np.ndarray) -> bool:
+    """Whether the estimate from superpixels y (pixel, signal) is what a wrong matrix makes and no
+    scene: a pattern in proportion to brightness, or much negative light.
+    """
+    bright = lmmse.brightness(y)
+    detail = lmmse.gain @ lmmse.shrunk(lmmse.coordinates(y), lmmse.scales(y))
+    energy = float(np.sum(detail**2))
+    if not energy > 0:
+        return False
+    along = detail @ bright
+    squares = float(bright @ bright)
+    in_proportion = float(along @ along) / squares / energy
+    count = squares**2 / float(np.sum(bright**4))
+    alike = detail.sum(axis=1)
+    in_common = float(alike @ alike) / detail.shape[1] / energy
+    pattern = in_proportion > max(EXPLAINED, in_common + MORE) and count > FEW
+    level = lmmse.even @ (lmmse.levels @ y) + lmmse.mean[:, None]
+    negative = float(np.sum(np.minimum(level + detail, 0) ** 2))
+    return pattern or negative > NEGATIVE * energy

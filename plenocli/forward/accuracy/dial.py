@@ -617,7 +617,13 @@ def _warnings(request: _Request, best: Candidate) -> list[str]:
     for axis, name in ((0, "rows"), (1, "columns")):
         size = geometry.pixel_shape[axis] * geometry.pixel_pitch
         spacing = geometry.superpixel_pitch * (1.0 if axis else geometry.row_spacing)
-        if request.pixel_shift is None and abs(size / spacing - 1) > 1e-4:
+        if superpixels[axis] > 1 and size > spacing * (1 + 1e-9):
+            found.append(
+                f"windows of {geometry.pixel_shape[axis]} pixels overlap, as superpixels are "
+                f"{spacing / geometry.pixel_pitch:.3f} pixels apart ({name}): light beyond the "
+                "border between two counts for the nearer lenslet's window only"
+            )
+        elif request.pixel_shift is None and abs(size / spacing - 1) > 1e-4:
             found.append(
                 f"superpixels are {spacing / geometry.pixel_pitch:.3f} pixels apart, not "
                 f"{geometry.pixel_shape[axis]} ({name}): A is for the grid centred on each "

@@ -14,7 +14,7 @@ lattice; on the hexagonal one its corners stick out of the hexagon into the next
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from plenocli.base.errors import ConfigError
@@ -49,7 +49,9 @@ class Geometry:
     ray_reach: farthest that a ray of an aberrated pupil lands on the array from the image point
         along either axis, None without wavefront error;
     chief: where the object's own lenslet stands from the optical axis, (rows, columns) m on the
-        array.
+        array;
+    borders: how far (rows, columns; m) from a superpixel's centre its light ends, None where its
+        pixels say so (`parted`).
 
     Berkner et al. 2013, section 2-3-1.
     """
@@ -72,6 +74,7 @@ class Geometry:
     pixel_shift: tuple[float, float] | None = None
     ray_reach: float | None = None
     chief: tuple[float, float] = (0.0, 0.0)
+    borders: tuple[float, float] | None = None
 
     @property
     def k(self) -> float:
@@ -231,6 +234,34 @@ class Geometry:
             (far + c) * self.D2 + e
             for far, c, e in zip(self.reach(grid, window), cell, self.lenslet_extent)
         )
+
+    def parted(self, grid: tuple[int, int]) -> Geometry:
+        """This geometry for superpixels of which each counts its own light only: where windows of
+        neighbours overlap, they end at the border between the two superpixels.
+
+        grid: (rows, columns) of the superpixels kept.
+        """
+        spacing = self.superpixel_pitch * self.row_spacing, self.superpixel_pitch
+        borders = [
+            half / 2 if n > 1 and count * self.pixel_pitch > half * (1 + 1e-9) else math.inf
+            for half, n, count in zip(spacing, grid, self.pixel_shape)
+        ]
+        return self if min(borders) == math.inf else replace(self, borders=(borders[0], borders[1]))
+
+    def pixel_spans(self, axis: int, n: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sensitive parts of pixels begin and end, within a superpixel's borders.
+
+        axis: 0 rows, 1 columns;
+        n: where the superpixel stands along the axis, in superpixel pitches.
+
+        Returns (low, high) (pixel,) m from the superpixel's centre; both are the border for pixels
+        beyond it.
+        """
+        import numpy as np
+
+        middle, half = self.pixels(axis) + self.window_shift(axis, n), self.pixel_active / 2
+        border = math.inf if self.borders is None else self.borders[axis]
+        return np.clip(middle - half, -border, border), np.clip(middle + half, -border, border)
 
     def window_shift(self, axis: int, n: float = 0.0) -> float:
         """From the centre of a superpixel to the middle of its window.

@@ -207,7 +207,9 @@ def band_fields(
         [
             model.fields(
                 camera,
-                geometry_of(camera, w, geometry.pixel_shift, geometry.chief),
+                geometry_of(camera, w, geometry.pixel_shift, geometry.chief).parted(
+                    plan.superpixels
+                ),
                 plan,
                 replace(band, wavelength=w),
             )

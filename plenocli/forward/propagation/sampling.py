@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,13 +60,13 @@ TOUCHING = 0.999
 """Width of square lenslets over their pitch from which on no point lies in a gap."""
 BRIGHT = 0.25
 """Light of the dimmest point of square lenslets that touch: a corner's, which four share."""
-UNTRIED, UNTRIED_WEIGHT = 1e-6, 21.0
+UNTRIED, UNTRIED_WEIGHT = 1e-6, 3.0
 """Light that the dimmest point is expected to have where columns are too large to be tried, and by
 how much finer pixels are then sampled.
 """
 OTHERS = 1.2, 3.0
-"""By how much other columns are worse than those tried, the latter where a pixel takes in many
-fringes (measured: at most 1.3, 4.6).
+"""By how much columns may be worse than those tried say, the latter where a pixel takes in many
+fringes (found: at most 4.6, which the margin of the nodes' choice covers).
 """
 NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
@@ -206,12 +206,21 @@ def size_band(
     else:
         camera = at_wavelength(camera, geometry.wavelength)
         trial = trial_columns(camera, geometry, superpixels, window, is_symmetric(camera))
-        faintest = UNTRIED if trial is None else trial.faintest
+        alone = None
+        if trial is None and window is not None:
+            alone = trial_columns(camera, geometry, superpixels, None, is_symmetric(camera))
+        tried = trial or alone
+        faintest = UNTRIED if tried is None else tried.faintest
         # a point between lenslets is dim, and what is missed weighs more in its column
-        if trial is None:
-            weight, error = UNTRIED_WEIGHT, lambda n, step: pixel_error(n, step, *light)
+        # of neighbours' fringes, where they were not tried, the law for lenslets that touch
+        fringes = _fringes_beside_gaps(geometry, light)
+        if tried is None:
+            weight, error = UNTRIED_WEIGHT, fringes
         else:
-            weight, error = 1.0 if trial.whole else OTHERS[own > FEW_FRINGES[0]], trial.error
+            # what rules err by along both axes at once is left out of a trial
+            many = joint > FEW_FRINGES[0]
+            weight = 1.0 if tried.whole and not many else OTHERS[many]
+            error = tried.error if trial else partial(_worse, tried.error, fringes)
         nodes, rule = _required(_fewest(error, accuracy / weight), joint)
         errors.append(weight * error(nodes, rule))
     root = min(1.0, math.sqrt(faintest / BRIGHT))
@@ -229,6 +238,20 @@ def size_band(
         pixel_rule=rule,
         beside=beside,
     )
+
+
+def _fringes_beside_gaps(
+    geometry: Geometry, light: tuple[float, float, float, float]
+) -> Callable[[int, int], float]:
+    """pixel_error of `light`, larger where lenslets leave gaps."""
+    faint = 1 + min(20.0, 80 * (1 - geometry.lenslet_width / geometry.D2))
+    return lambda count, rule: faint * pixel_error(count, rule, *light)
+
+
+def _worse(
+    one: Callable[[int, int], float], other: Callable[[int, int], float], count: int, rule: int
+) -> float:
+    return max(one(count, rule), other(count, rule))
 
 
 def is_symmetric(camera: Camera) -> bool:

@@ -154,7 +154,7 @@ class PifBuilder:
         band = next(b for b in plan.bands if b.wavelength == wavelength)
         self.plan, self.geometry, self.dtype = (
             plan,
-            geometry(camera, wavelength, plan.pixel_shift, plan.chief),
+            geometry(camera, wavelength, plan.pixel_shift, plan.chief).parted(plan.superpixels),
             np.dtype(dtype),
         )
         camera = at_wavelength(camera, wavelength)
@@ -169,6 +169,7 @@ class PifBuilder:
             else:
                 self.lenslets = model.fields(camera, self.geometry, plan, band)
         self._sampling = band.sampling
+        self._entered: np.ndarray | None = None
         self.notes: FieldNotes = self.lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape
         self.points = self.object_shape[0] * self.object_shape[1]
@@ -246,15 +247,18 @@ class PifBuilder:
                 if progress:
                     progress(len(points) * len(self.offsets))
             return
+        total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, A[first])
             spread(one.parts, one.compute)
-            one.complete()
+            share = one.complete()
             for index, how in members:
+                total += turned_planes(share[None, None], how)[0, 0]
                 if index != first:
                     np.copyto(self.planes(A[index]), turned_planes(self.planes(A[first]), how))
                 if progress:
                     progress(self.points)
+        self.require_all_light(total)
 
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """The matrix superpixel by superpixel, in the order of `orbits`.
@@ -269,16 +273,19 @@ class PifBuilder:
             yield from enumerate(whole)
             return
         slab, other = np.empty((2, self.shape[1], self.points), self.dtype)
+        total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, slab)
             spread(one.parts, one.compute)
-            one.complete()
+            share = one.complete()
             for index, how in members:
+                total += turned_planes(share[None, None], how)[0, 0]
                 if how == (False, False, False):
                     yield index, slab
                 else:
                     np.copyto(self.planes(other), turned_planes(self.planes(slab), how))
                     yield index, other
+        self.require_all_light(total)
 
     def planes(self, slab: np.ndarray) -> np.ndarray:
         """A of one superpixel (pixel, point) by rows and columns of both: a view."""
@@ -343,6 +350,16 @@ class PifBuilder:
             columns,
         )
 
+    def require_all_light(self, sensor: np.ndarray) -> None:
+        """As require_light, of all points.
+
+        sensor: (point row, point column) shares of their light.
+        """
+        if self._entered is None:
+            places = (a.ravel() for a in np.indices(self.object_shape))
+            self._entered = self.lenslets.incident(*places)
+        self.require_light(sensor, self._entered, *np.indices(self.object_shape))
+
     def require_light(
         self, sensor: np.ndarray, entered: np.ndarray, rows: np.ndarray, columns: np.ndarray
     ) -> None:
@@ -385,9 +402,6 @@ class _OneSuperpixel:
         self._rows = (oy + 1) // 2 if self._mirror_y else oy
         self._columns = (ox + 1) // 2 if self._mirror_x else ox
         self._share = np.empty((oy, ox))
-        self._entered = builder.lenslets.incident(
-            *(a.ravel() for a in np.indices((oy, ox)))
-        ).reshape(oy, ox)
         self._energies = builder.lenslets.on_superpixel(sy, sx)
         # a cache line of points at a time; where columns differ in length, fewer,
         # for threads to share
@@ -420,9 +434,10 @@ class _OneSuperpixel:
             stop - start, count, *pixels
         ).transpose(2, 3, 1, 0)
 
-    def complete(self) -> None:
+    def complete(self) -> np.ndarray:
         """Fill in what symmetry gives, once all parts are there.
 
+        Returns the share of the light of each point (row, column) on this superpixel.
         Raises NumericsError as PifBuilder.columns.
         """
         planes, share, rows, columns = self._planes, self._share, self._rows, self._columns
@@ -435,7 +450,8 @@ class _OneSuperpixel:
         if self._mirror_x:
             planes[:, :, :, columns:] = planes[:, ::-1, :, : ox - columns][:, :, :, ::-1]
             share[:, columns:] = share[:, : ox - columns][:, ::-1]
-        self._builder.require_light(share, self._entered, *np.indices((oy, ox)))
+        self._builder.require_all_light(share)
+        return share
 
 
 def build_pif(

@@ -38,6 +38,9 @@ def sensor_nodes(
     Returns (positions from the superpixel's centre (count, pixel) m, weights (count, pixel) m).
     """
     t, w = band_rule(count, rule)
+    if geometry.borders is not None:
+        low, high = geometry.pixel_spans(axis, place)
+        return (low + high) / 2 + (high - low) / 2 * t[:, None], (high - low) / 2 * w[:, None]
     half = geometry.pixel_active / 2
     return half * t[:, None] + (
         geometry.pixels(axis) + geometry.window_shift(axis, place)

@@ -9,6 +9,7 @@ everything, without separable terms.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -17,15 +18,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.forward.camera.quadrature import band_rule, gauss, nodes_for, opening_weights
-from plenocli.forward.propagation.fresnel.array_to_sensor import lenslet_kernel
+from plenocli.forward.propagation.fresnel.array_to_sensor import lenslet_kernel, sensor_nodes
 from plenocli.forward.propagation.fresnel.spread_function import legendre, sampled_field
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
-CHEAP, AFFORDED = 5e8, 1e9
+CHEAP, AFFORDED = 3e8, 6e8
 """Complex multiplications that a trial may take, and one of few points."""
+NEAR = 2
+"""Rings of lenslets around those under a point's blur whose fields are tried together: farther ones
+bring little light.
+"""
 FEW, LINES = 3, 8
 """Points that a trial should have, and the most lines of points along an axis."""
 VALUES = 1 << 22
@@ -80,6 +85,8 @@ def trial_columns(
     symmetric: whether pupil and wavefront are mirrored by both axes.
     """
     lens = camera.main_lens
+    if window is not None:
+        window = min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
     return _tried(
         _Hashed(camera, (lens.samples("aperture_image"), lens.samples("wavefront"))),
         geometry,
@@ -110,13 +117,13 @@ class _Hashed:
 def _tried(
     hashed: _Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
 ) -> TrialColumns | None:
-    # lenslets farther off bring little light
-    for near in [None] if window is None else range(window, 0, -1):
-        trial = _Trial(geometry, grid, near, symmetric)
+    # fewer lenslets and superpixels where that is too much
+    for near, beside in product([None] if window is None else range(window, 0, -1), (1, 0)):
+        trial = _Trial(geometry, grid, near, symmetric, beside)
         points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
         if points and trial.values <= VALUES:
             light, fringes = trial.columns(hashed.camera, points)
-            whole = near == window and len(points) == len(trial.points) and trial.whole
+            whole = len(points) == len(trial.points) and trial.whole
             return TrialColumns(light=light, fringes=fringes, whole=whole)
     return None
 
@@ -131,10 +138,20 @@ class _Trial:
     """Nodes on lenslets and pixels of one trial."""
 
     def __init__(
-        self, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+        self,
+        geometry: Geometry,
+        grid: tuple[int, int],
+        window: int | None,
+        symmetric: bool,
+        beside: int,
     ) -> None:
+        """`beside`: superpixels on either side of those under the blur that are looked at."""
         g = geometry
-        self.geometry, self.places = g, list(g.places(grid))
+        self.geometry = g
+        seen = math.ceil(g.blur / (2 * g.D2)) + beside + 0.01
+        # the points that symmetry leaves light superpixels on their own side
+        other = 0.51 if symmetric and g.blur == 0 else seen
+        self.places = [p for p in g.places(grid) if -seen <= min(p) and max(p) <= other]
         self.products = None if window is None else g.neighbourhood(window)
         lit = 0.0 if window is None else max(g.reach(grid, window))
         away = 0.0 if window is None else lit + max(g.reach(grid))
@@ -244,10 +261,7 @@ class _Trial:
         key = axis, place, *positions
         if key not in kept:
             g = self.geometry
-            t, w = gauss(self.degrees)
-            half = g.pixel_active / 2
-            middle = g.pixels(axis) + g.window_shift(axis, place)
-            v, wv = (middle[:, None] + half * t).ravel(), np.tile(half * w, len(middle))
+            v, wv = (a.T.ravel() for a in sensor_nodes(g, axis, self.degrees, place))
             x = g.lenslet_extent[axis] * gauss(self.count)[0]
             kept[key] = np.hstack([lenslet_kernel(g, n - place, v, wv, x) for n in positions])
         return kept[key]

@@ -30,8 +30,10 @@ def pixel_operator(geometry: Geometry, band: HarmonicBand, real: np.dtype) -> cs
     few = [(n + 1) // 2 if m else n for n, m in zip(g.pixel_shape, mirrored)]
     y, x = (sensor_nodes(g, axis, band.pixel_nodes, 0.0, band.pixel_rule) for axis in (0, 1))
     at = [a[0][:, :n].T for a, n in zip((y, x), few)]
-    weight = np.outer(y[1][:, 0], x[1][:, 0])
-    lines = [_line(band, at[0][i], at[1], weight, real) for i in range(few[0])]
+    # pixels at the border of overlapping windows are narrower
+    down, across = (a[1][:, :n].T for a, n in zip((y, x), few))
+    weights = down[:, None, :, None] * across[:, None, :]
+    lines = [_line(band, at[0][i], at[1], weights[i], real) for i in range(few[0])]
     quadrant = vstack(lines, format="csr")
     parts, order = [], []
     for flip_y in (False, True)[: 1 + mirrored[0]]:
@@ -51,7 +53,7 @@ def _line(
     """The operator of a row of pixels.
 
     y: (node,), x: (pixel, node) m;
-    weight: (row node, column node) m^2.
+    weight: (pixel, row node, column node) m^2.
     """
     from scipy.sparse import csr_matrix
 
@@ -63,7 +65,7 @@ def _line(
     along = tap_weights((radius - inner).ravel(), band.taps, band.finer[0])
     around = tap_weights((angle - before).ravel(), band.taps, band.finer[1])
     value = along[:, :, None] * around[:, None, :]
-    value *= np.broadcast_to(weight, shape).reshape(-1, 1, 1)
+    value *= weight.reshape(-1, 1, 1)
     # sums over a pixel's nodes: on a patch of the raster about it, as wide as the widest
     turned = (before - before[:, :1] + band.angles // 2) % band.angles - band.angles // 2
     low, left = inner.min(axis=1, keepdims=True), turned.min(axis=1, keepdims=True)

@@ -201,12 +201,9 @@ class RayLenslets(LensletFields):
         g = self.geometry
         points, where = np.unique(points, return_inverse=True)
         u0 = g.points(axis)[points] + g.z2 * self._tilt[axis]
-        pixel = place * g.superpixel_pitch + g.window_shift(axis, place) + g.pixels(axis)
-        half = g.pixel_active / 2
-        edges = (
-            np.r_[pixel[0] - half, pixel + half]
-            if self._joined
-            else np.stack([pixel - half, pixel + half], -1).ravel()
+        low, high = g.pixel_spans(axis, place)
+        edges = place * g.superpixel_pitch + (
+            np.r_[low[0], high] if self._joined else np.stack([low, high], -1).ravel()
         )
         t = edges - (g.z3 * g.kappa * u0 + m * g.D2 * g.z3 / g.f2)[:, None]
         opening = np.array([-1, 1]) * g.lenslet_extent[axis] + m * g.D2 - u0[:, None]

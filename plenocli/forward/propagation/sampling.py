@@ -68,6 +68,10 @@ OTHERS = 1.2, 3.0
 """By how much columns may be worse than those tried say, the latter where a pixel takes in many
 fringes (found: at most 4.6, which the margin of the nodes' choice covers).
 """
+TRIED_CUT_EFFECT = 0.06
+"""The same where columns were tried, whose cut is for the dimmest point: with it what is said is
+within a factor of ten of 95 % of 349 foreign cameras' errors, with PSF_CUT_EFFECT of 87 %.
+"""
 NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
 over the spread function's cut.
@@ -221,6 +225,8 @@ def size_band(
             many = joint > FEW_FRINGES[0]
             weight = 1.0 if tried.whole and not many else OTHERS[many]
             error = tried.error if trial else partial(_worse, tried.error, fringes)
+        if tried is not None:
+            errors = [TRIED_CUT_EFFECT * tolerance]
         nodes, rule = _required(_fewest(error, accuracy / weight), joint)
         errors.append(weight * error(nodes, rule))
     root = min(1.0, math.sqrt(faintest / BRIGHT))

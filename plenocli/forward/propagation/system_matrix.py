@@ -22,6 +22,7 @@ from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.bands import band_fields
 from plenocli.forward.propagation.models import model_named
+from plenocli.forward.propagation.sampling import PSF_CUT_EFFECT
 from plenocli.forward.propagation.symmetry import (
     Turn,
     fill_below_diagonal,
@@ -168,7 +169,8 @@ class PifBuilder:
                 self.lenslets = band_fields(model, camera, self.geometry, plan, band)
             else:
                 self.lenslets = model.fields(camera, self.geometry, plan, band)
-        self._sampling = band.sampling
+        # a column's energy, and the light that enters, are known to this
+        self._sampling = max(band.sampling, PSF_CUT_EFFECT * band.spread_cut / band.faintest)
         self._entered: np.ndarray | None = None
         self.notes: FieldNotes = self.lenslets.notes
         self.pixel_shape, self.object_shape = self.geometry.pixel_shape, self.geometry.object_shape

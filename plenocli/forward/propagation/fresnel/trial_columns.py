@@ -43,7 +43,7 @@ KEPT = 16
 class TrialColumns:
     """Columns of a few points of a camera.
 
-    light: (column,) share of a point's light that enters the lenslets;
+    light: (column,) share of a point's light on the superpixels looked at;
     fringes: (column, degree, degree) Gram matrices, over all pixels and over the column's squared
         norm, of the Legendre coefficients of the light within a pixel, both axes together;
     whole: whether they are all columns that symmetry does not give.
@@ -206,7 +206,6 @@ class _Trial:
             products = self.products or [(np.array([place[0]]), np.array([place[1]]))]
             if entered is None or self.products is None:
                 entered = [self._entering(camera, lenslets, at) for lenslets in products]
-                light += sum(share for _, share in entered)
             for n in range(len(at)):
                 field: np.ndarray | int = 0
                 for lenslets, (fields, _) in zip(products, entered):
@@ -222,6 +221,7 @@ class _Trial:
                 series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
                 gram[n] += series @ series.T
                 norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
+                light[n] += float(energy.sum())
         return light, gram / norm[:, None, None]
 
     def _entering(

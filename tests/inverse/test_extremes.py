@@ -163,3 +163,18 @@ def test_without_light_or_with_wrong_numbers_there_is_a_named_refusal():
     with pytest.raises(NumericsError, match="noise"):
         lmmse.prepare(good, np.zeros(3), np.eye(3), 0.0)
     assert np.isnan(spectral.demultiplex(np.ones((5, 2)), np.ones((3, 5)), "pinv")[0]).all()
+
+
+@pytest.mark.slow
+def test_a_real_matrix_of_condition_1e12_and_captures_at_the_extremes():
+    """2704 pixels, 1600 points: equations are solved as well as arithmetic allows, and estimates of
+    what a capture may hold at worst are finite.
+    """
+    a = extremes.real_matrix()
+    assert 1e11 < np.linalg.cond(a) < 1e13
+    for name, y in extremes.captures(a).items():
+        for found in (extremes.tikhonov(a, y, 1e-12), extremes.truncated(a, y)):
+            assert found < MOST, name
+        scale = max(np.abs(y).max(), 1e-300)
+        for x in (nnls.projected_gradient(a, y, 5).x, extremes.wiener(a, y, 1e-3 * scale)[0]):
+            assert np.isfinite(x).all(), name

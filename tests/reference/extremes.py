@@ -5,14 +5,19 @@ As in LAPACK's tests, a backward stable method stays below about 30: |residual| 
 |A| (|A| |x| + |y|)).
 """
 
+from pathlib import Path
+
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.files.config.camera_file import load_camera
+from plenocli.forward.accuracy.dial import system_matrix
 from plenocli.inverse.picture.solvers import least_squares as linear
 from plenocli.inverse.picture.solvers import lmmse, nnls
 from plenocli.inverse.sparse.l1.solve import sparse_code
 from plenocli.inverse.spectra import demultiplex as spectral
 
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_configs"
 EPS = np.finfo(float).eps
 SIZES = ((1, 1), (2, 1), (3, 2), (5, 3), (4, 4), (11, 10), (50, 50), (60, 17))
 CONDITIONS = tuple(10.0**k for k in range(0, 17, 2))
@@ -122,6 +127,38 @@ def wiener(a, y, sigma):
     return lmmse.prepare(linear.decompose(a), np.full(a.shape[1], 0.4), covariance, sigma).adaptive(
         y
     )
+
+
+def real_matrix():
+    """A (2704, 1600) of an isolated lenslet of seed_spatial in double precision: condition 1e12."""
+    camera = load_camera(SAMPLES / "seed_spatial.toml")
+    request = dict(superpixels=(1, 1), coherent_ring=0, model="fresnel")
+    return system_matrix(camera, accuracy=1e-8, dtype=np.float64, **request).A[0, 0]
+
+
+def captures(a, count=2):
+    """Name -> superpixels (pixel, lenslet) at the extremes of what a capture may hold."""
+    rng = np.random.default_rng(5)
+    clean = a @ rng.random((a.shape[1], count))
+    noise = np.sqrt(np.mean(clean**2)) * rng.normal(size=clean.shape)
+    hot = clean.copy()
+    hot[len(hot) // 2] = 1e6 * clean.max()
+    return {
+        "60 dB": clean + 1e-3 * noise,
+        "-40 dB": clean + 100 * noise,
+        "all zero": 0 * clean,
+        "one hot pixel": hot,
+        "1e150": 1e150 * clean,
+    }
+
+
+def real_table():
+    """Markdown: what answers by the real matrix violate of their equations, by capture."""
+    a = real_matrix()
+    rows = ["| capture | Tikhonov, 1e-12 | truncated |", "|---|---|---|"]
+    for name, y in captures(a).items():
+        rows.append(f"| {name} | {tikhonov(a, y, 1e-12):.2g} | {truncated(a, y):.2g} |")
+    return "\n".join(rows)
 
 
 def table(conditions=CONDITIONS, sizes=SIZES):

@@ -24,6 +24,8 @@ from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, Su
 from plenocli.forward.sensor.noise import Noise
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
+FURTHEST = 1e100
+"""Of the largest value of a capture from 1, in either direction."""
 _CFA = re.compile(r"mono|[RGB]{4}")
 
 
@@ -67,6 +69,13 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
             f"holds {int((~np.isfinite(found.mosaic)).sum())} values that are NaN or infinite",
             path,
             "make it again",
+        )
+    loudest = max(abs(float(found.mosaic.max())), abs(float(found.mosaic.min())))
+    if loudest and not 1 / FURTHEST < loudest < FURTHEST:
+        raise InputError(
+            f"has values up to {loudest:.3g}, whose squares no number holds",
+            path,
+            "divide it by its white level; a unit changes nothing else",
         )
     return found
 

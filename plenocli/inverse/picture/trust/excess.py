@@ -87,6 +87,8 @@ def _contrasts(power: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarra
 
 def _running_mean(values: np.ndarray) -> np.ndarray:
     """Means of TOGETHER values in a row, as many as come out where there are fewer."""
+    if not len(values):
+        return values
     half = TOGETHER // 2
     padded = np.pad(values, half, mode="edge")
     return np.convolve(padded, np.full(2 * half + 1, 1 / (2 * half + 1)), "valid")

@@ -42,15 +42,18 @@ def steady_rest(svd: Svd, y: np.ndarray, sigma: float) -> float:
     y: (pixel, signal) superpixels.
     sigma: noise of a pixel.
     """
-    bright = svd.s * svd.vt.sum(axis=1)
-    energy = float(np.sum(y**2)) / y.shape[1] / float(bright @ bright) * svd.vt.shape[1]
+    even = svd.s * svd.vt.sum(axis=1)
+    energy = float(np.sum(y**2)) / y.shape[1] / float(even @ even) * svd.vt.shape[1]
     reached = svd.u[:, : min(svd.rank(1e-6), int(np.count_nonzero(svd.s**2 * energy > sigma**2)))]
     rest = y - reached @ (reached.T @ y)
-    weighted = rest * y.sum(axis=0)
+    bright = y.sum(axis=0)
+    weighted = rest * bright
     each = np.sum(weighted**2, axis=0)
     total = weighted.sum(axis=1)
     common = float(total @ total) - float(each.sum())
     left = max(len(svd.u) - reached.shape[1], 1)
+    # light far below the noise that is stated says nothing, however clean it is
+    each = np.maximum(each, left * sigma**2 * bright**2)
     chance = 2 * (float(each.sum()) ** 2 - float(each @ each)) / left
     return common / np.sqrt(chance) if chance > 0 else 0.0
 

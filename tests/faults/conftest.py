@@ -71,6 +71,11 @@ def make_all(folder, runner):
     fit = ["fit-camera", "capture.h5", "--camera", "camera.toml", "--details", "fit.h5"]
     outcome = runner.run([*fit, "-o", "fitted.toml"], folder, limit=120)
     assert outcome.code == 0, outcome.text
+    (folder / "near.toml").write_text('depth = ["545 mm", "555 mm"]\n')
+    pif = ["simulate-pif", "camera.toml", "--scene", "near.toml", "--accuracy", "0.05"]
+    pif += ["--superpixels", "1x1", "--coherent-ring", "0"]
+    outcome = runner.run([*pif, "-o", "stack.h5"], folder, limit=120)
+    assert outcome.code == 0, outcome.text
     write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
     (folder / "done").touch()
 

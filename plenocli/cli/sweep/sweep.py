@@ -40,10 +40,10 @@ def command(
     keys of it and of the stages' options that vary (a grid, a Latin hypercube or a list), and what
     counts as better.
 
-    OUT is a table (.h5), with the same as .csv beside it and the points that no other beats marked;
-    OUT's .measured.csv has the processor seconds of each stage, which differ from run to run.
+    OUT is a table (.h5), with the same as .csv beside it and the points that no other beats marked.
     Finished points are kept in OUT's folder .parts: a run that was stopped goes on where it was,
-    and one with more values computes only those. A camera that a stage refuses is a
+    and one with more values computes only those; measured.csv there has the processor seconds of
+    each stage, which differ from run to run. A camera that a stage refuses is a
     row with the reason.
 
     \b

@@ -1,5 +1,5 @@
 """Processor seconds of the points of a sweep: measured, and so in a file of their own beside the
-table, which is the same on every run.
+table, which is the same on every run: among the parts of the sweep.
 """
 
 import csv
@@ -16,7 +16,7 @@ NOT_INVERTED = ("capture-sim cpu_s", "score cpu_s")
 
 def measured_path(table: Path) -> Path:
     """Where the seconds of a table lie."""
-    return table.with_suffix(".measured.csv")
+    return table.with_suffix(".parts") / "measured.csv"
 
 
 def read_measured(table: Path, points: int) -> Mapping[str, np.ndarray] | None:

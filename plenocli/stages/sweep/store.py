@@ -18,7 +18,6 @@ from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost, Pool
-from plenocli.files.results.measured_seconds import measured_path
 from plenocli.stages.sweep.point import run_capture, run_matrix, run_point
 from plenocli.stages.sweep.task import (
     Job,
@@ -58,8 +57,7 @@ def open_store(
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".h5",))
     folder = output.with_suffix(".parts")
     again = overwrite or folder.is_dir()  # what an unfinished run left is ours
-    for beside in (output.with_suffix(".csv"), measured_path(output)):
-        check_output(beside, overwrite=again, inputs=inputs)
+    check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs)
     if plot is not None:
         if find_spec("matplotlib") is None:
             raise UsageError(

@@ -228,7 +228,7 @@ def finish(
         _csv(points, table).encode(),
         overwrite=store.again,
     )
-    publish(measured_path(store.output), _measured(points).encode(), overwrite=store.again)
+    publish(measured_path(store.output), _measured(points).encode(), overwrite=True)
     if store.plot is not None and not table.ahead.any():
         note("no point has all figures of the front: there is nothing to draw")
     elif store.plot is not None:

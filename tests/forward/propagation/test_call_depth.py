@@ -15,12 +15,12 @@ MOST_FRAMES, MOST_FILES = 5, 3
 
 
 def frames_up():
-    """(file, function) of the package's frames from the caller up to run_simulate_pif, without
-    it.
-    """
+    """(file, function) of the package's frames from the caller up to the stage, without it."""
     frame, found = sys._getframe(1), []
-    while frame is not None and frame.f_code.co_name != "run_simulate_pif":
+    while frame is not None:
         file = Path(frame.f_code.co_filename)
+        if file.name == "simulate_pif.py":
+            break
         if file.is_relative_to(PACKAGE):
             found.append((file.name, frame.f_code.co_name))
         frame = frame.f_back

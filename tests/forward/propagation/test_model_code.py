@@ -49,7 +49,7 @@ def changed(code, copy, file, old, new):
             "total += 1.1 * weight * part",
             NAMES,
         ),
-        (f"{PROPAGATION}/sampling.py", "NARROWING_LOSS = 2.0", "NARROWING_LOSS = 20.0", NAMES[:4]),
+        (f"{PROPAGATION}/sampling.py", "NARROWING_LOSS = 2.0", "NARROWING_LOSS = 20.0", NAMES),
         (
             f"{PROPAGATION}/fresnel/square.py",
             "TERM_VALUES = 1 << 21",

@@ -50,6 +50,10 @@ SURE, HINT = 4.0, 2.5
 """Standard deviations of chance from which on noise found over the capture's own speaks against the
 matrix by itself, and from which on beside a picture that may not go on across borders.
 """
+STEADY = 5.0
+"""Standard deviations from which on light that goes with brightness speaks against the matrix by
+itself: what a noisy white image leaves has 4.7.
+"""
 CHANCE = 1.0
 """Standard deviation of chance that a factor is allowed, times, where nothing else is found."""
 LEAST_PAIRS = 8
@@ -130,7 +134,7 @@ def believe(
         and quiet
         and _scene_jumps(estimators.svd, lmmse, stacked, level, first)
     )
-    if not found and steady <= SURE and (continuous or rough):
+    if not found and steady <= STEADY and (continuous or rough):
         return Belief(
             level=level,
             lmmse=lmmse,

@@ -80,13 +80,13 @@ class Runner:
 
 
 def tree(folder):
-    """Relative path -> bytes of every file below a folder, but for the journal that a
+    """Relative path -> bytes of every file below a folder, but for the journal and seconds that a
     sweep keeps on purpose.
     """
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in sorted(Path(folder).rglob("*"))
-        if p.is_file() and p.name != "points.jsonl"
+        if p.is_file() and p.name not in ("points.jsonl", "measured.csv")
     }
 
 

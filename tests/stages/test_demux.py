@@ -167,6 +167,40 @@ def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files,
         )
 
 
+def test_a_band_without_values_is_counted_where_it_is(files, tmp_path, capsys):
+    """A white reference that is dark in one band tells no reflectance there, and of the others all
+    is said.
+    """
+    dark = capture(tmp_path / "dark.h5", [1.0, 0.0], 30)
+    out = tmp_path / "s.h5"
+    words = ["--calibration", str(files["calibration"]), "--reference", str(dark), "-o", str(out)]
+    assert run(["demux", str(files["shots"][0]), *words]) == 0
+    value = read_artefact(out, "spectra").data["spectra/value"]
+    known = np.isfinite(value).sum(axis=(1, 2))
+    assert known[0] == COUNT**2 > known[1]
+    line = capsys.readouterr().out
+    assert f"lenslets with a value: 480 nm {known[0]}, 620 nm {known[1]}" in line
+    assert f"behind {np.isfinite(value).all(axis=0).sum()} lenslets" in line
+
+
+def test_lmmse_without_known_light_is_refused(files, tmp_path):
+    """The calibration's white is dark in one band."""
+    found = read_artefact(files["calibration"], "calibration")
+    response, white = found.data["response/F"], found.data["response/white"]
+    less = response[..., 0] - 0.01 * response[..., 1]
+    found.data["response/white"] = np.broadcast_to(less, white.shape).copy()
+    write_artefact(tmp_path / "c.h5", found)
+    words = ["--calibration", str(tmp_path / "c.h5"), "--method", "lmmse"]
+    with pytest.raises(NumericsError, match="does not tell"):
+        run_demux(
+            [files["shots"][0]],
+            tmp_path / "s.h5",
+            calibration=tmp_path / "c.h5",
+            settings=Settings("lmmse"),
+        )
+    assert run(["demux", str(files["shots"][0]), *words, "-o", str(tmp_path / "s.h5")]) == 5
+
+
 def test_captures_of_another_kind_are_refused(files, tmp_path):
     def attempt(path, match):
         with pytest.raises(InputError, match=match):

@@ -109,6 +109,10 @@ def command(
             f"{one.output}: {one.quantity} in {len(one.bands_nm)} bands behind "
             f"{one.lenslets} lenslets, {one.method} ({one.reason})"
         )
+        if min(one.known) < max(one.known):
+            line += "; lenslets with a value: " + ", ".join(
+                f"{nm:.4g} nm {count}" for nm, count in zip(one.bands_nm, one.known)
+            )
         registration = one.registration
         if registration and registration.motion and registration.corrected:
             line += (

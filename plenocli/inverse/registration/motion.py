@@ -49,7 +49,7 @@ class Motion:
     offset: that all pixels share, in the values' unit; NaN sigma where no pixel of a superpixel
         tells it from light.
     stray: light that the calibration does not know, spread over superpixels, in shares of their
-        mean light.
+        mean light; below zero by no more than the calibration's darkest pixel has.
     sigma: (3,), standard deviations of row shift, column shift and offset.
     stray_sigma: of `stray`, NaN where all lenslets are alike.
     before, after: mean square of the residual over the expected one, median over the lenslets used,
@@ -168,6 +168,13 @@ class _LensletSample:
     def smooth(self) -> SmoothResponses:
         return self.reference.smooth(self.which)
 
+    @cached_property
+    def least_stray(self) -> float:
+        """Light cannot be below zero: what the darkest pixel of the calibration has, taken off."""
+        typical = np.nanmean(self.response, axis=0, dtype=float).sum(axis=-1)
+        typical = typical[own_pixels(self.window) & np.isfinite(typical)]
+        return -max(0.0, float(typical.min() / typical.mean())) if len(typical) else 0.0
+
     def values(self, whole: np.ndarray) -> np.ndarray:
         """Values (lenslet, pixel) of windows moved by whole pixels, NaN at their borders."""
         from plenocli.forward.sensor.superpixel import extract
@@ -220,7 +227,7 @@ class _LensletSample:
             normal, right, chi, product = self._equations(shifts, arms)
             if turn == 0:
                 before = chi
-            solved, spread = _solve(normal, right)
+            solved, spread = _solve(normal, right, self.least_stray)
             step = solved[: q.size].reshape(q.shape)
             length = np.abs(arms @ step.T).max()
             q = q + step / max(1.0, length)
@@ -347,20 +354,36 @@ def _chi_after(product: np.ndarray, chi: np.ndarray, step: np.ndarray) -> np.nda
     return chi * (1 - gain / np.maximum(product[:, 4, 4], 1e-300))
 
 
-def _solve(normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve(
+    normal: np.ndarray, right: np.ndarray, least: float = -np.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """Solution and standard deviations; what the data do not tell is 0 with deviation NaN:
-    stray before offset.
+    stray before offset. Stray is at least `least`, to which the others then go.
     """
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    spread, solved = np.full(len(right), np.nan), np.zeros(len(right))
+    spread, solved = np.full((2, len(right)), [[np.nan], [0.0]])
     keep = list(range(len(right)))
     for drop in (None, len(right) - 1, len(right) - 2):
         if drop is not None:
             keep.remove(drop)
-        unit = normal[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
-        if np.linalg.cond(unit) < 1e4:
+        if np.linalg.cond(_unit(normal, scale, keep)) < 1e4:
             break
-    inverse = np.linalg.pinv(unit)
-    solved[keep] = inverse @ (right[keep] / scale[keep]) / scale[keep]
-    spread[keep] = np.sqrt(np.maximum(np.diag(inverse), 0)) / scale[keep]
+    solved[keep], spread[keep] = _solved(normal, right, scale, keep)
+    if solved[-1] < least:
+        solved[-1] = least
+        keep.remove(len(right) - 1)
+        solved[keep], spread[keep] = _solved(normal, right - least * normal[-1], scale, keep)
     return solved, spread
+
+
+def _unit(normal: np.ndarray, scale: np.ndarray, keep: list[int]) -> np.ndarray:
+    return normal[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
+
+
+def _solved(
+    normal: np.ndarray, right: np.ndarray, scale: np.ndarray, keep: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solution and standard deviations of the unknowns `keep`, the others being 0."""
+    inverse = np.linalg.pinv(_unit(normal, scale, keep))
+    value = inverse @ (right[keep] / scale[keep]) / scale[keep]
+    return value, np.sqrt(np.maximum(np.diag(inverse), 0)) / scale[keep]

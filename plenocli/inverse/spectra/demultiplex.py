@@ -89,7 +89,7 @@ def noise_variance(
     radiance: (..., band), the expected one, not the outcome of a noisy pixel; negative parts count
         as zero.
     noise: of the signal, with that of the rounding.
-    response_variance: (..., pixel, band) or (band,), adds b^2 var(F).
+    response_variance: (..., pixel, band) or (band,), adds b^2 var(F); its leading axes broadcast.
 
     Returns (..., pixel), units^2.
     """
@@ -97,10 +97,9 @@ def noise_variance(
     mean = (np.nan_to_num(response) @ radiance[..., None])[..., 0]
     variance = np.asarray(noise.variance(mean))
     if response_variance is not None:
-        spread = np.broadcast_to(
-            np.nan_to_num(response_variance),
-            response.shape[-2:] if np.ndim(response_variance) < 3 else response.shape,
-        )
+        spread = np.nan_to_num(response_variance)
+        if spread.ndim < 2:
+            spread = np.broadcast_to(spread, response.shape[-2:])
         variance = variance + (spread @ (radiance**2)[..., None])[..., 0]
     return variance
 

@@ -148,8 +148,15 @@ def estimate(
         band's, unknowns of their own for all methods but single pixel.
 
     Returns Spectra, of the quantity radiance.
-    Raises NumericsError where the method needs the noise, or no lenslet can be demultiplexed.
+    Raises NumericsError where the method needs the noise or a prior that there is none of, or no
+        lenslet can be demultiplexed.
     """
+    if method == "lmmse" and prior is None:
+        raise NumericsError(
+            "lmmse needs to know the light in every band, which the calibration's white does not "
+            "tell",
+            fix="use wls or pinv",
+        )
     widened, prior = _with_stray(c, stray, prior, values)
     job = _Estimation(c=c, widened=widened, prior=prior, values=values, noise=noise, ratio=ratio)
     if noise is None:

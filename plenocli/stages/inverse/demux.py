@@ -52,9 +52,11 @@ class CaptureSummary:
     capture, output: file names.
     method, reason, registration, warning: plenocli.inverse.spectra.spectra.Trace.
     quantity: "radiance" or "reflectance".
-    lenslets: how many have a spectrum.
+    lenslets: how many have a value in every band.
     array: rows and columns of lenslets.
-    bands_nm, mean, sigma: (band,), mean value and standard deviation; sigma None: unknown.
+    bands_nm: (band,) nm.
+    known: (band,), how many lenslets have a value.
+    mean, sigma: (band,), over those, mean value and standard deviation; None: unknown.
     """
 
     capture: str
@@ -67,8 +69,9 @@ class CaptureSummary:
     lenslets: int
     array: list[int]
     bands_nm: list[float]
-    mean: list[float]
-    sigma: list[float] | None
+    known: list[int]
+    mean: list[float | None]
+    sigma: list[float | None] | None
 
     def as_json(self) -> dict[str, Any]:
         """The entry of --json."""
@@ -330,8 +333,8 @@ class CaptureDemultiplexer:
 
 
 def _capture_summary(found: Spectra, capture: Name, target: Name) -> CaptureSummary:
-    value, sigma = (np.moveaxis(part, 0, -1) for part in (found.value, found.sigma))
-    seen = np.isfinite(value).all(axis=-1)
+    seen = np.isfinite(found.value)
+    sigma = _means(found.sigma)
     return CaptureSummary(
         capture=Path(capture).name,
         output=str(target),
@@ -340,11 +343,16 @@ def _capture_summary(found: Spectra, capture: Name, target: Name) -> CaptureSumm
         registration=found.trace.registration,
         warning=found.trace.warning,
         quantity=found.quantity,
-        lenslets=int(seen.sum()),
-        array=list(value.shape[:2]),
+        lenslets=int(seen.all(axis=0).sum()),
+        array=list(found.value.shape[1:]),
         bands_nm=[float(w * 1e9) for w in found.wavelength],
-        mean=[float(v) for v in value[seen].mean(axis=0)],
-        sigma=[float(v) for v in np.nanmean(sigma[seen], axis=0)]
-        if np.isfinite(sigma[seen]).any()
-        else None,
+        known=[int(n) for n in seen.sum(axis=(1, 2))],
+        mean=_means(found.value),
+        sigma=sigma if any(one is not None for one in sigma) else None,
     )
+
+
+def _means(values: np.ndarray) -> list[float | None]:
+    """Mean of the known values of each band, None where there is none."""
+    known = [band[np.isfinite(band)] for band in values]
+    return [float(band.mean()) if band.size else None for band in known]

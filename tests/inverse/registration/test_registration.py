@@ -166,6 +166,26 @@ def test_a_diffuse_leak_of_another_size_is_seen_as_stray_light(truth, leak):
     assert motion.strayed and np.sign(motion.stray) == np.sign(leak - 0.05) and not motion.moved
 
 
+def test_stray_light_below_zero_is_not_believed(truth):
+    """A capture darker in the dark and as bright elsewhere, of a calibration that is dark there:
+    free stray light explains it by -0.1.
+    """
+    from plenocli.inverse.registration.motion import _solve
+
+    signal, response = capture(truth, 0.0, 9), calibrated()
+    level = signal[FRAME:-FRAME, FRAME:-FRAME].reshape(ROWS, PITCH, COLUMNS, PITCH)
+    less = 0.1 * level.mean(axis=(1, 3), keepdims=True) * np.ones_like(level)
+    signal[FRAME:-FRAME, FRAME:-FRAME] -= less.reshape(ROWS * PITCH, -1)
+    motion = find_motion(signal, response, "mono", NOISE)
+    assert motion.stray > -0.03  # of what the gaps between the cells have
+    normal, right = np.diag([1.0, 2.0, 3.0, 4.0]) + 0.2, np.array([0.3, 0.1, 0.2, -0.9])
+    free, bound = _solve(normal, right)[0], _solve(normal, right, -0.01)[0]
+    np.testing.assert_allclose(free, np.linalg.solve(normal, right))
+    assert free[-1] < -0.2 and bound[-1] == -0.01
+    rest = np.linalg.solve(normal[:3, :3], right[:3] + 0.01 * normal[:3, 3])
+    np.testing.assert_allclose(bound[:3], rest)
+
+
 def test_without_noise_figures_the_motion_is_found_too(truth):
     motion = find_motion(capture(truth, (0.4, -0.2), 10), calibrated())
     np.testing.assert_allclose(motion.shift, (0.4, -0.2), atol=0.01)

@@ -173,7 +173,8 @@ class _LensletSample:
         """Light cannot be below zero: what the darkest pixel of the calibration has, taken off."""
         typical = np.nanmean(self.response, axis=0, dtype=float).sum(axis=-1)
         typical = typical[own_pixels(self.window) & np.isfinite(typical)]
-        return -max(0.0, float(typical.min() / typical.mean())) if len(typical) else 0.0
+        lit = len(typical) and typical.mean() > 0
+        return -max(0.0, float(typical.min() / typical.mean())) if lit else 0.0
 
     def values(self, whole: np.ndarray) -> np.ndarray:
         """Values (lenslet, pixel) of windows moved by whole pixels, NaN at their borders."""

@@ -22,8 +22,8 @@ the axis).
 
 
 def pupil_points(camera, wavelength, reach, density=1.0):
-    """Nodes of a round or square pupil and weights A(xi) d^2 xi/sqrt(integral of A^2):
-    (y, x, weight).
+    """Nodes of a round or square pupil, weights A(xi) d^2 xi/sqrt(integral of A^2) and the
+    wavefront error there, none: (y, x, weight, m).
 
     reach: m on the array between an image point and where its field is wanted.
     """
@@ -43,13 +43,52 @@ def pupil_points(camera, wavelength, reach, density=1.0):
         y, x = np.outer(r, np.sin(phi)).ravel(), np.outer(r, np.cos(phi)).ravel()
         weight = np.repeat(w * r, turns) * 2 * np.pi / turns
     size = (z * z / (z * z + y * y + x * x)) ** (PUPIL_AMPLITUDE[lens.apodisation] / 2)
-    return y, x, weight * size / np.sqrt((weight * size**2).sum())
+    return y, x, weight * size / np.sqrt((weight * size**2).sum()), 0.0
+
+
+def cut_pupil(shift, azimuth, coma):
+    """As pupil_points, of a round pupil that a disc of its size cuts, and with coma in one
+    direction: a function like it.
+
+    shift: of the disc, over the pupil's radius, against the direction at `azimuth` (rad, +x to +y);
+    coma: coefficient of sqrt(8) (3 rho^3 - 2 rho) cos(theta - azimuth), m.
+    """
+
+    def points(camera, wavelength, reach, density=1.0):
+        lens, z = camera.main_lens, camera.lenslet_array.distance
+        k, radius = 2 * np.pi / wavelength, lens.aperture_diameter / 2
+        slope = density * k * (radius / z * reach + 20 * abs(coma)) / radius
+        along, weights = [], []
+        middle = -shift * radius / 2
+        for start in (-radius, (1 - shift) * radius):
+            # chords grow as a root from the tips: cosines take it off
+            size = middle - start
+            t, w = nodes(0, np.pi / 2, slope * abs(size) + 20)
+            along.append(start + size * (1 - np.cos(t)))
+            weights.append(abs(size) * np.sin(t) * w)
+        along, weights = np.concatenate(along), np.concatenate(weights)
+        side = np.maximum(np.abs(along), np.abs(along + shift * radius))
+        half = np.sqrt(np.maximum(radius**2 - side**2, 0))
+        t, w = nodes(-1, 1, slope * radius)
+        a, b = np.repeat(along, len(t)), np.outer(half, t).ravel()
+        weight = np.outer(weights * half, w).ravel()
+        y = a * np.sin(azimuth) + b * np.cos(azimuth)
+        x = a * np.cos(azimuth) - b * np.sin(azimuth)
+        power = PUPIL_AMPLITUDE[lens.apodisation]
+        size = (z * z / (z * z + y * y + x * x)) ** (power / 2)
+        r, wr = nodes(0, radius, 20 / radius)
+        whole = 2 * np.pi * (wr * r * (z * z / (z * z + r * r)) ** power).sum()
+        rho2 = (a * a + b * b) / radius**2
+        late = coma * np.sqrt(8) * (3 * rho2 - 2) * a / radius
+        return y, x, weight * size / np.sqrt(whole), late
+
+    return points
 
 
 def field_on_lenslet(camera, wavelength, image_point, y, x, pupil):
     """Field on the grid y, x of a point imaged at `image_point`: (len(y), len(x)), 1/m."""
     k, z = 2 * np.pi / wavelength, camera.lenslet_array.distance
-    py, px, weight = pupil
+    py, px, weight, late = pupil
     eps = 1 / camera.object.distance + 1 / z - 1 / camera.main_lens.focal_length
     image = 1 / (1 / z - eps)
     if abs(eps) * z < 1e-9:
@@ -61,7 +100,7 @@ def field_on_lenslet(camera, wavelength, image_point, y, x, pupil):
     )
     # lengths in turns, so that compiled sines see small numbers
     parts = (_fast_spheres if njit else _spheres)(
-        np.asarray(y), np.asarray(x), py, px, weight, before + middle, z, k
+        np.asarray(y), np.asarray(x), py, px, weight, before + middle - late, z, k
     )
     return parts * z / wavelength
 
@@ -114,6 +153,7 @@ def oblique_columns(
     density=1.0,
     pixel_nodes=6,
     shift=(0.0, 0.0),
+    pupil_of=pupil_points,
 ):
     """Energy in each pixel (of `rows`, default all) from points behind a lenslet off the axis:
     (point, row, column).
@@ -122,7 +162,8 @@ def oblique_columns(
     image_points: from the lenslet's centre, m;
     lenslets: (row, column) from it, whose fields add;
     superpixel: whose pixels are wanted, likewise;
-    shift: of their window from the chief ray, in pixels.
+    shift: of their window from the chief ray, in pixels;
+    pupil_of: its nodes, as pupil_points.
     """
     array, sensor = camera.lenslet_array, camera.sensor
     k, z = 2 * np.pi / wavelength, sensor.distance
@@ -163,7 +204,7 @@ def oblique_columns(
         for point in image_points:
             at = tuple(p + q for p, q in zip(place, point))
             reach = np.hypot(*(abs(m - a) + half for m, a in zip(middle, at)))
-            pupil = pupil_points(camera, wavelength, reach, density)
+            pupil = pupil_of(camera, wavelength, reach, density)
             fields.append(
                 field_on_lenslet(camera, wavelength, at, y + middle[0], x + middle[1], pupil)
             )

@@ -13,9 +13,10 @@ import pytest
 from plenocli.base.errors import ConfigError, InputError
 from plenocli.cli.main import run
 from plenocli.files.config.lens_file import lens_toml, load_lens, parse_lens
+from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.glass import medium
-from plenocli.forward.camera.lens import at_wavelength, first_order
+from plenocli.forward.camera.lens import first_order
 from plenocli.forward.camera.prescription import Prescription, Surface
 from plenocli.forward.camera.pupil import wavefront
 from plenocli.forward.camera.raytrace import Rays, entrance_pupil
@@ -227,7 +228,7 @@ def test_a_camera_takes_focal_shift_and_wavefront_from_its_lens_file():
     camera = camera_with_triplet()
     design = geometry(camera, 550e-9).f1
     assert design == pytest.approx(first_order(triplet(), 550e-9).focal_length, rel=1e-3)
-    red = at_wavelength(camera, 650e-9).main_lens
+    red = at_field(camera, 650e-9).main_lens
     assert red.focal_length == geometry(camera, 650e-9).f1 != design
     assert {a.noll for a in red.aberrations} == {4, 11, 22, 37, 56}
     rim = camera.main_lens.aperture_diameter / 2
@@ -250,7 +251,7 @@ def test_the_system_matrix_is_that_of_the_thin_camera_which_the_rays_give(tmp_pa
     from plenocli.files.config.camera_file import to_toml
 
     camera = camera_with_triplet(light__wavelengths=[450e-9], main_lens__aperture_diameter=4e-3)
-    resolved = at_wavelength(camera, 450e-9)
+    resolved = at_field(camera, 450e-9)
     plain = camera_with_triplet(
         light__wavelengths=[450e-9], main_lens__aperture_diameter=4e-3
     ).main_lens.model_copy(update={"prescription": None})

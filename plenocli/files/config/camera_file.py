@@ -42,6 +42,7 @@ _NUMBERS = {
     "quantum_efficiency",
     "peak",
     "blocking",
+    "transmission",
     "pixel_shift",
     "model_error",
 }

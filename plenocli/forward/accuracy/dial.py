@@ -15,6 +15,7 @@ from plenocli.base.errors import NumericsError, UsageError
 from plenocli.base.units import format_length
 from plenocli.forward.accuracy.machine_rate import product_rate
 from plenocli.forward.accuracy.scene_needs import seen_wavelengths, sensor_noise, visible_accuracy
+from plenocli.forward.camera.field import at_field, pupil_change
 from plenocli.forward.camera.geometry import chief_ray, corner_ray, lenslet_shift
 from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
@@ -219,6 +220,10 @@ class _Request:
             return (int(asked),)
         return tuple(range(1, MAX_RING + 1))
 
+    def seen(self, geometry: Geometry) -> Camera:
+        """The camera with the main lens as the lenslet sees it at the geometry's wavelength."""
+        return at_field(self.camera, geometry.wavelength, geometry.chief)
+
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """(band, lenslet, pixel, point) of the matrix."""
@@ -256,14 +261,14 @@ def _consider(request: _Request, model: Model) -> Candidate:
     that it would take.
     """
     reason = next(
-        (r for r in (model.valid_for(request.camera, v) for v in request.geometries) if r), None
+        (r for r in (model.valid_for(request.seen(v), v) for v in request.geometries) if r), None
     )
     if reason:
         return Candidate(name=model.name, model=model.kind, why=reason)
     fixed = {
         "model": 0.0
         if request.model != "auto"
-        else max(model.error_bound(request.camera, v) for v in request.geometries),
+        else max(model.error_bound(request.seen(v), v) for v in request.geometries),
         "storage": 3e-8 if request.dtype == np.float32 else 0.0,
     }
     tried = []
@@ -340,7 +345,7 @@ def _sized(
     sampling = min(max(room, 0.9 * BEST_ACCURACY), 0.5)
     try:
         bands = tuple(
-            model.size(request.camera, v, request.superpixels, ring, sampling, sampling / 2)
+            model.size(request.seen(v), v, request.superpixels, ring, sampling, sampling / 2)
             for v in _finest(request, nodes)
         )
         # single precision's rounding is of the size of the brightest points' light
@@ -348,7 +353,7 @@ def _sized(
         double = request.dtype == np.float64 or sampling * faintest < SINGLE_LIMIT
         rounding = ROUNDING[double] / (1 if double else faintest)
         costs = [
-            model.cost(request.camera, v, b, request.shape, double)
+            model.cost(request.seen(v), v, b, request.shape, double)
             for v, b in zip(request.geometries, bands)
         ]
     except NumericsError as error:
@@ -552,7 +557,7 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
 
 def _model_error(request: _Request, best: Candidate) -> float:
     model = next(m for m in MODELS if m.name == best.name)
-    error = max(model.error_bound(request.camera, v) for v in request.geometries)
+    error = max(model.error_bound(request.seen(v), v) for v in request.geometries)
     fitted = request.camera.fitted
     return error if fitted is None else math.hypot(error, fitted.model_error)
 
@@ -565,7 +570,16 @@ def _over_the_field(request: _Request) -> tuple[float, str | None]:
         return 0.0, None
     there = [replace(v, chief=request.corner) for v in request.geometries]
     parabolic = request.camera.lenslet_array.profile == "parabolic"
-    error = max(oblique_error(v, parabolic) for v in there)
+    error = min(
+        1.0,
+        max(
+            math.hypot(
+                oblique_error(v, parabolic),
+                pupil_change(request.camera, v.wavelength, request.corner),
+            )
+            for v in there
+        ),
+    )
     if error < BEST_ACCURACY:
         return 0.0, None
     angle = math.degrees(there[0].obliquity)

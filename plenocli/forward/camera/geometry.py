@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from plenocli.base.errors import ConfigError
+from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.glass import focal_length
-from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.pupil import ray_reach
 
@@ -316,7 +316,7 @@ def geometry(
     chief: (rows, columns) m from the optical axis to the object's own lenslet, as chief_ray gives
         it.
     """
-    camera = at_wavelength(camera, wavelength)
+    camera = at_field(camera, wavelength, chief)
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     design = camera.light.design_wavelength or wavelength
     f1, z1, z2 = (

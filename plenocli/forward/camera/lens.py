@@ -8,17 +8,16 @@ distances (m) from the last vertex. docs/model.md, "Real lenses".
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError
 from plenocli.forward.camera.prescription import Prescription
-from plenocli.forward.camera.pupil import unit_radius, zernike
+from plenocli.forward.camera.pupil import zernike
 from plenocli.forward.camera.raytrace import (
     Pupil,
     Rays,
@@ -29,9 +28,6 @@ from plenocli.forward.camera.raytrace import (
     to_plane,
     trace,
 )
-
-if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera
 
 # first order
 
@@ -563,64 +559,3 @@ def camera_lens(
         )
     stopped = replace(lens, stop_radius=lens.stop_radius * aperture_diameter / widest)
     return CameraLens(stopped, from_vertex, object_distance, z2)
-
-
-def at_wavelength(camera: Camera, wavelength: float) -> Camera:
-    """A camera with its lens prescription, if it names one, resolved for one wavelength.
-
-    A thin main lens of the traced focal length takes its place, whose aberrations are those of the
-    description and the traced ones together.
-
-    wavelength: m.
-
-    Raises ConfigError where main_lens.focal_length is not the prescription's, or the lens cannot be
-    used so (see camera_lens).
-    """
-    thin = camera.main_lens
-    if thin.prescription is None:
-        return camera
-    from plenocli.forward.camera.model import Aberration
-
-    focal_length, terms = _resolved(
-        thin.samples("prescription"),
-        camera.object.distance,
-        2 * unit_radius(thin),
-        camera.light.design_wavelength,
-        wavelength,
-        thin.focal_length,
-    )
-    traced = tuple(Aberration.model_construct(noll=j, coefficient=c) for j, c in terms)
-    changed = thin.model_copy(
-        update={
-            "focal_length": focal_length,
-            "aberrations": (*thin.aberrations, *traced),
-            "prescription": None,
-        }
-    )
-    return camera.model_copy(update={"main_lens": changed})
-
-
-@functools.lru_cache(maxsize=512)
-def _resolved(
-    lens: Prescription,
-    object_distance: float,
-    aperture_diameter: float,
-    design_wavelength: float,
-    wavelength: float,
-    nominal: float,
-) -> tuple[float, tuple[tuple[int, float], ...]]:
-    """(focal length (m), Noll terms) of a prescription in a camera whose description
-    says `nominal` (m).
-    """
-    inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
-    own = first_order(lens, design_wavelength).focal_length
-    if abs(own / nominal - 1) > 0.02:
-        raise ConfigError(
-            (
-                f"the lens file has a focal length of {own * 1e3:.5g} mm at "
-                f"{design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm"
-            ),
-            "main_lens.focal_length",
-            "write the lens's own, or scale the lens: plenocli lens import --focal-length",
-        )
-    return inside.focal_length(wavelength), inside.aberrations(wavelength)

@@ -26,11 +26,13 @@ from plenocli.base.quantities import (
     SignedLength,
     Unit,
     Wavelength,
+    quantity,
 )
 from plenocli.base.text import by
 from plenocli.base.toml import violations
-from plenocli.base.units import format_length
+from plenocli.base.units import format_length, parse_length
 from plenocli.forward.camera.plausible import Lengths, implausible
+from plenocli.forward.camera.quadrature import Disc
 
 ROW_SPACING = math.sqrt(3) / 2
 """Spacing of the rows of a hexagonal lattice, in units of its pitch."""
@@ -67,6 +69,18 @@ class Samples:
         return hash(self.values.tobytes())
 
 
+def noll_indices(j: int) -> tuple[int, int]:
+    """Radial and signed azimuthal order (n, m) of Noll's Zernike polynomial j >= 1; m < 0 is the
+    sine term.
+
+    Noll 1976.
+    """
+    n = int((math.sqrt(8 * j - 7) - 1) / 2)
+    rest = j - n * (n + 1) // 2 - 1
+    m = 2 * ((rest + 1 - n % 2) // 2) + n % 2
+    return n, (-m if j % 2 else m)
+
+
 class Aberration(Section):
     """One Zernike term of the wavefront error W in the main-lens pupil, Noll index, in
     metres of optical path.
@@ -74,6 +88,30 @@ class Aberration(Section):
 
     noll: Annotated[int, Field(ge=1, le=231)]
     coefficient: SignedLength
+
+
+class FieldRow(Section):
+    """The main lens as lenslets at `height` from the optical axis see it, beside what it is for all
+    of them.
+
+    transmission: share of a round pupil's area that rims leave open; the rest is beyond a disc of
+        the pupil's size whose centre is moved away from the lenslet, as by a rim behind the lens.
+    aberrations: for a lenslet to the right of the axis (+x); they turn with its azimuth.
+    """
+
+    height: Annotated[float, quantity(parse_length, "5 mm", 0.0, 1.0, format_length)]
+    transmission: Unit = 1.0
+    aberrations: tuple[Aberration, ...] = ()
+
+    @model_validator(mode="after")
+    def _symmetric(self) -> Self:
+        odd = [term.noll for term in self.aberrations if noll_indices(term.noll)[1] < 0]
+        if odd:
+            raise ValueError(
+                f"Noll terms {', '.join(map(str, odd))} are sines, which a lens that is symmetric "
+                "about its axis does not have for a lenslet to the right of it"
+            )
+        return self
 
 
 def _known_glass(name: str) -> str:
@@ -98,6 +136,9 @@ class MainLens(Section):
     aperture of this camera take the place of `glass`; focal_length must be the lens's own. What
     files hold is attached by Camera.attach; nothing here opens a file.
 
+    field: what the lens is to lenslets off the axis, rows by height from 0 to the array's corner,
+        linear in between. A prescription needs none: its pupil and wavefront are traced for every
+        lenslet, rims where surfaces have a semi_diameter.
     apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps
         Abbe's sine condition, as lenses corrected over a field do), "uniform-pupil" (an evenly lit
         plane aperture) or "uniform-sine" (even in direction cosines, which gives Airy's pattern).
@@ -114,6 +155,8 @@ class MainLens(Section):
     apodisation: Literal["aplanatic", "uniform-pupil", "uniform-sine"] = "aplanatic"
     wavefront: FileName | None = None
     prescription: FileName | None = None
+    field: tuple[FieldRow, ...] = ()
+    _rims: tuple[Disc, ...] = PrivateAttr(())
     _samples: dict = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
@@ -136,7 +179,22 @@ class MainLens(Section):
             raise ValueError(
                 "glass and prescription exclude each other: a lens file names its own glasses"
             )
+        heights = [row.height for row in self.field]
+        if heights and (heights[0] != 0 or any(b <= a for a, b in zip(heights, heights[1:]))):
+            raise ValueError("heights of field must ascend from 0 without repetition")
+        if self.aperture_shape == "image" and any(row.transmission < 1 for row in self.field):
+            raise ValueError(
+                'transmission below 1 is of a pupil with a rim, which aperture_shape = "image" '
+                "lacks"
+            )
         return self
+
+    @property
+    def rims(self) -> tuple[Disc, ...]:
+        """Discs (y, x, radius; m) beyond which rims cut the pupil of a lens that was resolved for
+        one lenslet (plenocli.forward.camera.field).
+        """
+        return self._rims
 
     def samples(self, name: str) -> Any:
         """What the file that a key names holds.
@@ -367,9 +425,21 @@ class Camera(Section):
         used = (self.light.design_wavelength, *light.wavelengths)
         _check_range("main_lens", self.main_lens.glass, used)
         _check_range("lenslet_array", self.lenslet_array.glass, used)
+        self._check_field()
         if self.filter_array is not None:
             self.__dict__.update(filter_array=self._fitting(self.filter_array))
         return self
+
+    def _check_field(self) -> None:
+        """ValueError where rows of main_lens.field end before the array does."""
+        rows, array = self.main_lens.field, self.lenslet_array
+        reach = [(n - 1) / 2 * array.pitch for n in array.count]
+        corner = math.hypot(reach[0] * array.row_spacing, reach[1])
+        if rows and rows[-1].height < corner * (1 - 1e-9):
+            raise ValueError(
+                f"main_lens.field ends at {format_length(rows[-1].height)} from the axis, the "
+                f"array at {format_length(corner)}: add a row for its corner"
+            )
 
     def _lengths(self) -> Lengths:
         """The lengths as they are given, before any is derived from others."""

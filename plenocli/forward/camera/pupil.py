@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.quadrature import Cell
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 
 def aperture_area(lens: MainLens) -> float:
-    """Area (m^2) of the open main-lens aperture P1, filters not counted; of an aperture image the
-    integral of its values.
+    """Area (m^2) of the open main-lens aperture P1, filters and rims not counted; of an aperture
+    image the integral of its values.
     """
     radius = lens.aperture_diameter / 2
     if lens.aperture_shape == "image":
@@ -43,6 +44,13 @@ def aperture_picture(lens: MainLens, y: np.ndarray, x: np.ndarray) -> np.ndarray
 
     y, x: pupil coordinates, m, broadcast against each other.
     """
+    open_ = np.ones(())
+    for cy, cx, radius in lens.rims:
+        open_ = open_ * (np.hypot(y - cy, x - cx) <= radius)
+    return open_ * _aperture(lens, y, x)
+
+
+def _aperture(lens: MainLens, y: np.ndarray, x: np.ndarray) -> np.ndarray:
     half = lens.aperture_diameter / 2
     edge = half * (1 + 1e-9)
     if lens.aperture_shape == "image":
@@ -95,18 +103,6 @@ def filter_cells(camera: Camera, wavelength: float) -> list[tuple[Cell, float]] 
             ((top, top + high, left, left + wide), filter_transmittance(filter_, wavelength))
         )
     return cells
-
-
-def noll_indices(j: int) -> tuple[int, int]:
-    """Radial and signed azimuthal order (n, m) of Noll's Zernike polynomial j >= 1; m < 0 is the
-    sine term.
-
-    Noll 1976.
-    """
-    n = int((math.sqrt(8 * j - 7) - 1) / 2)
-    rest = j - n * (n + 1) // 2 - 1
-    m = 2 * ((rest + 1 - n % 2) // 2) + n % 2
-    return n, (-m if j % 2 else m)
 
 
 def zernike(j: int, y: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -180,12 +176,12 @@ def _spline(lens: MainLens) -> NdBSpline | None:
 def _terms(lens: MainLens) -> tuple[Aberration, ...]:
     """The lens's Noll terms.
 
-    A real lens has others at every wavelength:
-    plenocli.forward.camera.lens.at_wavelength comes first.
+    A real lens has others at every wavelength and place:
+    plenocli.forward.camera.field.at_field comes first.
     """
-    if lens.prescription is not None:
+    if lens.prescription is not None or lens.field:
         raise RuntimeError(
-            "the wavefront error of a lens prescription was asked for without a wavelength"
+            "the wavefront error of a lens was asked for without a wavelength and a place"
         )
     return lens.aberrations or ()
 

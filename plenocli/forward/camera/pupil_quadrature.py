@@ -32,7 +32,7 @@ def pupil_rows(camera: Camera, geometry: Geometry, slope: float) -> list[Rows]:
         defocus and W are added here.
 
     Returns panels with complex weights, which carry sqrt(T), exp(j k W) and exp(j k eps r^2/2) and
-    the sign -1 over a central obscuration.
+    the sign -1 over a central obscuration; what rims cut off is left out.
     """
     lens, k, eps = camera.main_lens, geometry.k, geometry.eps
     radius = lens.aperture_diameter / 2
@@ -45,19 +45,19 @@ def pupil_rows(camera: Camera, geometry: Geometry, slope: float) -> list[Rows]:
     elif lens.aperture_shape == "square":
         for (y0, y1, x0, x1), t in cells or [((-radius, radius, -radius, radius), 1.0)]:
             box = (max(y0, -radius), min(y1, radius), max(x0, -radius), min(x1, radius))
-            panels += [(math.sqrt(t), rows) for rows in cell_rows(box, None, slope)]
+            panels += [(math.sqrt(t), rows) for rows in cell_rows(box, lens.rims, slope)]
     else:
         discs = [(1.0, radius)]
         if lens.obscuration:
             discs.append((-1.0, radius * lens.obscuration))
         for sign, r in discs:
-            if cells is None:
+            if cells is None and not lens.rims:
                 panels.append((sign, disc_rows(r, slope)))
             else:
                 panels += [
                     (sign * math.sqrt(t), rows)
-                    for cell, t in cells
-                    for rows in cell_rows(cell, r, slope)
+                    for cell, t in cells or [((-r, r, -r, r), 1.0)]
+                    for rows in cell_rows(cell, ((0.0, 0.0, r), *lens.rims), slope)
                 ]
     return [_weighted(lens, k, eps, amplitude, rows) for amplitude, rows in panels]
 

@@ -6,7 +6,7 @@ see docs/model.md).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,7 +14,15 @@ import numpy as np
 
 Cell = tuple[float, float, float, float]
 """A rectangle (y0, y1, x0, x1), m."""
+Disc = tuple[float, float, float]
+"""A disc (y, x of its centre, radius), m."""
 Chords = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+NEAR = 1e-9
+"""Distance from the tip of a disc, over the height of what it cuts, that counts as none."""
+SMOOTH = 14
+"""Least nodes of a panel whose ends are arcs of several circles."""
+STEEP = 1.5
+"""Length of such an arc over the half circle about its panel, at most about."""
 RULE_STEP = 0.1
 """Cycles over [-1, 1] for each node by which the bands of band_rule grow."""
 
@@ -152,62 +160,92 @@ def disc_rows(radius: float, slope: float) -> Rows:
     )
 
 
-def cell_rows(cell: Cell, radius: float | None, slope: float) -> list[Rows]:
-    """Rows over the part of a rectangle inside a centred disc.
+def cell_rows(cell: Cell, discs: Sequence[Disc], slope: float) -> list[Rows]:
+    """Rows over the part of a rectangle inside all of some discs.
 
     cell: (y0, y1, x0, x1) m;
-    radius: of the disc, m; None: no disc;
+    discs: none, one or several;
     slope: as in disc_rows.
 
-    Returns panels, maybe none; they end where the circle meets the rectangle's sides, so that every
-    integrand is smooth.
+    Returns panels, maybe none; they end where circles meet each other and the rectangle's sides, so
+    that every integrand is smooth.
     """
     panels = []
-    for y, weight, left, right in cell_chords(cell, radius, slope):
+    for y, weight, left, right in cell_chords(cell, discs, slope):
         t, w = gauss(nodes_for(slope * np.max(right - left) / 2))
         x = ((left + right) / 2)[:, None] + ((right - left) / 2)[:, None] * t
         panels.append(Rows(y, x, (weight * (right - left) / 2)[:, None] * w))
     return panels
 
 
-def cell_chords(cell: Cell, radius: float | None, slope: float) -> list[Chords]:
+def cell_chords(cell: Cell, discs: Sequence[Disc], slope: float) -> list[Chords]:
     """The region of cell_rows as chords.
 
     Returns panels (y, weight, left, right), (row,) each; weights integrate over y alone, m.
     """
     y0, y1, x0, x1 = cell
-    if radius is None:
-        return [_panel(y0, y1, lambda y: (np.full_like(y, x0), np.full_like(y, x1)), None, slope)]
-    y0, y1 = max(y0, -radius), min(y1, radius)
-    if y1 <= y0:
+    low, high = (max([y0, *(y - r for y, _, r in discs)]), min([y1, *(y + r for y, _, r in discs)]))
+    if high <= low:
         return []
-    cuts = [s * np.sqrt(radius**2 - x * x) for x in (x0, x1) if abs(x) < radius for s in (-1, 1)]
-    edges = [y0, *sorted(c for c in cuts if y0 < c < y1), y1]
 
     def ends(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        half = np.sqrt(np.maximum(radius**2 - y * y, 0))
-        return np.maximum(x0, -half), np.minimum(x1, half)
+        left, right = np.full_like(y, x0), np.full_like(y, x1)
+        for cy, cx, r in discs:
+            half = np.sqrt(np.maximum(r * r - (y - cy) ** 2, 0))
+            left, right = np.maximum(left, cx - half), np.minimum(right, cx + half)
+        return left, right
 
-    panels = []
-    for low, high in zip(edges, edges[1:]):
+    cuts = sorted(c for c in _crossings(discs, (x0, x1)) if low < c < high)
+    panels, rest = [], [*zip([low, *cuts], [*cuts, high])]
+    tips = [y + s * r for y, _, r in discs for s in (-1, 1)] if len(discs) > 1 else []
+    while rest:
+        low, high = rest.pop(0)
         left, right = ends(np.array([(low + high) / 2]))
-        if right[0] > left[0] and high - low > 1e-12 * radius:
-            panels.append(_panel(low, high, ends, radius, slope))
+        if right[0] <= left[0] or high - low <= 1e-12 * (y1 - y0):
+            continue
+        gaps = [max(low - t, t - high) for t in tips]
+        if any(NEAR * (y1 - y0) < gap < (high - low) / 4 for gap in gaps):
+            rest[:0] = [(low, (low + high) / 2), ((low + high) / 2, high)]
+            continue
+        panels.append(_panel(low, high, ends, discs, slope))
     return panels
 
 
-def _panel(low: float, high: float, ends: Callable, radius: float | None, slope: float) -> Chords:
-    """Chords between y = low and high at Gauss-Legendre nodes; on a disc in theta =
-    asin(y/radius), where its rim is smooth.
+def _crossings(discs: Sequence[Disc], sides: tuple[float, float]) -> list[float]:
+    """y where circles meet vertical lines x = sides and each other."""
+    found = []
+    for n, (cy, cx, r) in enumerate(discs):
+        for x in sides:
+            if abs(x - cx) < r:
+                found += [cy + s * math.sqrt(r * r - (x - cx) ** 2) for s in (-1, 1)]
+        for y, x, other in discs[:n]:
+            apart = math.hypot(y - cy, x - cx)
+            if abs(r - other) < apart < r + other:
+                along = (apart**2 + r * r - other * other) / (2 * apart)
+                aside = math.sqrt(max(r * r - along * along, 0.0))
+                found += [cy + (along * (y - cy) + s * aside * (x - cx)) / apart for s in (-1, 1)]
+    return found
+
+
+def _panel(low: float, high: float, ends: Callable, discs: Sequence[Disc], slope: float) -> Chords:
+    """Chords between y = low and high at Gauss-Legendre nodes: on one disc in its angle,
+    where its rim is smooth, on several in the angle of a circle about the panel.
     """
-    if radius is None:
-        t, w = gauss(nodes_for(slope * (high - low) / 2))
-        y, wy = (low + high) / 2 + (high - low) / 2 * t, (high - low) / 2 * w
+    half = (high - low) / 2
+    if not discs:
+        t, w = gauss(nodes_for(slope * half))
+        y, wy = (low + high) / 2 + half * t, half * w
     else:
-        a, b = np.arcsin(low / radius), np.arcsin(high / radius)
-        t, w = gauss(nodes_for(slope * radius * (b - a) / 2))
+        if len(discs) == 1:
+            middle, _, radius = discs[0]
+            a, b = np.arcsin((low - middle) / radius), np.arcsin((high - middle) / radius)
+            least, steep = 1, 1.0
+        else:
+            middle, radius, a, b = (low + high) / 2, half, -np.pi / 2, np.pi / 2
+            least, steep = SMOOTH, STEEP
+        t, w = gauss(max(least, nodes_for(steep * slope * radius * (b - a) / 2)))
         theta = (a + b) / 2 + (b - a) / 2 * t
-        y, wy = radius * np.sin(theta), (b - a) / 2 * w * radius * np.cos(theta)
+        y, wy = middle + radius * np.sin(theta), (b - a) / 2 * w * radius * np.cos(theta)
     return y, wy, *ends(y)
 
 

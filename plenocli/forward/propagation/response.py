@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.geometry import geometry as geometry_of
-from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, aperture_picture, filter_cells, wavefront
 from plenocli.forward.camera.quadrature import cell_chords, gauss, nodes_for
 from plenocli.forward.propagation.ray.rays import pupil_measure
@@ -81,7 +81,7 @@ def uniform_response(
     Returns (lenslet, pixel).
     docs/model.md, "The response predicted".
     """
-    geometry, lens = geometry_of(camera, wavelength), at_wavelength(camera, wavelength).main_lens
+    geometry, lens = geometry_of(camera, wavelength), at_field(camera, wavelength).main_lens
     shifts = np.atleast_2d(np.asarray(shifts, float))
     cells = filter_cells(camera, wavelength)
     half = lens.aperture_diameter / 2
@@ -141,7 +141,7 @@ def own_light(camera: Camera, wavelength: float, count: int = 256) -> float:
     wavelength: m;
     count: points of the pupil per axis, which tell a share to about 1/count.
     """
-    lens = at_wavelength(camera, wavelength).main_lens
+    lens = at_field(camera, wavelength).main_lens
     geometry = geometry_of(camera, wavelength)
     axis = ((np.arange(count) + 0.5) / count - 0.5) * lens.aperture_diameter
     y, x, step = axis[:, None], axis[None, :], lens.aperture_diameter / count / 2
@@ -277,7 +277,7 @@ def _strips(geometry: Geometry, lens: MainLens, cells: FilterCells) -> list[tupl
         for cell, t in cells:
             strips += [
                 (sign * t * weight, y, None, left, right)
-                for y, weight, left, right in cell_chords(cell, radius, slope)
+                for y, weight, left, right in cell_chords(cell, [(0.0, 0.0, radius)], slope)
             ]
     return strips
 

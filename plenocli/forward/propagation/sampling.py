@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.camera.lens import at_wavelength
-from plenocli.forward.camera.pupil import noll_indices
+from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
@@ -208,7 +207,6 @@ def size_band(
             # a point at a corner lights two of them
             errors.append(math.sqrt(2) * pixel_error(*fewer, *light, BESIDE))
     else:
-        camera = at_wavelength(camera, geometry.wavelength)
         trial = trial_columns(camera, geometry, superpixels, window, is_symmetric(camera))
         alone = None
         if trial is None and window is not None:
@@ -266,7 +264,10 @@ def is_symmetric(camera: Camera) -> bool:
     """
     lens = camera.main_lens
     plain = (
-        lens.aperture_shape != "image" and camera.filter_array is None and lens.wavefront is None
+        lens.aperture_shape != "image"
+        and camera.filter_array is None
+        and lens.wavefront is None
+        and not lens.rims
     )
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 

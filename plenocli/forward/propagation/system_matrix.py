@@ -17,8 +17,8 @@ import numpy as np
 
 from plenocli.base.budget import one_thread, spread
 from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.bands import band_fields
 from plenocli.forward.propagation.models import model_named
@@ -158,7 +158,7 @@ class PifBuilder:
             geometry(camera, wavelength, plan.pixel_shift, plan.chief).parted(plan.superpixels),
             np.dtype(dtype),
         )
-        camera = at_wavelength(camera, wavelength)
+        camera = at_field(camera, wavelength, plan.chief)
         model = model_named(plan.rung)
         # a library can be told to stay on one thread only once it is loaded
         for library in model.libraries:

@@ -260,6 +260,8 @@ def require_fittable(camera: Camera) -> None:
         trouble = "its lenslets are not square"
     elif lens.prescription is not None:
         trouble = "its main lens is a prescription"
+    elif lens.field:
+        trouble = "its main lens changes over the field"
     elif len(camera.light.wavelengths) > 1 or camera.light.band is not None:
         trouble = "it has more than one wavelength"
     if trouble:

@@ -8,11 +8,12 @@ import pytest
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.dial import plan_pif
+from plenocli.forward.camera.field import shift_of
 from plenocli.forward.camera.geometry import array_position, chief_ray, corner_ray, lenslet_shift
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.forward.propagation.test_exact import errors, image_points
-from tests.reference.oblique import oblique_columns
+from tests.reference.oblique import cut_pupil, oblique_columns
 from tests.reference.rayleigh import column_energies
 
 
@@ -228,3 +229,31 @@ def test_towards_the_axis_oblique_light_becomes_upright():
     )
     apart = np.linalg.norm(upright - leaning, axis=0) / np.linalg.norm(upright, axis=0)
     assert apart.max() < 3e-4
+
+
+@pytest.mark.parametrize("degrees, turn, share", [(15, 0.0, 0.7), (14, 1.0, 0.85)])
+def test_a_pupil_that_changes_over_the_field_meets_the_oracle(degrees, turn, share):
+    """Cut by a rim and bent by coma, both turned to the lenslet, at 15 degrees and 1e-3."""
+    camera, coma = wide_camera(half=15.5), 60e-9
+    corner = math.hypot(*corner_ray(camera))
+    rows = [
+        {"height": 0.0},
+        {
+            "height": corner,
+            "transmission": share,
+            "aberrations": [{"noll": 8, "coefficient": coma}],
+        },
+    ]
+    camera = camera.replace(**{"main_lens.field": rows})
+    middle = (camera.lenslet_array.count[0] - 1) // 2
+    far = camera.lenslet_array.distance * math.tan(math.radians(degrees))
+    aside = far / camera.lenslet_array.pitch
+    place = (middle + round(aside * math.sin(turn)), middle + round(aside * math.cos(turn)))
+    chief = chief_ray(camera, *place)
+    part = math.hypot(*chief) / corner
+    seen = cut_pupil(shift_of(1 - (1 - share) * part), math.atan2(*chief), coma * part)
+    plan = plan_pif(
+        camera, lenslet=place, accuracy=1e-3, superpixels=(1, 1), coherent_ring=0, dtype="float64"
+    )
+    assert plan.model == "exact"
+    assert worst_error(camera, place, plan, pupil_of=seen) < 1e-3

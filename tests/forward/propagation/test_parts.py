@@ -7,10 +7,10 @@ from scipy.special import j0, j1
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.glass import focal_length, refractive_index
+from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.pupil import (
     filter_cells,
     filter_transmittance,
-    noll_indices,
     zernike,
 )
 from plenocli.forward.camera.pupil_quadrature import pupil_rows
@@ -83,7 +83,7 @@ def test_disc_rows_give_the_airy_amplitude():
 
 def test_cells_that_cover_a_disc_add_up_to_it():
     cells = [(y, y + 1.1, x, x + 1.1) for y in (-1.1, 0.0) for x in (-1.3, -0.2, 0.9)]
-    parts = [rows for cell in cells for rows in cell_rows(cell, 1.0, 20.0)]
+    parts = [rows for cell in cells for rows in cell_rows(cell, [(0.0, 0.0, 1.0)], 20.0)]
     assert sum(rows.weight.sum() for rows in parts) == pytest.approx(np.pi, abs=1e-9)
     wave = sum(np.sum(r.weight * np.exp(1j * (12 * r.x - 9 * r.y[:, None]))) for r in parts)
     assert wave == pytest.approx(2 * np.pi * j1(15) / 15, abs=1e-9)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.pupil import (
     aperture_area,
-    noll_indices,
     unit_radius,
     wavefront,
     wavefront_slope,
@@ -40,6 +40,7 @@ def is_radial(camera: Camera) -> bool:
         lens.aperture_shape in ("circle", "annulus")
         and camera.filter_array is None
         and lens.wavefront is None
+        and not lens.rims
     )
     return plain and all(noll_indices(term.noll)[1] == 0 for term in lens.aberrations or ())
 

@@ -90,4 +90,5 @@ def _is_separable(camera: Camera) -> bool:
         and camera.filter_array is None
         and lens.wavefront is None
         and not lens.aberrations
+        and not lens.rims
     )

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
 from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.lenslet_fields import (
@@ -53,12 +52,14 @@ FOCUSED = 1e-9
 
 def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """As Model.valid_for: the rays must keep the pupil's image affine."""
-    lens = at_wavelength(camera, geometry.wavelength).main_lens
+    lens = camera.main_lens
     if lens.wavefront is not None or any(term.noll > 4 for term in lens.aberrations or ()):
         return (
             "wavefront errors beyond tilt and defocus bend the pupil's image, which "
             "rays here take as affine"
         )
+    if lens.rims:
+        return "rims cut the pupil, whose areas rays here know for whole discs and squares only"
     if (
         geometry.lenslet_shape != "square"
         and abs(_affine(lens, geometry)[0]) * geometry.z2 * geometry.D1 > FOCUSED * geometry.D2
@@ -143,7 +144,7 @@ class RayLenslets(LensletFields):
     """Pixel energies by rays."""
 
     def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan) -> None:
-        lens = at_wavelength(camera, geometry.wavelength).main_lens
+        lens = camera.main_lens
         self.geometry, self.superpixels, self.window = geometry, plan.superpixels, band.window
         self.eps, *self._tilt = _affine(lens, geometry)
         self.slope = geometry.z3 * (geometry.kappa * geometry.z2 * self.eps - 1 / geometry.z2)

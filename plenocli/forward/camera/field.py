@@ -1,0 +1,368 @@
+"""The main lens as one lenslet sees it: at its wavelength, and at its place in the field.
+
+A lens that is symmetric about the axis looks the same from all lenslets at one height but for its
+azimuth. Here a is the pupil coordinate towards the lenslet and b the one across; W has cosine terms
+of the angle from a only, and what rims leave open is the part of the pupil within discs whose
+centres lie on the axis of a. docs/model.md, "Fields that change over the field".
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.base.errors import ConfigError, NumericsError
+from plenocli.base.units import format_length
+from plenocli.forward.camera.lens import (
+    CameraLens,
+    camera_lens,
+    chief_height,
+    disc_points,
+    first_order,
+    paraxial_image,
+    wavefront,
+)
+from plenocli.forward.camera.model import noll_indices
+from plenocli.forward.camera.prescription import Prescription
+from plenocli.forward.camera.pupil import aperture_picture, unit_radius, zernike
+from plenocli.forward.camera.pupil import wavefront as wavefront_error
+from plenocli.forward.camera.raytrace import Rays, aim, entrance_pupil, trace
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera, FieldRow, MainLens
+
+ON_AXIS: tuple[float, float] = (0.0, 0.0)
+TERMS = 66
+"""Noll terms, of which the cosine ones describe a traced wavefront off the axis."""
+CHANGE_NODES = 64
+"""Points of the pupil along an axis that tell how much it changes."""
+CUT = 1e-4
+"""Share of the pupil's radius that a rim must reach into it to count."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """What a height adds to the lens, for a lenslet in the direction of a.
+
+    focal_length: m;
+    terms: ((Noll index, coefficient in m), ...);
+    rims: ((centre along a, radius), ...), m.
+    """
+
+    focal_length: float
+    terms: tuple[tuple[int, float], ...] = ()
+    rims: tuple[tuple[float, float], ...] = ()
+
+
+def at_field(camera: Camera, wavelength: float, chief: tuple[float, float] = ON_AXIS) -> Camera:
+    """A camera whose main lens is the one that a lenslet sees at one wavelength.
+
+    A thin main lens takes the place of a prescription and of the rows of `field`: of the traced
+    focal length, with the aberrations of all of them and the rims that cut its pupil. A camera that
+    has neither is returned as it is, so doing it twice does no harm.
+
+    wavelength: m;
+    chief: (rows, columns) m from the optical axis to the lenslet, as chief_ray gives it.
+
+    Raises ConfigError where main_lens.focal_length is not the prescription's, the lens cannot be
+    used so (see camera_lens), or rims and aperture image meet; NumericsError where no light gets to
+    the lenslet.
+    """
+    thin = camera.main_lens
+    if thin.prescription is None and not thin.field:
+        return camera
+    height, unit = math.hypot(*chief), unit_radius(thin)
+    seen = _of_rows(thin.field, height, unit, thin.focal_length)
+    if thin.prescription is not None:
+        traced = _traced(
+            thin.samples("prescription"),
+            camera.object.distance,
+            2 * unit,
+            camera.light.design_wavelength,
+            wavelength,
+            thin.focal_length,
+            height / camera.lenslet_array.distance,
+        )
+        seen = _Seen(
+            focal_length=traced.focal_length,
+            terms=seen.terms + traced.terms,
+            rims=seen.rims + traced.rims,
+        )
+    if seen.rims and thin.aperture_shape == "image":
+        raise ConfigError(
+            "rims cut the pupil off the axis, which an aperture image cannot have",
+            "main_lens.aperture_image",
+            "put what the rims leave into the image, or name an aperture_shape",
+        )
+    return camera.model_copy(update={"main_lens": _turned(thin, seen, chief)})
+
+
+def _turned(thin: MainLens, seen: _Seen, chief: tuple[float, float]) -> MainLens:
+    """The thin lens with what is seen from a lenslet, turned to its azimuth."""
+    from plenocli.forward.camera.model import Aberration
+
+    height = math.hypot(*chief)
+    down, right = (c / height for c in chief) if height else (0.0, 1.0)
+    azimuth = math.atan2(down, right)
+    terms = [
+        Aberration.model_construct(noll=j, coefficient=c)
+        for term in seen.terms
+        for j, c in turned_term(*term, azimuth)
+        if c
+    ]
+    changed = thin.model_copy(
+        update={
+            "focal_length": seen.focal_length,
+            "aberrations": (*thin.aberrations, *terms),
+            "prescription": None,
+            "field": (),
+        }
+    )
+    changed._rims = tuple((a * down, a * right, radius) for a, radius in seen.rims)
+    return changed
+
+
+def turned_term(noll: int, coefficient: float, azimuth: float) -> list[tuple[int, float]]:
+    """A cosine term of W, given for the direction of +x, turned to an azimuth.
+
+    noll, coefficient: Noll index and m;
+    azimuth: rad from +x to +y.
+
+    Returns [(Noll index, coefficient)] of the cosine term and, where it has one, its sine.
+    """
+    n, m = noll_indices(noll)
+    if m == 0:
+        return [(noll, coefficient)]
+    sine = next(j for j in (noll - 1, noll + 1) if noll_indices(j) == (n, -m))
+    parts = ((noll, math.cos(m * azimuth)), (sine, math.sin(m * azimuth)))
+    # at right angles rounding must not break the symmetry
+    return [(j, coefficient * (0.0 if abs(part) < 1e-15 * m else part)) for j, part in parts]
+
+
+def pupil_change(camera: Camera, wavelength: float, chief: tuple[float, float]) -> float:
+    """Estimated relative L2 difference of the worst column, by its pupil alone, of a lenslet off
+    the axis from that of the lenslet on it.
+
+    Pixels that see what a rim cuts off are dark: the root of the share that is lost. A wavefront
+    changes what a point on the border of two lenslets sends through each: k times the root mean
+    square of the difference.
+
+    wavelength: m;
+    chief: as for at_field.
+
+    Returns a number, 1 at the most.
+    """
+    here, there = (at_field(camera, wavelength, at).main_lens for at in (ON_AXIS, chief))
+    if here is there:
+        return 0.0
+    axis = np.linspace(-0.5, 0.5, 2 * CHANGE_NODES + 1)[1::2] * here.aperture_diameter
+    y, x = axis[:, None], axis[None, :]
+    whole, left = (aperture_picture(lens, y, x) for lens in (here, there))
+    error = (wavefront_error(there, y, x) - wavefront_error(here, y, x))[left > 0]
+    lost = 1 - left.sum() / whole.sum()
+    return min(1.0, math.hypot(math.sqrt(lost), 2 * math.pi / wavelength * float(error.std())))
+
+
+# rows of a description
+
+
+def _of_rows(rows: Sequence[FieldRow], height: float, unit: float, focal_length: float) -> _Seen:
+    """What the rows of a description say at a height (m), linear between them."""
+    if not rows:
+        return _Seen(focal_length=focal_length)
+    heights = [row.height for row in rows]
+    if height > heights[-1] * (1 + 1e-9):
+        raise ConfigError(
+            f"the rows end at {format_length(heights[-1])} from the axis, a lenslet stands at "
+            f"{format_length(height)}",
+            "main_lens.field",
+            "add a row for the corner of the array",
+        )
+    given = [{term.noll: term.coefficient for term in row.aberrations} for row in rows]
+    terms = {
+        j: float(np.interp(height, heights, [row.get(j, 0.0) for row in given]))
+        for j in sorted(set().union(*given))
+    }
+    share = float(np.interp(height, heights, [row.transmission for row in rows]))
+    return _Seen(
+        focal_length=focal_length,
+        terms=tuple((j, c) for j, c in terms.items() if c),
+        rims=((-shift_of(share) * unit, unit),) if share < 1 else (),
+    )
+
+
+def shift_of(share: float) -> float:
+    """How far apart two discs of radius 1 stand that overlap in `share` of their area."""
+    from scipy.optimize import brentq
+
+    return float(brentq(lambda shift: overlap(shift) - share, 0.0, 2.0, xtol=1e-14))
+
+
+def overlap(shift: float) -> float:
+    """Share of its area in which a disc of radius 1 overlaps one that stands `shift` aside."""
+    half = shift / 2
+    return 2 / math.pi * (math.acos(half) - half * math.sqrt(1 - half * half))
+
+
+# a traced lens
+
+
+@functools.lru_cache(maxsize=1024)
+def _traced(
+    lens: Prescription,
+    object_distance: float,
+    aperture_diameter: float,
+    design_wavelength: float,
+    wavelength: float,
+    nominal: float,
+    slope: float,
+) -> _Seen:
+    """What a prescription is to a camera whose description gives it the focal length `nominal` (m).
+
+    slope: of the lenslet's chief ray, tangent of the angle behind the rear principal point.
+    """
+    inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
+    own = first_order(lens, design_wavelength).focal_length
+    if abs(own / nominal - 1) > 0.02:
+        raise ConfigError(
+            (
+                f"the lens file has a focal length of {own * 1e3:.5g} mm at "
+                f"{design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm"
+            ),
+            "main_lens.focal_length",
+            "write the lens's own, or scale the lens: plenocli lens import --focal-length",
+        )
+    focal_length = inside.focal_length(wavelength)
+    terms, rims = _off_axis(inside, wavelength, slope, aperture_diameter / 2)
+    if slope == 0:
+        terms = inside.aberrations(wavelength)
+    return _Seen(focal_length=focal_length, terms=terms, rims=rims)
+
+
+def _off_axis(
+    inside: CameraLens, wavelength: float, slope: float, radius: float
+) -> tuple[tuple[tuple[int, float], ...], tuple[tuple[float, float], ...]]:
+    """(Noll terms, rims) of a traced lens off the axis; arguments as _traced and _field_angle."""
+    points, weights = disc_points(24, 48)
+    angle = _field_angle(inside, wavelength, slope)
+    wave = wavefront(
+        inside.lens,
+        wavelength,
+        points,
+        angle,
+        inside.object_distance,
+        paraxial_image(inside.lens, wavelength, inside.object_distance),
+        clip=False,
+    )
+    place = _pupil_places(wave.cosines, slope, inside.z2, radius, _rim_sine(inside, wavelength))
+    cosine = [j for j in range(2, TERMS + 1) if noll_indices(j)[1] >= 0]
+    lit = np.isfinite(wave.error)
+    if lit.sum() < 4 * len(cosine):
+        raise NumericsError(
+            f"{int(lit.sum())} rays get through the lens {math.degrees(angle):.3g} degrees off the "
+            "axis, too few to know its wavefront",
+            "main_lens.prescription",
+            "use a smaller array",
+        )
+    a, b = place[:, lit] / radius
+    root = np.sqrt(weights[lit])
+    basis = np.stack([np.ones(a.shape), *(zernike(j, b, a) for j in cosine)], axis=1)
+    found = np.linalg.lstsq(basis * root[:, None], wave.error[lit] * root, rcond=1e-10)[0][1:]
+    start = aim(
+        inside.lens, wavelength, points, angle=angle, object_distance=inside.object_distance
+    )
+    rims = _rims(inside.lens, wavelength, start, points, place / radius)
+    terms = tuple((j, float(c)) for j, c in zip(cosine, found))
+    return terms, tuple((centre * radius, size * radius) for centre, size in rims)
+
+
+def _field_angle(inside: CameraLens, wavelength: float, slope: float) -> float:
+    """The field angle (rad) whose chief ray meets the image plane where a straight line of that
+    slope from the rear principal point does, distortion included.
+    """
+    lens = inside.lens
+    before = inside.object_distance + entrance_pupil(lens, lens.design_wavelength).position
+    tangent, height = slope * inside.z1 / before, slope * inside.z2
+    image = paraxial_image(lens, lens.design_wavelength, inside.object_distance)
+    for _ in range(8 if slope else 0):
+        found = chief_height(lens, wavelength, math.atan(tangent), inside.object_distance, image)
+        tangent *= height / found
+        if abs(found / height - 1) < 1e-6:
+            break
+    return math.atan(tangent)
+
+
+def _rim_sine(inside: CameraLens, wavelength: float) -> float:
+    """Sine of the angle at which the ray through the stop's rim comes to the image on the axis."""
+    wave = wavefront(
+        inside.lens,
+        wavelength,
+        np.array([[0.0], [1.0]]),
+        object_distance=inside.object_distance,
+        image_distance=paraxial_image(inside.lens, wavelength, inside.object_distance),
+        clip=False,
+    )
+    return float(np.hypot(*wave.cosines[:, 0]))
+
+
+def _pupil_places(
+    cosines: np.ndarray, slope: float, z2: float, radius: float, rim: float
+) -> np.ndarray:
+    """Where the rays of a field go through the thin lens's pupil, (2, ray) m along a and b: the
+    points from which a lenslet at `slope` sees them as far from its chief ray, in direction cosines
+    and in units of the rim's on the axis.
+
+    cosines: (2, ray) x, y beside the chief ray's, y towards the lenslet;
+    radius: of the pupil, m;
+    rim: sine of the traced lens's rim on the axis.
+    """
+    upright = math.hypot(1, slope)
+    scale = radius / math.hypot(radius, z2) / rim
+    across, along = cosines[0] * scale, slope / upright + cosines[1] * scale
+    with np.errstate(invalid="ignore"):
+        forward = np.sqrt(1 - along**2 - across**2)
+    return z2 * np.stack([slope - along / forward, -across / forward])
+
+
+def _rims(
+    lens: Prescription, wavelength: float, start: Rays, points: np.ndarray, place: np.ndarray
+) -> list[tuple[float, float]]:
+    """Discs (centre along a, radius) over the pupil's radius that the stop and the clear apertures
+    leave open, those that cut nothing left out; NumericsError where they leave nothing.
+
+    start: rays of a field;
+    points: (2, ray) x, y where they meet the stop, over its radius;
+    place: (2, ray) the same over the pupil's radius, along a and b.
+    """
+    squares = [(points**2).sum(axis=0)]
+    for number, surface in enumerate(lens.surfaces):
+        if math.isfinite(surface.semi_diameter):
+            at = trace(lens.surfaces, start, wavelength, upto=number).position
+            squares.append((at[0] ** 2 + at[1] ** 2) / surface.semi_diameter**2)
+    if not (np.nan_to_num(squares, nan=2.0) <= 1).all(axis=0).any():
+        raise NumericsError(
+            "the rims of the lens keep all light from a lenslet",
+            "main_lens.prescription",
+            "use a smaller array, or mend the semi_diameters of the lens",
+        )
+    found = [_circle(square, place) for square in squares]
+    return [disc for disc in found if disc and abs(disc[0]) + 1 > disc[1] + CUT]
+
+
+def _circle(square: np.ndarray, place: np.ndarray) -> tuple[float, float] | None:
+    """The disc (centre along a, radius) where `square` (ray,) is below 1, fitted where it is near
+    to 1; None where it is nowhere.
+    """
+    near = np.isfinite(square) & np.isfinite(place[0]) & (np.abs(square - 1) < 0.3)
+    if near.sum() < 12:
+        return None
+    a, b = place[:, near]
+    basis = np.stack([a * a + b * b, a, np.ones(a.shape)], axis=1)
+    curve, tilt, level = np.linalg.lstsq(basis, square[near], rcond=None)[0]
+    centre = -tilt / (2 * curve)
+    return float(centre), math.sqrt((1 - level) / curve + centre**2)

@@ -102,7 +102,7 @@ def captures(run):
     from plenocli.files.config.camera_file import load_camera
     from plenocli.files.images.dng import write_dng
     from plenocli.forward.scene.tables import surfaces
-    from plenocli.forward.sensor.noise import SensorModel
+    from plenocli.forward.sensor.detector import SensorModel
 
     camera = load_camera(ROOT / "sample_configs" / "dslr.toml").replace(
         **{"lenslet_array.count": (2, 2)}

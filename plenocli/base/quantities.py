@@ -22,7 +22,12 @@ from plenocli.base.units import (
     format_duration,
     format_length,
     parse_duration,
+    parse_illuminance,
     parse_length,
+    parse_luminance,
+    parse_radiance,
+    parse_spectral_radiance,
+    parse_temperature,
 )
 
 
@@ -118,6 +123,39 @@ Gain = Annotated[float, quantity(_suffix("DN/e"), "0.25 DN/e", 1e-9, 1e9, _plain
 
 
 Duration = Annotated[float, quantity(parse_duration, "10 ms", 1e-9, 1e6, format_duration)]
+
+
+Illuminance = Annotated[float, quantity(parse_illuminance, "500 lx", 1e-6, 1e9, _plain("lx"))]
+
+
+Luminance = Annotated[float, quantity(parse_luminance, "150 cd/m2", 1e-6, 1e9, _plain("cd/m2"))]
+
+
+Radiance = Annotated[float, quantity(parse_radiance, "0.5 W/m2/sr", 1e-12, 1e9, _plain("W/m2/sr"))]
+
+
+SpectralRadiance = Annotated[
+    float,
+    quantity(
+        parse_spectral_radiance,
+        "2 mW/m2/sr/nm",
+        1e-3,
+        1e18,
+        lambda number: f"{number * 1e-9:g} W/m2/sr/nm",
+    ),
+]
+
+
+Temperature = Annotated[float, quantity(parse_temperature, "25 C", 173.15, 423.15, _plain("K"))]
+
+
+Kelvins = Annotated[float, quantity(_suffix("K"), "7 K", 1.0, 100.0, _plain("K"))]
+
+
+ElectronRate = Annotated[float, quantity(_suffix("e/s"), "5 e/s", 0.0, 1e12, _plain("e/s"))]
+
+
+Digits = Annotated[float, quantity(_suffix("DN"), "1.5 DN", 0.0, 65535.0, _plain("DN"))]
 
 
 Unit = Annotated[float, Field(gt=0.0, le=1.0)]

@@ -16,6 +16,15 @@ LENGTHS = {
     "km": 1e3,
 }
 DURATIONS = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0}
+ILLUMINANCES = {"mlx": 1e-3, "lx": 1.0, "klx": 1e3}
+LUMINANCES = {"cd/m2": 1.0, "kcd/m2": 1e3}
+RADIANCES = {"uW/m2/sr": 1e-6, "mW/m2/sr": 1e-3, "W/m2/sr": 1.0}
+SPECTRAL_RADIANCES = {
+    "uW/m2/sr/nm": 1e3,
+    "mW/m2/sr/nm": 1e6,
+    "W/m2/sr/nm": 1e9,
+    "W/m2/sr/m": 1.0,
+}
 BYTES = {
     "B": 1,
     "KiB": 2**10,
@@ -81,6 +90,32 @@ def parse_wavelength(text: str) -> float:
 def parse_duration(text: str) -> float:
     """Seconds from text such as "10 ms"; a bare number is refused (UnitError)."""
     return _parse(text, DURATIONS, "duration", "10 ms")
+
+
+def parse_illuminance(text: str) -> float:
+    """Lux from text such as "500 lx" (UnitError otherwise)."""
+    return _parse(text, ILLUMINANCES, "illuminance", "500 lx")
+
+
+def parse_luminance(text: str) -> float:
+    """Candela per square metre from text such as "150 cd/m2" (UnitError otherwise)."""
+    return _parse(text, LUMINANCES, "luminance", "150 cd/m2")
+
+
+def parse_radiance(text: str) -> float:
+    """W/m2/sr from text such as "0.5 W/m2/sr" (UnitError otherwise)."""
+    return _parse(text, RADIANCES, "radiance", "0.5 W/m2/sr")
+
+
+def parse_spectral_radiance(text: str) -> float:
+    """W/m2/sr/m from text such as "2 mW/m2/sr/nm" (UnitError otherwise)."""
+    return _parse(text, SPECTRAL_RADIANCES, "spectral radiance", "2 mW/m2/sr/nm")
+
+
+def parse_temperature(text: str) -> float:
+    """Kelvin from text such as "25 C" or "298.15 K" (UnitError otherwise)."""
+    value = _parse(text, {"C": 1.0, "degC": 1.0, "K": 1.0}, "temperature", "25 C")
+    return value if text.rstrip().endswith("K") else value + 273.15
 
 
 def parse_bytes(text: str) -> int:

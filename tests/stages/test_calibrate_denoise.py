@@ -7,7 +7,7 @@ import pytest
 
 from plenocli.base.errors import NumericsError
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
-from plenocli.forward.sensor.noise import SensorModel
+from plenocli.forward.sensor.detector import SensorModel
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
 from tests.reference.prototype import superpixels

@@ -186,6 +186,68 @@ def test_exposure_scales_electrons(camera, tmp_path):
     ].mean() == pytest.approx(4, rel=0.01)
 
 
+LIT = """
+bits = 16
+gain = "1 DN/e"
+full_well = "60000 e"
+quantum_efficiency = 0.5
+{exposure}
+[light]
+illuminance = "{lux} lx"
+"""
+
+
+def lit(camera, f_number, lux=1000, exposure="40 ms"):
+    """The same camera under a light of known strength, its lenslets' field kept."""
+    text = camera.read_text()
+    for old, new in [
+        ("f_number = 8", f"f_number = {f_number}"),
+        ("[light]\n", LIT.format(lux=lux, exposure=f'exposure = "{exposure}"' * bool(exposure))),
+    ]:
+        assert old in text
+        text = text.replace(old, new)
+    path = camera.with_name(f"lit-{f_number}-{lux}.toml")
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("f_number", [5.6, 8])
+def test_photons_agree_with_a_hand_calculation_on_the_image_side(camera, tmp_path, f_number):
+    """Irradiance pi L sin^2 u' behind the lens, over one lenslet: what the simulation takes from
+    the object's side.
+    """
+    found = capture(
+        lit(camera, f_number),
+        "--target",
+        "white",
+        "--superpixels",
+        "5x5",
+        "-o",
+        tmp_path / "white.h5",
+    )
+    luminance = 1000 / np.pi * 0.99
+    eye = 0.99495  # V(550 nm)
+    photons = luminance / (683 * eye) * 550e-9 / (6.62607015e-34 * 299792458.0)
+    pitch = 18e-6 / (1 + 144e-6 / 55e-3)
+    half = np.arctan(1 / (2 * f_number))
+    electrons = photons * np.pi * np.sin(half) ** 2 * pitch**2 * 0.5 * 0.04
+    assert found.data["capture/mosaic"].sum(dtype=float) / 12 == pytest.approx(electrons, rel=0.02)
+
+
+def test_without_a_time_light_of_known_strength_is_exposed_until_white_is_bright(
+    camera, tmp_path, capsys
+):
+    """A quarter of the light takes four times as long, and says so."""
+    times = []
+    for lux in (1000, 250):
+        target = tmp_path / f"{lux}.h5"
+        found = capture(lit(camera, 8, lux, None), "--target", "white", "-o", target)
+        times.append(found.attrs["capture"]["exposure_s"])
+        assert found.data["capture/mosaic"].max() == pytest.approx(0.8 * 60000 * 0.99, rel=0.02)
+    assert times[1] == pytest.approx(4 * times[0])
+    assert f"exposed for {times[1] * 1e3:.3g} ms" in capsys.readouterr().err
+
+
 def test_same_seed_same_bytes_other_seed_other_noise(camera, tmp_path):
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         capture(camera, "--target", "white", "--seed", seed, "-o", tmp_path / f"{name}.h5")

@@ -1,6 +1,7 @@
 """demux as a batch: folders, reruns, bad files, workers, formats."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -299,3 +300,67 @@ def test_a_saturated_capture_and_bands_that_do_not_differ_are_said(files, tmp_pa
             "no lenslet could be demultiplexed" in capsys.readouterr().err
             and not (tmp_path / "never.h5").exists()
         )
+
+
+WARM = """dark_current = "20000 e/s"
+dsnu = "150 e"
+hot_pixels = 0.01
+hot_pixel_current = "200000 e/s"
+black_level = 200
+[light]
+white_exposure = "40 ms"
+"""
+
+
+def test_a_dark_frame_takes_off_what_the_sensor_makes_without_light(tmp_path):
+    """Dark current, its fixed pattern and hot pixels, in every frame: with a dark frame spectra are
+    those of a sensor without them, but for the dark current's shot noise; without one they are
+    not.
+    """
+    text = (
+        Path(__file__).resolve().parents[2] / "sample_configs" / "demo_spectral.toml"
+    ).read_text()
+    for old, new in {
+        "count = [20, 30]": "count = [6, 6]",
+        "[20, 20]": "[12, 12]",
+        '"80 um"': '"48 um"',
+        '"640 um"': '"384 um"',
+        "[3, 3]": "[1, 1]",
+        "black_level = 64\n": "",
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    fast = ["--model", "fresnel", "--accuracy", "1e-2", "--superpixels", "1x1", "--overwrite"]
+
+    def spectra(light, dark):
+        (tmp_path / "camera.toml").write_text(text.replace("[light]", light))
+        names = {"white": "white", "dark": "dark", "shot": "colorchecker"}
+        names |= {f"b{nm}": f"mono:{nm}nm" for nm in (450, 540, 570, 650)}
+        for seed, (name, target) in enumerate(names.items()):
+            made = str(tmp_path / f"{name}.h5")
+            camera = str(tmp_path / "camera.toml")
+            asked = ["capture-sim", camera, "--target", target, "--seed", str(seed), "-o", made]
+            assert run([*asked, *fast]) == 0
+        run_calibrate(
+            tmp_path / "c.h5",
+            whites=[tmp_path / "white.h5"],
+            darks=[tmp_path / "dark.h5"] if dark else [],
+            bands=[(nm * 1e-9, tmp_path / f"b{nm}.h5") for nm in (450, 540, 570, 650)],
+            overwrite=True,
+        )
+        settings = Settings(method="pinv", register="off")
+        run_demux(
+            [tmp_path / "shot.h5"],
+            tmp_path / "s.h5",
+            calibration=tmp_path / "c.h5",
+            settings=settings,
+            suffix=".h5",
+        )
+        found = read_artefact(tmp_path / "s.h5", "spectra").data["spectra/value"]
+        (tmp_path / "s.h5").unlink()
+        return found
+
+    ideal = spectra('black_level = 200\n[light]\nwhite_exposure = "40 ms"', True)
+    off = {dark: np.sqrt(np.mean((spectra(WARM, dark) - ideal) ** 2)) for dark in (True, False)}
+    assert off[True] < 0.006 * np.abs(ideal).max()
+    assert off[False] > 5 * off[True]

@@ -11,7 +11,7 @@ import pytest
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
-from plenocli.forward.sensor.noise import SensorModel
+from plenocli.forward.sensor.detector import SensorModel
 from plenocli.inverse.spectra.radiance import estimate, light_prior
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
@@ -151,7 +151,7 @@ def test_monte_carlo_errors_are_the_predicted_ones_with_everything_estimated(fol
     electrons = rng.poisson(4 * response @ truth, (100, 100, 26**2))
     values = np.rint(0.25 * (electrons + rng.normal(0, 4, electrons.shape))).astype(np.float32)
     c = ideal(response, (100, 100))
-    noise = SENSOR.noise
+    noise = SENSOR.noise()
     snr = {}
     for method in ("pinv", "wls", "lmmse", "single-pixel"):
         found = estimate(c, values, noise, method, light_prior(c))
@@ -180,7 +180,7 @@ def test_when_starved_the_prior_pays_and_auto_takes_it():
     values = np.rint(
         0.25 * (rng.poisson(4 * truth * LIGHT @ response.T) + rng.normal(0, 4, (6, 400, 4)))
     )
-    c, noise = ideal(response, (6, 400)), SENSOR.noise
+    c, noise = ideal(response, (6, 400)), SENSOR.noise()
     error = {
         m: rmse(
             np.moveaxis(estimate(c, values, noise, m, light_prior(c)).value, 0, -1) / LIGHT, truth

@@ -49,8 +49,8 @@ from plenocli.cli import options
     "--exposure",
     type=options.DURATION,
     help=(
-        "Exposure time, such as 2.5ms; default the camera's white_exposure, at which white "
-        "reaches 80 % of full well."
+        "Exposure time, such as 2.5ms; default the camera's own: [sensor] exposure, or what "
+        "fills a perfect white to 80 % of full well."
     ),
 )
 @click.option(

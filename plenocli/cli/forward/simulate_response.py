@@ -54,7 +54,7 @@ from plenocli.cli import options
 @click.option(
     "--exposure",
     type=options.DURATION,
-    help="Exposure to which F refers, such as 2.5ms; default the camera's white_exposure.",
+    help="Exposure to which F refers, such as 2.5ms; default the camera's own.",
 )
 @click.option(
     "--spectral-step",

@@ -31,7 +31,21 @@ def parse_camera(text: str, where: str | os.PathLike[str] = "camera") -> Camera:
     return parse_toml(text, where, Camera)
 
 
-_UNITS = {"full_well": "e", "read_noise": "e", "gain": "DN/e"}
+_UNITS = {
+    "full_well": "e",
+    "read_noise": "e",
+    "gain": "DN/e",
+    "dark_current": "e/s",
+    "temperature": "K",
+    "dark_current_doubling": "K",
+    "dsnu": "e",
+    "hot_pixel_current": "e/s",
+    "black_drift": "DN",
+    "illuminance": "lx",
+    "luminance": "cd/m2",
+    "radiance": "W/m2/sr",
+    "spectral_radiance": "W/m2/sr/m",
+}
 
 
 _NUMBERS = {
@@ -44,6 +58,9 @@ _NUMBERS = {
     "blocking",
     "transmission",
     "pixel_shift",
+    "prnu",
+    "hot_pixels",
+    "crosstalk",
     "model_error",
 }
 
@@ -69,6 +86,6 @@ def _toml(key: str, value: Any) -> str:
         return str(value)
     if key in _UNITS:
         return f'"{value!r} {_UNITS[key]}"'
-    if key == "white_exposure":
+    if key in ("white_exposure", "exposure"):
         return f'"{format_duration(value)}"'
     return repr(value) if key in _NUMBERS else f'"{format_length(value)}"'

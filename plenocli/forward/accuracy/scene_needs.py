@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from plenocli.forward.sensor.noise import SensorModel
+from plenocli.forward.sensor.detector import SensorModel
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera

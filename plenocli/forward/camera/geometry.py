@@ -21,7 +21,7 @@ from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.glass import focal_length
 from plenocli.forward.camera.model import ROW_SPACING
-from plenocli.forward.camera.pupil import ray_reach
+from plenocli.forward.camera.pupil import aperture_area, ray_reach
 
 if TYPE_CHECKING:
     import numpy as np
@@ -300,6 +300,20 @@ def _steps(n: int) -> np.ndarray:
 def hexagonal_rows(window: int) -> int:
     """Rows of a hexagonal lattice, to either side, that cover `window` and a half pitches."""
     return math.ceil((window + 0.5 - ROW_SPACING / 3) / ROW_SPACING) if window else 0
+
+
+def point_etendue(camera: Camera) -> float:
+    """Etendue between one object point and the clear pupil, m^2 sr: light of radiance L sends L
+    times that through the main lens.
+
+    A point stands for its share of one lenslet's field; from it a circular pupil of area S at the
+    distance z fills pi sin^2 = S/(z^2 + S/pi), which counts for pupils of other shapes too.
+    docs/model.md, "From radiance to electrons".
+    """
+    array, z = camera.lenslet_array, camera.object.distance
+    field = array.row_spacing * (array.pitch * z / array.distance) ** 2
+    area = aperture_area(camera.main_lens)
+    return field / math.prod(camera.object.samples_per_lenslet) * area / (z**2 + area / math.pi)
 
 
 def geometry(

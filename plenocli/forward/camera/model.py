@@ -7,7 +7,7 @@ each with its path.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,15 +15,23 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_
 
 from plenocli.base.errors import ConfigError
 from plenocli.base.quantities import (
+    Digits,
     Duration,
+    ElectronRate,
     Electrons,
     FileName,
     Gain,
     Gap,
+    Illuminance,
+    Kelvins,
     Length,
+    Luminance,
     Pair,
+    Radiance,
     Section,
     SignedLength,
+    SpectralRadiance,
+    Temperature,
     Unit,
     Wavelength,
     quantity,
@@ -264,7 +272,24 @@ class LensletArray(Section):
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0
 
 
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
 class Sensor(Section):
+    """The sensor. What is fixed about its pixels (dsnu, prnu, hot_pixels) is drawn from `serial`,
+    as sensors of one kind differ, and is the same in every frame.
+
+    exposure: its time, under a light of known strength; without it as long as fills a perfect
+        white to 80 % of full well.
+    dark_current: electrons a second and pixel in the mean, at 25 C.
+    temperature: of the sensor; dark currents double every `dark_current_doubling`.
+    dsnu: standard deviation over the pixels of the electrons without light and time.
+    prnu: standard deviation over the pixels of their sensitivity, relative.
+    hot_pixels: share of the pixels with a dark current of `hot_pixel_current` in the mean.
+    crosstalk: share of a pixel's electrons that its four neighbours collect together.
+    black_drift: standard deviation from frame to frame of the black level.
+    """
+
     distance: Length
     pixel_pitch: Length
     pixels_per_lenslet: Pair
@@ -277,6 +302,24 @@ class Sensor(Section):
     gain: Gain = 0.25
     bits: Annotated[int, Field(ge=2, le=16)] = 12
     black_level: Annotated[int, Field(ge=0, le=65534)] = 0
+    exposure: Duration | None = None
+    dark_current: ElectronRate | None = None
+    temperature: Temperature | None = None
+    dark_current_doubling: Kelvins | None = None
+    dsnu: Electrons | None = None
+    prnu: Share | None = None
+    hot_pixels: Share | None = None
+    hot_pixel_current: ElectronRate | None = None
+    crosstalk: Share | None = None
+    black_drift: Digits | None = None
+    serial: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+
+    DETECTION: ClassVar[frozenset[str]] = frozenset(
+        "quantum_efficiency full_well read_noise gain bits black_level exposure dark_current "
+        "temperature dark_current_doubling dsnu prnu hot_pixels hot_pixel_current crosstalk "
+        "black_drift serial cfa camera".split()
+    )
+    """Keys that say what becomes of the light, not where it goes."""
 
     @model_validator(mode="after")
     def _levels(self) -> Self:
@@ -289,6 +332,14 @@ class Sensor(Section):
             )
         if self.full_well <= 0:
             raise ValueError("full_well must be above 0 e")
+        return self
+
+    @model_validator(mode="after")
+    def _dark(self) -> Self:
+        if self.hot_pixel_current is not None and not self.hot_pixels:
+            raise ValueError("hot_pixel_current goes with hot_pixels, the share of such pixels")
+        if self.dark_current_doubling is not None and self.temperature is None:
+            raise ValueError("dark_current_doubling goes with temperature")
         return self
 
 
@@ -312,8 +363,13 @@ class Band(Section):
 
 
 class Light(Section):
-    """What lights the scene; under it a perfect white fills the brightest pixel to 80 % of full
-    well in `white_exposure`.
+    """What lights the scene.
+
+    Its strength is that of a perfect white in the scene, by one of: `illuminance` (lux on it),
+    `luminance`, `radiance` (over all its wavelengths) or `spectral_radiance` (at
+    design_wavelength). Without any, exposure is relative: a perfect white fills the brightest pixel
+    to 80 % of full well in `white_exposure`, whatever the lens, the filters and the pixels. A
+    narrow band that --target mono shows has a lamp of its own, whose exposure is always relative.
 
     Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths`
     resolves to its centre.
@@ -326,6 +382,29 @@ class Light(Section):
     design_wavelength: Resolved[Wavelength] = _LEFT_OUT
     illuminant: str = "D65"
     white_exposure: Duration = 0.01
+    illuminance: Illuminance | None = None
+    luminance: Luminance | None = None
+    radiance: Radiance | None = None
+    spectral_radiance: SpectralRadiance | None = None
+
+    STRENGTHS: ClassVar[tuple[str, ...]] = (
+        "illuminance",
+        "luminance",
+        "radiance",
+        "spectral_radiance",
+    )
+
+    @property
+    def strength(self) -> str | None:
+        """Name of the key that says how strong the light is; None where exposure is relative."""
+        return next((key for key in self.STRENGTHS if getattr(self, key) is not None), None)
+
+    @model_validator(mode="after")
+    def _one_strength(self) -> Self:
+        given = [key for key in self.STRENGTHS if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give at most one of {' and '.join(given)}")
+        return self
 
     @model_validator(mode="after")
     def _ascending(self) -> Self:
@@ -412,6 +491,13 @@ class Camera(Section):
         trouble = implausible(self._lengths())
         if trouble:
             raise ValueError(trouble)
+        if self.sensor.exposure is not None and light.strength is None:
+            raise ValueError(
+                "sensor.exposure needs to know how strong the light is: give light.illuminance "
+                '(such as "500 lx"), luminance, radiance or spectral_radiance; or give '
+                "light.white_exposure, in which a perfect white fills the brightest pixel to 80 % "
+                "of full well"
+            )
         if lens.aperture_diameter is None:
             width = {"aperture_diameter": array.distance / lens.f_number, "f_number": None}
             self.__dict__.update(main_lens=lens.model_copy(update=width))

@@ -7,6 +7,7 @@ photon's h c / l). See docs/model.md, "From radiance to electrons".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,12 +15,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plenocli.base.errors import UsageError
+from plenocli.base.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 VISIBLE = (400e-9, 700e-9)
+GAUSSIAN = math.sqrt(math.pi / (4 * math.log(2)))
+"""Area of a Gaussian band over its peak and full width at half maximum."""
+LUMENS_PER_WATT = 683.0
+"""K_m of the photopic eye, lm/W."""
+PHOTON = 6.62607015e-34 * 299792458.0
+"""Energy of a photon times its wavelength, J m."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +35,13 @@ class Quadrature:
 
     wavelengths: (node,) m, ascending.
     photons: (node,) relative photon radiance, summing to 1.
+    width: radiance of all nodes over the spectral radiance at the camera's design wavelength (in a
+        band: at its centre), m; None where the source is of lines.
     """
 
     wavelengths: np.ndarray
     photons: np.ndarray
+    width: float | None = None
 
 
 def broadband(
@@ -52,7 +62,9 @@ def broadband(
     """
     if not has_colour(camera):
         lines = np.array(camera.light.wavelengths)
-        return Quadrature(lines, np.full(len(lines), 1 / len(lines)))
+        band = camera.light.band
+        width = None if band is None else band.fwhm * (GAUSSIAN if band.shape == "gaussian" else 1)
+        return Quadrature(lines, np.full(len(lines), 1 / len(lines)), width)
     if step is None:
         step = (
             min((f.fwhm for f in camera.filter_array.filters), default=20e-9) / 2
@@ -72,7 +84,10 @@ def broadband(
     nodes = np.linspace(low, high, int(round((high - low) / step)) + 1)
     weights = np.ones(len(nodes))
     weights[[0, -1]] = 0.5
-    return _normalised(nodes, weights * power(nodes) * nodes)
+    power_at = weights * power(nodes)
+    design = float(power(np.array([camera.light.design_wavelength]))[0])
+    width = float(power_at.sum()) * (nodes[1] - nodes[0]) / design if design > 0 else None
+    return _normalised(nodes, power_at * nodes, width)
 
 
 def narrow_band(centre: float, fwhm: float = 0.0, nodes: int = 5) -> Quadrature:
@@ -86,7 +101,7 @@ def narrow_band(centre: float, fwhm: float = 0.0, nodes: int = 5) -> Quadrature:
         return Quadrature(np.array([centre]), np.ones(1))
     x, weights = np.polynomial.hermite_e.hermegauss(nodes)
     wavelengths = centre + x * fwhm / np.sqrt(8 * np.log(2))
-    return _normalised(wavelengths, weights * wavelengths)
+    return _normalised(wavelengths, weights * wavelengths, GAUSSIAN * fwhm)
 
 
 def broadened(lines: Iterable[float], fwhm: float) -> Quadrature:
@@ -98,7 +113,8 @@ def broadened(lines: Iterable[float], fwhm: float) -> Quadrature:
     bands = [narrow_band(line, fwhm) for line in lines]
     order = np.argsort(np.concatenate([b.wavelengths for b in bands]))
     wavelengths = np.concatenate([b.wavelengths for b in bands])[order]
-    return _normalised(wavelengths, np.concatenate([b.photons for b in bands])[order])
+    photons = np.concatenate([b.photons for b in bands])[order]
+    return _normalised(wavelengths, photons, len(bands) * GAUSSIAN * fwhm)
 
 
 def band_weights(
@@ -163,7 +179,47 @@ def has_colour(camera: Camera) -> bool:
     return camera.filter_array is not None or camera.sensor.cfa != "mono"
 
 
-def _normalised(wavelengths: np.ndarray, photons: np.ndarray) -> Quadrature:
+def photon_radiance(camera: Camera, source: Quadrature) -> float:
+    """Photons of all wavelengths that a perfect white sends, 1/(s m^2 sr).
+
+    camera: whose [light] says how strong it is; a Lambertian white of `illuminance` E has the
+        luminance E/pi.
+    source: its wavelengths and their shares.
+
+    Raises ConfigError where the light's strength is one that its wavelengths do not have.
+    CIE 1931 standard observer, K_m = 683 lm/W. docs/model.md, "From radiance to electrons".
+    """
+    from plenocli.forward.scene.tables import observer
+
+    light = camera.light
+    energy = source.photons / source.wavelengths
+    if light.radiance is not None:
+        radiance = light.radiance
+    elif light.spectral_radiance is not None:
+        if source.width is None:
+            raise ConfigError(
+                "a line of light has no width that a spectral radiance could be multiplied with",
+                "light.spectral_radiance",
+                "give radiance, or [light] band, or --bandwidth",
+            )
+        radiance = light.spectral_radiance * source.width
+    else:
+        seen = float(observer(source.wavelengths)[1][1] @ energy)
+        if not seen > 1e-6 * energy.sum():
+            raise ConfigError(
+                "the light has no wavelengths that the eye sees, so lux and cd/m2 do not say how "
+                "strong it is",
+                f"light.{light.strength}",
+                "give radiance in W/m2/sr",
+            )
+        luminance = light.luminance or (light.illuminance or 0.0) / np.pi
+        radiance = luminance / LUMENS_PER_WATT * energy.sum() / seen
+    return float(radiance / energy.sum() / PHOTON)
+
+
+def _normalised(
+    wavelengths: np.ndarray, photons: np.ndarray, width: float | None = None
+) -> Quadrature:
     total = photons.sum()
     if not (np.isfinite(total) and total > 0):
         raise UsageError(
@@ -173,4 +229,4 @@ def _normalised(wavelengths: np.ndarray, photons: np.ndarray) -> Quadrature:
             ),
             fix="choose another illuminant or other wavelengths",
         )
-    return Quadrature(wavelengths, photons / total)
+    return Quadrature(wavelengths, photons / total, width)

@@ -39,7 +39,7 @@ class ExposureOptions:
     model: of the propagation, "auto", "ray", "fresnel" or "exact".
     snr_db: of white noise instead of the sensor's own, dB.
     noise: "sensor" or "none".
-    exposure: s, None for the camera's white exposure.
+    exposure: s, None for the camera's own.
     seed: of the noise.
     """
 
@@ -94,7 +94,7 @@ def simulate_capture(
     Berkner et al. 2013, section 2.
     """
     light = carry_light(camera, source, scene, options, matrices)
-    capture, saturated = detect(camera, light, options, name)
+    capture, saturated = detect(camera, source, light, options, name, lamp=band_m is not None)
     return SimulatedCapture(
         capture=_described(capture, camera, light.scene, name, band_m),
         scene=light.scene,
@@ -292,10 +292,20 @@ def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> 
 
 
 def detect(
-    camera: Camera, light: SensorLight, options: ExposureOptions, scene: str
+    camera: Camera,
+    source: Quadrature,
+    light: SensorLight,
+    options: ExposureOptions,
+    scene: str,
+    *,
+    lamp: bool = False,
 ) -> tuple[Capture, float | None]:
     """What the sensor reports of relative light, and the share of pixels over full well (None in
     relative units).
+
+    source: the light.
+    scene: its name, for messages.
+    lamp: whether the light is not the camera's [light], but a lamp as bright as is needed.
     """
     mosaic = _through_the_filters(camera, light)
     if not float(light.white.max()) > 0:
@@ -307,7 +317,9 @@ def detect(
     rng = stream(options.seed, "capture-sim")
     if options.snr_db is not None or options.noise == "none":
         return _relative(camera, mosaic, options, rng), None
-    return _exposed(camera, mosaic, float(light.white.max()), options, scene, rng)
+    brightest = float(light.white.max())
+    electrons = exposure_scale(camera, source, brightest, options.exposure, lamp=lamp)
+    return _exposed(camera, mosaic, electrons, scene, rng)
 
 
 def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
@@ -346,23 +358,71 @@ def _relative(
     )
 
 
+@dataclass(frozen=True)
+class ExposureScale:
+    """How long the sensor is exposed, and to what.
+
+    electrons: photo-electrons of a unit of relative light at a quantum efficiency of 1.
+    seconds: s.
+    """
+
+    electrons: float
+    seconds: float
+
+
+def exposure_scale(
+    camera: Camera,
+    source: Quadrature,
+    brightest: float,
+    seconds: float | None,
+    *,
+    lamp: bool = False,
+) -> ExposureScale:
+    """Electrons and time of an exposure.
+
+    Light of known strength gives photons in proportion to time; without a time, it lasts until a
+    perfect white fills the brightest pixel to WHITE_LEVEL of full well. Without a strength that is
+    what `light.white_exposure` does, and other times are relative to it.
+    source: the light.
+    brightest: relative light, quantum efficiency included, of the brightest pixel under a perfect
+        white, above 0.
+    seconds: exposure, None for the camera's own.
+    lamp: whether the light is not the camera's [light], but a lamp as bright as is needed.
+
+    Raises ConfigError where the light's strength is one that its wavelengths do not have.
+    docs/model.md, "From radiance to electrons".
+    """
+    from plenocli.forward.camera.geometry import point_etendue
+    from plenocli.forward.scene.light import photon_radiance
+
+    full = WHITE_LEVEL * camera.sensor.full_well / brightest
+    own = camera.sensor.exposure
+    asked = own if seconds is None else seconds
+    if lamp or camera.light.strength is None:
+        base = own or camera.light.white_exposure
+        taken = asked or base
+        return ExposureScale(full * taken / base, taken)
+    rate = photon_radiance(camera, source) * point_etendue(camera)
+    if asked is None:
+        note(
+            f"exposed for {full / rate * 1e3:.3g} ms, in which a perfect white fills the brightest "
+            f"pixel to {WHITE_LEVEL:.0%} of full well"
+        )
+    taken = full / rate if asked is None else asked
+    return ExposureScale(rate * taken, taken)
+
+
 def _exposed(
     camera: Camera,
     mosaic: np.ndarray,
-    peak: float,
-    options: ExposureOptions,
+    exposure: ExposureScale,
     scene: str,
     rng: np.random.Generator,
 ) -> tuple[Capture, float]:
-    """A capture in digital numbers, and the share of its pixels over full well.
+    """A capture in digital numbers, and the share of its pixels over full well."""
+    from plenocli.forward.sensor.detector import SensorModel
 
-    peak: relative light of the brightest pixel under a uniform white object.
-    """
-    from plenocli.forward.sensor.noise import SensorModel
-
-    sensor = camera.sensor
-    exposure = options.exposure or camera.light.white_exposure
-    scale = WHITE_LEVEL * sensor.full_well / peak * exposure / camera.light.white_exposure
+    sensor, scale = camera.sensor, exposure.electrons
     model = SensorModel.from_camera(camera)
     if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
         raise InputError(
@@ -370,7 +430,7 @@ def _exposed(
             scene,
             "clip it (reconstruct --clip), or use --noise none",
         )
-    values = model.expose(mosaic * scale, rng)
+    values = model.expose(mosaic * scale, rng, exposure.seconds)
     saturated = float(np.mean(mosaic * scale >= sensor.full_well))
     if saturated > 0.001:
         note(
@@ -385,8 +445,8 @@ def _exposed(
             white=float(model.white_level),
             gain=sensor.gain,
         ),
-        exposure_s=exposure,
-        noise=model.noise,
+        exposure_s=exposure.seconds,
+        noise=model.noise(exposure.seconds),
         metadata=CaptureMetadata(
             noise_from="camera",
             electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),

@@ -18,7 +18,8 @@ from plenocli.forward.propagation.response import (
     uniform_response,
     valid_for,
 )
-from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE, WHITE_LEVEL
+from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
+from plenocli.forward.sensor.exposure import exposure_scale
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -169,14 +170,16 @@ class ResponsePrediction:
         samples = tuple(max(n, least) for n in self.camera.object.samples_per_lenslet)
         return self.camera.replace(**{"object.samples_per_lenslet": samples})
 
-    def white_signal(self, source: Quadrature, exposure: float | None) -> np.ndarray:
+    def white_signal(
+        self, source: Quadrature, exposure: float | None, *, lamp: bool = False
+    ) -> tuple[np.ndarray, float]:
         """Expected signal of the white reference.
 
         source: the light.
-        exposure: s; None: the camera's white exposure.
+        exposure: s; None: the camera's own.
+        lamp: whether the light is not the camera's [light], but a lamp as bright as is needed.
 
-        Returns (kind, pixel) DN: the brightest pixel of a perfect white under this light is filled
-        to WHITE_LEVEL in the white exposure.
+        Returns (kind, pixel) DN, and the exposure in s.
         Raises ConfigError where no light reaches the sensor.
         """
         from plenocli.forward.sensor.cfa import cfa_map, sensitivity
@@ -206,9 +209,9 @@ class ResponsePrediction:
                 for kind, mosaic in enumerate(mosaics)
             ]
         )
-        white = camera.light.white_exposure
-        scale = WHITE_LEVEL * camera.sensor.full_well / peak * (exposure or white) / white
-        return seen * (scale * REFERENCE_REFLECTANCE * camera.sensor.gain)
+        scale = exposure_scale(camera, source, peak, exposure, lamp=lamp)
+        signal = seen * (scale.electrons * REFERENCE_REFLECTANCE * camera.sensor.gain)
+        return signal, scale.seconds
 
     def notes(self, bands: tuple[float, ...]) -> PredictionNotes:
         """What is recorded of F in `bands` (m), once it was computed."""

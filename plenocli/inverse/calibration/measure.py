@@ -11,8 +11,9 @@ import numpy as np
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import bar
 from plenocli.base.text import by
+from plenocli.forward.sensor.detector import ROUNDING, SensorModel
 from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
-from plenocli.forward.sensor.noise import ROUNDING, Noise, SensorModel
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration.calibration import (
     Calibration,
     Sensor,
@@ -220,7 +221,7 @@ def require_alike(capture: Capture, like: Capture) -> None:
 def _noise(white: Sequence[Capture], dark: Dark, camera: Camera | None) -> KnownNoise:
     """Gain and read variance as far as the camera description or the files say them."""
     if camera is not None and white[0].units == "DN":
-        noise = SensorModel.from_camera(camera).noise
+        noise = SensorModel.from_camera(camera).temporal_noise(white[0].exposure_s or 0.0)
         return KnownNoise(noise.gain, noise.read_variance, "camera")
     known = white[0].white_noise
     if known is not None and known.white:

@@ -11,6 +11,7 @@ import numpy as np
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import note
 from plenocli.files.read.scenes import read_scene
+from plenocli.forward.camera.model import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.scene.scenes import Chart, Scene, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
@@ -45,7 +46,7 @@ class Settings:
     model: of the propagation, "auto" or a rung.
     snr_db: of white noise instead of the sensor's own, dB.
     noise: "sensor" or "none".
-    exposure: s, None for the camera's white exposure.
+    exposure: s, None for the camera's own.
     seed: of the noise.
     """
 
@@ -289,19 +290,7 @@ def _source(
     return white, scenes[target]
 
 
-_OF_THE_DETECTOR = {
-    "lenslet_array": {"count"},
-    "sensor": {
-        "full_well",
-        "read_noise",
-        "gain",
-        "bits",
-        "black_level",
-        "quantum_efficiency",
-        "cfa",
-        "camera",
-    },
-}
+_OF_THE_DETECTOR = {"lenslet_array": {"count"}, "sensor": Sensor.DETECTION}
 """What may differ, by section, between a capture's camera and the one that a pif was made for."""
 
 
@@ -338,7 +327,7 @@ def _read_pif(
         )
     made_for = parse_camera(artefact.provenance.config, path)
     for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array", "fitted"):
-        drop = _OF_THE_DETECTOR.get(section, set())
+        drop = set(_OF_THE_DETECTOR.get(section, ()))
         ours, theirs = getattr(camera, section), getattr(made_for, section)
         if (ours and ours.model_dump(exclude=drop)) != (theirs and theirs.model_dump(exclude=drop)):
             raise InputError(

@@ -129,11 +129,12 @@ def run_simulate_response(
     )
     prediction = ResponsePrediction(camera, settings.options(), kinds, camera_path)
     bands = tuple(sorted(set(settings.wavelengths))) or camera.light.wavelengths
-    sources = _narrow(bands, settings)
-    matrix = np.stack(
-        [prediction.white_signal(source, settings.exposure) for source in sources], axis=-1
-    )
     known = measured or _described(camera, prediction, settings)
+    seconds = settings.exposure if measured else known.sensor.exposure
+    lamps = _narrow(bands, settings)
+    matrix = np.stack(
+        [prediction.white_signal(lamp, seconds, lamp=True)[0] for lamp in lamps], axis=-1
+    )
     notes = prediction.notes(bands)
     calibration = _with_response(known, kinds, matrix, bands, notes)
     provenance = Provenance(
@@ -207,20 +208,21 @@ def _described(camera: Camera, prediction: ResponsePrediction, settings: Setting
     """A calibration without errors, and without a response: the grid of the description, its
     white, its black level.
     """
+    from plenocli.forward.sensor.detector import SensorModel
     from plenocli.forward.sensor.frames import Dark
-    from plenocli.forward.sensor.noise import SensorModel
     from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, Windows
     from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
     sensor, array, kinds = camera.sensor, camera.lenslet_array, prediction.kinds
-    signal = prediction.white_signal(_white(camera, settings), settings.exposure)
+    signal, exposure = prediction.white_signal(_white(camera, settings), settings.exposure)
     pitch = (
         np.array([camera.superpixel_pitch * array.row_spacing, camera.superpixel_pitch])
         / sensor.pixel_pitch
     )
     right = 0.0 if array.lattice == "square" else pitch[1] / 2
     model = SensorModel.from_camera(camera)
-    exposure, read_noise = settings.exposure or camera.light.white_exposure, model.noise.sigma
+    read_noise = model.temporal_noise(exposure).sigma
+    black = sensor.black_level + model.gain * model.dark_current * exposure
     return Calibration(
         grid=LensletGrid(
             lattice=array.lattice,
@@ -245,7 +247,7 @@ def _described(camera: Camera, prediction: ResponsePrediction, settings: Setting
         windows=Windows(kinds.origin, kinds.window),
         white=White.predicted(signal, kinds),
         dark=Dark(
-            mean=np.full(kinds.sensor_shape, sensor.black_level, np.float32),
+            mean=np.full(kinds.sensor_shape, black, np.float32),
             black=np.full((2, 2), float(sensor.black_level)),
             exposure=exposure,
             sigma=read_noise,

@@ -271,20 +271,19 @@ def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
 
     files: path -> SHA-256 of the files it names.
     """
+    from plenocli.forward.camera.model import Light, Sensor
+
     if not task.needs_matrix:
         return ""
     settings = task.options("simulate-pif")
     kept = camera.model_dump(mode="json")
     # without an accuracy asked for, the sensor's noise decides how exact the matrix is
-    noise = {"full_well", "read_noise"} if settings.get("accuracy") is not None else set()
-    colour = set() if task.chain == "spectral" else {"cfa"}
+    noise = set() if settings.get("accuracy") is not None else {"full_well", "read_noise"}
+    colour = {"cfa"} if task.chain == "spectral" else set()
     for section, names in (
         ("lenslet_array", {"count"}),
-        ("light", {"illuminant", "white_exposure"}),
-        (
-            "sensor",
-            {"camera", "bits", "black_level", "gain", "quantum_efficiency"} | colour | noise,
-        ),
+        ("light", {"illuminant", "white_exposure", *Light.STRENGTHS}),
+        ("sensor", Sensor.DETECTION - colour - noise),
     ):
         kept[section] = {name: value for name, value in kept[section].items() if name not in names}
     return digest_of({"camera": kept, "settings": settings}, files)

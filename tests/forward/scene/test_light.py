@@ -5,10 +5,11 @@ over all wavelengths.
 import numpy as np
 import pytest
 
-from plenocli.base.errors import UsageError
+from plenocli.base.errors import ConfigError, UsageError
 from plenocli.files.config.camera_file import parse_camera
 from plenocli.forward.camera.pupil import filter_transmittance
-from plenocli.forward.scene.light import band_weights, broadband
+from plenocli.forward.scene.light import band_weights, broadband, narrow_band, photon_radiance
+from plenocli.forward.scene.tables import illuminant
 
 CAMERA = """
 [main_lens]
@@ -89,3 +90,67 @@ def test_without_filters_lines_are_equally_strong():
 def test_light_without_power_is_refused():
     with pytest.raises(UsageError, match="has no power between 400 and 700 nm"):
         broadband(parse_camera(CAMERA + FILTERS), lambda wavelengths: 0 * wavelengths)
+
+
+def lit(strength, camera=CAMERA):
+    """A camera with a light of known strength."""
+    return parse_camera(camera.replace("[light]", f"[light]\n{strength}"))
+
+
+def test_photons_of_one_line_are_those_of_the_photometric_definition():
+    """683 lm/W at 540 THz, where V is 1 but for the standard observer's table."""
+    camera = lit('luminance = "683 cd/m2"')
+    photon = 6.62607015e-34 * 540e12
+    found = photon_radiance(camera, narrow_band(299792458.0 / 540e12))
+    assert found == pytest.approx(1 / photon, rel=1e-3)
+    same = lit(f'illuminance = "{683 * np.pi} lx"')
+    assert photon_radiance(same, narrow_band(299792458.0 / 540e12)) == pytest.approx(found)
+
+
+@pytest.mark.parametrize("name", ["D65", "A", "E"])
+def test_photons_of_white_light_are_the_integral_over_its_spectrum(name):
+    import colour
+
+    camera = lit(f'luminance = "100 cd/m2"\nilluminant = "{name}"', CAMERA + FILTERS)
+    found = photon_radiance(camera, broadband(camera, lambda w: illuminant(name, w)))
+    nm = np.arange(400, 701)
+    spectrum = colour.SDS_ILLUMINANTS[name].copy().interpolate(colour.SpectralShape(400, 700, 1))
+    power = spectrum.values
+    eye = colour.SDS_LEFS["CIE 1924 Photopic Standard Observer"].copy()
+    seen = eye.align(colour.SpectralShape(400, 700, 1)).values
+    radiance = power * 100 / (683 * np.sum(power * seen))  # W/m2/sr in each nm
+    photons = np.sum(radiance * nm * 1e-9) / (6.62607015e-34 * 299792458.0)
+    assert found == pytest.approx(photons, rel=5e-3)
+
+
+def test_a_spectral_radiance_is_that_at_the_design_wavelength():
+    camera = lit('spectral_radiance = "2 mW/m2/sr/nm"', CAMERA + FILTERS)
+    flat = photon_radiance(camera, broadband(camera, lambda w: np.ones_like(w)))
+    nm = np.arange(400, 701)
+    weights = np.where((nm == 400) | (nm == 700), 0.5, 1.0)
+    photons = 2e-3 * np.sum(weights * nm * 1e-9) / (6.62607015e-34 * 299792458.0)
+    assert flat == pytest.approx(photons, rel=1e-6)
+    total = lit('radiance = "0.6 W/m2/sr"', CAMERA + FILTERS)
+    assert photon_radiance(total, broadband(total, lambda w: np.ones_like(w))) == pytest.approx(
+        flat
+    )
+
+
+@pytest.mark.parametrize(
+    "strength, wavelength, words",
+    [
+        ('spectral_radiance = "2 mW/m2/sr/nm"', 550e-9, "a line of light has no width"),
+        ('illuminance = "500 lx"', 900e-9, "no wavelengths that the eye sees"),
+    ],
+)
+def test_a_strength_that_its_wavelengths_do_not_have_is_refused(strength, wavelength, words):
+    camera = lit(strength)
+    with pytest.raises(ConfigError, match=words):
+        photon_radiance(camera, narrow_band(wavelength))
+
+
+def test_two_strengths_and_an_exposure_without_strength_are_refused():
+    with pytest.raises(ConfigError, match="at most one of illuminance and luminance"):
+        lit('illuminance = "500 lx"\nluminance = "100 cd/m2"')
+    with pytest.raises(ConfigError, match="how strong the light is"):
+        parse_camera(CAMERA.replace("[sensor]", '[sensor]\nexposure = "10 ms"'))

@@ -7,8 +7,9 @@ import pytest
 from scipy.stats import norm
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.sensor.detector import SensorModel
 from plenocli.forward.sensor.frames import photon_transfer
-from plenocli.forward.sensor.noise import Noise, SensorModel, add_white_noise
+from plenocli.forward.sensor.noise import Noise, add_white_noise
 
 MODEL = SensorModel(gain=0.25, read_noise=4.0, full_well=15000, bits=12, black_level=64)
 
@@ -22,7 +23,7 @@ def test_photon_transfer_slope_is_the_gain(count):
     assert slope == pytest.approx(MODEL.gain, rel=0.01)
     assert offset == pytest.approx(MODEL.gain**2 * MODEL.read_noise**2 + 1 / 12, rel=0.03)
     np.testing.assert_allclose(mean, 64 + 0.25 * levels, atol=0.5)
-    np.testing.assert_allclose(variance, MODEL.noise.variance(MODEL.gain * levels), rtol=0.04)
+    np.testing.assert_allclose(variance, MODEL.noise().variance(MODEL.gain * levels), rtol=0.04)
     count(
         "photon transfer, slope against gain",
         off_by_parts_per_10000=round(1e4 * abs(slope / MODEL.gain - 1)),
@@ -71,7 +72,7 @@ def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of
                 z_scores(
                     values,
                     model.black_level + model.gain * mean,
-                    model.noise.variance(model.gain * mean),
+                    model.noise().variance(model.gain * mean),
                     model.gain**3 * mean,
                 )
             ),
@@ -85,7 +86,7 @@ def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of
             z_scores(
                 model.expose(np.full(size, 7507.5), rng).astype(float),
                 model.black_level + model.gain * 7500,
-                model.noise.variance(model.gain * 7500),
+                model.noise().variance(model.gain * 7500),
                 0,
             )[0]
         )
@@ -96,7 +97,7 @@ def test_two_million_pixels_of_each_class_have_the_mean_variance_and_skewness_of
         z_scores(
             noisier.expose(np.zeros(size), rng).astype(float),
             model.black_level,
-            model.noise.variance(0),
+            model.noise().variance(0),
             0,
         )[1]
         > 4

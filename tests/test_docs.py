@@ -315,6 +315,6 @@ def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):
         space.point(number, point)
         for number, point in enumerate(points(space.sweep, space.axes, 0))
     ]
-    assert len(rows) == 4 * 5 * 3 * 2 and all(
+    assert len(rows) == 4 * 5 * 3 and all(
         row.task is not None and row.result is None for row in rows
     )

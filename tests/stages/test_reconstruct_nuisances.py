@@ -99,3 +99,19 @@ def test_the_white_image_undoes_vignetting_and_knows_dead_pixels(tmp_path):
         return psnr(found.value, scene.scene[0])
 
     assert quality(gain) > quality(np.ones(gain.shape)) - 0.3
+
+
+def test_the_white_image_of_lenslets_that_exchange_light_changes_nothing(tmp_path):
+    """Neighbours' light belongs to the white that the matrix expects: the picture with a white
+    image is that without one where there is nothing to undo.
+    """
+    camera = pc.read_camera(pc.sample("tiny.toml"))
+    shot = pc.simulate_capture(camera, "skimage:astronaut", refine=2)
+    white = pc.simulate_capture(camera, np.ones((40, 40)), refine=2, seed=4)
+    matrix = pc.system_matrix(camera, superpixels=(3, 3), accuracy=1e-2)
+    evened = pc.reconstruct(
+        shot, matrix, method="lmmse", calibration=pc.calibrate(white.capture, camera=camera)
+    )
+    plain = pc.reconstruct(shot, matrix, method="lmmse")
+    truth = shot.scene[0]
+    assert psnr(evened.value, truth) > psnr(plain.value, truth) - 0.2

@@ -1,10 +1,9 @@
-"""The way up to the most likely camera: Levenberg's steps on Fisher's matrix, lengthened while the
-evidence rises, with noise that starts as large as the captures' misfit makes it.
+"""The way up to the most likely camera: Levenberg's steps by Gauss and Newton's curvature, lengthened
+while the evidence rises, with noise that starts as large as the captures' misfit makes it.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,13 +11,13 @@ import numpy as np
 
 from plenocli.inverse.fit.evidence import Evidence, EvidenceAt
 from plenocli.inverse.fit.finer import FinerModel
-from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt, fringes_a_pixel
+from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt
 from plenocli.inverse.fit.optics import CameraFamily
 
 GAIN = 0.3
 """A step that makes the captures less than this more likely (log) is the last one."""
 ENOUGH = 3.0
-"""So is one that gains less than this where Fisher's matrix promised no more: what is left to gain
+"""So is one that gains less than this where the curvature promised no more: what is left to gain
 is below what the parameters' standard deviations stand for, and there are valleys to creep along.
 """
 LONGER = 2.5
@@ -35,31 +34,10 @@ CHANGED = 0.1
 """Of the noise: what the difference of a finer model may have changed by at the end of a climb."""
 UNDAMPED = 1e-5
 """Least damping of steps."""
-KEPT = 4
-"""Steps that Fisher's matrix is kept for, where they help."""
-STALE = 1.5
-"""By how much the noise may fall meanwhile."""
+TRIES = 6
+"""How often the damping of a step that does not rise is raised."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
-COARSE = 2.0
-"""Quadrature nodes a period of the finest fringes of what Fisher's matrix is made of."""
-
-
-@dataclass(frozen=True)
-class _Fisher:
-    """Fisher's matrix (parameter, parameter), the noise factor where it was made, and how many
-    steps it was used for since.
-    """
-
-    matrix: np.ndarray
-    factor: float
-    age: int = 1
-
-    def serves(self, at: Point) -> bool:
-        """Whether a step from a point may still be made on it."""
-        return self.age < KEPT and self.factor < STALE * at.factor
-
-
 @dataclass(frozen=True, kw_only=True)
 class Point:
     """A camera on the way.
@@ -83,6 +61,32 @@ class Point:
         paraxial = self.paraxial.matrix
         return paraxial if self.finer is None else paraxial + self.finer
 
+    def under(self, factor: float) -> Point:
+        """The same camera under `factor` times the noise told."""
+        height = self.evidence.value(factor) - 0.5 * float(self.x @ self.x)
+        return replace(self, factor=factor, height=height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slopes:
+    """How things change around a Point with the parameters in tolerances.
+
+    rise: (parameter,) derivatives of the height;
+    light: for every capture (parameter, pixel, lenslet) derivatives of what the objects that the
+        captures tell of make;
+    products: (parameter, parameter) of the matrix's derivatives.
+    """
+
+    rise: np.ndarray
+    light: tuple[np.ndarray, ...]
+    products: np.ndarray
+
+    def curvature(self, at: Point, factor: float) -> np.ndarray:
+        """How fast the slopes of the height fall at `factor` times the noise told, (parameter,
+        parameter), what is believed of the parameters included; at: the Point.
+        """
+        return at.evidence.curvature(self.light, factor) + np.eye(len(self.rise))
+
 
 class Ascent:
     """One problem: a family of cameras and captures of one of them."""
@@ -105,9 +109,6 @@ class Ascent:
         self._model, self._rounds = model, rounds
         nodes = None if model is None else NODES
         self.lenslets = LensletFamily(family, tolerance=tolerance, pixel_nodes=nodes)
-        few = max(1, math.ceil(COARSE * fringes_a_pixel(family)))
-        self._coarse = LensletFamily(family, tolerance=max(tolerance, 1e-3), pixel_nodes=few)
-        self._state: tuple[MatrixAt, list[np.ndarray]] | None = None
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """(parameter,) in their units, of x in tolerances."""
@@ -118,7 +119,6 @@ class Ascent:
         x: np.ndarray,
         factor: float | None = None,
         *,
-        slopes: bool = False,
         finer: np.ndarray | None = None,
     ) -> Point:
         """The Point at x.
@@ -126,41 +126,32 @@ class Ascent:
         factor: of the noise, None for the most likely one, 1 at the least;
         finer: as in Point.
         """
-        matrix = self.lenslets.at(self.values(x), slopes=slopes)
+        matrix = self.lenslets.at(self.values(x))
         found = self.evidence.at(matrix.matrix if finer is None else matrix.matrix + finer)
-        if factor is None:
-            factor = max(1.0, found.noise_factor())
-        height = found.value(factor) - 0.5 * float(x @ x)
-        return Point(
-            x=x, factor=factor, height=height, evidence=found, paraxial=matrix, finer=finer
+        at = Point(x=x, factor=1.0, height=0.0, evidence=found, paraxial=matrix, finer=finer)
+        return at.under(max(1.0, found.noise_factor()) if factor is None else factor)
+
+    def slopes(self, at: Point) -> Slopes:
+        """The Slopes at a point, from one pass over the matrix's derivatives."""
+        objects = [at.evidence.objects(k, at.factor) for k in range(len(self.evidence.captures))]
+        borders = np.cumsum([x.shape[1] for x in objects])[:-1]
+        turn = self.family.jacobian(self.values(at.x)) * self.family.tolerance
+        by_matrix = at.evidence.by_matrix(at.factor)
+        rise, products = np.zeros(len(turn)), np.zeros((len(turn), len(turn)))
+        kind = at.paraxial.matrix.dtype
+        x = np.hstack(objects).astype(kind)
+        light = np.zeros((len(turn), len(by_matrix), x.shape[1]), kind)
+        for points, slopes in at.paraxial.slopes():
+            light += slopes.transpose(0, 2, 1) @ x[points]
+            flat = slopes.reshape(len(turn), -1)
+            rise += flat @ by_matrix.T[points].astype(kind).ravel()
+            products += flat @ flat.T
+        light = np.tensordot(turn.T.astype(kind), light, 1)
+        return Slopes(
+            rise=turn.T @ rise - at.x,
+            light=tuple(np.split(light, borders, axis=2)),
+            products=turn.T @ products @ turn,
         )
-
-    def information(self, at: Point) -> np.ndarray:
-        """Fisher's matrix by parameters in tolerances, with what is believed of them (parameter,
-        parameter), from a coarse matrix.
-        """
-        state, slopes, turn = self._slopes(at)
-        counts = at.evidence.contrasts(at.factor)
-        by_optics = self.evidence.at(state.matrix).fisher(slopes, at.factor, counts)
-        return turn.T @ by_optics @ turn + np.eye(len(at.x))
-
-    def products(self, at: Point) -> np.ndarray:
-        """Products of the matrix's slopes by parameters in tolerances (parameter, parameter)."""
-        _, slopes, turn = self._slopes(at)
-        # slopes are transposed views: their own order costs no copies
-        pairs = [[float(np.vdot(a.T, b.T)) for b in slopes] for a in slopes]
-        return turn.T @ np.array(pairs) @ turn
-
-    def _slopes(self, at: Point) -> tuple[MatrixAt, list[np.ndarray], np.ndarray]:
-        """(a coarse matrix at a point, its slopes by the optics, derivatives of the optics by
-        parameters in tolerances).
-        """
-        values = self.values(at.x)
-        if self._state is None or not np.array_equal(self._state[0].values, values):
-            state = self._coarse.at(values, slopes=True)
-            slopes = [state.slope(place) for place in range(len(self.family.optics(values)))]
-            self._state = state, slopes
-        return *self._state, self.family.jacobian(values) * self.family.tolerance
 
     def settle(self, x: np.ndarray, steps: int) -> Point:
         """The Point where climbs from x end whose matrix is the finer model's there: each with the
@@ -186,50 +177,43 @@ class Ascent:
         return self._model.matrix(values) - self.lenslets.at(values).matrix
 
     def climb(self, x: np.ndarray, steps: int, finer: np.ndarray | None = None) -> Point:
-        """The Point, with slopes, where going on from x gains nothing, or after so many steps;
-        finer: as in Point, kept.
+        """The Point where going on from x gains nothing, or after so many steps; finer: as in
+        Point, kept.
         """
-        at, damping = self.point(x, slopes=True, finer=finer), 1e-3
-        fisher, patient = _Fisher(np.eye(len(x)), np.inf), True
+        at, damping, patient = self.point(x, finer=finer), 1e-3, True
         for step in range(steps):
             if self._progress is not None:
                 self._progress()
-            rise = at.paraxial.back(at.evidence.by_matrix(at.factor)) * self.family.tolerance - at.x
-            best = at
-            if fisher.serves(at):
-                best, damping = self._step(at, fisher.matrix, rise, damping, 1)
-                fisher = replace(fisher, age=fisher.age + 1)
-            if best is at:
-                fisher = _Fisher(self.information(at), at.factor)
-                best, damping = self._step(at, fisher.matrix, rise, damping, 6)
+            slopes = self.slopes(at)
+            curvature = slopes.curvature(at, at.factor)
+            best, damping = self._step(at, curvature, slopes.rise, damping)
             if at.factor > MISFIT and step % 3 == 2:
                 best = max([best, *self._mirrored(best)], key=lambda p: p.height)
             gain = best.height - at.height
-            promised = 0.5 * float(rise @ np.linalg.solve(fisher.matrix, rise))
+            promised = 0.5 * float(slopes.rise @ np.linalg.solve(curvature, slopes.rise))
             if best is not at:
-                at = self.point(best.x, slopes=True, finer=best.finer)
+                at = best.under(max(1.0, best.evidence.noise_factor()))
             if max(gain, promised) < ENOUGH or (gain < GAIN and not patient):
                 break
             if gain < GAIN:
                 # damping goes with each parameter's own information: it stops steps along valleys
                 damping, patient = UNDAMPED, False
-                fisher = replace(fisher, age=KEPT)
         return at
 
     def _step(
-        self, at: Point, fisher: np.ndarray, rise: np.ndarray, damping: float, tries: int
+        self, at: Point, curvature: np.ndarray, rise: np.ndarray, damping: float
     ) -> tuple[Point, float]:
         """(the Point after one step, `at` itself where none rises; damping for the next).
 
-        fisher: (parameter, parameter); rise: (parameter,) derivatives of the height; tries: how
-        often the damping is raised.
+        curvature: (parameter, parameter) at the point; rise: (parameter,) derivatives of the
+            height.
         """
-        for _ in range(tries):
-            way = _damped(fisher, damping, rise)
+        for _ in range(TRIES):
+            way = _damped(curvature, damping, rise)
             while np.linalg.norm(way) > FAR:
                 damping *= 3
-                way = _damped(fisher, damping, rise)
-            best = self._along(at, way, float(rise @ way - 0.5 * way @ fisher @ way))
+                way = _damped(curvature, damping, rise)
+            best = self._along(at, way, float(rise @ way - 0.5 * way @ curvature @ way))
             if best is not at:
                 return best, max(damping / 5, UNDAMPED)
             damping = max(damping * 10, 1e-2)
@@ -266,5 +250,5 @@ class Ascent:
         return found
 
 
-def _damped(fisher: np.ndarray, damping: float, rise: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(fisher + damping * np.diag(np.diag(fisher)), rise)
+def _damped(curvature: np.ndarray, damping: float, rise: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), rise)

@@ -64,7 +64,7 @@ def likeliest_cause(
 ) -> Cause | None:
     """The parameter that alone explains most of what the described camera does not.
 
-    By the slopes of the evidence and Fisher's matrix at the description, and one step along the
+    By the slopes of the evidence and its curvature at the description, and one step along the
     parameters that promise most; some are tried either way. A hint and no measurement: paraxial,
     of the LENSLETS x LENSLETS lenslets in the middle.
 
@@ -76,11 +76,11 @@ def likeliest_cause(
     problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
     family = problem.family
     ascent = Ascent(family, problem.evidence, tolerance=problem.tolerance)
-    start = ascent.point(np.zeros(len(family.parameters)), slopes=True)
-    rise = start.paraxial.back(start.evidence.by_matrix(start.factor)) * family.tolerance
-    fisher = ascent.information(start)
-    step = np.clip(rise / np.diag(fisher), -FAR, FAR)
-    promise = rise * step - 0.5 * np.diag(fisher) * step**2
+    start = ascent.point(np.zeros(len(family.parameters)))
+    slopes = ascent.slopes(start)
+    rise, curvature = slopes.rise, np.diag(slopes.curvature(start, start.factor))
+    step = np.clip(rise / curvature, -FAR, FAR)
+    promise = rise * step - 0.5 * curvature * step**2
     tries = [(int(k), float(step[k])) for k in np.argsort(-promise)[:LOOKED_AT]]
     for name, length in EITHER_WAY:
         if family.has(name):

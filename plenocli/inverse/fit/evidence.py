@@ -1,5 +1,5 @@
 """How likely captures are under a matrix, whatever the objects: the marginal likelihood of LMMSE
-over all lenslets, its derivatives by the matrix, and what captures can tell (Fisher).
+over all lenslets, its derivatives by the matrix, and its curvature.
 
 A lenslet's superpixel is y = A x + b + n, x = B c with coefficients c of the PhotographPrior at one
 of CONTRASTS, b an even veil and n white noise. With M = [A B, veil] D, D the standard deviations,
@@ -168,60 +168,28 @@ class EvidenceAt:
             found += scale[:, None] * mean * share
         return self._of.prior.patterns @ found[:-1]
 
-    def contrasts(self, factor: float) -> list[np.ndarray]:
-        """How many lenslets of each capture have each contrast, (contrast,), as far as is known."""
-        counts = []
-        for index in range(len(self._of.captures)):
-            likelihood = self._likelihood(index, factor)
-            counts.append(np.exp(likelihood - logsumexp(likelihood, axis=0)).sum(axis=1))
-        return counts
+    def curvature(self, rises: Sequence[np.ndarray], factor: float) -> np.ndarray:
+        """How fast the slopes of `value` fall with numbers that the matrix depends on, by Gauss
+        and Newton: r^T Lambda^-1 r summed over lenslets, Lambda = M M^T + s^2 at the contrast that
+        is the likeliest for each.
 
-    def fisher(
-        self, slopes: Sequence[np.ndarray], factor: float, counts: Sequence[np.ndarray]
-    ) -> np.ndarray:
-        """What the captures are expected to tell of numbers that the matrix has `slopes` (pixel,
-        point) by: Fisher's matrix (number, number).
+        rises: for every capture (number, pixel, lenslet) dA x, x as `objects` gives them.
 
-        counts: as `contrasts` gives them.
+        Returns (number, number).
         """
-        patterns = self._of.prior.patterns
-        rises = [np.asarray(d @ patterns.astype(d.dtype), float) for d in slopes]
-        flat = np.array([rise.ravel() for rise in rises])
-        total = np.zeros((len(slopes), len(slopes)))
-        for index, capture in enumerate(self._of.captures):
+        total = np.zeros((len(rises[0]), len(rises[0])))
+        for index, (capture, rise) in enumerate(zip(self._of.captures, rises)):
             noise = (factor * capture.sigma) ** 2
-            cross = np.array([self._whole[index].T @ rise for rise in rises])
-            common = np.zeros((flat.shape[1] // len(rises[0]),) * 2)
-            for spectrum, scale, number in zip(
-                self._spectra[index], self._of.scales, counts[index]
-            ):
-                told, inner = _told(spectrum, scale, cross, noise)
-                total += number * told
-                common += number / noise * inner
-            total += np.array([(rise @ common).ravel() for rise in rises]) @ flat.T
-        return (total + total.T) / 2
+            likeliest = self._likelihood(index, factor).argmax(axis=0)
+            for contrast in np.unique(likeliest):
+                spectrum, scale = self._spectra[index][contrast], self._of.scales[contrast]
+                left = np.asarray(rise[:, :, likeliest == contrast], float)
+                told = (spectrum.vectors.T * scale) @ (self._whole[index].T @ left)
+                told /= np.sqrt(spectrum.values + noise)[:, None]
+                total += (_products(left) - _products(told)) / noise
+        return total
 
 
-def _told(
-    spectrum: _Spectrum, scale: np.ndarray, cross: np.ndarray, noise: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """What one lenslet of a contrast tells but for a part that contrasts share: tr(P_i P_j) -
-    tr(dM_j^T M R M^T dM_i Q)/s^2 with R = (s^2 + M^T M)^-1, P_i = M^T Lambda^-1 dM_i = R M^T dM_i
-    and Q = M^T Lambda^-1 M, Lambda = M M^T + s^2.
-
-    cross: (number, coefficient, pattern) [A B, veil]^T dA_i B; noise: s^2.
-
-    Returns ((number, number), D Q D (pattern, pattern)).
-    """
-    kept = spectrum.values + noise
-    q = scale[:, None] * ((spectrum.vectors * (spectrum.values / kept)) @ spectrum.vectors.T)
-    q = (q * scale)[:-1, :-1]
-    left = ((spectrum.vectors / kept) @ spectrum.vectors.T) * scale
-    carried = left @ cross
-    count = len(cross)
-    # the veil does not move: its column of dM is zero
-    p = carried[:, :-1] * scale[:-1]
-    told = p.reshape(count, -1) @ p.transpose(0, 2, 1).reshape(count, -1).T
-    folded = (cross @ q).reshape(count, -1)
-    carried = (scale[:, None] * carried).reshape(count, -1)
-    return told - folded @ carried.T / noise, q
+def _products(rises: np.ndarray) -> np.ndarray:
+    flat = rises.reshape(len(rises), -1)
+    return flat @ flat.T

@@ -5,7 +5,6 @@ are most likely, whatever their objects are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +43,7 @@ CLEAR = 4.0
 on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
 """
 INFLATION = 1.8
-"""By how much the standard deviations exceed Fisher's: draws of cameras were this much farther."""
+"""By how much the standard deviations exceed those of the curvature: draws of cameras were this much farther."""
 MATRIX_INFLATION = 1.6
 """The same for the error of the matrix, to which errors of parameters add up less."""
 FINER, FINER_IN_MATRIX = 3e-3, 2e-3
@@ -198,14 +197,16 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
     values, quiet = ascent.evidence.values, ascent.evidence.quiet
     excess = max(0.0, ratio**2 - 1 - 2 * float(np.sqrt(2 / values))) * values
 
+    slopes = ascent.slopes(at)
+
     def covariance(finer: float) -> np.ndarray:
         factor = max(at.factor, float(np.hypot(1, finer * quiet)))
-        return np.linalg.inv(ascent.information(replace(at, factor=factor)))
+        return np.linalg.inv(slopes.curvature(at, factor))
 
     found = covariance(FINER) * (INFLATION**2 + LEFT_OVER * excess)
     sigma = np.sqrt(np.diag(found))
     correlation = found / np.outer(sigma, sigma)
-    missed = float(np.sum(covariance(FINER_IN_MATRIX) * ascent.products(at)))
+    missed = float(np.sum(covariance(FINER_IN_MATRIX) * slopes.products))
     error = MATRIX_INFLATION * float(np.sqrt(max(missed, 0.0)))
     # nothing is known less well than before
     return np.minimum(sigma, 1.0), correlation, error / float(np.linalg.norm(at.matrix))

@@ -1,6 +1,5 @@
-"""The matrix of one lenslet as a smooth function of a camera's parameters, with its derivatives
-both ways: how the matrix changes with each, and what a change of the matrix says of all of them at
-the cost of a few matrices.
+"""The matrix of one lenslet as a smooth function of a camera's parameters, with its derivatives by
+all of them.
 
 Paraxial, square lenslets, each lit by the object in front of it only.
 """
@@ -82,11 +81,10 @@ class LensletFamily:
         """
         return self._nodes[axis]
 
-    def at(self, values: np.ndarray, *, slopes: bool = False) -> MatrixAt:
-        """The matrix at `values` (parameter,); slopes: whether its derivatives are wanted."""
+    def at(self, values: np.ndarray) -> MatrixAt:
+        """The matrix at `values` (parameter,)."""
         optics = self.family.optics(values)
-        core = self.spread.core(optics, slopes=slopes)
-        return MatrixAt(self, values, optics, core)
+        return MatrixAt(self, values, optics, self.spread.core(optics))
 
 
 class MatrixAt:
@@ -115,61 +113,36 @@ class MatrixAt:
             out[:, j] = self._summed(_squared(field))
         self.matrix = self._flat(out)
 
-    def back(self, weights: np.ndarray) -> np.ndarray:
-        """The derivatives by all parameters, (parameter,), of a number that has the derivatives
-        `weights` (pixel, point) by the matrix. Needs slopes.
+    def slopes(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """The derivatives of the matrix by each number of the optics, a column of points after the
+        other: (which points, (optics, row of points, pixel)).
         """
-        of, core = self._of, self._core
-        by_pixel = weights.T.reshape(*of.object_shape, *of.pixel_shape)
-        left = np.zeros((self._high.shape[0] * self._high.shape[1], self._high.shape[2]), of.type)
-        right = np.empty_like(self._right)
-        flat = self._high.reshape(left.shape)
+        of, core, o = self._of, self._core, self._optics
+        type_ = self._right.dtype
+        moved = [
+            {place: self._table(axis, self._turned(axis, place)) for place in places}
+            for axis, places in enumerate(((CURVATURE, RELAY, DOWN), (CURVATURE, RELAY, RIGHT)))
+        ]
+        high = {place: self._flat_table(table) for place, table in moved[0].items()}
+        wide = {
+            place: table @ core.value.T.astype(type_) for place, table in moved[1].items()
+        } | {place: self._wide @ slope.T.astype(type_) for place, slope in core.slopes.items()}
+        columns = of.object_shape[1]
+        whole = self.matrix.T.reshape(*of.object_shape, -1)
         for j, field in self._fields(self._high, self._right):
-            field *= self._spread(by_pixel[:, j].astype(field.real.dtype))
-            left += field @ self._right[j].conj()
-            right[j] = field.T @ flat.conj()
-        scale = 2 * self._amplitude**2
-        tables = left.reshape(self._high.shape), right @ core.value.conj().astype(of.type)
-        middle = np.einsum("jua,jub->ab", right, self._wide.conj(), optimize=True)
-        slopes = np.zeros(len(self._optics))
-        for place, slope in core.slopes.items():
-            slopes[place] = scale * float(np.vdot(middle, slope).real)
-        for axis, table in enumerate(tables):
-            # of the kernel (pixel node, lenslet node)
-            kernel = np.einsum("iva,xia->vx", table, self._terms[axis].conj(), optimize=True)
-            for place in (CURVATURE, RELAY, DOWN if axis == 0 else RIGHT):
-                slopes[place] += scale * float(np.vdot(kernel, self._turned(axis, place)).real)
-        whole = 2 * float(np.vdot(weights, self.matrix))
-        slopes[PUPIL] += whole / self._optics[PUPIL]
-        slopes[RELAY] += whole / self._optics[RELAY]
-        return self._of.family.jacobian(self.values).T @ slopes
-
-    def slope(self, place: int) -> np.ndarray:
-        """The derivative of the matrix (pixel, point) by one number of the optics. Needs slopes."""
-        out, core = self._empty(), self._core
-        left, right = self._high, self._right
-        if place in core.slopes:
-            changed = self._wide @ core.slopes[place].T.astype(self._of.type)
-            other = left
-        else:
-            axes = {DOWN: (0,), RIGHT: (1,)}.get(place, (0, 1))
-            moved = [
-                self._table(axis, self._turned(axis, place)) if axis in axes else None
-                for axis in (0, 1)
-            ]
-            parts = []
-            if moved[0] is not None:
-                parts.append((moved[0], right))
-            if moved[1] is not None:
-                parts.append((left, moved[1] @ core.value.T.astype(self._of.type)))
-            other, changed = (np.concatenate(p, axis=2) for p in zip(*parts))
-        for (j, field), (_, rise) in zip(self._fields(left, right), self._fields(other, changed)):
-            product = field.real * rise.real + field.imag * rise.imag
-            out[:, j] = self._summed(2 * product)
-        dA = self._flat(out)
-        if place in (PUPIL, RELAY):
-            dA += 2 / self._optics[place] * self.matrix
-        return dA
+            out = np.empty((len(o), of.object_shape[0], whole.shape[2]), whole.dtype)
+            for place in range(len(o)):
+                rise = 0
+                if place in wide:
+                    rise = self._flat_table(self._high) @ wide[place][j].T
+                if place in high:
+                    rise = rise + high[place] @ self._right[j].T
+                product = field.real * rise.real + field.imag * rise.imag
+                out[place] = self._summed(product).reshape(out.shape[1:])
+            out *= 2 * self._amplitude**2
+            for place in (PUPIL, RELAY):
+                out[place] += 2 / o[place] * whole[:, j]
+            yield slice(j, None, columns), out
 
     def _kernel(self, axis: int) -> np.ndarray:
         """(pixel node, lenslet node), weights included."""
@@ -199,9 +172,8 @@ class MatrixAt:
 
     def _fields(self, left: np.ndarray, right: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """(column j of points, field (row of points x node, node)), without the amplitude."""
-        flat = left.reshape(-1, left.shape[2])
         for j, columns in enumerate(right):
-            yield j, flat @ columns.T
+            yield j, self._flat_table(left) @ columns.T
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
         """Values on nodes (row of points x node, node) summed over the nodes of each pixel:
@@ -211,12 +183,10 @@ class MatrixAt:
         parts = values.reshape(-1, n, py, n, px)
         return parts.sum(axis=1).sum(axis=2)
 
-    def _spread(self, by_pixel: np.ndarray) -> np.ndarray:
-        """The opposite of _summed: each node gets the value of its pixel."""
-        n, (py, px) = self._of.pixel_nodes, self._of.pixel_shape
-        rows = len(by_pixel)
-        whole = np.broadcast_to(by_pixel[:, None, :, None], (rows, n, py, n, px))
-        return whole.reshape(rows * n * py, n * px)
+    @staticmethod
+    def _flat_table(table: np.ndarray) -> np.ndarray:
+        """(point x pixel node, term)."""
+        return table.reshape(-1, table.shape[2])
 
     def _empty(self) -> np.ndarray:
         of = self._of

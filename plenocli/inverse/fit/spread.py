@@ -31,8 +31,7 @@ class Core:
 
     rows, columns: (node, term) complex, orthonormal with the quadrature weights of the grid;
     value: (row term, column term) C;
-    slopes: its derivatives by optics, {place in the vector of optics: (row term, column term)};
-        empty where they were not asked for.
+    slopes: its derivatives by optics, {place in the vector of optics: (row term, column term)}.
     """
 
     rows: np.ndarray
@@ -86,12 +85,12 @@ class SpreadFamily:
         """What carries values at the grid to positions d (place,), pitches: (place, node)."""
         return legendre(d / self.half, len(self.nodes), 1) @ self._project
 
-    def core(self, optics: np.ndarray, *, slopes: bool) -> Core:
-        """The Core at a vector of optics; slopes: whether with derivatives."""
-        fields = self._fields(optics, slopes)
+    def core(self, optics: np.ndarray) -> Core:
+        """The Core at a vector of optics."""
+        fields = self._fields(optics)
         root = np.sqrt(self.weights)
         fields = root[:, None] * fields * root
-        weight = np.array([1.0, *(self._step[p] for p in self.places)][: len(fields)])
+        weight = np.array([1.0, *(self._step[p] for p in self.places)])
         scaled = fields * weight[:, None, None]
         rows = self._basis(np.einsum("mij,mkj->ik", scaled, scaled.conj(), optimize=True))
         columns = self._basis(np.einsum("mji,mjk->ik", scaled, scaled.conj(), optimize=True))
@@ -100,7 +99,7 @@ class SpreadFamily:
             rows=rows / root[:, None],
             columns=columns / root[:, None],
             value=cores[0],
-            slopes=dict(zip(self.places, cores[1:])) if slopes else {},
+            slopes=dict(zip(self.places, cores[1:])),
         )
 
     def _basis(self, gram: np.ndarray) -> np.ndarray:
@@ -109,29 +108,27 @@ class SpreadFamily:
         lost = np.sqrt(np.maximum(np.cumsum(np.maximum(values, 0)), 0) / np.trace(gram).real)
         return vectors[:, int(np.searchsorted(lost, self.tolerance)) :]
 
-    def _fields(self, optics: np.ndarray, slopes: bool) -> np.ndarray:
-        """h and, if asked for, its derivatives by `places` on the grid, (field, node, node)."""
+    def _fields(self, optics: np.ndarray) -> np.ndarray:
+        """h and its derivatives by `places` on the grid, (field, node, node)."""
         beta, count = optics[PUPIL], len(self.nodes)
-        total = np.zeros((1 + len(self.places) if slopes else 1, count, count), complex)
+        total = np.zeros((1 + len(self.places), count, count), complex)
         for y, x, bare, phases in self._panels:
             turns = optics[DEFOCUS] * phases[0] + optics[WAVES] * phases[1]
             for omega, term in zip(optics[7:], phases[2:]):
                 turns = turns + omega * term
             weight = bare * np.exp(2j * np.pi * turns)
-            sets = [weight]
-            if slopes:
-                sets += [2j * np.pi * weight * x, *(2j * np.pi * weight * p for p in phases)]
+            rising = 2j * np.pi * weight
             across = np.matmul(
-                np.stack(sets, axis=1), np.exp(-2j * np.pi * beta * x[:, :, None] * self.nodes)
+                np.stack([weight, rising * x, *(rising * p for p in phases)], axis=1),
+                np.exp(-2j * np.pi * beta * x[:, :, None] * self.nodes),
             )
             down = np.exp(-2j * np.pi * beta * np.outer(self.nodes, y))
             fields = (down @ across.reshape(len(y), -1)).reshape(count, -1, count)
             fields = fields.transpose(1, 0, 2)
+            by_row = ((down * (2j * np.pi * y)) @ across[:, 0]) * self.nodes[:, None]
             total[0] += fields[0]
-            if slopes:
-                rising = ((down * (2j * np.pi * y)) @ across[:, 0]) * self.nodes[:, None]
-                total[1] -= fields[1] * self.nodes + rising
-                total[2:] += fields[2:]
+            total[1] -= fields[1] * self.nodes + by_row
+            total[2:] += fields[2:]
         return total * self._scale
 
 

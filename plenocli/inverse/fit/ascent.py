@@ -1,5 +1,5 @@
-"""The way up to the most likely camera: Levenberg's steps by Gauss and Newton's curvature, lengthened
-while the evidence rises, with noise that starts as large as the captures' misfit makes it.
+"""The way up to the most likely camera: Levenberg's steps by Gauss and Newton's curvature,
+lengthened while the evidence rises, with noise that starts as large as the captures' misfit makes it.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ TRIES = 6
 """How often the damping of a step that does not rise is raised."""
 MISFIT = 1.02
 """Noise over the noise told, above which mirrored cameras are looked at on the way."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Point:
     """A camera on the way.
@@ -153,11 +155,12 @@ class Ascent:
             products=turn.T @ products @ turn,
         )
 
-    def settle(self, x: np.ndarray, steps: int) -> Point:
-        """The Point where climbs from x end whose matrix is the finer model's there: each with the
-        difference of the models where the climb before ended, until that changes no more.
+    def settle(self, at: Point, steps: int) -> Point:
+        """The Point where climbs from one with the finer model's difference end whose matrix is
+        the finer model's there: each with the difference of the models where the climb before
+        ended, until that changes no more.
         """
-        at = self.climb(x, steps, self.difference(x))
+        at = self.climb(at, steps)
         for _ in range(self._rounds):
             finer = self.difference(at.x)
             if finer is None or at.finer is None:
@@ -166,7 +169,7 @@ class Ascent:
             changed = np.linalg.norm(finer - at.finer) / np.linalg.norm(at.matrix)
             if changed * self.evidence.quiet < CHANGED:
                 break
-            at = self.climb(at.x, steps, finer)
+            at = self.climb(self.point(at.x, finer=finer), steps)
         return at
 
     def difference(self, x: np.ndarray) -> np.ndarray | None:
@@ -176,11 +179,11 @@ class Ascent:
         values = self.values(x)
         return self._model.matrix(values) - self.lenslets.at(values).matrix
 
-    def climb(self, x: np.ndarray, steps: int, finer: np.ndarray | None = None) -> Point:
-        """The Point where going on from x gains nothing, or after so many steps; finer: as in
-        Point, kept.
+    def climb(self, at: Point, steps: int) -> Point:
+        """The Point where going on from one gains nothing, or after so many steps; what a finer
+        model adds is kept.
         """
-        at, damping, patient = self.point(x, finer=finer), 1e-3, True
+        damping, patient = 1e-3, True
         for step in range(steps):
             if self._progress is not None:
                 self._progress()

@@ -43,7 +43,7 @@ CLEAR = 4.0
 on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
 """
 INFLATION = 1.8
-"""By how much the standard deviations exceed those of the curvature: draws of cameras were this much farther."""
+"""By how much the standard deviations exceed the curvature's: draws of cameras were so much farther."""
 MATRIX_INFLATION = 1.6
 """The same for the error of the matrix, to which errors of parameters add up less."""
 FINER, FINER_IN_MATRIX = 3e-3, 2e-3
@@ -99,7 +99,7 @@ def fit_camera(
     start = np.zeros(len(family.parameters))
     begun = ascent.point(start, finer=ascent.difference(start))
     limits = accepted_ratios(problem.evidence.values, problem.evidence.quiet)
-    best = _highest(ascent, limits[0])
+    best = _highest(ascent, begun, limits[0])
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
         best, turned = _told_apart(ascent, best, problem.captures)
@@ -126,11 +126,11 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
 
 
-def _highest(ascent: Ascent, limit: float) -> Point:
+def _highest(ascent: Ascent, begun: Point, limit: float) -> Point:
     """Where the way up leads from the described camera or, if that explains nothing, from the best
     of further starts.
     """
-    first = ascent.settle(np.zeros(len(ascent.family.parameters)), STEPS)
+    first = ascent.settle(begun, STEPS)
     if first.evidence.noise_factor() <= limit:
         return first
     starts = []
@@ -140,10 +140,11 @@ def _highest(ascent: Ascent, limit: float) -> Point:
             x[ascent.family.place(name)] = far
             starts.append(ascent.point(x))
     starts = sorted(starts, key=lambda p: p.height, reverse=True)[:TRIALS]
-    found = [ascent.climb(start.x, TRIAL) for start in starts]
+    found = [ascent.climb(start, TRIAL) for start in starts]
     if not found:
         return first
-    other = ascent.settle(max(found, key=_likely).x, STEPS)
+    x = max(found, key=_likely).x
+    other = ascent.settle(ascent.point(x, finer=ascent.difference(x)), STEPS)
     return max([first, other], key=_likely)
 
 
@@ -168,7 +169,7 @@ def _told_apart(
         return at, None
     if steps[0] <= steps[1]:
         return at, steps[1] / steps[0]
-    return ascent.climb(other.x, STEPS, other.finer), steps[0] / steps[1]
+    return ascent.climb(other, STEPS), steps[0] / steps[1]
 
 
 def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets]) -> float | None:

@@ -108,41 +108,45 @@ class MatrixAt:
         self._kernels = tuple(self._kernel(axis) for axis in (0, 1))
         self._high, self._wide = (self._table(axis, self._kernels[axis]) for axis in (0, 1))
         self._right = self._wide @ core.value.T.astype(lenslets.type)
-        out = self._empty()
-        for j, field in self._fields(self._high, self._right):
-            out[:, j] = self._summed(_squared(field))
-        self.matrix = self._flat(out)
+        rows, columns = lenslets.object_shape
+        out = np.empty((rows, columns, np.prod(lenslets.pixel_shape)), self._right.real.dtype)
+        for j, field in self._fields():
+            out[:, j] = self._summed(_product(field, field))
+        out *= self._amplitude**2
+        self.matrix = out.reshape(rows * columns, -1).T
 
     def slopes(self) -> Iterator[tuple[slice, np.ndarray]]:
         """The derivatives of the matrix by each number of the optics, a column of points after the
         other: (which points, (optics, row of points, pixel)).
         """
-        of, core, o = self._of, self._core, self._optics
-        type_ = self._right.dtype
-        moved = [
-            {place: self._table(axis, self._turned(axis, place)) for place in places}
-            for axis, places in enumerate(((CURVATURE, RELAY, DOWN), (CURVATURE, RELAY, RIGHT)))
-        ]
-        high = {place: self._flat_table(table) for place, table in moved[0].items()}
-        wide = {
-            place: table @ core.value.T.astype(type_) for place, table in moved[1].items()
-        } | {place: self._wide @ slope.T.astype(type_) for place, slope in core.slopes.items()}
-        columns = of.object_shape[1]
+        of, o, core = self._of, self._optics, self._core
+        high: dict[int, np.ndarray] = {}
+        wide: dict[int, np.ndarray] = {}
+        for axis, tables, place in ((0, high, DOWN), (1, wide, RIGHT)):
+            tables[place] = self._table(axis, self._kernels[axis] * (-2j * np.pi * o[RELAY] * of.x))
+            tables[CURVATURE] = self._table(axis, self._kernels[axis] * (1j * np.pi * of.x**2))
+        wide = {place: table @ core.value.T for place, table in wide.items()}
+        wide |= {place: self._wide @ slope.T for place, slope in core.slopes.items()}
+        high, wide = ({p: t.astype(of.type) for p, t in each.items()} for each in (high, wide))
+        # a phase -nu x v turns with nu as with a shift of v, times v/nu
+        down, right = ((of.pixel_nodes_of(k)[0] + o[DOWN + k]) / o[RELAY] for k in (0, 1))
+        lever = {DOWN: np.tile(down, len(self._high))[:, None], RIGHT: np.repeat(right, 2)}
         whole = self.matrix.T.reshape(*of.object_shape, -1)
-        for j, field in self._fields(self._high, self._right):
-            out = np.empty((len(o), of.object_shape[0], whole.shape[2]), whole.dtype)
-            for place in range(len(o)):
-                rise = 0
-                if place in wide:
-                    rise = self._flat_table(self._high) @ wide[place][j].T
+        for j, field in self._fields():
+            out = np.zeros((len(o), *whole[:, j].shape), whole.dtype)
+            for place in {*high, *wide}:
+                product = np.zeros(1, whole.dtype)
                 if place in high:
-                    rise = rise + high[place] @ self._right[j].T
-                product = field.real * rise.real + field.imag * rise.imag
-                out[place] = self._summed(product).reshape(out.shape[1:])
+                    product = _product(field, _flat(high[place]) @ self._right[j].T)
+                if place in wide:
+                    product = product + _product(field, _flat(self._high) @ wide[place][j].T)
+                out[place] = self._summed(product)
+                if place in lever:
+                    out[RELAY] += self._summed(product * lever[place].astype(whole.dtype))
             out *= 2 * self._amplitude**2
             for place in (PUPIL, RELAY):
                 out[place] += 2 / o[place] * whole[:, j]
-            yield slice(j, None, columns), out
+            yield slice(j, None, of.object_shape[1]), out
 
     def _kernel(self, axis: int) -> np.ndarray:
         """(pixel node, lenslet node), weights included."""
@@ -153,50 +157,32 @@ class MatrixAt:
         turns -= np.rint(turns)
         return (np.exp(2j * np.pi * turns) * weight[:, None] * of.wx).astype(of.type)
 
-    def _turned(self, axis: int, place: int) -> np.ndarray:
-        """The derivative of the kernel of an axis by one number of the optics."""
-        of, o = self._of, self._optics
-        kernel = self._kernels[axis]
-        if place == CURVATURE:
-            return (kernel * (1j * np.pi * of.x**2)).astype(of.type)
-        if place == RELAY:
-            v = of.pixel_nodes_of(axis)[0] + o[DOWN + axis]
-            return (kernel * (-2j * np.pi * np.outer(v, of.x))).astype(of.type)
-        return (kernel * (-2j * np.pi * o[RELAY] * of.x)).astype(of.type)
-
     def _table(self, axis: int, kernel: np.ndarray) -> np.ndarray:
         """(point, pixel node, term)."""
         terms = self._terms[axis]
         table = (kernel @ terms.reshape(len(terms), -1)).reshape(len(kernel), *terms.shape[1:])
         return np.ascontiguousarray(table.transpose(1, 0, 2))
 
-    def _fields(self, left: np.ndarray, right: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    def _fields(self) -> Iterator[tuple[int, np.ndarray]]:
         """(column j of points, field (row of points x node, node)), without the amplitude."""
-        for j, columns in enumerate(right):
-            yield j, self._flat_table(left) @ columns.T
+        for j, columns in enumerate(self._right):
+            yield j, _flat(self._high) @ columns.T
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
-        """Values on nodes (row of points x node, node) summed over the nodes of each pixel:
-        (row of points, pixel row, pixel column).
+        """Products as of _product (row of points x node, node x 2) summed over the nodes of each
+        pixel: (row of points, pixel).
         """
         n, (py, px) = self._of.pixel_nodes, self._of.pixel_shape
-        parts = values.reshape(-1, n, py, n, px)
-        return parts.sum(axis=1).sum(axis=2)
-
-    @staticmethod
-    def _flat_table(table: np.ndarray) -> np.ndarray:
-        """(point x pixel node, term)."""
-        return table.reshape(-1, table.shape[2])
-
-    def _empty(self) -> np.ndarray:
-        of = self._of
-        return np.empty((*of.object_shape, *of.pixel_shape), np.zeros(0, of.type).real.dtype)
-
-    def _flat(self, images: np.ndarray) -> np.ndarray:
-        """(pixel, point) from (point row, point column, pixel row, pixel column)."""
-        images *= self._amplitude**2
-        return images.reshape(images.shape[0] * images.shape[1], -1).T
+        parts = values.reshape(-1, n, py, n, px, 2).sum(axis=1).sum(axis=2)
+        return (parts[..., 0] + parts[..., 1]).reshape(len(parts), -1)
 
 
-def _squared(field: np.ndarray) -> np.ndarray:
-    return field.real**2 + field.imag**2
+def _flat(table: np.ndarray) -> np.ndarray:
+    """(point x node, term) of (point, node, term)."""
+    return table.reshape(-1, table.shape[2])
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The products of real parts and of imaginary parts, side by side."""
+    kind = a.real.dtype
+    return a.view(kind) * b.view(kind)

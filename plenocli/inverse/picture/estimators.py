@@ -98,7 +98,7 @@ class Estimators:
     @cached_property
     def prior(self) -> ScenePrior:
         """What photographs look like to this matrix."""
-        return ScenePrior(self.system, self.svd, self.read_pictures, self.options.seed)
+        return ScenePrior(self.system, lambda: self.svd, self.read_pictures, self.options.seed)
 
     @cached_property
     def learnt(self) -> Dictionary:

@@ -33,10 +33,10 @@ class ScenePrior:
     """
 
     def __init__(
-        self, system: LensletMatrix, svd: Svd, read_pictures: ReadPictures, seed: int
+        self, system: LensletMatrix, svd: Callable[[], Svd], read_pictures: ReadPictures, seed: int
     ) -> None:
-        """svd: of the own block of `system`; read_pictures: called once a scene; seed: of the
-        patches drawn.
+        """svd: gives that of the own block of `system`; read_pictures: called once a scene; seed:
+        of the patches drawn.
         """
         self.system, self.svd, self.read_pictures, self.seed = system, svd, read_pictures, seed
         self.pictures_of: dict[str | None, list[TrainingPicture]] = {}
@@ -84,7 +84,7 @@ class ScenePrior:
         return _kept(
             self._own,
             (sigma, scene),
-            lambda: lmmse.prepare(self.svd, mean, covariance, sigma, self.bands()),
+            lambda: lmmse.prepare(self.svd(), mean, covariance, sigma, self.bands()),
         )
 
     def heard(self, sigma: float, scene: str | None) -> np.ndarray:
@@ -96,7 +96,7 @@ class ScenePrior:
             self._heard,
             (sigma, scene),
             lambda: joint_lmmse.loud_directions(
-                self.svd, self.statistics[scene][1], sigma, self.bands()
+                self.svd(), self.statistics[scene][1], sigma, self.bands()
             ),
         )
 

@@ -53,20 +53,31 @@ def test_its_derivatives_by_the_matrix():
         assert abs(np.vdot(found, way) - rise) < 1e-5 * np.linalg.norm(found)
 
 
-def test_fishers_matrix_is_that_of_whole_covariances():
+def test_its_curvature_is_that_of_what_objects_make_of_whole_covariances():
     slopes = [RANDOM.standard_normal(A.shape) for _ in range(3)]
     at, told = EVIDENCE.at(A), np.zeros((3, 3))
-    for capture, counts in zip(CAPTURES, at.contrasts(1.3)):
-        weights = likelihoods(A, capture, 1.3)
-        weights = np.exp(weights - logsumexp(weights, axis=0)).sum(axis=1)
-        assert np.allclose(counts, weights, rtol=1e-6)
-        for contrast, count, covariance in zip(CONTRASTS, weights, covariances(A, capture, 1.3)):
-            patterns = PRIOR.patterns * PRIOR.scales(contrast)
-            rises = [d @ patterns @ (A @ patterns).T for d in slopes]
-            turned = [np.linalg.solve(covariance, r + r.T) for r in rises]
-            told += count / 2 * np.array([[np.trace(a @ b) for b in turned] for a in turned])
-    found = at.fisher(slopes, 1.3, at.contrasts(1.3))
+    light = [np.array([d @ at.objects(k, 1.3) for d in slopes]) for k in range(len(CAPTURES))]
+    for capture, rises in zip(CAPTURES, light):
+        likeliest = likelihoods(A, capture, 1.3).argmax(axis=0)
+        whole = covariances(A, capture, 1.3)
+        for lenslet, contrast in enumerate(likeliest):
+            left = rises[:, :, lenslet]
+            told += left @ np.linalg.solve(whole[contrast], left.T)
+    found = at.curvature(light, 1.3)
     assert np.allclose(found, told, rtol=1e-6, atol=1e-6 * np.abs(told).max())
+
+
+def test_the_curvature_foretells_how_the_slopes_fall():
+    """Of captures that the matrix explains: within a few percent along the slopes of a camera."""
+    rng = np.random.default_rng(7)
+    x = PRIOR.patterns @ rng.standard_normal((PRIOR.patterns.shape[1], 400))
+    capture = Lenslets(A @ x + 1e-3 * rng.standard_normal((30, 400)), 1e-3)
+    evidence, way = Evidence([capture], PRIOR), rng.standard_normal(A.shape)
+    at = evidence.at(A)
+    told = at.curvature([(way @ at.objects(0, 1.0))[None]], 1.0)[0, 0]
+    step = 0.1 / told**0.5
+    ahead, behind = (np.vdot(evidence.at(A + s * way).by_matrix(1.0), way) for s in (step, -step))
+    assert abs((behind - ahead) / (2 * step) / told - 1) < 0.1
 
 
 def test_patterns_that_noise_hides_are_left_out():

@@ -1,5 +1,5 @@
 """The matrix that a fit works with: the same as the one that plenocli makes, and derivatives that
-finite differences confirm, both ways.
+finite differences confirm.
 """
 
 from dataclasses import replace
@@ -52,26 +52,25 @@ def test_the_matrix_is_that_of_the_forward_model(changes):
     shift = cameras.geometry_at(values).pixel_shift
     told = build_pif(camera, replace(plan, pixel_shift=shift)).A[0, 0]
     assert np.linalg.norm(found - told) < 2e-5 * np.linalg.norm(told)
-    single = LensletFamily(cameras).at(values, slopes=True).matrix
+    single = LensletFamily(cameras).at(values).matrix
     assert np.linalg.norm(single - found) < 2e-6 * np.linalg.norm(found)
 
 
-def test_one_pass_back_gives_all_derivatives():
+def test_one_pass_gives_all_derivatives():
     cameras = family(main_lens__aberrations=({"noll": 4, "coefficient": 4e-8},))
     lenslets = LensletFamily(cameras, double=True, tolerance=1e-9)
     values = cameras.start + 0.5 * cameras.tolerance * PLACE
-    at = lenslets.at(values, slopes=True)
-    weights = RANDOM.standard_normal(at.matrix.shape)
-    back, turn = at.back(weights), cameras.jacobian(values)
-    ahead = [np.vdot(weights, at.slope(place)) for place in range(len(turn))]
+    at, turn = lenslets.at(values), cameras.jacobian(values)
+    slopes = np.zeros((len(turn), *at.matrix.T.shape))
+    for points, part in at.slopes():
+        slopes[:, points] = part
     for i, tolerance in enumerate(cameras.tolerance):
         step = np.zeros(len(values))
         step[i] = 1e-4 * tolerance
         rise = lenslets.at(values + step).matrix - lenslets.at(values - step).matrix
-        told = np.vdot(weights, rise) / 2e-4
-        scale = np.linalg.norm(rise) / 2e-4 * np.linalg.norm(weights) / rise.size**0.5
-        assert abs(back[i] * tolerance - told) < 1e-4 * scale, cameras.parameters[i].name
-        assert abs(ahead @ turn[:, i] * tolerance - told) < 1e-4 * scale
+        told = rise.T / 2e-4
+        error = np.tensordot(turn[:, i], slopes, 1) * tolerance - told
+        assert np.linalg.norm(error) < 3e-4 * np.linalg.norm(told), cameras.parameters[i].name
 
 
 def test_the_mirrored_camera_sees_turned_objects():

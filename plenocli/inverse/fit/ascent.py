@@ -1,5 +1,5 @@
 """The way up to the most likely camera: Levenberg's steps by Gauss and Newton's curvature,
-lengthened while the evidence rises, with noise that starts as large as the captures' misfit makes it.
+lengthened while the evidence rises, with noise that starts as large as the misfit makes it.
 """
 
 from __future__ import annotations

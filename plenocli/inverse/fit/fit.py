@@ -43,7 +43,7 @@ CLEAR = 4.0
 on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
 """
 INFLATION = 1.8
-"""By how much the standard deviations exceed the curvature's: draws of cameras were so much farther."""
+"""By how much the standard deviations exceed the curvature's: drawn cameras were farther by it."""
 MATRIX_INFLATION = 1.6
 """The same for the error of the matrix, to which errors of parameters add up less."""
 FINER, FINER_IN_MATRIX = 3e-3, 2e-3
@@ -53,7 +53,7 @@ above all the sensor distance.
 """
 LEFT_OVER = 0.01
 """By how much of what a fit leaves over, beyond the noise, the variances grow."""
-SECONDS = 1e-5
+SECONDS = 5e-6
 """A fit takes on one core for each pixel and point of a lenslet, about."""
 MOST_LENSLETS = 16
 """Lenslets looked at along each side of a capture, from its middle."""

@@ -80,8 +80,9 @@ def command(
 
     OUT is a camera description (.toml) like any other; a matrix that simulate-pif makes from it
     carries the remaining uncertainty as its model error. Captures must be of one camera, in light
-    of one wavelength, with square lenslets that light only their own superpixels. Where no camera
-    near the described one explains them, nothing is written and the exit code is 5.
+    of one wavelength, with square lenslets that light only their own superpixels. Defective
+    and saturated pixels count for nothing. Where no camera near the described one explains the
+    captures, nothing is written and the exit code is 5.
 
     \b
     Examples:

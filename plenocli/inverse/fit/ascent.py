@@ -5,6 +5,7 @@ lengthened while the evidence rises, with noise that starts as large as the misf
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -111,6 +112,12 @@ class Ascent:
         self._model, self._rounds = model, rounds
         nodes = None if model is None else NODES
         self.lenslets = LensletFamily(family, tolerance=tolerance, pixel_nodes=nodes)
+
+    def of(self, evidence: Evidence) -> Ascent:
+        """The same of the same captures with other pixels filled in."""
+        other = copy(self)
+        other.evidence = evidence
+        return other
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """(parameter,) in their units, of x in tolerances."""

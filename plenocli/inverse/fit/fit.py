@@ -5,6 +5,7 @@ are most likely, whatever their objects are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,10 @@ import numpy as np
 from plenocli.base.errors import ConfigError
 from plenocli.inverse.fit.ascent import Ascent, Point
 from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
+from plenocli.inverse.fit.captures import Mender
 from plenocli.inverse.fit.finer import FinerModel
-from plenocli.inverse.fit.optics import ZERNIKES, Parameter
-from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
+from plenocli.inverse.fit.optics import ZERNIKES, Parameter, require_fittable
+from plenocli.inverse.fit.problem import CapturedLenslets, FitProblem, described_matrix, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -30,6 +32,10 @@ STARTS = (
 """Further starts, in tolerances, where the way from the described camera does not lead to one that
 explains the captures: in focus a camera and its mirror image are alike, and the evidence has a
 saddle.
+"""
+MENDED, ALIKE = 3, 0.03
+"""How often, at the most, pixels that count for nothing are filled in anew under the camera that
+was found, and by how much of the noise, root mean square, that must change the captures.
 """
 SLACK, DEVIATIONS = 0.01, 3.0
 """Noise over the noise told, less one, up to which a fit explains its captures: photographs are
@@ -72,7 +78,9 @@ def fit_camera(
     """The camera that makes captures most likely.
 
     camera: as described: square lenslets, one wavelength.
-    captures: of one camera, whose superpixels are cut out around their centres.
+    captures: of one camera, whose superpixels are cut out around their centres; pixels that are
+        defective, saturated or not known are found and filled in as the rest of their lenslet has
+        them under the camera that is found.
     pictures: training photographs, linear luminance (row, column) in [0, 1], at several scales.
     parameters: that may change, with their tolerances; None: all_parameters.
     model: of propagation behind which captures are believed to have come about: "auto" for the
@@ -84,28 +92,71 @@ def fit_camera(
     Raises UsageError for other cameras, InputError for captures that hold nothing.
     docs/model.md, "A camera that fits itself".
     """
+    require_fittable(camera)
+    mender = Mender(camera, pictures, seed)
+    known = [c.middle(MOST_LENSLETS) for c in captures]
+    told = described_matrix(camera)
+    mended = [mender.mended(c, told) for c in known]
     problem = fit_problem(
-        camera, captures, pictures, parameters=parameters, lenslets=MOST_LENSLETS, seed=seed
+        camera, mended, pictures, parameters=parameters, lenslets=MOST_LENSLETS, seed=seed
     )
-    family = problem.family
     ascent = Ascent(
-        family,
+        problem.family,
         problem.evidence,
         tolerance=problem.tolerance,
-        model=FinerModel(family, model),
+        model=FinerModel(problem.family, model),
         rounds=1 if model == "fresnel" else ROUNDS,
         progress=progress,
     )
-    start = np.zeros(len(family.parameters))
+    start = np.zeros(len(problem.family.parameters))
     begun = ascent.point(start, finer=ascent.difference(start))
     limits = accepted_ratios(problem.evidence.values, problem.evidence.quiet)
-    best = _highest(ascent, begun, limits[0])
+    mend = partial(_mended, mender=mender, known=known)
+    first = ascent.settle(begun, STEPS)
+    if not _whole(problem, known) or first.evidence.noise_factor() > limits[0]:
+        first, ascent, problem = mend(first, ascent, problem)
+    best = _highest(ascent, first, limits[0])
+    if best is not first and not _whole(problem, known):
+        best, ascent, problem = mend(best, ascent, problem)
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
         best, turned = _told_apart(ascent, best, problem.captures)
     # what is left over beyond the noise is believed of fine objects only where pictures go on
     sure = turned is not None and turned >= CLEAR
     return _described(ascent, best, limits[1] if sure else limits[0], begun, turned)
+
+
+def _mended(
+    at: Point,
+    ascent: Ascent,
+    problem: FitProblem,
+    *,
+    mender: Mender,
+    known: Sequence[CapturedLenslets],
+) -> tuple[Point, Ascent, FitProblem]:
+    """Where the way goes on with the pixels that count for nothing filled in under the camera at
+    hand, until that changes no more; known: the captures as they were.
+    """
+    for _ in range(MENDED):
+        again = [mender.mended(c, at.matrix) for c in known]
+        if _change(problem.captures, again) < ALIKE:
+            break
+        problem = problem.of(again)
+        ascent = ascent.of(problem.evidence)
+        at = ascent.settle(ascent.point(at.x, finer=at.finer), STEPS)
+    return at, ascent, problem
+
+
+def _whole(problem: FitProblem, known: Sequence[CapturedLenslets]) -> bool:
+    """Whether nothing was filled in."""
+    return all(a is b for a, b in zip(problem.captures, known))
+
+
+def _change(before: Sequence[CapturedLenslets], after: Sequence[CapturedLenslets]) -> float:
+    """Root mean square over the noise, of the capture that changed most."""
+    return max(
+        float(np.sqrt(np.nanmean((a.y - b.y) ** 2)) / a.sigma) for a, b in zip(after, before)
+    )
 
 
 def expected_seconds(camera: Camera) -> float:
@@ -126,11 +177,10 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
 
 
-def _highest(ascent: Ascent, begun: Point, limit: float) -> Point:
-    """Where the way up leads from the described camera or, if that explains nothing, from the best
-    of further starts.
+def _highest(ascent: Ascent, first: Point, limit: float) -> Point:
+    """Where the way up led from the described camera or, if that explains nothing, where it leads
+    from the best of further starts.
     """
-    first = ascent.settle(begun, STEPS)
     if first.evidence.noise_factor() <= limit:
         return first
     starts = []

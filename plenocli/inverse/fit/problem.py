@@ -5,7 +5,7 @@ and how likely each is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,13 +30,15 @@ LOST = 0.01
 class CapturedLenslets:
     """Superpixels of one capture.
 
-    y: (lenslet_row, lenslet_column, pixel) in any units of A x; lenslets with values that are not
-        finite, or all 0, are left out.
+    y: (lenslet_row, lenslet_column, pixel) in any units of A x; NaN where nothing is known, which
+        is filled in before it comes here. Lenslets with such values, or all 0, are left out.
     sigma: standard deviation of their noise, in these units.
+    saturated: like y, which pixels were clipped; None where nobody says.
     """
 
     y: np.ndarray
     sigma: float
+    saturated: np.ndarray | None = None
 
     @property
     def used(self) -> np.ndarray:
@@ -44,12 +46,14 @@ class CapturedLenslets:
         return np.isfinite(self.y).all(axis=2) & (self.y != 0).any(axis=2)
 
     def middle(self, most: int) -> CapturedLenslets:
-        """The lenslets in the middle, `most` a side."""
+        """The lenslets in the middle, `most` a side; itself where there are no more."""
         rows, columns = self.y.shape[:2]
+        if max(rows, columns) <= most:
+            return self
         r, c = (max(0, (n - most) // 2) for n in (rows, columns))
-        return CapturedLenslets(
-            np.asarray(self.y, float)[r : r + most, c : c + most], float(self.sigma)
-        )
+        at = slice(r, r + most), slice(c, c + most)
+        clipped = None if self.saturated is None else self.saturated[at]
+        return CapturedLenslets(self.y[at], self.sigma, clipped)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +62,20 @@ class FitProblem:
 
     family: of cameras;
     captures: the lenslets that are looked at;
-    evidence: of these, in units of photographs.
+    evidence: of these, in units of photographs;
+    told: (pixel, point) the paraxial matrix as described, by which these units go.
     """
 
     family: CameraFamily
     captures: tuple[CapturedLenslets, ...]
     evidence: Evidence
+    told: np.ndarray
+
+    def of(self, captures: Sequence[CapturedLenslets]) -> FitProblem:
+        """The same of the same captures with other pixels filled in."""
+        data = [_in_units_of_photographs(c, self.told) for c in captures]
+        evidence = Evidence(data, self.evidence.prior)
+        return replace(self, captures=tuple(captures), evidence=evidence)
 
     @property
     def tolerance(self) -> float:
@@ -94,7 +106,7 @@ def fit_problem(
     data = [_in_units_of_photographs(c, told) for c in middle]
     prior = photograph_prior(pictures, family.geometry.object_shape, seed)
     seen = prior.seen(told, HIDDEN * min(c.sigma for c in data))
-    return FitProblem(family=family, captures=middle, evidence=Evidence(data, seen))
+    return FitProblem(family=family, captures=middle, evidence=Evidence(data, seen), told=told)
 
 
 def camera_family(camera: Camera, parameters: Sequence[Parameter] | None = None) -> CameraFamily:
@@ -115,7 +127,7 @@ def _as_described(family: CameraFamily) -> np.ndarray:
 
 def _in_units_of_photographs(capture: CapturedLenslets, told: np.ndarray) -> Lenslets:
     """The lenslets as bright as photographs are; told: matrix (pixel, point) as described."""
-    y = capture.y[capture.used].T
+    y = np.asarray(capture.y, float)[capture.used].T
     if y.size == 0 or not float(y.sum()) > 0:
         raise InputError("holds no light that a fit could look at")
     if not capture.sigma > 0:

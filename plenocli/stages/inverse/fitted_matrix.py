@@ -11,13 +11,10 @@ import numpy as np
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.nuisances.clean import clean
 from plenocli.stages.inverse.fit_camera import fitted
 
 HIDDEN = 0.2
 """Neighbours' light over the noise up to which a fit does not see it."""
-WHOLE = 0.5
-"""Share of the lenslets that must be wholly measured for a fit to look at these alone."""
 
 if TYPE_CHECKING:
     from plenocli.inverse.fit.camera_fit import CameraFit
@@ -54,7 +51,7 @@ def with_fitted_camera(
         model = data.accuracy.model
     fit = fitted(
         system.origin.camera,
-        [CapturedLenslets(_measured(estimators, data), float(sigma))],
+        [CapturedLenslets(data.y, float(sigma), data.saturated)],
         estimators.prior.pictures(data.scene),
         name="--fit",
         model=model,
@@ -86,19 +83,6 @@ def _neighbours_count(system: LensletMatrix, data: Superpixels, sigma: float) ->
         "--fit",
         advice,
     )
-
-
-def _measured(estimators: Estimators, data: Superpixels) -> np.ndarray:
-    """Superpixels (lenslet_row, lenslet_column, pixel) that a fit may look at: NaN in lenslets that
-    are not wholly measured, or, where too few are, all of them as the matrix at hand fills them in.
-    """
-    missing = ~np.isfinite(data.y)
-    if data.saturated is not None:
-        missing |= data.saturated
-    whole = ~missing.any(axis=2)
-    if np.count_nonzero(whole) >= WHOLE * whole.size:
-        return np.where(whole[..., None], data.y, np.nan)
-    return clean(estimators, data).data.y
 
 
 def likely_cause(

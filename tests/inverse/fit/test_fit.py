@@ -119,6 +119,25 @@ def test_several_captures_tell_more_than_one():
     assert np.linalg.norm(three.matrix - right) < np.linalg.norm(one.matrix - right)
 
 
+@pytest.mark.parametrize("what", ["dead and hot", "saturated"])
+def test_defective_and_saturated_pixels_count_for_nothing(what):
+    """The camera is found as if they did not exist, though the described one tells them badly."""
+    truth, _ = fitted("all")
+    whole = captured(truth)
+    y, clipped = whole.y.copy(), None
+    if what == "saturated":
+        limit = np.quantile(y, 0.98)
+        clipped, y = y >= limit, np.minimum(y, limit)
+    else:
+        lost = np.random.default_rng(5).random(y.shape)
+        y[lost < 0.005], y[lost > 0.999] = 0.0, 1.2 * y.max()
+    fit = fit_camera(CAMERA, [CapturedLenslets(y, whole.sigma, clipped)], TRAINING, model="fresnel")
+    right = exact(tuple(truth), 1)
+    assert fit.accepted, fit.why
+    assert np.linalg.norm(fit.matrix - right) < 3 * fit.model_error * np.linalg.norm(right)
+    assert np.abs([(p.value - t) / p.sigma for p, t in zip(fit.parameters, truth)]).max() < 4
+
+
 def test_a_fit_that_cannot_be_says_so_and_changes_nothing():
     rng = np.random.default_rng(1)
     noise = CapturedLenslets(rng.random((2, 2, 256)), 1e-2)

@@ -62,8 +62,8 @@ from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, split_by_scene
 from plenocli.inverse.sparse import dictionary as sparse
-from plenocli.inverse.sparse.dictionary import Dictionary
-from plenocli.inverse.sparse.learning import learner_for
+from plenocli.inverse.sparse.dictionary import INCOHERENCE, PULL, Dictionary
+from plenocli.inverse.sparse.learning import advance, learner_for
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer
 from plenocli.inverse.spectra.spectra import Spectra
 
@@ -440,6 +440,8 @@ def learn_dictionary(
     iterations: int = 10,
     lam: float | None = None,
     delta: float = 1e-3,
+    pull: float = PULL,
+    incoherence: float = INCOHERENCE,
     snr_db: float = 60.0,
     seed: int = 0,
 ) -> Dictionary:
@@ -451,6 +453,8 @@ def learn_dictionary(
     batch: patches an iteration, None for 4 an atom.
     lam: weight of |c|_1; None: chosen on the held-out pictures.
     delta: weight of |A Phi|^2.
+    pull: batches that the atoms so far are worth when they are refitted.
+    incoherence: share of a full step that draws atoms apart which the sensor sees alike.
     snr_db: of the measurements that it is learnt from, dB.
     seed: of every random stream.
 
@@ -467,7 +471,10 @@ def learn_dictionary(
         atoms=count,
         batch=batch or 4 * count,
         lam=np.nan if lam is None else lam,
+        lam_rule="validation" if lam is None else "given",
         delta=delta,
+        pull=pull,
+        incoherence=incoherence,
         snr_db=snr_db,
         seed=seed,
     )
@@ -481,7 +488,7 @@ def learn_dictionary(
     )
     state = learner.start()
     for _ in range(iterations):
-        state = learner.step(state)
+        learner, state = advance(learner, state)
     return Dictionary(
         atoms=state.atoms,
         synthesis=state.atoms,

@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from plenocli.evaluation.metrics.coherence import coherence, exact_recovery_sparsity, welch_bound
+from plenocli.evaluation.metrics.coherence import (
+    coherence,
+    dictionary_coherence,
+    exact_recovery_sparsity,
+    welch_bound,
+)
 from plenocli.inverse.sparse.coherence import column_coherence
 
 
@@ -87,3 +92,19 @@ def test_column_coherence_by_hand():
     assert largest == pytest.approx(np.sqrt(0.5)) and mean == pytest.approx(2 * np.sqrt(0.5) / 3)
     assert visible.tolist() == [True, True, True, False]
     assert column_coherence(d[:, 3:])[:2] == (None, None)
+
+
+def test_constant_atoms_do_not_count_and_random_ones_stand_beside():
+    """A that adds up everything sees a constant atom best of all."""
+    rng = np.random.default_rng(4)
+    system = 1 + 0.1 * rng.random((20, 16))
+    atoms = np.linalg.qr(np.hstack([np.ones((16, 1)), rng.standard_normal((16, 15))]))[0]
+    whole, varying = coherence(system, atoms), dictionary_coherence(system, atoms)
+    assert whole.mutual > 0.99 and varying.atoms == 15
+    assert varying.mutual == pytest.approx(coherence(system, atoms[:, 1:]).mutual)
+    assert varying.mutual < 0.2
+    draws = rng.standard_normal((200, 16, 15))
+    draws -= draws.mean(axis=1, keepdims=True)
+    draws /= np.linalg.norm(draws, axis=1, keepdims=True)
+    usual = [coherence(system, draw).mutual for draw in draws]
+    assert min(usual) <= varying.random_mutual <= max(usual)

@@ -333,3 +333,31 @@ def test_gradient_steps_are_part_of_what_a_resumed_run_keeps(pif, tmp_path, caps
     assert (
         learn(pif, "--iterations", 2, "--resume", tmp_path / "a.h5", "-o", tmp_path / "b.h5") == 0
     )
+
+
+def test_quality_that_falls_is_told_with_what_to_do(pif, tmp_path, capsys):
+    """Batches of as many patches as atoms, refitted afresh: what is learnt is their noise."""
+    assert learn(pif, "--iterations", 6, "--pull", 0, "--batch", 12, "-o", tmp_path / "a.h5") == 0
+    said = capsys.readouterr()
+    assert "held-out patches had" in said.err and "a larger --batch or --pull" in said.err
+    assert "before learning" in said.out and "random atoms" in said.out
+
+
+def test_lambda_is_chosen_again_once_atoms_were_learnt(pif, tmp_path, capsys):
+    """And a run that goes on keeps what was chosen: its bytes are those of one long run."""
+    for name, *options in (
+        ("long", "--iterations", 3),
+        ("short", "--iterations", 1),
+        ("on", "--iterations", 3, "--resume", tmp_path / "short.h5"),
+    ):
+        output = tmp_path / f"{name}.h5"
+        known = ["skimage:camera", "skimage:coins", "--pif", str(pif), "--batch", "40"]
+        asked = ["learn-dict", *known, "--init", "random", *map(str, options), "-o", str(output)]
+        assert run(asked) == 0
+        said = capsys.readouterr().err
+        assert said.count("lambda =") == (0 if name == "on" else 2)
+    from plenocli.files.artefacts.container import read_artefact
+
+    whole, resumed = (read_artefact(tmp_path / f"{n}.h5", "dictionary") for n in ("long", "on"))
+    assert whole.attrs["dictionary"]["lambda"] == resumed.attrs["dictionary"]["lambda"]
+    np.testing.assert_array_equal(whole.data["dictionary/atoms"], resumed.data["dictionary/atoms"])

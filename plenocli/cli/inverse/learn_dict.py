@@ -61,7 +61,24 @@ class Lambda(click.ParamType):
     type=options.NON_NEGATIVE,
     default="0.001",
     show_default=True,
-    help="Weight of |A Phi|^2, which keeps A and the atoms incoherent.",
+    help="The paper's weight of |A Phi|^2, which makes atoms faint to the sensor.",
+)
+@click.option(
+    "--pull",
+    type=options.NON_NEGATIVE,
+    default="8",
+    show_default=True,
+    help="Batches that the atoms so far are worth when they are refitted; 0 refits them afresh.",
+)
+@click.option(
+    "--incoherence",
+    type=options.NON_NEGATIVE,
+    default="0.05",
+    show_default=True,
+    help=(
+        "Draws atoms apart that the sensor sees alike, by this share of a full step in every "
+        "iteration; 0 does not."
+    ),
 )
 @click.option(
     "--init",
@@ -76,7 +93,10 @@ class Lambda(click.ParamType):
     type=options.Whole(0),
     default=0,
     show_default=True,
-    help="Refit the atoms by so many gradient steps, as published; 0 solves the equation.",
+    help=(
+        "Refit the atoms by so many gradient steps, as published, without --pull; 0 solves the "
+        "equation."
+    ),
 )
 @click.option(
     "--synthesis",
@@ -120,6 +140,8 @@ def command(
     snr_db: float,
     lam: float | str | None,
     delta: float,
+    pull: float,
+    incoherence: float,
     initial: str,
     gradient_steps: int,
     synthesis: bool,
@@ -142,6 +164,8 @@ def command(
       plenocli learn-dict --pif pif.h5 --iterations 20 -o dictionary.h5
       plenocli learn-dict photos/*.png --pif pif.h5 --atoms 400 --batch 1600 \\
           --snr 40dB -o dictionary.h5
+      plenocli learn-dict --pif pif.h5 --init random --gradient-steps 10 --incoherence 0 \\
+          -o published.h5
       plenocli learn-dict --pif pif.h5 --resume dictionary.h5 --iterations 40 -o longer.h5
     """
     from plenocli.stages.inverse.learn_dict import Settings, run_learn_dict
@@ -156,6 +180,8 @@ def command(
             snr_db=snr_db,
             lam=lam,
             delta=delta,
+            pull=pull,
+            incoherence=incoherence,
             initial=initial,
             gradient_steps=gradient_steps,
             synthesis=synthesis,

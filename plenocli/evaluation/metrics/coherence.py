@@ -6,10 +6,11 @@ sensor sees of each atom. See docs/model.md, "Spatial reconstruction".
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.base.random_streams import stream
 from plenocli.inverse.sparse.coherence import column_coherence
 
 DEFINITIONS = {
@@ -34,6 +35,10 @@ DEFINITIONS = {
         "largest k < (1 + 1/mu(D)) / 2: any k atoms are recovered exactly without noise "
         "(Donoho and Elad 2003)"
     ),
+    "random_candes_romberg": (
+        "coherence_candes_romberg of as many random atoms of mean zero, normally distributed"
+    ),
+    "random_effective_mean": "coherence_effective_mean of the same",
     "dead_atoms": "atoms of zero norm",
     "invisible_atoms": (
         "atoms with |A phi| < 1e-6 of the largest: the sensor cannot tell them from "
@@ -45,7 +50,7 @@ DEFINITIONS = {
 @dataclass(frozen=True, kw_only=True)
 class CoherenceScore:
     """Measures of a dictionary with a matrix, NaN where two visible atoms are due and there are
-    none. See DEFINITIONS.
+    none, and where no random atoms were asked for. See DEFINITIONS.
     """
 
     coherence_raw: float
@@ -59,6 +64,44 @@ class CoherenceScore:
     atoms: int
     points: int
     pixels: int
+    random_candes_romberg: float = math.nan
+    random_effective_mean: float = math.nan
+
+    @property
+    def mutual(self) -> float:
+        """Largest |cosine| between a row of A and an atom: 1/sqrt(n) to 1; the paper asks for one
+        far below 1.
+        """
+        return self.coherence_candes_romberg / math.sqrt(self.points)
+
+    @property
+    def random_mutual(self) -> float:
+        """The same of random atoms."""
+        return self.random_candes_romberg / math.sqrt(self.points)
+
+
+def dictionary_coherence(system: np.ndarray, atoms: np.ndarray) -> CoherenceScore:
+    """Measures of a learnt dictionary, and of random atoms beside them.
+
+    Constant atoms are left out: the sparse code has them for free, and nearly all light is in the
+    mean, so that they alone would make any dictionary look coherent.
+
+    system: A (pixel, point).
+    atoms: Phi (point, atom).
+
+    Raises ValueError where the points of the two differ.
+    """
+    atoms = np.asarray(atoms)
+    varying = atoms[:, np.ptp(atoms, axis=0) > 1e-6 * np.linalg.norm(atoms, axis=0)]
+    found = coherence(system, varying)
+    draw = stream(0, "coherence").standard_normal(varying.shape).astype(atoms.dtype)
+    draw -= draw.mean(axis=0)
+    random = coherence(system, draw / np.linalg.norm(draw, axis=0))
+    return replace(
+        found,
+        random_candes_romberg=random.coherence_candes_romberg,
+        random_effective_mean=random.coherence_effective_mean,
+    )
 
 
 def coherence(system: np.ndarray, atoms: np.ndarray, block: int = 512) -> CoherenceScore:

@@ -3,6 +3,7 @@
 import numpy as np
 
 INVISIBLE = 1e-6
+"""Share of the largest column's norm below which the sensor cannot tell one from nothing."""
 
 
 def column_coherence(

@@ -7,6 +7,8 @@ docs/model.md, "Spatial reconstruction".
 
 import numpy as np
 
+from plenocli.inverse.sparse.coherence import INVISIBLE
+
 
 def moments(patches: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What the dictionary step needs of patches and their codes.
@@ -89,6 +91,54 @@ def gradient_step(
         ahead = stepped + (momentum - 1) / after * (stepped - atoms)
         atoms, momentum = stepped, after
     return atoms, _normal_residual(energy, basis, gram, right, delta, atoms)
+
+
+def pulled(
+    gram: np.ndarray, right: np.ndarray, atoms: np.ndarray, batches: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """G and R of the dictionary step with w |Phi - atoms|^2 added to what it makes least.
+
+    Few patches use an atom: what one batch says of it is mostly noise. w is the median power of a
+    coefficient times `batches`, so that to a typical atom its past is worth so many batches.
+
+    gram: (atom, atom) G.
+    right: (point, atom) R.
+    atoms: (point, atom) before the step.
+    batches: 0 for none.
+    """
+    weight = batches * float(np.median(np.diag(gram)))
+    return gram + weight * np.eye(len(gram)), right + weight * atoms
+
+
+def decorrelated(seen: np.ndarray, atoms: np.ndarray, share: float) -> np.ndarray:
+    """Atoms one step down the gradient of the sum of squared cosines of what the sensor sees of
+    two of them, |U^T U - I|^2 with U the unit columns of A Phi.
+
+    The step mixes atoms and leaves their number and span as they are: U (I - share (U^T U - I) /
+    |U|^2), which for share up to 1 takes no correlation beyond its opposite. Invisible atoms stay.
+
+    seen: (row, point) A.
+    atoms: (point, atom).
+    share: 0 for none.
+
+    Returns (point, atom).
+    """
+    visible, unit, norm = _visible(seen @ atoms)
+    if not share or not visible.any():
+        return atoms
+    gram = unit.T @ unit
+    largest = np.linalg.norm(unit @ unit.T if len(unit) < len(gram) else gram, 2)
+    mix = np.eye(len(gram)) - share / largest * (gram - np.eye(len(gram)))
+    mixed = atoms.copy()
+    mixed[:, visible] = (atoms[:, visible] / norm) @ mix * norm
+    return mixed
+
+
+def _visible(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(which columns are more than INVISIBLE of the largest, those at unit norm, their norms)."""
+    norm = np.linalg.norm(columns, axis=0)
+    visible = norm > INVISIBLE * norm.max(initial=0)
+    return visible, columns[:, visible] / norm[visible], norm[visible]
 
 
 def ridge_of(gram: np.ndarray) -> float:

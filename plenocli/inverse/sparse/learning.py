@@ -10,7 +10,7 @@ import numpy as np
 
 from plenocli.base.progress import note
 from plenocli.inverse.picture.solvers.least_squares import Svd
-from plenocli.inverse.sparse.dictionary import Learner, Settings
+from plenocli.inverse.sparse.dictionary import Learner, Settings, State
 from plenocli.inverse.sparse.l1.solve import noise_lambda
 
 LAMBDAS = np.logspace(-7, -4, 13)
@@ -28,7 +28,6 @@ def learner_for(
     training: Sequence[np.ndarray],
     held_out: Sequence[np.ndarray],
     *,
-    rule: float | str | None = None,
     workers: int | None = None,
 ) -> Learner:
     """The Learner of one system matrix, its lambda chosen where the settings have NaN for it.
@@ -36,38 +35,36 @@ def learner_for(
     svd: of the matrix.
     object_shape: points (rows, columns) of an object.
     training, held_out: pictures (row, column) to learn from, and to choose and judge with.
-    rule: "noise" takes lambda from the noise; else the best on the validation patches.
     workers: threads, None for all cores.
     """
-
-    def learner(lam: float) -> Learner:
-        return Learner(
-            svd,
-            object_shape,
-            training,
-            held_out,
-            replace(settings, lam=lam),
-            workers=workers,
-        )
-
-    given = not math.isnan(settings.lam)
-    return learner(settings.lam if given else _choose_lambda(learner(1.0), rule))
+    known = not math.isnan(settings.lam)
+    start = settings if known else replace(settings, lam=1.0)
+    machine = Learner(svd, object_shape, training, held_out, start, workers=workers)
+    return machine if known else _with_chosen_lambda(machine, machine.start().atoms)
 
 
-def _choose_lambda(machine: Learner, rule: float | str | None) -> float:
-    """The largest lambda with the best validation PSNR for the starting dictionary, or
-    lambda by the noise.
+def advance(machine: Learner, state: State) -> tuple[Learner, State]:
+    """One iteration, and after the first lambda chosen again where it is not given: what is best
+    for starting atoms, above all random ones, is not for those that were learnt.
     """
-    atoms = machine.start().atoms
-    if rule == "noise":
+    state = machine.step(state)
+    again = state.iteration == 1 and machine.settings.lam_rule != "given"
+    return (_with_chosen_lambda(machine, state.atoms) if again else machine), state
+
+
+def _with_chosen_lambda(machine: Learner, atoms: np.ndarray) -> Learner:
+    """The learner with the largest lambda of the best validation PSNR for some atoms, or with that
+    of the noise.
+    """
+    if machine.settings.lam_rule == "noise":
         lam = noise_lambda(machine.seen @ atoms[:, 1:], machine.sigma)
         note(f"lambda = {lam:.2e}, from the noise")
-        return lam
+        return machine.with_lambda(lam)
     table = machine.validate_path(atoms, LAMBDAS)
     top = max(quality for _, quality, _ in table)
     best, quality, nonzeros = max(row for row in table if row[1] > top - INDIFFERENT_DB)
     note(
-        f"lambda = {best:.2e}: validation {quality:.2f} dB with the starting atoms "
+        f"lambda = {best:.2e}: validation {quality:.2f} dB with the atoms so far "
         f"({nonzeros:.0f} of them a patch), out of {len(LAMBDAS)} values"
     )
-    return best
+    return machine.with_lambda(best)

@@ -17,7 +17,7 @@ from plenocli.base.progress import note
 from plenocli.base.text import json_value
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
 from plenocli.evaluation.depth_score import known_depth, score_lightfield
-from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
+from plenocli.evaluation.metrics.coherence import CoherenceScore, dictionary_coherence
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
 from plenocli.evaluation.metrics.response import score_response
@@ -475,7 +475,7 @@ def _score_dictionary(result: Result, comparison: _Comparison) -> _Scored:
             result.path,
             "name the matrix it was learnt for",
         )
-    found: CoherenceScore = coherence(
+    found: CoherenceScore = dictionary_coherence(
         matrix / matrix.dtype.type(result.scale), result.values.astype(matrix.dtype, copy=False)
     )
     return _Scored(

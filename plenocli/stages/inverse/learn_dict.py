@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
-from plenocli.evaluation.metrics.coherence import CoherenceScore, coherence
+from plenocli.evaluation.metrics.coherence import CoherenceScore, dictionary_coherence
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.files.read.dictionaries import Unfinished, read_unfinished
 from plenocli.files.read.system_matrices import read_lenslet_matrix
@@ -22,9 +22,12 @@ from plenocli.inverse.picture.footprint import require_learning
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
 from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, split_by_scene
-from plenocli.inverse.sparse.dictionary import HISTORY, Learner, State
+from plenocli.inverse.sparse.dictionary import HISTORY, INCOHERENCE, PULL, Learner, State
 from plenocli.inverse.sparse.dictionary import Settings as LearnerSettings
-from plenocli.inverse.sparse.learning import learner_for
+from plenocli.inverse.sparse.learning import advance, learner_for
+
+FALLEN = 0.1
+"""dB of held-out quality lost since the best iteration that are told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +42,8 @@ class Settings:
     snr_db: noise of the measurements.
     initial: patches, pca or random.
     gradient_steps: of the dictionary step; 0 is its closed form.
+    pull: batches that the atoms so far are worth to the closed form.
+    incoherence: share of a full step that draws atoms apart.
     synthesis: also regress atoms that paint.
     seed: of every random stream.
     workers: threads, None for all cores.
@@ -52,6 +57,8 @@ class Settings:
     snr_db: float = 60.0
     initial: str = "patches"
     gradient_steps: int = 0
+    pull: float = PULL
+    incoherence: float = INCOHERENCE
     synthesis: bool = False
     seed: int = 0
     workers: int | None = None
@@ -95,6 +102,7 @@ class LearnSummary:
 
     iterations, atoms, batch, lam, delta: as it was learnt.
     validation_psnr_db: of one coding of the held-out patches.
+    start_psnr_db: the same of the atoms that learning started with.
     averaged_psnr_db: of the mean over mirror images, which reconstruct takes.
     lmmse_psnr_db: of the LMMSE that reconstruct takes of a lenslet by itself.
     nonzeros, worst_gap, objective: of the coding (Validation).
@@ -109,6 +117,7 @@ class LearnSummary:
     lam: float
     delta: float
     validation_psnr_db: float
+    start_psnr_db: float
     averaged_psnr_db: float
     lmmse_psnr_db: float
     nonzeros: float
@@ -135,10 +144,12 @@ class LearnSummary:
         verdict = "above" if self.beats_lmmse else "NOT above"
         return (
             f"{self.atoms} atoms, {self.iterations} iterations, lambda {self.lam:.2e}, held out "
-            f"{self.validation_psnr_db:.2f} dB, averaged over mirror images "
+            f"{self.validation_psnr_db:.2f} dB ({self.start_psnr_db:.2f} before learning), "
+            "averaged over mirror images "
             f"{self.averaged_psnr_db:.2f} dB, {verdict} LMMSE {self.lmmse_psnr_db:.2f} dB; "
             f"coherence of A Phi: largest {self.coherence.coherence_effective:.3f}, mean "
-            f"{self.coherence.coherence_effective_mean:.3f}"
+            f"{self.coherence.coherence_effective_mean:.3f}; of A and Phi "
+            f"{self.coherence.mutual:.2f} (random atoms {self.coherence.random_mutual:.2f})"
         )
 
 
@@ -172,12 +183,12 @@ def run_learn_dict(
     machine, scenes, state = learning.machine, learning.scenes, learning.state
     left = settings.iterations - state.iteration
     for _ in bar(range(left), left, "iterations"):
-        state = machine.step(state)
+        machine, state = advance(machine, state)
         _tell(state)
         if checkpoint is not None:
             _write(checkpoint, state, machine, scenes, origin, overwrite=True)
     synthesis = machine.synthesis(state) if settings.synthesis else None
-    summary = _judge(learning, state, synthesis, output)
+    summary = _judge(replace(learning, machine=machine), state, synthesis, output)
     _write(
         output,
         state,
@@ -190,6 +201,7 @@ def run_learn_dict(
     )
     if checkpoint is not None:
         Path(checkpoint).unlink(missing_ok=True)
+    _warn_of_a_fall(state, summary)
     if not summary.beats_lmmse:
         note(
             "the dictionary does NOT beat LMMSE with a contrast for every patch on held-out "
@@ -235,7 +247,6 @@ def _begin(
         chosen,
         [p for _, p in scenes.training],
         [p for _, p in scenes.held_out],
-        rule=settings.lam,
         workers=settings.workers,
     )
     state = earlier.state if earlier else machine.start()
@@ -303,12 +314,23 @@ def _resolve(
             seed=settings.seed,
             initial=settings.initial,
             gradient_steps=settings.gradient_steps,
+            pull=settings.pull,
+            incoherence=settings.incoherence,
+            lam_rule=_rule(settings),
         )
     asked, stored, default = asdict(settings), asdict(earlier.settings), asdict(Settings())
     wanted = [name for name in ("atoms", "batch", "lam") if asked[name] not in (None, "noise")]
     wanted += [
         name
-        for name in ("delta", "snr_db", "seed", "initial", "gradient_steps")
+        for name in (
+            "delta",
+            "snr_db",
+            "seed",
+            "initial",
+            "gradient_steps",
+            "pull",
+            "incoherence",
+        )
         if same or asked[name] != default[name]
     ]
     for name in wanted:
@@ -325,6 +347,12 @@ def _resolve(
     return earlier.settings
 
 
+def _rule(settings: Settings) -> str:
+    if settings.lam == "noise":
+        return "noise"
+    return "validation" if settings.lam is None else "given"
+
+
 def _tell(state: State) -> None:
     """One line about the last iteration."""
     last = state.history[-1]
@@ -334,6 +362,18 @@ def _tell(state: State) -> None:
         f"dead, coherence mean {last.coherence_mean:.3f} max {last.coherence_max:.4f}, gap "
         f"{last.worst_gap:.0e}, step residual {last.step_residual:.0e}"
     )
+
+
+def _warn_of_a_fall(state: State, summary: LearnSummary) -> None:
+    """Say where held-out patches were better before."""
+    quality = [summary.start_psnr_db, *(done.validation_psnr for done in state.history)]
+    best = int(np.argmax(quality))
+    if quality[best] > quality[-1] + FALLEN:
+        note(
+            f"warning: held-out patches had {quality[best]:.2f} dB after {best} iterations and "
+            f"have {quality[-1]:.2f} dB now: what is learnt is the noise of its batches; give "
+            f"--iterations {best}, more pictures, a larger --batch or --pull"
+        )
 
 
 def _judge(
@@ -386,7 +426,8 @@ def _judge(
         worst_gap=found.worst_gap,
         objective=found.objective,
         dead_share=state.history[-1].dead_share if state.history else None,
-        coherence=coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms),
+        coherence=dictionary_coherence(svd.u @ (svd.s[:, None] * svd.vt), state.atoms),
+        start_psnr_db=machine.validate(machine.start().atoms).psnr,
         output=str(output),
     )
 
@@ -448,12 +489,13 @@ def _judgement(summary: LearnSummary) -> dict[str, Any]:
         "coherence_effective": found.coherence_effective,
         "coherence_average": found.coherence_effective_mean,
         "coherence_raw": found.coherence_raw,
-        "coherence_mutual": found.coherence_candes_romberg / np.sqrt(found.points),
+        "coherence_mutual": found.mutual,
         "coherence_welch": found.welch_bound,
     }
     return {k: v for k, v in measures.items() if math.isfinite(v)} | {
         "notes": {
             "validation_psnr_db": summary.validation_psnr_db,
+            "start_psnr_db": summary.start_psnr_db,
             "averaged_psnr_db": summary.averaged_psnr_db,
             "lmmse_psnr_db": summary.lmmse_psnr_db,
             "beats_lmmse": summary.beats_lmmse,

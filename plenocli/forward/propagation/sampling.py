@@ -214,15 +214,13 @@ def size_band(
         tried = trial or alone
         faintest = UNTRIED if tried is None else tried.faintest
         # a point between lenslets is dim, and what is missed weighs more in its column
-        # of neighbours' fringes, where they were not tried, the law for lenslets that touch
-        fringes = _fringes_beside_gaps(geometry, light)
         if tried is None:
-            weight, error = UNTRIED_WEIGHT, fringes
+            weight, error = UNTRIED_WEIGHT, _fringes_beside_gaps(geometry, light)
         else:
             # what rules err by along both axes at once is left out of a trial
             many = joint > FEW_FRINGES[0]
             weight = 1.0 if tried.whole and not many else OTHERS[many]
-            error = tried.error if trial else partial(_worse, tried.error, fringes)
+            error = tried.error if trial else partial(_worse, tried.error, _untried(geometry, light))
         if tried is not None:
             errors = [TRIED_CUT_EFFECT * tolerance]
         nodes, rule = _required(_fewest(error, accuracy / weight), joint)
@@ -250,6 +248,22 @@ def _fringes_beside_gaps(
     """pixel_error of `light`, larger where lenslets leave gaps."""
     faint = 1 + min(20.0, 80 * (1 - geometry.lenslet_width / geometry.D2))
     return lambda count, rule: faint * pixel_error(count, rule, *light)
+
+
+def _untried(
+    geometry: Geometry, light: tuple[float, float, float, float]
+) -> Callable[[int, int], float]:
+    """pixel_error of `light` where neighbours' fringes could not be tried: those of lenslets side
+    by side, or under one point's blur, may be all that a point between lenslets has.
+    """
+    own, joint, _, blur = light
+    beside = geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3)
+    cycles = np.linspace(0, min(joint, own + max(1.0, blur) * beside), MANY)
+    return partial(
+        _worse,
+        _fringes_beside_gaps(geometry, light),
+        lambda count, rule: float(rule_error(count, cycles, rule).max()),
+    )
 
 
 def _worse(

@@ -144,10 +144,11 @@ def lenslets_of(camera, window):
     if camera.lenslet_array.lattice == "square":
         far = range(-window, window + 1)
         return [(r, c) for r in far for c in far]
-    # whole rows that reach half a pitch beyond the window, as wide as that
+    # whole rows up to those that end half a pitch beyond the window, as wide as that; a row ends a
+    # third of their distance from its middle
     reach, found = window + 0.5, []
     for r in range(-2 * window - 2, 2 * window + 3):
-        if abs(r) * WIDEST - WIDEST / 3 < reach - 1e-9 and window or r == 0:
+        if (abs(r) - 1) * WIDEST + WIDEST / 3 < reach - 1e-9 and window or r == 0:
             found += [
                 (r, c)
                 for c in range(-3 * window - 3, 3 * window + 4)

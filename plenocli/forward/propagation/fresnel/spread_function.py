@@ -105,6 +105,18 @@ def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
     return out.T
 
 
+def carried(fine: int, few: int) -> np.ndarray:
+    """What carries values at few Gauss-Legendre nodes onto fine ones, times the weights of these.
+
+    fine, few: nodes on [-1, 1], on which polynomials of degrees below `few` are known.
+
+    Returns (fine node, node of few).
+    """
+    (t, w), (tf, wf) = gauss(few), gauss(fine)
+    degrees = np.arange(few) + 0.5
+    return wf[:, None] * ((legendre(tf, few, 1) * degrees) @ (legendre(t, few, 1).T * w))
+
+
 def psf_nodes(geometry: Geometry, half: float) -> int:
     """Gauss-Legendre nodes per axis that resolve h on [-half, half], an even number.
 

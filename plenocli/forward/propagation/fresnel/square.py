@@ -17,8 +17,8 @@ from plenocli.forward.propagation.fresnel.array_to_sensor import (
 )
 from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.fresnel.spread_function import (
+    carried,
     edge_emphasis,
-    legendre,
     psf_nodes,
     separable_field,
 )
@@ -181,10 +181,8 @@ class SquareLenslets(LensletFields):
         t, w = gauss(min(fine, few))
         if few >= fine:
             return half * t, half * w, (half * t, (half * w).astype(self._real))
-        tf, wf = gauss(fine)
-        degrees = np.arange(few) + 0.5
-        carry = (legendre(tf, few, 1) * degrees) @ (legendre(t, few, 1).T * w)
-        return half * t, half * w, (half * tf, (half * wf[:, None] * carry).astype(self._real))
+        carry = half * carried(fine, few)
+        return half * t, half * w, (half * gauss(fine)[0], carry.astype(self._real))
 
     def _kernel(self, axis: int, n: int, place: int, nodes: int, rule: int) -> np.ndarray:
         """The kernel (sensor node, 2, term node), real and imaginary part, from a lenslet to the

@@ -19,7 +19,12 @@ import numpy as np
 
 from plenocli.forward.camera.quadrature import band_rule, gauss, nodes_for, opening_weights
 from plenocli.forward.propagation.fresnel.array_to_sensor import lenslet_kernel, sensor_nodes
-from plenocli.forward.propagation.fresnel.spread_function import legendre, sampled_field
+from plenocli.forward.propagation.fresnel.spread_function import (
+    carried,
+    legendre,
+    psf_nodes,
+    sampled_field,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -35,6 +40,8 @@ FEW, LINES = 3, 8
 """Points that a trial should have, and the most lines of points along an axis."""
 VALUES = 1 << 22
 """Values of the spread function, or on the sensor, that it may hold."""
+THINNED = 12, 6
+"""Lines of pixels along an axis of which the light is looked at where all are too many."""
 KEPT = 16
 """Trials that are kept for the next plan of the same camera."""
 
@@ -46,7 +53,8 @@ class TrialColumns:
     light: (column,) share of a point's light on the superpixels looked at;
     fringes: (column, degree, degree) Gram matrices, over all pixels and over the column's squared
         norm, of the Legendre coefficients of the light within a pixel, both axes together;
-    whole: whether they are all columns that symmetry does not give.
+    whole: whether they are all columns that symmetry does not give, with all their lenslets and
+        pixels.
     """
 
     light: np.ndarray
@@ -117,9 +125,10 @@ class _Hashed:
 def _tried(
     hashed: _Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
 ) -> TrialColumns | None:
-    # fewer lenslets and superpixels where that is too much
-    for near, beside in product([None] if window is None else range(window, 0, -1), (1, 0)):
-        trial = _Trial(geometry, grid, near, symmetric, beside)
+    # fewer pixels, superpixels and lenslets where that is too much
+    lenslets = [None] if window is None else range(window, 0, -1)
+    for near, beside, lines in product(lenslets, (1, 0), (None, *THINNED)):
+        trial = _Trial(geometry, grid, near, symmetric, beside, lines)
         points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
         if points and trial.values <= VALUES:
             light, fringes = trial.columns(hashed.camera, points)
@@ -134,6 +143,19 @@ def _lines(count: int, symmetric: bool) -> list[int]:
     return np.unique(np.linspace(0, last, LINES).round().astype(int)).tolist()
 
 
+def _pixel_lines(geometry: Geometry, count: int, most: int | None) -> tuple[list[int], float]:
+    """`most` of the lines of pixels along an axis that has `count`, from one end of the pupil's
+    image to the other; and how many of the lines there these are.
+    """
+    if most is None or count <= most:
+        return list(range(count)), 1.0
+    g = geometry
+    image = g.D1 * g.z3 / g.z2 + 2 * abs(g.kappa) * g.z3 * max(g.lenslet_extent) + g.blur
+    lit = min(count, max(most, math.ceil(image / g.pixel_pitch) + 2))
+    lines = (count - lit) // 2 + np.linspace(0, lit - 1, most).round().astype(int)
+    return lines.tolist(), most / lit
+
+
 class _Trial:
     """Nodes on lenslets and pixels of one trial."""
 
@@ -144,8 +166,11 @@ class _Trial:
         window: int | None,
         symmetric: bool,
         beside: int,
+        lines: int | None,
     ) -> None:
-        """`beside`: superpixels on either side of those under the blur that are looked at."""
+        """`beside`: superpixels on either side of those under the blur that are looked at;
+        `lines` of pixels on each, None for all.
+        """
         g = geometry
         self.geometry = g
         seen = math.ceil(g.blur / (2 * g.D2)) + beside + 0.01
@@ -163,7 +188,13 @@ class _Trial:
         cycles = 2 * (half + lit * g.D2) * g.pixel_active / (g.wavelength * g.z3)
         # coarse rules miss what has many degrees
         self.degrees = nodes_for(2 * np.pi * cycles) + 2
-        self.whole = all((n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape)
+        self.few = self.count
+        if g.lenslet_shape == "square":  # fields need fewer nodes than kernels
+            self.few = min(self.count, psf_nodes(g, half))
+        self.pixels, self.sampled = zip(*(_pixel_lines(g, n, lines) for n in g.pixel_shape))
+        self.whole = lines is None and all(
+            (n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape
+        )
         # the farthest from the middle first
         self.points: list[tuple[int, int]] = sorted(
             product(_lines(g.object_shape[0], symmetric), _lines(g.object_shape[1], symmetric)),
@@ -180,14 +211,14 @@ class _Trial:
     @property
     def values(self) -> int:
         """Of the spread function and on the sensor, in memory at a time."""
-        pixels = int(np.prod(self.geometry.pixel_shape)) * self.degrees**2
-        return max(pixels, *(r * c * self.count**2 for r, c in self._lenslets))
+        pixels = math.prod(map(len, self.pixels)) * self.degrees**2
+        return max(pixels, *(r * c * self.few**2 for r, c in self._lenslets))
 
     @property
     def cost(self) -> float:
         """Complex multiplications for a column."""
-        v, u = (n * self.degrees for n in self.geometry.pixel_shape)
-        each = sum(v * c * self.count * (r * self.count + u) for r, c in self._lenslets)
+        v, u = (len(n) * self.degrees for n in self.pixels)
+        each = sum(v * c * self.few * (r * self.few + u) for r, c in self._lenslets)
         return float(len(self.places) * each)
 
     def columns(
@@ -208,30 +239,30 @@ class _Trial:
                 entered = [self._entering(camera, lenslets, at) for lenslets in products]
             for n in range(len(at)):
                 field: np.ndarray | int = 0
-                for lenslets, (fields, _) in zip(products, entered):
+                for lenslets, fields in zip(products, entered):
                     down, across = (
                         self._kernel(kernels, axis, lenslets[axis], place[axis]) for axis in (0, 1)
                     )
                     field = field + down @ fields[n] @ across.T
                 field = np.asarray(field)
                 energy = (field.real**2 + field.imag**2).reshape(
-                    g.pixel_shape[0], m, g.pixel_shape[1], m
+                    len(self.pixels[0]), m, len(self.pixels[1]), m
                 )
                 series = onto @ energy.sum(axis=3).transpose(1, 0, 2).reshape(m, -1)
                 series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
                 gram[n] += series @ series.T
                 norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
-                light[n] += float(energy.sum())
+                light[n] += float(energy.sum()) / math.prod(self.sampled)
         return light, gram / norm[:, None, None]
 
     def _entering(
         self, camera: Camera, lenslets: tuple, points: list[tuple[float, float]]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Fields (point, row, column) at the nodes of the lenslets of a product, weights included,
-        and their light (point,).
+    ) -> np.ndarray:
+        """Fields (point, row, column) at the nodes of the lenslets of a product, weights included
+        but those that kernels have.
         """
         g = self.geometry
-        t, _ = gauss(self.count)
+        t, _ = gauss(self.few)
         nodes = [
             (np.asarray(places)[:, None] * g.D2 + extent * t).ravel()
             for places, extent in zip(lenslets, g.lenslet_extent)
@@ -243,14 +274,13 @@ class _Trial:
         h = sampled_field(camera, g, dy, dx).reshape(
             len(lines[0]), len(nodes[0]), len(lines[1]), len(nodes[1])
         )
-        weight = np.tile(
-            opening_weights(g.lenslet_shape, self.count)
-            * (g.lenslet_extent[0] * g.lenslet_extent[1]),
-            (len(lenslets[0]), len(lenslets[1])),
-        )
         fields = np.stack([h[i, :, j] for i, j in zip(*which)])
-        light = (weight * (fields.real**2 + fields.imag**2)).sum(axis=(1, 2))
-        return fields * weight, light
+        fields *= g.lenslet_extent[0] * g.lenslet_extent[1]
+        if g.lenslet_shape == "square":
+            return fields
+        return fields * np.tile(
+            opening_weights(g.lenslet_shape, self.few), (len(lenslets[0]), len(lenslets[1]))
+        )
 
     def _kernel(
         self, kept: dict[tuple, np.ndarray], axis: int, positions: np.ndarray, place: float
@@ -261,7 +291,13 @@ class _Trial:
         key = axis, place, *positions
         if key not in kept:
             g = self.geometry
-            v, wv = (a.T.ravel() for a in sensor_nodes(g, axis, self.degrees, place))
+            v, wv = (
+                a.T[self.pixels[axis]].ravel() for a in sensor_nodes(g, axis, self.degrees, place)
+            )
             x = g.lenslet_extent[axis] * gauss(self.count)[0]
-            kept[key] = np.hstack([lenslet_kernel(g, n - place, v, wv, x) for n in positions])
+            kernels = [lenslet_kernel(g, n - place, v, wv, x) for n in positions]
+            if g.lenslet_shape == "square":
+                onto = carried(self.count, self.few)
+                kernels = [kernel @ onto for kernel in kernels]
+            kept[key] = np.hstack(kernels)
         return kept[key]

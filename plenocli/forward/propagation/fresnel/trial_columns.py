@@ -24,6 +24,7 @@ from plenocli.forward.propagation.fresnel.spread_function import (
     legendre,
     psf_nodes,
     sampled_field,
+    separable_field,
 )
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ VALUES = 1 << 22
 """Values of the spread function, or on the sensor, that it may hold."""
 THINNED = 12, 6
 """Lines of pixels along an axis of which the light is looked at where all are too many."""
+QUICK = 160
+"""Nodes of the spread function per axis up to which its terms are found rather than expected."""
+KEPT_VALUES = 1 << 20
+"""Coefficients of light within pixels that a trial keeps, of one point at least."""
 KEPT = 16
 """Trials that are kept for the next plan of the same camera."""
 
@@ -53,12 +58,15 @@ class TrialColumns:
     light: (column,) share of a point's light on the superpixels looked at;
     fringes: (column, degree, degree) Gram matrices, over all pixels and over the column's squared
         norm, of the Legendre coefficients of the light within a pixel, both axes together;
+    light_within: (some column, pixel, degree, degree) these coefficients of light itself, over the
+        column's norm;
     whole: whether they are all columns that symmetry does not give, with all their lenslets and
         pixels.
     """
 
     light: np.ndarray
     fringes: np.ndarray
+    light_within: np.ndarray
     whole: bool
 
     @property
@@ -73,9 +81,12 @@ class TrialColumns:
         rule: step of quadrature.band_rule.
         """
         t, w = band_rule(count, rule)
-        missed = legendre(t, self.fringes.shape[1], 1).T @ w
-        missed[0] -= 2
-        return float(np.sqrt(np.maximum(missed @ self.fringes @ missed, 0).max()))
+        found = legendre(t, self.fringes.shape[1], 1).T @ w
+        true = 2 * np.eye(len(found))[0]
+        missed = found - true
+        by_axes = np.sqrt(np.maximum(missed @ self.fringes @ missed, 0).max())
+        together = np.tensordot(self.light_within, np.outer(found, found) - np.outer(true, true))
+        return float(max(by_axes, np.linalg.norm(together, axis=1).max()))
 
 
 def trial_columns(
@@ -92,22 +103,31 @@ def trial_columns(
     window: coherent lenslets on either side, None for isolated ones;
     symmetric: whether pupil and wavefront are mirrored by both axes.
     """
-    lens = camera.main_lens
     if window is not None:
         window = min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
-    return _tried(
-        _Hashed(camera, (lens.samples("aperture_image"), lens.samples("wavefront"))),
-        geometry,
-        grid,
-        window,
-        symmetric,
-    )
+    return _tried(_Hashed(camera), geometry, grid, window, symmetric)
+
+
+def cut_field(
+    camera: Camera, geometry: Geometry, half: float, tolerance: float
+) -> tuple[int, float] | None:
+    """What separable_field makes of the spread function: (terms, root energy lost); None where
+    it takes more than QUICK nodes per axis.
+
+    camera: at the wavelength of `geometry`;
+    half, tolerance: as for separable_field.
+    """
+    if psf_nodes(geometry, half) > QUICK:
+        return None
+    return _cut(_Hashed(camera), geometry, half, tolerance)
 
 
 class _Hashed:
     """A camera with what its files hold, as a key."""
 
-    def __init__(self, camera: Camera, samples: tuple) -> None:
+    def __init__(self, camera: Camera) -> None:
+        lens = camera.main_lens
+        samples = lens.samples("aperture_image"), lens.samples("wavefront")
         self.camera = camera
         self._key = (
             camera.model_dump_json(),
@@ -122,6 +142,12 @@ class _Hashed:
 
 
 @lru_cache(maxsize=KEPT)
+def _cut(hashed: _Hashed, geometry: Geometry, half: float, tolerance: float) -> tuple[int, float]:
+    field = separable_field(hashed.camera, geometry, half, tolerance)
+    return field.terms, field.tail
+
+
+@lru_cache(maxsize=KEPT)
 def _tried(
     hashed: _Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
 ) -> TrialColumns | None:
@@ -131,9 +157,9 @@ def _tried(
         trial = _Trial(geometry, grid, near, symmetric, beside, lines)
         points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
         if points and trial.values <= VALUES:
-            light, fringes = trial.columns(hashed.camera, points)
+            light, fringes, within = trial.columns(hashed.camera, points)
             whole = len(points) == len(trial.points) and trial.whole
-            return TrialColumns(light=light, fringes=fringes, whole=whole)
+            return TrialColumns(light=light, fringes=fringes, light_within=within, whole=whole)
     return None
 
 
@@ -215,6 +241,12 @@ class _Trial:
         return max(pixels, *(r * c * self.few**2 for r, c in self._lenslets))
 
     @property
+    def looked_into(self) -> int:
+        """Points, the first ones, whose light is kept by both degrees within a pixel."""
+        values = len(self.places) * math.prod(map(len, self.pixels)) * self.degrees**2
+        return max(1, min(FEW, KEPT_VALUES // values))
+
+    @property
     def cost(self) -> float:
         """Complex multiplications for a column."""
         v, u = (len(n) * self.degrees for n in self.pixels)
@@ -223,11 +255,12 @@ class _Trial:
 
     def columns(
         self, camera: Camera, points: list[tuple[int, int]]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(light, fringes) of points, as TrialColumns has them."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(light, fringes, light_within) of points, as TrialColumns has them."""
         g, m = self.geometry, self.degrees
         at = [(g.points(0)[i], g.points(1)[j]) for i, j in points]
         light, norm, gram = np.zeros(len(at)), np.zeros(len(at)), np.zeros((len(at), m, m))
+        within: list[list[np.ndarray]] = [[] for _ in at[: self.looked_into]]
         entered = None
         kernels: dict[tuple, np.ndarray] = {}
         # from the light at a pixel's nodes, weights included, to Legendre coefficients over half of
@@ -253,7 +286,11 @@ class _Trial:
                 gram[n] += series @ series.T
                 norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
                 light[n] += float(energy.sum()) / math.prod(self.sampled)
-        return light, gram / norm[:, None, None]
+                if n < len(within):
+                    series = onto @ energy.transpose(0, 2, 1, 3) @ onto.T
+                    within[n].append(series.reshape(-1, m, m).astype(np.float32))
+        scale = np.sqrt(norm[: len(within), None, None, None]).astype(np.float32)
+        return light, gram / norm[:, None, None], np.stack([*map(np.concatenate, within)]) / scale
 
     def _entering(
         self, camera: Camera, lenslets: tuple, points: list[tuple[float, float]]

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.lens import at_wavelength
 from plenocli.forward.camera.quadrature import nodes_for
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
 from plenocli.forward.propagation.harmonics.bessel import bessel_tail
 from plenocli.forward.propagation.harmonics.interpolation import tap_error
 from plenocli.forward.propagation.plan import BandPlan
-from plenocli.forward.propagation.sampling import pixel_error
+from plenocli.forward.propagation.fresnel.trial_columns import trial_columns
+from plenocli.forward.propagation.sampling import OTHERS, dimness, is_symmetric, pixel_error
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -30,6 +32,8 @@ square lenslets: points beyond a round one's rim have little but fringes (measur
 """
 SHARE = 0.6
 """Of the accuracy asked for, what pixels and interpolation may take each."""
+DIMMEST = 6.0
+"""Most by which interpolation weighs more in a dim point's column."""
 MOST_NODES = 40
 """Most nodes per axis of a pixel."""
 
@@ -82,10 +86,19 @@ def harmonic_band(
         )
     g = geometry
     own = 2 * rim(g) * g.pixel_active / (g.wavelength * g.z3)
-    # measured: 0.25 to 2.4 times tap_error; a blurred point lights a patch of the superpixel
+
+    tried = trial_columns(
+        at_wavelength(camera, g.wavelength), g, superpixels, None, is_symmetric(camera)
+    )
+    root = 1.0 if tried is None else dimness(tried.faintest)
+    # measured: 0.25 to 2.4 times tap_error; a blurred point lights a patch of the superpixel, and a
+    # dim one has the finest fringes alone
     effect = max(0.3, min(2.5, 0.8 / own)) * (1.5 if g.blur > g.D2 else 1.0)
+    effect *= min(1 / root, DIMMEST)
 
     def missed(count: int) -> float:
+        if tried is not None:
+            return OTHERS * tried.error(count, 0)
         return PIXEL_EFFECT * pixel_error(count, 0, own, own, g.diffraction_cells, g.blur / g.D2)
 
     nodes = next((n for n in range(2, MOST_NODES) if missed(n) <= SHARE * accuracy), None)
@@ -97,7 +110,7 @@ def harmonic_band(
         )
     taps, finer = _taps(SHARE * accuracy / effect, g)
     sampling = math.hypot(missed(nodes), effect * tap_error(taps, finer))
-    return polar_band(g, accuracy, taps, finer, nodes, sampling)
+    return polar_band(g, accuracy, taps, finer, nodes, sampling, root)
 
 
 def rim(geometry: Geometry) -> float:
@@ -127,13 +140,14 @@ def polar_band(
     finer: float,
     nodes: int,
     sampling: float,
+    faintest: float = 1.0,
 ) -> HarmonicBand:
     """A HarmonicBand with so many taps and samples.
 
     accuracy: that orders are counted for;
     taps, finer: as interpolation.tap_error;
     nodes: per axis of a pixel;
-    sampling: as in BandPlan.
+    sampling, faintest: as in BandPlan.
     """
     g, a, inner = geometry, rim(geometry), geometry.lenslet_width / 2
     sine = g.D1 / 2 / math.hypot(g.D1 / 2, g.z2)
@@ -141,7 +155,7 @@ def polar_band(
     far = corner(g) + taps / 2 * step
     sweep, reach = g.k * _sweep(g.z3, a, far), g.k * sine * min(a, farthest(g))
     # what is left out is a product of two Bessel functions
-    tail = 0.3 * math.sqrt(accuracy)
+    tail = 0.3 * math.sqrt(accuracy * faintest)
     orders = min(bessel_tail(reach, tail), bessel_tail(sweep, tail)) + 1
     band, corner_orders, corner_nodes = min(reach, sweep), 0, 0
     q, v = np.linspace(0, a, 33)[:, None], np.linspace(-far, far, 65)
@@ -161,6 +175,7 @@ def polar_band(
         terms=0,
         half=a + farthest(g),
         sampling=sampling,
+        faintest=faintest,
         orders=orders,
         corner_orders=corner_orders,
         corner_nodes=corner_nodes,

@@ -198,7 +198,6 @@ def size_band(
     count = psf_nodes(geometry, half)
     light = own, joint, geometry.diffraction_cells, geometry.blur / geometry.D2
     cut_effect, errors, beside = PSF_CUT_EFFECT * tolerance, [], None
-    camera = at_wavelength(camera, geometry.wavelength)
     if geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2:
         faintest = BRIGHT
         nodes, rule = pixel_nodes(accuracy, *light)

@@ -35,10 +35,13 @@ def tap_weights(places: np.ndarray, taps: int, oversampling: float) -> np.ndarra
 
 
 @lru_cache(maxsize=512)
-def tap_error(taps: int, oversampling: float) -> float:
-    """Root mean square error of tap_weights at the worst place, where 1 is all but the mean."""
+def tap_error(taps: int, oversampling: float, rate: float | None = None) -> float:
+    """Root mean square error of tap_weights at the worst place, where 1 is all but the mean.
+
+    rate: of the samples over twice the highest frequency, where it is more than `oversampling`.
+    """
     places = np.linspace(0, 0.5, 5)
-    cycles, root, _ = _band(taps, oversampling)
+    cycles, root, _ = _band(taps, rate or oversampling)
     found = tap_weights(places, taps, oversampling) @ _waves(_stand(taps), cycles, root)
     missed = found - _waves(places, cycles, root)
     return float(np.sqrt((missed**2).sum(axis=1).max() / (root[:-1] ** 2).sum()))

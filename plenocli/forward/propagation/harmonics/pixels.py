@@ -62,8 +62,8 @@ def _line(
     radius = np.hypot(down, across).reshape(len(x), -1) / band.step - 0.5
     angle = np.arctan2(down, across).reshape(len(x), -1) * band.angles / (2 * np.pi)
     inner, before = np.floor(radius).astype(int), np.floor(angle).astype(int)
-    along = tap_weights((radius - inner).ravel(), band.taps, band.finer[0])
-    around = tap_weights((angle - before).ravel(), band.taps, band.finer[1])
+    along = tap_weights((radius - inner).ravel(), band.taps, band.finer)
+    around = tap_weights((angle - before).ravel(), band.taps, band.finer)
     value = along[:, :, None] * around[:, None, :]
     value *= weight.reshape(-1, 1, 1)
     # sums over a pixel's nodes: on a patch of the raster about it, as wide as the widest

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,9 @@ square lenslets: points beyond a round one's rim have little but fringes (measur
 """
 SHARE = 0.6
 """Of the accuracy asked for, what pixels and interpolation may take each."""
-DIMMEST = 6.0
+FEWEST_RADII = 24
+"""Radii to a superpixel's corner: where it has no fringe light changes with the distance."""
+DIMMEST = 4.0
 """Most by which interpolation weighs more in a dim point's column."""
 MOST_NODES = 40
 """Most nodes per axis of a pixel."""
@@ -49,7 +51,8 @@ class HarmonicBand(BandPlan):
     radii, step: of the polar raster on the sensor, at (i + 1/2) step (m);
     angles: of that raster;
     taps: its samples along either axis that a pixel's node is interpolated from;
-    finer: (radii, angles), rate of the samples over twice the highest frequency.
+    finer: rate of samples over twice the highest frequency that taps are weighted for;
+    rates: (radii, angles), that of the raster, no less.
     """
 
     orders: int
@@ -60,7 +63,8 @@ class HarmonicBand(BandPlan):
     step: float
     angles: int
     taps: int
-    finer: tuple[float, float]
+    finer: float
+    rates: tuple[float, float]
 
 
 def harmonic_band(
@@ -106,8 +110,9 @@ def harmonic_band(
             "use smaller pixels",
         )
     taps, finer = _taps(SHARE * accuracy / effect, g)
-    sampling = math.hypot(missed(nodes), effect * tap_error(taps, finer))
-    return polar_band(g, accuracy, taps, finer, nodes, sampling, root)
+    band = polar_band(g, accuracy, taps, finer, nodes, root)
+    interpolated = effect * max(tap_error(taps, finer, rate) for rate in band.rates)
+    return replace(band, sampling=math.hypot(missed(nodes), interpolated))
 
 
 def rim(geometry: Geometry) -> float:
@@ -136,7 +141,6 @@ def polar_band(
     taps: int,
     finer: float,
     nodes: int,
-    sampling: float,
     faintest: float = 1.0,
 ) -> HarmonicBand:
     """A HarmonicBand with so many taps and samples.
@@ -144,11 +148,12 @@ def polar_band(
     accuracy: that orders are counted for;
     taps, finer: as interpolation.tap_error;
     nodes: per axis of a pixel;
-    sampling, faintest: as in BandPlan.
+    faintest: as in BandPlan.
     """
     g, a, inner = geometry, rim(geometry), geometry.lenslet_width / 2
     sine = g.D1 / 2 / math.hypot(g.D1 / 2, g.z2)
-    step = g.wavelength * math.hypot(g.z3, a) / (4 * a * finer)
+    along = max(finer, FEWEST_RADII * _fringe(g) / corner(g))
+    step = _fringe(g) / along
     far = corner(g) + taps / 2 * step
     sweep, reach = g.k * _sweep(g.z3, a, far), g.k * sine * min(a, farthest(g))
     # what is left out is a product of two Bessel functions
@@ -171,7 +176,6 @@ def polar_band(
         psf_nodes=nodes_for(g.D1 / 4 * g.k * ((a + farthest(g)) / g.z2 + abs(g.eps) * g.D1 / 2)),
         terms=0,
         half=a + farthest(g),
-        sampling=sampling,
         faintest=faintest,
         orders=orders,
         corner_orders=corner_orders,
@@ -182,7 +186,8 @@ def polar_band(
         step=step,
         angles=angles,
         taps=taps,
-        finer=(finer, max(finer, angles / (4 * band))),
+        finer=finer,
+        rates=(along, max(finer, angles / (4 * max(band, 1.0)))),
     )
 
 
@@ -194,16 +199,24 @@ def _sweep(z: float, a: float, far: float) -> float:
     return float((a * far * np.sin(t) / side).max())
 
 
+def _fringe(geometry: Geometry) -> float:
+    """Distance (m) of samples at twice the highest frequency along a radius."""
+    return geometry.wavelength * math.hypot(geometry.z3, rim(geometry)) / (4 * rim(geometry))
+
+
 def _taps(error: float, g: Geometry) -> tuple[int, float]:
     """The cheapest (taps, rate) of at most this tap_error.
 
     Raises NumericsError where there is none.
     """
-    found = [(t, f) for t in TAPS for f in FINER if tap_error(t, f) <= error]
+    choices = [(t, f) for t in TAPS for f in FINER]
+    found = [c for c in choices if tap_error(*c) <= error]
+    if not found:  # the last digit, at no margin
+        found = [c for c in choices if tap_error(*c) <= error / SHARE]
     if not found:
         raise NumericsError("the polar raster cannot be interpolated so finely", "accuracy", "")
     sine = g.D1 / 2 / math.hypot(g.D1 / 2, g.z2)
-    fringe = g.wavelength * math.hypot(g.z3, rim(g)) / (4 * rim(g))
+    fringe = _fringe(g)
     turn = 4 * max(g.k * sine * min(rim(g), farthest(g)), 1.0)
 
     def cost(choice: tuple[int, float]) -> float:

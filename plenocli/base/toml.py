@@ -5,6 +5,7 @@ nearest known key.
 import difflib
 import re
 import tomllib
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -22,12 +23,19 @@ _MOST_LINES = 40
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def parse_toml(text: str, where: object, model: type[Model]) -> Model:
+def parse_toml(
+    text: str,
+    where: object,
+    model: type[Model],
+    *,
+    prepare: Callable[[dict[str, Any]], dict[str, Any]] = lambda data: data,
+) -> Model:
     """What a pydantic class makes of TOML text.
 
     text: TOML.
     where: the file, for messages.
     model: the class.
+    prepare: what is made of the tables before the class sees them.
 
     Raises ConfigError that lists every violation with its path.
     """
@@ -40,7 +48,7 @@ def parse_toml(text: str, where: object, model: type[Model]) -> Model:
     except ValueError as error:  # also a number with too many digits
         raise ConfigError(f"is not TOML: {_short(str(error))}", where, "mend the line") from None
     try:
-        return model.model_validate(data)
+        return model.model_validate(prepare(data))
     except ValidationError as error:
         raise violations(error, where, model) from None
 

@@ -26,7 +26,7 @@ from plenocli.report.drawing import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.model import Camera, Filter
 
 
 def calibration_picture(
@@ -158,6 +158,13 @@ def response_errors(
     return made.png
 
 
+def _filter_name(one: "Filter") -> str:
+    """What stands in a cell: its wavelength in nm, or how much it lets through."""
+    if one.middle is not None:
+        return f"{one.middle * 1e9:.4g}"
+    return "clear" if one.transmittance == 1 else f"{one.transmittance:.3g}"
+
+
 def filters_picture(camera: "Camera") -> bytes:
     """The filter array in the pupil of the main lens, and what filters and sensor let through, by
     wavelength, as PNG; nothing without filters.
@@ -181,7 +188,7 @@ def filters_picture(camera: "Camera") -> bytes:
             else Circle((0, 0), half, color="#444444")
         )
         for number, (((y0, y1, x0, x1), _), one) in enumerate(
-            zip(filter_cells(camera, filters[0].center) or (), filters, strict=True)
+            zip(filter_cells(camera, 550e-9) or (), filters, strict=True)
         ):
             colour = COLOURS[number % len(COLOURS)]
             pupil.add_patch(
@@ -190,7 +197,7 @@ def filters_picture(camera: "Camera") -> bytes:
             pupil.text(
                 (x0 + x1) * 500,
                 (y0 + y1) * 500,
-                f"{one.center * 1e9:.4g}",
+                _filter_name(one),
                 ha="center",
                 va="center",
                 color="white",

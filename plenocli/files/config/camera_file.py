@@ -6,6 +6,7 @@ from typing import Any
 
 from plenocli.base.toml import parse_toml
 from plenocli.base.units import format_duration, format_length
+from plenocli.files.config.curve_file import read_curve
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
 
@@ -17,7 +18,30 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
 
     Raises InputError where the file cannot be read, ConfigError for what it says.
     """
-    return parse_camera(read_text(Path(path), "camera"), path)
+    path = Path(path)
+    return parse_toml(
+        read_text(path, "camera"),
+        path,
+        Camera,
+        prepare=lambda data: with_curves(data, path.parent),
+    )
+
+
+def with_curves(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A description whose filters have the curves that they name by file: what is written of the
+    camera later holds the values.
+
+    data: the tables of a camera file; curves are put into it.
+    folder: of that file, to which names are relative.
+
+    Raises InputError for a file that holds no curve.
+    """
+    section = data.get("filter_array")
+    filters = section.get("filters") if isinstance(section, dict) else None
+    for one in filters if isinstance(filters, list) else ():
+        if isinstance(one, dict) and isinstance(one.get("curve"), str):
+            one["curve"] = read_curve(folder / one["curve"])
+    return data
 
 
 def parse_camera(text: str, where: str | os.PathLike[str] = "camera") -> Camera:
@@ -57,6 +81,8 @@ _NUMBERS = {
     "peak",
     "blocking",
     "transmission",
+    "transmittance",
+    "index",
     "pixel_shift",
     "prnu",
     "hot_pixels",

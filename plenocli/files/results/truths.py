@@ -110,10 +110,14 @@ def _through_filters(
             "--camera",
             "leave --camera out",
         )
-    filters = [
-        min(camera.filter_array.filters, key=lambda f: abs(f.center - band)) for band in bands
+    apart = [(f, f.middle) for f in camera.filter_array.filters if f.middle is not None]
+    nearest = [min(apart, key=lambda one: abs(one[1] - band), default=None) for band in bands]
+    filters = [one[0] for one in nearest if one is not None]
+    far = [
+        band
+        for band, one in zip(bands, nearest, strict=True)
+        if one is None or abs(one[1] - band) > one[0].width
     ]
-    far = [band for band, f in zip(bands, filters, strict=True) if abs(f.center - band) > f.fwhm]
     if far:
         raise UsageError(
             f"has no filter at {far[0] * 1e9:.4g} nm, a band of the result",

@@ -419,24 +419,123 @@ class Light(Section):
         return self
 
 
+class Curve(Section):
+    """Measured intensity transmittance, linear between its wavelengths, which ascend."""
+
+    wavelength: Annotated[tuple[Wavelength, ...], Field(min_length=2, max_length=4000)]
+    transmittance: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=1.0)], ...], Field(min_length=2, max_length=4000)
+    ]
+
+    @model_validator(mode="after")
+    def _paired(self) -> Self:
+        if len(self.wavelength) != len(self.transmittance):
+            raise ValueError(
+                f"holds {len(self.wavelength)} wavelengths and {len(self.transmittance)} values"
+            )
+        if any(b <= a for a, b in zip(self.wavelength, self.wavelength[1:])):
+            raise ValueError("wavelengths must ascend without repetition")
+        if not max(self.transmittance) > 0:
+            raise ValueError("lets no light through: all values are 0")
+        return self
+
+
 class Filter(Section):
-    """A Gaussian band of intensity transmittance: peak exp(-4 ln2 ((l - center)/fwhm)^2) on a
-    floor of `blocking`.
+    """Intensity transmittance of one cell of the filter array, as one of
+    - a Gaussian band, peak exp(-4 ln2 ((l - center)/fwhm)^2) on a floor of `blocking`;
+    - `transmittance` alike at all wavelengths: 1 is a clear cell, less a neutral one;
+    - a measured `curve`, in a file of two columns.
+
+    index: effective refractive index of an interference filter, whose band moves to shorter
+        wavelengths with the angle of the light: T(l) becomes T(l / sqrt(1 - (sin t / index)^2)).
     """
 
-    center: Wavelength
-    fwhm: Length
-    peak: Unit = 0.8
-    blocking: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    center: Resolved[Wavelength] = _LEFT_OUT
+    fwhm: Resolved[Length] = _LEFT_OUT
+    peak: Resolved[Unit] = _LEFT_OUT
+    blocking: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    transmittance: Unit | None = None
+    curve: Curve | None = None
+    index: Annotated[float, Field(ge=1.0, le=5.0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        band = self.center is not None or self.fwhm is not None
+        kinds = [band, self.transmittance is not None, self.curve is not None]
+        if sum(kinds) != 1:
+            raise ValueError(
+                "give exactly one of center and fwhm (a band), transmittance (a clear or neutral "
+                "cell) and curve (a measured one)"
+            )
+        if band and (self.center is None or self.fwhm is None):
+            raise ValueError("a band has center and fwhm")
+        if not band and (self.peak is not None or self.blocking is not None):
+            raise ValueError("peak and blocking go with center and fwhm")
+        if self.transmittance is not None and self.index is not None:
+            raise ValueError("index goes with a band or a curve, which it moves")
+        if band:
+            whole = {"peak": self.peak or 0.8, "blocking": self.blocking or 0.0}
+            self.__dict__.update(whole)
+        return self
+
+    @property
+    def middle(self) -> float | None:
+        """Mean wavelength that it lets through, m; None where it lets all through alike."""
+        if self.curve is None:
+            return self.center
+        return float(np.average(self.curve.wavelength, weights=self.curve.transmittance))
+
+    @property
+    def brightest(self) -> float | None:
+        """Wavelength (m) of the largest transmittance; None where it lets all through alike."""
+        if self.curve is None:
+            return self.center
+        return self.curve.wavelength[int(np.argmax(self.curve.transmittance))]
+
+    @property
+    def width(self) -> float:
+        """Of the band that it lets through, m: full width at half maximum, of a curve its area over
+        its peak; infinite where it lets all through alike.
+        """
+        if self.curve is None:
+            return self.fwhm or math.inf
+        area = np.trapezoid(self.curve.transmittance, self.curve.wavelength)
+        return float(area) / max(self.curve.transmittance)
+
+    @property
+    def detail(self) -> float:
+        """Width (m) of the Gaussian band whose flanks are as steep as its steepest, infinite where
+        it lets all through alike; no less than FINEST_DETAIL.
+        """
+        if self.curve is None:
+            return self.fwhm or math.inf
+        steepest = np.abs(np.diff(self.curve.transmittance) / np.diff(self.curve.wavelength)).max()
+        if steepest == 0:
+            return math.inf
+        flank = max(self.curve.transmittance) / steepest
+        return max(FINEST_DETAIL, min(self.width, GAUSSIAN_FLANK * float(flank)))
+
+
+FINEST_DETAIL = 5e-9
+"""m; flanks of measured filters that are steeper are averaged over by the wavelengths between."""
+GAUSSIAN_FLANK = 2 * math.sqrt(2 * math.log(2)) * math.exp(-0.5)
+"""Steepest slope of a Gaussian band of unit peak and full width at half maximum."""
 
 
 PixelShift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
 class FilterArray(Section):
+    """Filters in the main lens, in cells row by row.
+
+    side: of the main lens that they stand on, which says at which angles light crosses them: those
+        of the cone from the object point, or of that to its image on the array.
+    """
+
     layout: Pair
     gap: Gap = 0.0
     size: Resolved[Length] = _LEFT_OUT
+    side: Literal["object", "image"] | None = None
     filters: tuple[Filter, ...]
 
     @model_validator(mode="after")
@@ -447,6 +546,8 @@ class FilterArray(Section):
                 f"layout {rows} x {columns} needs {rows * columns} filters, row by row; there are "
                 f"{len(self.filters)}"
             )
+        if self.side is not None and all(one.index is None for one in self.filters):
+            raise ValueError("side goes with filters whose index says how far their bands move")
         return self
 
 

@@ -69,10 +69,15 @@ def _aperture(lens: MainLens, y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def filter_transmittance(filter_: Filter, wavelength: float) -> float:
-    """Intensity transmittance of one filter: peak exp(-4 ln2 ((l - center)/fwhm)^2) + blocking.
+    """Intensity transmittance of one filter for light that meets it at right angles.
 
-    wavelength: m.
+    wavelength: m; beyond a measured curve its last values hold.
     """
+    if filter_.transmittance is not None:
+        return filter_.transmittance
+    if filter_.curve is not None:
+        curve = filter_.curve
+        return float(np.interp(wavelength, curve.wavelength, curve.transmittance))
     arg = (wavelength - filter_.center) / filter_.fwhm
     return min(
         1.0, filter_.peak * math.exp(-4 * math.log(2) * arg * arg) + (filter_.blocking or 0.0)
@@ -82,6 +87,9 @@ def filter_transmittance(filter_: Filter, wavelength: float) -> float:
 def filter_cells(camera: Camera, wavelength: float) -> list[tuple[Cell, float]] | None:
     """Cells of the filter array.
 
+    Of a filter whose band moves with the angle, a cell has the mean over the angles at which light
+    crosses it; how the angle differs within the cell, and with the place of the object point, is
+    left out.
     wavelength: m.
 
     Returns [((y0, y1, x0, x1) m, intensity transmittance)], None where there is no array.
@@ -99,10 +107,27 @@ def filter_cells(camera: Camera, wavelength: float) -> list[tuple[Cell, float]] 
     for index, filter_ in enumerate(array.filters):
         top = -array.size / 2 + (index // columns) * (high + gap)
         left = -array.size / 2 + (index % columns) * (wide + gap)
-        cells.append(
-            ((top, top + high, left, left + wide), filter_transmittance(filter_, wavelength))
-        )
+        cell = (top, top + high, left, left + wide)
+        cells.append((cell, _through(camera, filter_, cell, wavelength)))
     return cells
+
+
+def _through(camera: Camera, filter_: Filter, cell: Cell, wavelength: float) -> float:
+    """Mean intensity transmittance of a filter over a cell (y0, y1, x0, x1) m of the pupil."""
+    if filter_.index is None:
+        return filter_transmittance(filter_, wavelength)
+    behind = camera.filter_array is not None and camera.filter_array.side == "image"
+    distance = camera.lenslet_array.distance if behind else camera.object.distance
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    y, x = (
+        (low + high) / 2 + nodes * (high - low) / 2
+        for low, high in ((cell[0], cell[1]), (cell[2], cell[3]))
+    )
+    square = y[:, None] ** 2 + x[None, :] ** 2
+    sine = np.sqrt(square / (square + distance**2))
+    moved = wavelength / np.sqrt(1 - (sine / filter_.index) ** 2)
+    passed = [[filter_transmittance(filter_, w) for w in row] for row in moved.tolist()]
+    return float(weights @ np.array(passed) @ weights) / 4
 
 
 def zernike(j: int, y: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 VISIBLE = (400e-9, 700e-9)
+COARSEST = 20e-9
+"""Width (m) of the finest band of a camera whose filters have none."""
 GAUSSIAN = math.sqrt(math.pi / (4 * math.log(2)))
 """Area of a Gaussian band over its peak and full width at half maximum."""
 LUMENS_PER_WATT = 683.0
@@ -66,11 +68,7 @@ def broadband(
         width = None if band is None else band.fwhm * (GAUSSIAN if band.shape == "gaussian" else 1)
         return Quadrature(lines, np.full(len(lines), 1 / len(lines)), width)
     if step is None:
-        step = (
-            min((f.fwhm for f in camera.filter_array.filters), default=20e-9) / 2
-            if camera.filter_array
-            else 10e-9
-        )
+        step = (_finest(camera) if camera.filter_array else COARSEST) / 2
     low = min(VISIBLE[0], *camera.light.wavelengths)
     high = max(VISIBLE[1], *camera.light.wavelengths)
     if not 0 < step <= (high - low) / 2:
@@ -142,20 +140,26 @@ def band_weights(
         return np.array([wavelengths.mean()]), np.full((1, len(wavelengths)), 1 / len(wavelengths))
     filters = camera.filter_array.filters
     step = np.diff(wavelengths).min() if len(wavelengths) > 1 else np.inf
-    if step <= min(f.fwhm for f in filters):
+    if step <= _finest(camera):
         light = broadband(camera, power, step)
         near = np.abs(light.wavelengths[None] - wavelengths[:, None]).argmin(axis=1)
         if np.abs(light.wavelengths[near] - wavelengths).max() < 1e-12:
             bands = np.array(sorted(camera.light.wavelengths))
             hats = np.stack([np.interp(wavelengths, bands, one) for one in np.eye(len(bands))])
             return bands, hats * light.photons[near]
+    if any(f.middle is None for f in filters):
+        raise UsageError(
+            "the camera has a clear or neutral cell, which passes all wavelengths, so that single "
+            "ones of its system matrix do not stand for bands",
+            fix="simulate-pif with --spectral-step auto",
+        )
     light = broadband(camera, power)
     passed = np.array([[filter_transmittance(f, w) for w in wavelengths] for f in filters])
     behind = passed.argmax(axis=0)
     blocked = [
         w
         for w, t, k in zip(wavelengths, passed.max(axis=0), behind)
-        if t < filter_transmittance(filters[k], filters[k].center) / 10
+        if t < filter_transmittance(filters[k], filters[k].brightest) / 10
     ]
     if blocked:
         raise UsageError(
@@ -172,6 +176,12 @@ def band_weights(
         ]
     )
     return wavelengths, np.diag(through[behind] / passed.max(axis=0) / np.bincount(behind)[behind])
+
+
+def _finest(camera: Camera) -> float:
+    """Width (m) of the finest band of the camera's filters."""
+    finest = min(f.detail for f in camera.filter_array.filters) if camera.filter_array else np.inf
+    return min(finest, COARSEST) if np.isinf(finest) else finest
 
 
 def has_colour(camera: Camera) -> bool:

@@ -167,6 +167,7 @@ def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Sp
 
     Raises InputError for files, ConfigError for what they say, UsageError for options.
     """
+    from plenocli.files.config.camera_file import with_curves
     from plenocli.files.config.sweep_file import STAGES, load_sweep
     from plenocli.files.config.toml_file import read_text
 
@@ -174,7 +175,7 @@ def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Sp
     sweep, axes = load_sweep(path)
     camera_path = path.parent / sweep.camera
     try:
-        base = tomllib.loads(read_text(camera_path, "camera"))
+        base = with_curves(tomllib.loads(read_text(camera_path, "camera")), camera_path.parent)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", camera_path, "mend the line") from None
     chain = sweep.chain or ("spectral" if "filter_array" in base else "spatial")

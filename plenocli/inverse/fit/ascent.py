@@ -186,10 +186,13 @@ class Ascent:
         values = self.values(x)
         return self._model.matrix(values) - self.lenslets.at(values).matrix
 
-    def climb(self, at: Point, steps: int) -> Point:
+    def climb(self, at: Point, steps: int, least: float = 1.0) -> Point:
         """The Point where going on from one gains nothing, or after so many steps; what a finer
         model adds is kept.
+
+        least: factor of the noise.
         """
+        at = at.under(max(least, at.evidence.noise_factor()))
         damping, patient = 1e-3, True
         for step in range(steps):
             if self._progress is not None:
@@ -202,7 +205,7 @@ class Ascent:
             gain = best.height - at.height
             promised = 0.5 * float(slopes.rise @ np.linalg.solve(curvature, slopes.rise))
             if best is not at:
-                at = best.under(max(1.0, best.evidence.noise_factor()))
+                at = best.under(max(least, best.evidence.noise_factor()))
             if max(gain, promised) < ENOUGH or (gain < GAIN and not patient):
                 break
             if gain < GAIN:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 STEPS, TRIAL, TRIALS, ROUNDS = 40, 8, 3, 3
-"""Steps from one start at the most, of those that compete for being gone on from, how many
-compete, and how often the difference of a finer model is brought up to date.
+"""Steps from one start at the most, of those that it begins with, how many starts compete for being
+gone on from, and how often the difference of a finer model is brought up to date.
 """
 STARTS = (
     *(("focus", far) for far in (0.25, -0.25, 1.0, -1.0)),
@@ -32,6 +32,10 @@ STARTS = (
 """Further starts, in tolerances, where the way from the described camera does not lead to one that
 explains the captures: in focus a camera and its mirror image are alike, and the evidence has a
 saddle.
+"""
+LOUD = 1e-2
+"""Noise over a capture's root mean square, the least that the way from a start begins with: the
+evidence of a louder capture has fewer false maxima.
 """
 MENDED, ALIKE = 3, 0.03
 """How often, at the most, pixels that count for nothing are filled in anew under the camera that
@@ -112,7 +116,7 @@ def fit_camera(
     begun = ascent.point(start, finer=ascent.difference(start))
     limits = accepted_ratios(problem.evidence.values, problem.evidence.quiet)
     mend = partial(_mended, mender=mender, known=known)
-    first = ascent.settle(begun, STEPS)
+    first = ascent.settle(ascent.climb(begun, TRIAL, LOUD * problem.evidence.quiet), STEPS)
     if not _whole(problem, known) or first.evidence.noise_factor() > limits[0]:
         first, ascent, problem = mend(first, ascent, problem)
     best = _highest(ascent, first, limits[0])
@@ -190,7 +194,7 @@ def _highest(ascent: Ascent, first: Point, limit: float) -> Point:
             x[ascent.family.place(name)] = far
             starts.append(ascent.point(x))
     starts = sorted(starts, key=lambda p: p.height, reverse=True)[:TRIALS]
-    found = [ascent.climb(start, TRIAL) for start in starts]
+    found = [ascent.climb(start, TRIAL, LOUD * ascent.evidence.quiet) for start in starts]
     if not found:
         return first
     x = max(found, key=_likely).x

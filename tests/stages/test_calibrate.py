@@ -3,6 +3,7 @@ sensor noise of EMVA 1288.
 """
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from plenocli.files.artefacts.container import Artefact, read_artefact, write_ar
 from plenocli.forward.sensor.detector import SensorModel
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
+
+ROOT = Path(__file__).resolve().parents[2]
 
 PITCH, ROWS, COLUMNS, BORDER = 16, 9, 11, 5
 BANDS = [450e-9, 540e-9, 570e-9, 650e-9]
@@ -395,3 +398,28 @@ def test_a_sensor_smaller_than_a_lenslet_is_refused():
     )
     with pytest.raises(NumericsError, match="no lenslet lies wholly"):
         windows_on(grid, (10, 10))
+
+
+def test_a_cell_that_is_much_brighter_does_not_pass_for_the_superpixel(tmp_path, capsys):
+    """A clear cell beside three bands: the description says that superpixels have parts; without
+    it the grid is drawn to the clear one, which is told.
+    """
+    text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
+    changes = {
+        "count = [20, 30]": "count = [7, 8]",
+        "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [1, 1]",
+    }
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    last = text.rindex("  { center")
+    text = text[:last] + "  { transmittance = 1 },\n]\n"
+    (tmp_path / "camera.toml").write_text(text)
+    fast = ["--target", "white", "--model", "fresnel", "--accuracy", "1e-2", "--superpixels", "1x1"]
+    white = str(tmp_path / "white.h5")
+    assert run(["capture-sim", str(tmp_path / "camera.toml"), *fast, "-o", white]) == 0
+    told = run_calibrate(tmp_path / "a.h5", whites=[white], camera=tmp_path / "camera.toml")
+    assert told.array == [7, 8] and told.deviation_px < 0.05
+    assert "warning" not in capsys.readouterr().err
+    untold = run_calibrate(tmp_path / "b.h5", whites=[white])
+    assert untold.deviation_px > 1 and "give --camera" in capsys.readouterr().err

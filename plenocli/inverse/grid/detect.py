@@ -45,6 +45,8 @@ def find_grid(
     lattice_kind: str = "auto",
     near: Sequence[float] | None = None,
     crop: int = 1024,
+    *,
+    parts: bool = False,
 ) -> LensletGrid:
     """Find the lenslet grid of a white image.
 
@@ -57,6 +59,8 @@ def find_grid(
         the pupil divide superpixels by dark lines as dark as their borders: then the phase that
         fits most whole superpixels into the frame is taken, or else the darkest lines.
     crop: px, side of the part in which the lattice is looked for first.
+    parts: whether superpixels are known to hold several bright parts, as those behind a filter
+        array do: one that is much brighter than the others passes for all of the superpixel.
 
     Raises NumericsError, saying what was seen, where there is no lattice, InputError for an image
     too small or not finite.
@@ -65,7 +69,8 @@ def find_grid(
     mosaic = prepare(white, cfa, dark)
     # what is left of the 2x2 pattern goes
     image = mosaic if cfa == "mono" else template.smoothed(mosaic)
-    basis, kind, structured = _basis(_brightest_crop(image, crop), lattice_kind)
+    basis, kind, several = _basis(_brightest_crop(image, crop), lattice_kind)
+    structured = several or parts
     pitch = float(np.hypot(*basis.T).min())
     index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
     inside = _whole(position, image.shape, 0.5 * pitch) & clean

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 Name = str | Path
 
+ASTRAY = 1.0
+"""px rms by which centres may miss those that a simulated capture knows before a warning."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ResponseSummary:
@@ -231,4 +234,10 @@ def _deviation(grid: LensletGrid, white: Name) -> float | None:
     miss, _ = cKDTree(truth.reshape(-1, 2)).query(grid.centres[grid.valid])
     deviation = float(np.sqrt(np.mean(miss**2)))
     note(f"the simulated capture knows its centres: found within {deviation:.4f} px rms")
+    if deviation > ASTRAY:
+        note(
+            "warning: superpixels are cut that far from where they are, which takes light of "
+            "neighbours for their own; filters in the pupil that differ much draw the grid to the "
+            "brightest: give --camera, whose filter array tells of them"
+        )
     return deviation

@@ -25,7 +25,7 @@ from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.nuisances.clean import Cleaned, clean
 from plenocli.inverse.picture.nuisances.veil import VeilFound
 from plenocli.inverse.picture.reconstruction import Reconstruction
-from plenocli.inverse.picture.trust.believe import Belief, believe
+from plenocli.inverse.picture.trust.believe import SURE, Belief, believe
 from plenocli.inverse.picture.trust.guard import guarded
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel, noise_level
 
@@ -244,6 +244,11 @@ def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: boo
         advice += "; neighbours' light takes a pif of --superpixels 3x3 and --overlap 3"
     if level.found is not None and level.found > level.sigma:
         against.append(f"what it cannot produce is {level.found / level.sigma:.3g} times the noise")
+    if belief.moved > SURE:
+        against.append(
+            "what is left over is the picture's own light, displaced "
+            f"({belief.moved:.2g} standard deviations)"
+        )
     if belief.continuity is not None:
         against.append(
             "across the lenslets' borders the picture goes on "

@@ -1,7 +1,8 @@
 """What a capture says of its matrix, and the noise that follows.
 
-Two witnesses that need no truth: what lies where the matrix reaches nothing, and how well the
-picture goes on across the lenslets' borders. Where both agree with the matrix, noise is what the
+Three witnesses that need no truth: how much lies where the matrix reaches nothing, whether it is
+what the picture would show if light moved, and how well the picture goes on across the lenslets'
+borders. Where all agree with the matrix, noise is what the
 capture says. Else it is raised coordinate by coordinate: by what the lenslets together hold beyond
 photographs and noise, and, where that does not do, until the picture is continuous.
 
@@ -28,6 +29,7 @@ from plenocli.inverse.picture.trust.continuity import (
     relative_factor,
 )
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
+from plenocli.inverse.picture.trust.moved_light import moved_rest
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
 
@@ -47,15 +49,18 @@ MISFIT = 1.5
 most: light from beyond the array is in it.
 """
 SURE, HINT = 4.0, 2.5
-"""Standard deviations of chance from which on noise found over the capture's own speaks against the
-matrix by itself, and from which on beside a picture that may not go on across borders.
+"""Standard deviations of chance from which on noise found over the capture's own, or light that
+moved, speaks against the matrix by itself, and from which on beside a picture that may not go on
+across borders.
 """
 STEADY = 5.0
 """Standard deviations from which on light that goes with brightness speaks against the matrix by
 itself: what a noisy white image leaves has 4.7.
 """
 CHANCE = 1.0
-"""Standard deviation of chance that a factor is allowed, times, where nothing else is found."""
+"""Standard deviations of chance that a factor is allowed where nothing else is found, and that are
+taken off where the matrix is not believed.
+"""
 LEAST_PAIRS = 8
 """Borders between lenslets that it takes to judge continuity."""
 ROOM = 0.25
@@ -78,6 +83,7 @@ class Belief:
     reference: factor of these photographs, for what is made with the noise that is believed; None
         where it is no measure: too few lenslets, or a scene that jumps everywhere.
     raised: root mean square over the coordinates in use of the noise over that of a pixel.
+    moved: standard deviations of light that moved, see `moved_rest`.
     pattern: (pixel,) what even light of brightness 1 makes beside what the matrix says, None where
         it is believed.
     """
@@ -88,6 +94,7 @@ class Belief:
     continuity: float | None = None
     reference: float | None = None
     raised: float = 1.0
+    moved: float = 0.0
     pattern: np.ndarray | None = None
 
     def cleared(self, y: np.ndarray) -> np.ndarray:
@@ -124,7 +131,11 @@ def believe(
     chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
     found = beyond > MISTOLD + SURE * chance or model_error * loud > level.sigma
     steady = 0.0 if coupled else steady_rest(estimators.svd, stacked, level.sigma)
-    quiet = beyond <= HINT * chance
+    moved = 0.0
+    if not coupled:
+        moved = moved_rest(estimators.system, estimators.svd, lmmse, stacked, level.sigma)
+    found = found or moved > SURE
+    quiet = beyond <= HINT * chance and moved <= HINT
     doubtful = not quiet or steady > HINT
     least = None if first is None else first.relative if doubtful else first.most
     continuous = least is None or least >= CONTINUOUS
@@ -164,6 +175,7 @@ def believe(
         continuity=None if first is None else first.relative,
         reference=None if now is None else now.reference,
         raised=float(np.sqrt(power)) / level.sigma,
+        moved=moved,
         pattern=pattern,
     )
 

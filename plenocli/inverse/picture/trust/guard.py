@@ -30,10 +30,10 @@ def detail_kept(
     found = Jumps(
         level=jumps(mean, shape), detail=jumps(value - mean, shape)[:, None], along=min(shape)
     )
-    # where the matrix is believed chance and unusual scenes are given the benefit of the doubt
+    # chance and unusual scenes are given the benefit of the doubt where the matrix is believed only
     least = max(belief.reference, LEAST_REFERENCE) * (CONTINUOUS if belief.right else 1.0)
-    most = found.factor + (CHANCE * found.deviation if belief.right else 0.0)
-    return float(np.clip(most / least, 0, 1))
+    factor = found.factor + CHANCE * found.deviation * (1 if belief.right else -1)
+    return float(np.clip(factor / least, 0, 1))
 
 
 def guarded(

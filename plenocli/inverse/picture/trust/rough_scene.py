@@ -31,12 +31,22 @@ def dark(svd: Svd) -> int:
     return len(svd.u) - svd.rank(1e-6)
 
 
+def reached(svd: Svd, energy: float, sigma: float) -> np.ndarray:
+    """(pixel, direction) that objects reach with what stands above the noise, were all light of a
+    superpixel of one direction.
+
+    energy: of an object, the sum of its squares.
+    sigma: noise of a pixel.
+    """
+    loud = int(np.count_nonzero(svd.s**2 * energy > sigma**2))
+    return svd.u[:, : min(svd.rank(1e-6), loud)]
+
+
 def steady_rest(svd: Svd, y: np.ndarray, sigma: float) -> float:
     """How far what no object gives goes with the brightness of lenslets, in standard deviations.
 
     An error of the matrix leaves a like pattern in every lenslet, noise does not: only products of
-    two different lenslets are summed, whose mean is 0 whatever the noise of each. Directions in
-    which all that the capture shows would hide in the noise count as unreached, too.
+    two different lenslets are summed, whose mean is 0 whatever the noise of each.
 
     svd: of the own block.
     y: (pixel, signal) superpixels.
@@ -44,14 +54,14 @@ def steady_rest(svd: Svd, y: np.ndarray, sigma: float) -> float:
     """
     even = svd.s * svd.vt.sum(axis=1)
     energy = float(np.sum(y**2)) / y.shape[1] / float(even @ even) * svd.vt.shape[1]
-    reached = svd.u[:, : min(svd.rank(1e-6), int(np.count_nonzero(svd.s**2 * energy > sigma**2)))]
-    rest = y - reached @ (reached.T @ y)
+    basis = reached(svd, energy, sigma)
+    rest = y - basis @ (basis.T @ y)
     bright = y.sum(axis=0)
     weighted = rest * bright
     each = np.sum(weighted**2, axis=0)
     total = weighted.sum(axis=1)
     common = float(total @ total) - float(each.sum())
-    left = max(len(svd.u) - reached.shape[1], 1)
+    left = max(len(svd.u) - basis.shape[1], 1)
     # light far below the noise that is stated says nothing, however clean it is
     each = np.maximum(each, left * sigma**2 * bright**2)
     chance = 2 * (float(each.sum()) ** 2 - float(each @ each)) / left

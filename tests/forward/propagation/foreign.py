@@ -11,9 +11,11 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.dial import plan_pif
+from plenocli.forward.camera.geometry import lenslet_shift
 from plenocli.forward.propagation.system_matrix import build_pif
 from tests.forward.propagation.cameras import small_camera
 from tests.reference import tensor
+from tests.reference.oblique import oblique_columns
 
 AFFORDED = 3e10
 """Multiplications of the oracle beyond which a case is left out."""
@@ -139,6 +141,44 @@ def case(seed, number, model=None):
     }
 
 
+def oblique_case(seed, number):
+    """A case of a square lenslet up to 20 degrees off the axis: (camera, request)."""
+    rng = np.random.default_rng((seed, number, 1))
+    camera = random_camera(rng)
+    array, turn = camera.lenslet_array, rng.uniform(0, math.pi / 2)
+    away = array.distance * math.tan(math.radians(rng.uniform(0.5, 20))) / array.pitch
+    away = min(away, 2000.0)
+    row, column = round(away * math.sin(turn)), round(away * math.cos(turn))
+    camera = camera.replace(
+        **{
+            "lenslet_array.lattice": "square",
+            "lenslet_array.aperture_shape": "square",
+            "lenslet_array.count": (2 * row + 1, 2 * column + 1),
+            "main_lens.aberrations": (),
+        }
+    )
+    return camera, {
+        "model": "auto",
+        "superpixels": (1, 1),
+        "coherent_ring": 0,
+        "accuracy": float(10.0 ** -rng.uniform(0.5, 5)),
+        "lenslet": (2 * row, 2 * column),
+    }
+
+
+def is_centred(seed, number):
+    """Whether the case of auto is one of harmonics: isolated, round or hexagonal, on the axis."""
+    camera, request = case(seed, number, "auto")
+    lens = camera.main_lens
+    return (
+        request["coherent_ring"] == 0
+        and request["superpixels"] == (1, 1)
+        and camera.lenslet_array.aperture_shape != "square"
+        and lens.aperture_shape != "square"
+        and all(term.noll in (4, 11) for term in lens.aberrations)
+    )
+
+
 def lenslets_of(camera, window):
     """(row, column) of the lenslets whose fields add, axial numbers on a hexagonal lattice."""
     if camera.lenslet_array.lattice == "square":
@@ -172,6 +212,50 @@ def points_of(camera):
 def answer(seed, number, model=None):
     """The Case, None where the oracle would take too long."""
     camera, request = case(seed, number, model)
+
+    def truth(plan):
+        if plan.rung == "rays" or _work(camera, plan) > AFFORDED:
+            return None
+        window, reach = plan.bands[0].window, [(n - 1) // 2 for n in plan.superpixels]
+        superpixels = [
+            (r, c) for r in range(-reach[0], reach[0] + 1) for c in range(-reach[1], reach[1] + 1)
+        ]
+        oracle = tensor.paraxial if request["model"] == "fresnel" else tensor.exact
+        lenslets = None if window is None else lenslets_of(camera, window)
+        return oracle(camera, points_of(camera), lenslets, superpixels)
+
+    return _judged(number, camera, request, truth)
+
+
+def oblique_answer(seed, number):
+    """As `answer`, of a lenslet off the axis: its corner points, or all of few."""
+    camera, request = oblique_case(seed, number)
+    array, (row, column) = camera.lenslet_array, request["lenslet"]
+    place = row / 2 * array.pitch, column / 2 * array.pitch
+    rows, columns = camera.object.samples_per_lenslet
+    some = sorted({0, columns - 1, (rows - 1) * columns, rows * columns - 1})
+
+    def truth(plan):
+        cells = array.pitch * camera.main_lens.aperture_diameter / array.distance
+        cells *= 1 / camera.light.wavelengths[0]
+        if plan.rung == "rays" or cells > 40 or cells * max(camera.sensor.pixels_per_lenslet) > 400:
+            return None
+        return oblique_columns(
+            camera,
+            camera.light.wavelengths[0],
+            place,
+            [points_of(camera)[n] for n in some],
+            shift=lenslet_shift(camera, row, column)[2],
+            pixel_nodes=plan.bands[0].pixel_nodes + 8,
+        )
+
+    return _judged(number, camera, request, truth, some)
+
+
+def _judged(number, camera, request, truth, points=slice(None)):
+    """The Case of a request, judged by truth(plan), whose columns are of `points`; None where that
+    is None.
+    """
     array, lens = camera.lenslet_array, camera.main_lens
     slow = lens.aperture_diameter * 2 <= array.distance and array.pitch * 2 <= array.focal_length
     told = dict(
@@ -186,24 +270,14 @@ def answer(seed, number, model=None):
         plan = plan_pif(
             camera, dtype=np.float64 if request["accuracy"] < 1e-6 else "auto", **request
         )
-        if plan.rung == "rays" or _work(camera, plan) > AFFORDED:
+        true = truth(plan)
+        if true is None:
             return None
         matrix = build_pif(camera, plan)
     except NumericsError as error:
         return Case(refused=str(error), **told)
-    window = plan.bands[0].window
-    reach = [(n - 1) // 2 for n in plan.superpixels]
-    superpixels = [
-        (r, c) for r in range(-reach[0], reach[0] + 1) for c in range(-reach[1], reach[1] + 1)
-    ]
-    oracle = tensor.paraxial if request["model"] == "fresnel" else tensor.exact
-    true = oracle(
-        camera,
-        points_of(camera),
-        None if window is None else lenslets_of(camera, window),
-        superpixels,
-    ).reshape(len(points_of(camera)), -1)
-    found = matrix.A[0].reshape(-1, len(true)).T
+    true = true.reshape(len(true), -1)
+    found = matrix.A[0].reshape(true.shape[1], -1).T[points]
     size = np.linalg.norm(true, axis=1)
     errors = np.linalg.norm(found - true, axis=1) / size
     energy = true.sum(axis=1)
@@ -228,7 +302,8 @@ def describe(camera, request):
         f"{array.focal_length / array.pitch:.1f}, {cells:.0f} cells, blur "
         f"{eps * lens.aperture_diameter * array.distance / array.pitch:.1f}, terms "
         f"{[t.noll for t in lens.aberrations or ()]}, pixels {sensor.pixels_per_lenslet}, "
-        f"{request['superpixels']} ring {request['coherent_ring']}"
+        f"{request['superpixels']} ring {request['coherent_ring']} "
+        f"lenslet {request.get('lenslet', 'on the axis')}"
     )
 
 
@@ -236,7 +311,9 @@ def _work(camera, plan):
     """Multiplications of the oracle, roughly."""
     band, shape = plan.bands[0], plan.shape
     lenslets = 1 if band.window is None else (2 * band.window + 1) ** 2
-    n, p = 2 * band.lenslet_nodes + 20, band.psf_nodes + 20
+    # harmonics count from the middle to the rim
+    width = 4 if plan.rung == "exact, harmonics" else 2
+    n, p = width * band.lenslet_nodes + 20, band.psf_nodes + 20
     v = max(camera.sensor.pixels_per_lenslet) * (2 * band.pixel_nodes + 5)
     if plan.model == "fresnel":
         return 4.0 * lenslets * shape[1] * shape[3] * (n * p * p + n * n * (p + v) + n * v * v)

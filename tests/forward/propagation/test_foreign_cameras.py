@@ -12,6 +12,12 @@ from tests.reference.fresnel import pixel_energies
 
 SAMPLE, PART, PARTS = 16, 50, 40
 """Cameras of the default tests; of each part of a campaign, and its parts: 2000 in all."""
+OBLIQUE, OBLIQUE_PARTS = 8, 6
+"""The same of lenslets off the axis: 300 in all."""
+CENTRED, CENTRED_PARTS = (342, 442), 20
+"""Of seed 41, two cameras whose lenslets are round or hexagonal, isolated and on the axis, of few
+fringes; parts of a campaign that looks for such.
+"""
 
 
 def summed(cases, count):
@@ -38,6 +44,30 @@ def test_a_sample_of_foreign_cameras_holds(count):
     done = summed(cases, count)
     assert len(done) > 0.6 * SAMPLE
     assert sum(c.told for c in done) > 0.8 * len(done)
+
+
+def test_a_sample_of_lenslets_off_the_axis_holds(count):
+    cases = [c for c in (foreign.oblique_answer(1, n) for n in range(OBLIQUE)) if c]
+    assert len(summed(cases, count)) >= 4
+
+
+def test_a_sample_of_harmonics_holds(count):
+    cases = [foreign.answer(41, n, "auto") for n in CENTRED]
+    assert all(c.rung == "exact, harmonics" for c in summed(cases, count))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(OBLIQUE_PARTS))
+def test_lenslets_off_the_axis_hold(part, count):
+    numbers = range(part * PART, (part + 1) * PART)
+    summed([c for c in (foreign.oblique_answer(2, n) for n in numbers) if c], count)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(CENTRED_PARTS))
+def test_harmonics_hold(part, count):
+    numbers = (n for n in range(part * PART, (part + 1) * PART) if foreign.is_centred(3, n))
+    summed([c for c in (foreign.answer(3, n, "auto") for n in numbers) if c], count)
 
 
 @pytest.mark.slow

@@ -70,7 +70,10 @@ is measured by; least share, and cut of the main lens's field, that this is done
 """
 
 GAPS = 3.0
-"""By how much finer fields are cut where lenslets leave gaps."""
+"""By how much finer fields are cut where lenslets leave gaps, and once more where these are narrow.
+"""
+NARROW = 2.0
+"""Diffraction cells of an opening."""
 
 
 def exact_band(
@@ -96,6 +99,9 @@ def exact_band(
     # points beside a lenslet: edges are all that their columns have
     if geometry.lenslet_width < 0.999 * geometry.D2:
         cut /= GAPS
+        opening = geometry.diffraction_cells * geometry.lenslet_width / geometry.D2
+        # narrow ones throw light of points beside them beside their superpixel
+        cut /= GAPS if opening < NARROW else 1.0
     count = prolate_count(_bandwidth(geometry, superpixels), cut / 100)
     count = (
         count

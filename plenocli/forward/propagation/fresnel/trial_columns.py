@@ -221,10 +221,15 @@ class _Trial:
         self.whole = lines is None and all(
             (n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape
         )
-        # the farthest from the middle first
+        # corners, middles of edges and the middle, then the farthest from it first
+        tried = [_lines(n, symmetric) for n in g.object_shape]
+        marked = [{line[0], line[len(line) // 2], line[-1]} for line in tried]
         self.points: list[tuple[int, int]] = sorted(
-            product(_lines(g.object_shape[0], symmetric), _lines(g.object_shape[1], symmetric)),
-            key=lambda p: -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, g.object_shape)),
+            product(tried[0], tried[1]),
+            key=lambda p: (
+                not all(i in some for i, some in zip(p, marked)),
+                -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, g.object_shape)),
+            ),
         )
 
     @property

@@ -5,6 +5,8 @@ A message says what is wrong, where (file, field, option) and what to do about i
 
 from __future__ import annotations
 
+import errno
+
 
 class PlenoError(Exception):
     """Root of all expected failures. `exit_code` is what the process returns."""
@@ -54,3 +56,10 @@ class NumericsError(PlenoError):
     """The numbers do not allow an answer, or not to the accuracy asked for."""
 
     exit_code = 5
+
+
+def remedy(error: OSError) -> str:
+    """What to do where a file or folder cannot be made."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "free some space or choose another folder"
+    return "check the folder and its permissions"

@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from plenocli.base.errors import OutputError
+from plenocli.base.errors import OutputError, remedy
 from plenocli.base.text import json_value
 
 
@@ -35,7 +35,7 @@ class Journal:
             raise OutputError(
                 f"cannot be written ({error.strerror})",
                 path,
-                "check the folder and its permissions",
+                remedy(error),
             ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

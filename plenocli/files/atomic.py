@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from plenocli.base.errors import OutputError, UsageError
+from plenocli.base.errors import OutputError, UsageError, remedy
 
 
 def check_output(
@@ -108,9 +108,7 @@ def replacement(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator
     try:
         descriptor = _open_partial(partial)
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})", path, "check the folder and its permissions"
-        ) from error
+        raise OutputError(f"cannot be written ({error.strerror})", path, remedy(error)) from error
     try:
         yield partial, descriptor
         os.fsync(descriptor)

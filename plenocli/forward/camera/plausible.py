@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from plenocli.base.units import format_length
 
-STEEPEST, SLOWEST = 0.05, 2000.0
+STEEPEST, SLOWEST = 0.1, 1000.0
 """F-numbers of the main lens and the lenslets."""
 SLOWEST_IMAGE = 1e5
 """F-number of the light that comes from the pupil; what blurs is refused for that."""

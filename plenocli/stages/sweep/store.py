@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import OutputError, PlenoError, UsageError
+from plenocli.base.errors import OutputError, PlenoError, UsageError, remedy
 from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
 from plenocli.execution.pool import Lost, Pool
@@ -106,9 +106,7 @@ class Store:
             for name in ("scratch", *SHARED):
                 (folder / name).mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(
-                f"cannot be made ({error.strerror})", folder, "check the folder and its permissions"
-            ) from None
+            raise OutputError(f"cannot be made ({error.strerror})", folder, remedy(error)) from None
 
     def close(self) -> None:
         """Let go of the folder; scratch files go, and all of it where no point was finished."""

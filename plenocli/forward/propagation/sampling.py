@@ -69,9 +69,9 @@ TRIED_CUT_EFFECT = 0.06
 """The same where columns were tried, whose cut is for the dimmest point: with it what is said is
 within a factor of ten of 95 % of 349 foreign cameras' errors, with PSF_CUT_EFFECT of 87 %.
 """
-FOUND_CUT_EFFECT = 0.12
-"""The same over the root energy that is known to be cut, and over the dimmest point's (0.013 to 0.8
-in 60 foreign cameras of few diffraction cells).
+FOUND_CUT_EFFECT, COARSE_CUT = (0.1, 0.3), 3e-3
+"""The same over the root energy that is known to be cut, and over the dimmest point's, below and
+above a coarse cut (0.013 to 0.7, and 0.05 to 0.8, in 60 foreign cameras of few diffraction cells).
 """
 NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
@@ -231,7 +231,7 @@ def size_band(
     cut = cut_field(camera, geometry, half, root * tolerance)
     if cut is not None:
         terms, tail = cut
-        cut_effect = FOUND_CUT_EFFECT * tail / root
+        cut_effect = FOUND_CUT_EFFECT[tail > COARSE_CUT] * tail / root
     return BandPlan(
         wavelength=geometry.wavelength,
         window=window,

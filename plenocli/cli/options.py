@@ -118,6 +118,24 @@ FRACTION = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-30,
 SHARE = _Quantity("number", parse_number, 0.0, exclusive=True, limits=(1e-3, 0.5))
 
 
+class Nodes(click.ParamType):
+    """An odd number of places along an axis, or auto where that is on offer."""
+
+    def __init__(self, *, auto: bool) -> None:
+        self._auto, self.name = auto, "auto|ODD" if auto else "ODD"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | str:
+        """As click.ParamType.convert."""
+        if isinstance(value, int) or (self._auto and value == "auto"):
+            return value
+        if value not in {str(n) for n in range(3, 34, 2)}:
+            known = "auto or an odd number" if self._auto else "an odd number"
+            self.fail(f"{value!r} is not {known} from 3 to 33", param, ctx)
+        return int(value)
+
+
 class Whole(click.IntRange):
     """A whole number within bounds."""
 

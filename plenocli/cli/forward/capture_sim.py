@@ -93,6 +93,15 @@ from plenocli.cli import options
     default=None,
     help="Relative error of the light on the sensor; default: what its noise lets be seen.",
 )
+@click.option(
+    "--field-nodes",
+    type=options.Nodes(auto=False),
+    default=None,
+    help=(
+        "Places of the field along an axis (3, 5, 7 ...) whose matrices stand for all lenslets, as "
+        "in simulate-pif; default: all are simulated as the one on the axis."
+    ),
+)
 @options.model("Propagation model, as in simulate-pif.")
 @click.option(
     "--scene-out",
@@ -122,6 +131,7 @@ def command(
     superpixels: tuple[int, int] | str,
     coherent_ring: int | str,
     accuracy: float | None,
+    field_nodes: int | None,
     model: str,
     scene_out: Path | None,
     seed: int,
@@ -159,6 +169,7 @@ def command(
             superpixels=superpixels,
             coherent_ring=coherent_ring,
             accuracy=accuracy,
+            field_nodes=field_nodes,
             model=model,
             seed=seed,
         ),

@@ -53,6 +53,16 @@ class _Step(click.ParamType):
         "default the one on the axis."
     ),
 )
+@click.option(
+    "--field-nodes",
+    type=options.Nodes(auto=True),
+    default=None,
+    help=(
+        "Compute the matrices of a whole array: places of the field along an axis (3, 5, 7 ...), "
+        "between which those of all lenslets are interpolated, or auto for the fewest that meet "
+        "the accuracy; in numbered files beside OUT. Default: one matrix, that of the axis."
+    ),
+)
 @options.model(
     "Propagation model; auto takes the cheapest that meets the accuracy, a named one is "
     "accurate within itself."
@@ -101,6 +111,7 @@ def command(
     superpixels: tuple[int, int] | str,
     coherent_ring: int | str,
     lenslet: tuple[int, int] | None,
+    field_nodes: int | Literal["auto"] | None,
     model: str,
     accuracy: float | None,
     scene: Path | None,
@@ -120,6 +131,7 @@ def command(
       plenocli simulate-pif camera.toml --wavelength 450nm --wavelength 650nm \\
           --accuracy 1e-3 --explain
       plenocli simulate-pif camera.toml --scene scene.toml -o pif.h5
+      plenocli simulate-pif camera.toml --field-nodes auto --accuracy 1e-2 -o field.h5
       plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 \\
           --coherent-ring 0 -o isolated.h5
     """
@@ -134,6 +146,7 @@ def command(
             superpixels=superpixels,
             coherent_ring=coherent_ring,
             lenslet=lenslet,
+            field_nodes=field_nodes,
             model=model,
             accuracy=accuracy,
             scene=scene,

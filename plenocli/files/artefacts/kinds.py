@@ -173,6 +173,57 @@ PIF_PLANES = Schema(
     },
 )
 
+PIF_FIELD = Schema(
+    kind="pif-field",
+    version=1,
+    doc=(
+        "System matrices of a whole array: one file of kind pif (or pif-index) beside it for each "
+        "of some places of the field; those of lenslets in between are interpolated."
+    ),
+    fields=(
+        dataset(
+            "field/row",
+            "row_node",
+            "f",
+            "m",
+            "rows of places on the array, from the optical axis",
+            ascending=True,
+        ),
+        dataset(
+            "field/column",
+            "column_node",
+            "f",
+            "m",
+            "columns of places on the array, from the optical axis",
+            ascending=True,
+        ),
+        dataset(
+            "field/file",
+            "row_node column_node",
+            "i",
+            "1",
+            "which of the files serves a place, counted from 0",
+            minimum=0,
+        ),
+        dataset(
+            "field/turn",
+            "row_node column_node 3",
+            "b",
+            "",
+            (
+                "how its matrix is turned for that place: rows and columns exchanged, then rows "
+                "turned over, columns turned over, of superpixels, pixels and points alike"
+            ),
+        ),
+    ),
+    attrs={
+        "field": (
+            attribute("files", "json", "", "name and SHA-256 of each file"),
+            attribute("error", "number", "1", "relative L2 error of the worst column in between"),
+        )
+    },
+)
+
 CAPTURE = Schema(
     kind="capture",
     version=1,
@@ -833,6 +884,7 @@ SCHEMAS = {
         PIF,
         PIF_INDEX,
         PIF_PLANES,
+        PIF_FIELD,
         CAPTURE,
         CALIBRATION,
         SPECTRA,

@@ -1,6 +1,6 @@
 """A system matrix in one file or in several: numbered artefacts of kind pif, each some
 superpixels, and an index of kind pif-index; or each a plane of a scene's depth, and an index of
-kind pif-planes.
+kind pif-planes; or each a place of the field, and an index of kind pif-field.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from plenocli.files.artefacts.stream import streamed_artefact
 from plenocli.files.atomic import check_output
 from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.accuracy.depth_planes import plane_weights
+from plenocli.forward.accuracy.field_nodes import FieldNodes, Place, turned_blocks
+from plenocli.forward.propagation.symmetry import Turn
 
 
 def shard_path(index: str | os.PathLike, number: int) -> Path:
@@ -156,17 +158,32 @@ def writing_pif(
         raise
 
 
-def read_pif(path: str | os.PathLike, distance: float | None = None) -> Artefact:
-    """The Artefact of kind pif at `path`; that of an index with its shards put together, that of
-    planes interpolated.
+PIF_KINDS = ("pif", "pif-index", "pif-planes", "pif-field")
 
-    distance: of the plane, m, which counts among planes only.
+
+def read_pif(
+    path: str | os.PathLike, distance: float | None = None, place: Place | None = None
+) -> Artefact:
+    """The Artefact of kind pif at `path`; that of an index with its shards put together, that of
+    planes or of places of the field interpolated.
+
+    distance: of the plane, m, which counts among planes only;
+    place: of a lenslet on the array, m, which counts among places of the field only.
 
     Errors as read_artefact.
     """
-    artefact = read_artefact(path, ("pif", "pif-index", "pif-planes"))
+    artefact = read_artefact(path, PIF_KINDS)
     if artefact.kind == "pif-planes":
         return _between_planes(Path(path), artefact, distance)
+    if artefact.kind == "pif-field":
+        nodes, parts = read_field(path, artefact)
+        if place is None:
+            raise InputError(
+                f"holds the matrices of {len(parts)} places of the field, of which one is due",
+                path,
+                f"name the file of one of them, such as {shard_path(path, 0).name}",
+            )
+        return at_place(nodes, parts, place)
     if artefact.kind == "pif":
         return artefact
     A = None
@@ -237,6 +254,84 @@ def write_planes(
     )
 
 
+def write_field(
+    path: str | os.PathLike, nodes: FieldNodes, provenance: Provenance, *, overwrite: bool = False
+) -> None:
+    """Write the index of places whose files stand at shard_path(path, 0), 1, ... already.
+
+    Errors as write_artefact.
+    """
+    files = [shard_path(path, number) for number in nodes.numbers]
+    named = [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    data = {
+        "field/row": nodes.rows,
+        "field/column": nodes.columns,
+        "field/file": nodes.file.astype(np.int32),
+        "field/turn": nodes.turn,
+    }
+    attrs = {"field": {"files": named, "error": nodes.error}}
+    write_artefact(path, Artefact("pif-field", data, attrs, provenance), overwrite=overwrite)
+
+
+def read_field(
+    path: str | os.PathLike, artefact: Artefact | None = None
+) -> tuple[FieldNodes, list[Artefact]]:
+    """Places of the field and their matrices, Artefacts of kind pif with the same superpixels.
+
+    Errors as read_artefact.
+    """
+    path = Path(path)
+    artefact = artefact or read_artefact(path, "pif-field")
+    nodes = FieldNodes(
+        rows=artefact.data["field/row"],
+        columns=artefact.data["field/column"],
+        file=artefact.data["field/file"],
+        turn=artefact.data["field/turn"],
+        error=float(artefact.attrs["field"]["error"]),
+    )
+    about = artefact.attrs.get("field", {})
+    listed = _named(path, about.get("files"), len(nodes.numbers))
+    parts = [read_pif(_same_file(path, listed[number])) for number in nodes.numbers]
+    same = ("lenslet_offset", "pixel_shape", "object_shape", "wavelength")
+    for part, entry in zip(parts, listed):
+        if any(
+            not np.array_equal(part.data[f"pif/{name}"], parts[0].data[f"pif/{name}"])
+            for name in same
+        ):
+            raise InputError(
+                f"holds another kind of matrix than {listed[0]['name']}",
+                path.with_name(entry["name"]),
+                "make all again",
+            )
+    return nodes, parts
+
+
+def turned_part(part: Artefact, how: Turn) -> np.ndarray:
+    """A (band, lenslet, pixel, point) of a place from the pif that serves it, as the Turn says."""
+    data = part.data
+    shapes = data["pif/pixel_shape"], data["pif/object_shape"]
+    return turned_blocks(data["pif/A"], data["pif/lenslet_offset"], shapes, how)
+
+
+def at_place(nodes: FieldNodes, parts: Sequence[Artefact], place: Place) -> Artefact:
+    """The Artefact of kind pif of a lenslet at a place (rows, columns; m) of the field."""
+    first = parts[0]
+    A = np.zeros(first.data["pif/A"].shape)
+    for weight, number, how in nodes.mix(place):
+        A += weight * turned_part(parts[number], how)
+    np.maximum(A, 0, out=A)
+    A = A.astype(first.data["pif/A"].dtype)
+    data = first.data | {"pif/A": A, "pif/column_energy": A.sum(axis=(1, 2), dtype=float)}
+    data.pop("pif/singular_values", None)
+    return Artefact("pif", data, {"pif": _without_figures(first)}, first.provenance)
+
+
+def _without_figures(artefact: Artefact) -> dict[str, Any]:
+    """Attributes of a pif that hold for one mixed with others, too."""
+    own = ("rank", "condition", "resolution", "symmetry_defect", "eps")
+    return {name: value for name, value in artefact.attrs["pif"].items() if name not in own}
+
+
 def _between_planes(path: Path, artefact: Artefact, distance: float | None) -> Artefact:
     """The Artefact of kind pif at a distance (m) between the planes of an index."""
     distances = artefact.data["planes/distance"]
@@ -265,11 +360,7 @@ def _between_planes(path: Path, artefact: Artefact, distance: float | None) -> A
         "pif/lenslet_offset": offsets.astype(np.int32),
         "pif/column_energy": A.sum(axis=(1, 2), dtype=float),
     }
-    attrs = {
-        name: value
-        for name, value in first.attrs["pif"].items()
-        if name not in ("rank", "condition", "resolution", "symmetry_defect", "eps")
-    }
+    attrs = _without_figures(first)
     data.pop("pif/singular_values", None)
     camera = parse_camera(first.provenance.config, path)
     config = to_toml(camera.replace(**{"object.distance": distance}))

@@ -81,6 +81,7 @@ def plan_pif(
     points: slice | None = None,
     needs: SceneNeeds | None = None,
     lenslet: tuple[int, int] | None = None,
+    chief: tuple[float, float] | None = None,
 ) -> PifPlan:
     """Choose how to compute a system matrix; no optics is computed.
 
@@ -94,7 +95,9 @@ def plan_pif(
     dtype: "auto", float32 or float64 of the stored matrix;
     points: slice of flat point indices;
     needs: what is known of the scene, which narrows the request; its depth is for depth_planes;
-    lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster.
+    lenslet: (row, column) of an off-axis lenslet whose pixels lie on the sensor's raster;
+    chief: instead, where a lenslet stands from the axis (rows, columns; m) whose pixels lie as
+        those of the one on the axis do.
 
     Returns the plan.
     Raises UsageError or NumericsError where the request cannot be met.
@@ -111,6 +114,7 @@ def plan_pif(
         points,
         needs,
         lenslet,
+        chief,
     )
     found = [_consider(request, each) for each in MODELS if model in ("auto", each.kind)]
     best = _cheapest(found)
@@ -134,6 +138,7 @@ class _Request:
         points: slice | None,
         needs: SceneNeeds | None,
         lenslet: tuple[int, int] | None,
+        chief: tuple[float, float] | None,
     ) -> None:
         if model not in KINDS:
             raise UsageError(f"model {model!r} is not one of {', '.join(KINDS)}", "model")
@@ -160,6 +165,7 @@ class _Request:
                 f"{len(dropped)} wavelength(s) without light in the scene: no error"
             )
         self.pixel_shift, self.chief = _place(camera, lenslet)
+        self.chief = chief or self.chief
         if camera.lenslet_array.pitch < max(kept):
             raise UsageError(
                 f"wavelength {format_length(max(kept))} is longer than lenslets are wide, "
@@ -169,7 +175,8 @@ class _Request:
             )
         self.geometries = [geometry_of(camera, w, self.pixel_shift, self.chief) for w in kept]
         # one matrix for all lenslets is that of the one on the axis
-        self.corner = None if lenslet is not None else corner_ray(camera)
+        alone = lenslet is not None or chief is not None
+        self.corner = None if alone else corner_ray(camera)
         # a band goes by its centre
         self.band = (
             camera.light.band

@@ -172,7 +172,10 @@ def pupil_change(camera: Camera, wavelength: float, chief: tuple[float, float]) 
 
 
 def _of_rows(rows: Sequence[FieldRow], height: float, unit: float, focal_length: float) -> _Seen:
-    """What the rows of a description say at a height (m), linear between them."""
+    """What the rows of a description say at a height (m). Near the axis a term of angular order m
+    goes with the m-th power of the height times an even function: odd orders and the rim's shift
+    are linear in the height between rows, even ones in its square.
+    """
     if not rows:
         return _Seen(focal_length=focal_length)
     heights = [row.height for row in rows]
@@ -184,15 +187,16 @@ def _of_rows(rows: Sequence[FieldRow], height: float, unit: float, focal_length:
             "add a row for the corner of the array",
         )
     given = [{term.noll: term.coefficient for term in row.aberrations} for row in rows]
-    terms = {
-        j: float(np.interp(height, heights, [row.get(j, 0.0) for row in given]))
-        for j in sorted(set().union(*given))
-    }
-    share = float(np.interp(height, heights, [row.transmission for row in rows]))
+    terms = []
+    for j in sorted(set().union(*given)):
+        power = 1 if noll_indices(j)[1] % 2 else 2
+        values = [row.get(j, 0.0) for row in given]
+        terms.append((j, float(np.interp(height**power, np.power(heights, power), values))))
+    shift = float(np.interp(height, heights, [shift_of(row.transmission) for row in rows]))
     return _Seen(
         focal_length=focal_length,
-        terms=tuple((j, c) for j, c in terms.items() if c),
-        rims=((-shift_of(share) * unit, unit),) if share < 1 else (),
+        terms=tuple((j, c) for j, c in terms if c),
+        rims=((-shift * unit, unit),) if shift > CUT else (),
     )
 
 

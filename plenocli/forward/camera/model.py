@@ -145,8 +145,8 @@ class MainLens(Section):
     files hold is attached by Camera.attach; nothing here opens a file.
 
     field: what the lens is to lenslets off the axis, rows by height from 0 to the array's corner,
-        linear in between. A prescription needs none: its pupil and wavefront are traced for every
-        lenslet, rims where surfaces have a semi_diameter.
+        interpolated in between. A prescription needs none: its pupil and wavefront are traced for
+        every lenslet, rims where surfaces have a semi_diameter.
     apodisation: amplitude over the exit wave of the exact model. "aplanatic" (a lens that keeps
         Abbe's sine condition, as lenses corrected over a field do), "uniform-pupil" (an evenly lit
         plane aperture) or "uniform-sine" (even in direction cosines, which gives Airy's pattern).

@@ -72,6 +72,7 @@ class MatrixNotes:
     quartic_phase_rad: phase that the paraxial model drops at a lenslet's edge;
     diffraction_cells: of a lenslet, per axis;
     energy_min, energy_max: of all columns;
+    chief: where the lenslet stands from the axis, m (rows, columns);
     window: of an off-axis lenslet.
     """
 
@@ -96,6 +97,7 @@ class MatrixNotes:
     energy_max: float
     reasons: tuple[str, ...]
     warnings: tuple[str, ...]
+    chief: tuple[float, float] = (0.0, 0.0)
     window: LensletWindow | None = None
 
     def as_json(self) -> dict[str, Any]:
@@ -578,4 +580,5 @@ def _notes(
         energy_max=float(energy.max()),
         reasons=plan.reasons,
         warnings=plan.warnings,
+        chief=plan.chief,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,6 +17,7 @@ from plenocli.forward.scene.white_reference import WHITE_LEVEL
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
 
 if TYPE_CHECKING:
+    from plenocli.forward.accuracy.field_nodes import FieldNodes
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
     from plenocli.forward.scene.light import Quadrature
@@ -40,6 +41,8 @@ class ExposureOptions:
     snr_db: of white noise instead of the sensor's own, dB.
     noise: "sensor" or "none".
     exposure: s, None for the camera's own.
+    field_nodes: places of the field along an axis whose matrices stand for all lenslets, None for
+        the axis alone.
     seed: of the noise.
     """
 
@@ -51,6 +54,7 @@ class ExposureOptions:
     snr_db: float | None = None
     noise: str = "sensor"
     exposure: float | None = None
+    field_nodes: int | None = None
     seed: int = 0
 
 
@@ -76,7 +80,7 @@ def simulate_capture(
     scene: Scene,
     options: ExposureOptions,
     *,
-    matrices: Mapping[float, MatrixByPoints] | None = None,
+    matrices: Mapping[float, MatrixByPoints | StoredField] | None = None,
     name: str = "scene",
     band_m: float | None = None,
 ) -> SimulatedCapture:
@@ -130,6 +134,36 @@ class StoredMatrix:
     def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """All points at once: they are in memory."""
         yield np.arange(self.matrix.shape[2]), self.matrix
+
+
+@dataclass(frozen=True)
+class StoredField:
+    """The system matrices of a whole array at one wavelength, those of places of the field.
+
+    nodes: the places.
+    matrices: (lenslet offset, pixel, point) by row and column of the places.
+    offsets: (lenslet offset, 2).
+    """
+
+    nodes: FieldNodes
+    matrices: Mapping[tuple[int, int], np.ndarray]
+    offsets: np.ndarray
+
+    def parts(self, camera: Camera) -> Iterator[tuple[StoredMatrix, np.ndarray]]:
+        """Each place's matrix and its weight for the lenslets, (lenslet_row, lenslet_column)."""
+        count, pitch = camera.lenslet_array.count, camera.lenslet_array.pitch
+        down, across = (
+            self.nodes.weights(axis, (np.arange(n) - (n - 1) / 2) * pitch)
+            for axis, n in enumerate(count)
+        )
+        for (i, j), matrix in self.matrices.items():
+            yield StoredMatrix(matrix, self.offsets), np.outer(down[:, i], across[:, j])
+
+    @property
+    def on_axis(self) -> StoredMatrix:
+        """The matrix of the middle of the array."""
+        rows, columns = (len(line) // 2 for line in (self.nodes.rows, self.nodes.columns))
+        return StoredMatrix(self.matrices[rows, columns], self.offsets)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,9 +239,19 @@ def planned_accuracy(
     """
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.accuracy.explain import expectation
+    from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, field_nodes
+    from plenocli.forward.camera.geometry import corner_ray
 
-    plan = plan_pif(camera, wavelengths=(wavelengths[len(wavelengths) // 2],), **_request(options))
-    expected = expectation(plan, times=len(wavelengths) * options.refine**2)
+    request = _request(options) | {"wavelengths": (wavelengths[len(wavelengths) // 2],)}
+    times = len(wavelengths) * options.refine**2
+    if options.field_nodes is None:
+        plan = plan_pif(camera, **request)
+    else:
+        plan_at = PlansOfPlaces(camera, **request)
+        nodes = field_nodes(camera, plan_at, options.field_nodes)
+        plan = nodes.told(plan_at(corner_ray(camera)))
+        times *= len(nodes.numbers)
+    expected = expectation(plan, times=times)
     if expected:
         note(expected)
     return plan.accuracy_record()
@@ -238,7 +282,7 @@ def carry_light(
     source: Quadrature,
     scene: Scene,
     options: ExposureOptions,
-    matrix: Mapping[float, MatrixByPoints] | None,
+    matrix: Mapping[float, MatrixByPoints | StoredField] | None,
 ) -> SensorLight:
     """Light of the scene on every superpixel, band by band through the system matrix."""
     from plenocli.base.budget import budget
@@ -259,9 +303,13 @@ def carry_light(
         if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
             picture = scene.at(wavelength, *grid)
         size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
-        carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
-        if isinstance(scene, Uniform):
-            carried = np.broadcast_to(scene.level * white, (*count, pixels))
+        if isinstance(system, StoredField):
+            even = np.full(grid, scene.level) if isinstance(scene, Uniform) else picture
+            carried, white = _carried_over_the_field(system, camera, even, fine)
+        else:
+            carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
+            if isinstance(scene, Uniform):
+                carried = np.broadcast_to(scene.level * white, (*count, pixels))
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / options.refine**2
         light = light + weight[:, :, None, None] * carried[None]
         whites = whites + weight * white[None]
@@ -273,10 +321,54 @@ def carry_light(
     )
 
 
-def _build(camera: Camera, wavelength: float, options: ExposureOptions) -> MatrixByPoints:
-    from plenocli.forward.accuracy.dial import pif_builder
+def _carried_over_the_field(
+    system: StoredField, camera: Camera, picture: np.ndarray | None, samples: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As superpixel_light, every object through the matrix of its own lenslet; white is that of the
+    axis.
+    """
+    from plenocli.forward.sensor.irradiance import superpixel_light
 
-    return pif_builder(camera, wavelength, **_request(options))
+    light: np.ndarray = np.zeros(())
+    assert picture is not None
+    for matrix, weight in system.parts(camera):
+        share = picture * np.kron(weight, np.ones(samples))
+        light = light + superpixel_light(matrix.blocks(), matrix.offsets, share, samples)[0]
+    axis = system.on_axis
+    return light, superpixel_light(axis.blocks(), axis.offsets, None, samples)[1]
+
+
+def _build(
+    camera: Camera, wavelength: float, options: ExposureOptions
+) -> MatrixByPoints | StoredField:
+    from plenocli.forward.accuracy.dial import pif_builder
+    from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, lay_nodes
+    from plenocli.forward.propagation.system_matrix import build_pif
+
+    if options.field_nodes is None:
+        return pif_builder(camera, wavelength, **_request(options))
+    plan_at = PlansOfPlaces(camera, wavelengths=(wavelength,), **_request(options))
+    nodes = lay_nodes(camera, options.field_nodes, plan_at((0.0, 0.0)).superpixels)
+    made = [build_pif(camera, plan_at(place)) for place in nodes.places]
+    shapes = made[0].pixel_shape, made[0].object_shape
+    blocks = [one.A[0] for one in made if one.A is not None]
+    return stored_field(nodes, blocks, made[0].lenslet_offset, shapes)
+
+
+def stored_field(
+    nodes: FieldNodes,
+    matrices: Sequence[np.ndarray],
+    offsets: np.ndarray,
+    shapes: tuple[Sequence[int], Sequence[int]],
+) -> StoredField:
+    """The StoredField of the matrices that `nodes` number; arguments as turned_blocks."""
+    from plenocli.forward.accuracy.field_nodes import turned_blocks
+
+    found = {
+        (i, j): turned_blocks(matrices[int(nodes.file[i, j])], offsets, shapes, nodes.turn_at(i, j))
+        for i, j in np.ndindex(nodes.file.shape)
+    }
+    return StoredField(nodes, found, offsets)
 
 
 def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> np.ndarray:

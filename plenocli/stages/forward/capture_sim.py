@@ -18,11 +18,13 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.forward.sensor.exposure import (
     ExposureOptions,
     SimulatedCapture,
+    StoredField,
     StoredMatrix,
     planned_accuracy,
     require_memory_for,
     require_tiling,
     simulate_capture,
+    stored_field,
 )
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ class Settings:
     snr_db: of white noise instead of the sensor's own, dB.
     noise: "sensor" or "none".
     exposure: s, None for the camera's own.
+    field_nodes: places of the field along an axis whose matrices stand for all lenslets, None for
+        the axis alone.
     seed: of the noise.
     """
 
@@ -62,6 +66,7 @@ class Settings:
     snr_db: float | None = None
     noise: str = "sensor"
     exposure: float | None = None
+    field_nodes: int | None = None
     seed: int = 0
 
     @property
@@ -76,6 +81,7 @@ class Settings:
             snr_db=self.snr_db,
             noise=self.noise,
             exposure=self.exposure,
+            field_nodes=self.field_nodes,
             seed=self.seed,
         )
 
@@ -311,20 +317,27 @@ def _read_pif(
     settings: Settings,
     wavelengths: np.ndarray,
     camera_path: str | Path,
-) -> tuple[dict[float, StoredMatrix], dict[str, Any]]:
+) -> tuple[dict[float, StoredMatrix | StoredField], dict[str, Any]]:
     """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it
     belongs to another camera or lacks a wavelength.
     """
-    from plenocli.files.artefacts.shards import read_pif
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.shards import PIF_KINDS, read_field, read_pif
     from plenocli.files.config.camera_file import parse_camera
     from plenocli.files.read.cameras import require_same_files
 
-    artefact = read_pif(path, camera.object.distance)
-    if settings.refine != 1:
-        raise UsageError(
-            "--refine computes its own finer system matrix and cannot take --pif",
-            fix="leave one of them out",
-        )
+    for option, given in (
+        ("--refine", settings.refine != 1),
+        ("--field-nodes", settings.field_nodes is not None),
+    ):
+        if given:
+            raise UsageError(
+                f"{option} computes its own finer system matrix and cannot take --pif",
+                fix="leave one of them out",
+            )
+    field = read_artefact(path, PIF_KINDS).kind == "pif-field"
+    nodes, parts = read_field(path) if field else (None, [read_pif(path, camera.object.distance)])
+    artefact = parts[0]
     made_for = parse_camera(artefact.provenance.config, path)
     for section in ("main_lens", "object", "lenslet_array", "sensor", "filter_array", "fitted"):
         drop = set(_OF_THE_DETECTOR.get(section, ()))
@@ -336,10 +349,9 @@ def _read_pif(
                 "run simulate-pif on this camera",
             )
     require_same_files(camera_path, camera, artefact, path)
-    known, matrices, offsets = (
-        artefact.data[f"pif/{part}"] for part in ("wavelength", "A", "lenslet_offset")
-    )
-    stored = {}
+    known, offsets = (artefact.data[f"pif/{part}"] for part in ("wavelength", "lenslet_offset"))
+    shapes = artefact.data["pif/pixel_shape"], artefact.data["pif/object_shape"]
+    stored: dict[float, StoredMatrix | StoredField] = {}
     for wavelength in wavelengths:
         band = int(np.argmin(np.abs(known - wavelength)))
         if abs(known[band] - wavelength) > 1e-12:
@@ -348,7 +360,12 @@ def _read_pif(
                 path,
                 "run simulate-pif with the same --spectral-step, or leave --pif out",
             )
-        stored[wavelength] = StoredMatrix(matrices[band], offsets)
+        matrices = [part.data["pif/A"][band] for part in parts]
+        stored[wavelength] = (
+            StoredMatrix(matrices[0], offsets)
+            if nodes is None
+            else stored_field(nodes, matrices, offsets, shapes)
+        )
     return stored, artefact.provenance.accuracy
 
 

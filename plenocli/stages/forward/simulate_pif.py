@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.accuracy.depth_planes import DepthPlanes
     from plenocli.forward.accuracy.explain import Considered, PlaneCost
+    from plenocli.forward.accuracy.field_nodes import FieldNodes
     from plenocli.forward.accuracy.scene_needs import SceneNeeds
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
@@ -42,6 +43,8 @@ class Settings:
     model: "auto", "ray", "fresnel" or "exact";
     scene: file of the scene that the matrix is for;
     lenslet: (row, column) of the array, None for the one on the axis;
+    field_nodes: places of the field along an axis whose matrices stand for all lenslets, an odd
+        number, "auto" or None for the axis alone;
     dtype: "auto", "float32" or "float64".
     """
 
@@ -53,6 +56,7 @@ class Settings:
     model: str = "auto"
     scene: Path | str | None = None
     lenslet: tuple[int, int] | None = None
+    field_nodes: int | Literal["auto"] | None = None
     dtype: str = "auto"
 
 
@@ -63,8 +67,9 @@ class PlanSummary:
     plan: several lines of text;
     memory, bytes: at work, and of the result;
     seconds: of one core of this machine, diagnosis, start and writing included;
-    planes: of a scene's depth, where it takes several: `memory` is that of the dearest, `bytes` and
-        `seconds` are those of all, the rest tells of the one that takes longest.
+    planes: of a scene's depth, where it takes several, as places of the field do: `memory` is that
+        of the dearest, `bytes` and `seconds` are those of all, the rest tells of the one that takes
+        longest.
     """
 
     plan: str
@@ -191,6 +196,38 @@ class PlanesSummary:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class FieldSummary:
+    """What was computed and written for a whole array.
+
+    nodes: places (rows, columns) of the field;
+    interpolation_error: relative, of the worst column in between.
+    """
+
+    output: str
+    nodes: tuple[int, int]
+    interpolation_error: float
+    places: list[PifSummary]
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {
+            "output": self.output,
+            "nodes": list(self.nodes),
+            "interpolation_error": self.interpolation_error,
+            "places": [place.as_json() for place in self.places],
+        }
+
+    def line(self) -> str:
+        """One sentence for people."""
+        return (
+            f"{Path(self.output)}: A of {self.nodes[0]}x{self.nodes[1]} places of the field, in "
+            f"{len(self.places)} files beside it; estimated error "
+            f"{max(place.estimated_accuracy for place in self.places):.1g}, interpolation between "
+            f"places ({self.interpolation_error:.1g}) included"
+        )
+
+
 def _share(energy: float) -> str:
     return f"{energy:.3f}" if energy >= 0.001 else f"{energy:.1e}"
 
@@ -220,8 +257,9 @@ def run_simulate_pif(
     overwrite: bool = False,
     workers: int = 1,
     command: str = "",
-) -> PifSummary | PlanesSummary | PlanSummary:
-    """Compute A and write it as a pif artefact; of a scene with depth, one a plane and an index.
+) -> PifSummary | PlanesSummary | FieldSummary | PlanSummary:
+    """Compute A and write it as a pif artefact; of a scene with depth one a plane, of a whole array
+    one a place of the field, and an index.
 
     camera_path: camera description (.toml);
     output: file to write (.h5), not needed with `explain`;
@@ -241,9 +279,11 @@ def run_simulate_pif(
     camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
     planes = _planes(camera, settings, needs)
-    jobs = _jobs(camera, settings, needs, planes)
+    field = _field(camera, settings, needs)
+    nodes = None if field is None else field[0]
+    jobs = _jobs(camera, settings, needs, planes) if field is None else field[1]
     if explain:
-        return _explained(jobs, planes, camera_path)
+        return _explained(jobs, planes or nodes, camera_path)
     assert output is not None  # _require_output
     task = _Task(
         camera_path=camera_path,
@@ -252,9 +292,11 @@ def run_simulate_pif(
         workers=workers,
         command=command,
     )
-    if planes is None or len(jobs) == 1:
+    if len(jobs) == 1:
         return _write(task, jobs[0], output)
-    return _write_planes(task, jobs, planes, output)
+    several = planes or nodes
+    assert several is not None
+    return _write_several(task, jobs, several, output)
 
 
 @dataclass(frozen=True)
@@ -274,6 +316,7 @@ class _Task:
     overwrite: bool
     workers: int
     command: str
+    announced: set[str] = field(default_factory=set)
 
 
 def _planes(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> DepthPlanes | None:
@@ -305,6 +348,44 @@ def _jobs(
     return found
 
 
+def _field(
+    camera: Camera, settings: Settings, needs: SceneNeeds | None
+) -> tuple[FieldNodes, list[_Job]] | None:
+    """The places of the field that stand for the array, and the matrices to compute; None where one
+    matrix was asked for.
+    """
+    from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, field_nodes
+
+    if settings.field_nodes is None:
+        return None
+    for other, given in (
+        ("--lenslet", settings.lenslet is not None),
+        ("a scene with depth", needs is not None and needs.depth is not None),
+    ):
+        if given:
+            raise UsageError(
+                f"places of the field and {other} exclude each other",
+                "--field-nodes",
+                "leave one of them out",
+            )
+    if camera.lenslet_array.lattice != "square":
+        raise UsageError(
+            "a hexagonal lattice has no places of the field yet",
+            "--field-nodes",
+            "take --lenslet, one matrix a lenslet",
+        )
+    plan_at = PlansOfPlaces(camera, **_request(camera, settings, needs))
+    count = None if settings.field_nodes == "auto" else settings.field_nodes
+    nodes = field_nodes(camera, plan_at, count)
+    if nodes.error > plan_at.accuracy:
+        note(
+            f"between {len(nodes.rows)}x{len(nodes.columns)} places of the field columns are off "
+            f"by about {nodes.error:.1g}, more than the accuracy {plan_at.accuracy:.1g}"
+            + ("" if count is None else "; --field-nodes auto takes as many as it needs")
+        )
+    return nodes, [_Job(camera, nodes.told(plan_at(place))) for place in nodes.places]
+
+
 def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     """Compute one matrix into its file."""
     from plenocli.base.budget import budget, one_thread, within
@@ -315,7 +396,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
 
     camera, plan = job.camera, job.plan
     chosen = pif_pieces.layout(plan, task.camera_path)
-    _announce(camera, plan, pif_pieces.cost(plan)[1])
+    _announce(camera, plan, pif_pieces.cost(plan)[1], task.announced)
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
@@ -345,37 +426,50 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     return _summary(str(output), matrix, found, plan)
 
 
-def _write_planes(
-    task: _Task, jobs: list[_Job], planes: DepthPlanes, output: Path | str
-) -> PlanesSummary:
-    """Compute the matrices of all planes into files of their own, then the index; of a failure no
-    new file is left.
+def _write_several(
+    task: _Task, jobs: list[_Job], several: DepthPlanes | FieldNodes, output: Path | str
+) -> PlanesSummary | FieldSummary:
+    """Compute the matrices of all planes or places into files of their own, then the index; of a
+    failure no new file is left.
     """
     from plenocli.files.artefacts import pif_pieces
-    from plenocli.files.artefacts.shards import shard_path, write_planes
+    from plenocli.files.artefacts.shards import shard_path, write_field, write_planes
     from plenocli.files.atomic import check_output
+    from plenocli.forward.accuracy.field_nodes import FieldNodes
 
     files = [shard_path(output, number) for number in range(len(jobs))]
     for job, file in zip(jobs, files):
         check_output(file, overwrite=task.overwrite, inputs=[task.camera_path], suffixes=(".h5",))
         pif_pieces.layout(job.plan, task.camera_path)  # refused before the first is computed
     before = {file for file in files if file.exists()}
-    note(planes.line())
+    note(several.line())
     try:
         made = [_write(task, job, file) for job, file in zip(jobs, files)]
         provenance = _provenance(
             task.camera_path, jobs[0].camera, task.settings, jobs[0].plan, task.command
         )
-        write_planes(output, planes.distances, planes.error, provenance, overwrite=task.overwrite)
+        if isinstance(several, FieldNodes):
+            write_field(output, several, provenance, overwrite=task.overwrite)
+        else:
+            write_planes(
+                output, several.distances, several.error, provenance, overwrite=task.overwrite
+            )
     except BaseException:
         for file in files:
             if file not in before:
                 file.unlink(missing_ok=True)
         raise
+    if isinstance(several, FieldNodes):
+        return FieldSummary(
+            output=str(output),
+            nodes=(len(several.rows), len(several.columns)),
+            interpolation_error=several.error,
+            places=made,
+        )
     return PlanesSummary(
         output=str(output),
-        distances=planes.distances,
-        interpolation_error=planes.error,
+        distances=several.distances,
+        interpolation_error=several.error,
         planes=made,
     )
 
@@ -396,8 +490,13 @@ def _require_output(camera_path: Path | str, output: Path | str | None, overwrit
 def _planned(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> PifPlan:
     from plenocli.forward.accuracy.dial import plan_pif
 
-    return plan_pif(
-        camera,
+    request = _request(camera, settings, needs)
+    return plan_pif(camera, **request, lenslet=settings.lenslet)
+
+
+def _request(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> dict[str, Any]:
+    """What the dial is asked, wherever the lenslet stands."""
+    return dict(
         wavelengths=_wavelengths(camera, settings),
         superpixels=settings.superpixels,
         coherent_ring=settings.coherent_ring,
@@ -405,18 +504,20 @@ def _planned(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> Pi
         model=settings.model,
         dtype=settings.dtype,
         needs=needs,
-        lenslet=settings.lenslet,
     )
 
 
-def _announce(camera: Camera, plan: PifPlan, memory: int) -> None:
-    """Tell the warnings of a plan, and that the work takes long where it does."""
+def _announce(camera: Camera, plan: PifPlan, memory: int, announced: set[str]) -> None:
+    """Tell the warnings of a plan that were not `announced` before, and that the work takes long
+    where it does.
+    """
     from plenocli.forward.accuracy.explain import command_seconds, expectation
 
     beside = command_seconds(camera, plan).beside
     for line in (*plan.warnings, expectation(plan, memory, beside=beside)):
-        if line:
+        if line and line not in announced:
             note(line)
+            announced.add(line)
 
 
 def _provenance(
@@ -437,7 +538,7 @@ def _provenance(
 
 
 def _explained(
-    jobs: list[_Job], planes: DepthPlanes | None, camera_path: Path | str
+    jobs: list[_Job], several: DepthPlanes | FieldNodes | None, camera_path: Path | str
 ) -> PlanSummary:
     """The plan of all matrices; in detail that of the dearest one."""
     from plenocli.files.artefacts import pif_pieces
@@ -448,6 +549,7 @@ def _explained(
         explain,
         planes_table,
     )
+    from plenocli.forward.accuracy.field_nodes import FieldNodes
 
     took = [command_seconds(job.camera, job.plan) for job in jobs]
     costs = [
@@ -466,8 +568,9 @@ def _explained(
     if refusal:
         plan = replace(plan, warnings=(*plan.warnings, f"would be refused: {refusal}"))
     text = explain(plan, costs[dearest].memory, took[dearest])
-    if planes is not None and len(jobs) > 1:
-        text = "\n".join([planes.line(), *planes_table(costs), "", "the dearest:", text])
+    if several is not None and len(jobs) > 1:
+        table = [] if isinstance(several, FieldNodes) else planes_table(costs)
+        text = "\n".join([several.line(), *table, "", "the dearest:", text])
     return PlanSummary(
         plan=text,
         memory=max(cost.memory for cost in costs),
@@ -478,7 +581,7 @@ def _explained(
         superpixels=plan.superpixels,
         coherent_ring=plan.coherent_ring,
         estimated_accuracy=plan.estimated,
-        planes=costs if len(jobs) > 1 else [],
+        planes=costs if len(jobs) > 1 and not isinstance(several, FieldNodes) else [],
     )
 
 

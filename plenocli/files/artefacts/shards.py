@@ -323,7 +323,9 @@ def at_place(nodes: FieldNodes, parts: Sequence[Artefact], place: Place) -> Arte
     A = A.astype(first.data["pif/A"].dtype)
     data = first.data | {"pif/A": A, "pif/column_energy": A.sum(axis=(1, 2), dtype=float)}
     data.pop("pif/singular_values", None)
-    return Artefact("pif", data, {"pif": _without_figures(first)}, first.provenance)
+    attrs = _without_figures(first)
+    attrs["notes"] = (attrs.get("notes") or {}) | {"chief": list(place)}
+    return Artefact("pif", data, {"pif": attrs}, first.provenance)
 
 
 def _without_figures(artefact: Artefact) -> dict[str, Any]:

@@ -2,14 +2,16 @@
 in float64.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.base.progress import note
+from plenocli.base.progress import collected_notes, note
 from plenocli.base.text import by
+from plenocli.forward.accuracy.field_nodes import FieldNodes, Place
 from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, MatrixOrigin, gathered
@@ -29,7 +31,61 @@ def read_lenslet_matrix(path: Path, *, by_band: bool = False) -> LensletMatrix:
     """
     from plenocli.files.artefacts.shards import read_pif
 
-    artefact = read_pif(path)
+    return _lenslet_matrix(read_pif(path), path, by_band=by_band)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldMatrix:
+    """The matrices of a whole array.
+
+    path: of the index of kind pif-field.
+    nodes: places of the field.
+    parts: their matrices.
+    pitch: of the lenslets, m.
+    by_band: as for read_lenslet_matrix.
+    """
+
+    path: Path
+    nodes: FieldNodes
+    parts: list["Artefact"]
+    pitch: float
+    by_band: bool = False
+
+    def at(self, place: Place) -> LensletMatrix:
+        """The matrix of a lenslet at a place (rows, columns; m from the axis)."""
+        from plenocli.files.artefacts.shards import at_place
+
+        mixed = at_place(self.nodes, self.parts, place)
+        with collected_notes():
+            return _lenslet_matrix(mixed, self.path, by_band=self.by_band)
+
+
+def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | None:
+    """The matrices of an index of kind pif-field; None where it is a pif of another kind.
+
+    Raises InputError as read_lenslet_matrix.
+    """
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.shards import PIF_KINDS, read_field
+
+    artefact = read_artefact(path, PIF_KINDS)
+    if artefact.kind != "pif-field":
+        return None
+    nodes, parts = read_field(path, artefact)
+    camera = _camera(parts[0], path)
+    if camera is None:
+        raise InputError("does not say for which camera it is", path, "run simulate-pif again")
+    return FieldMatrix(
+        path=Path(path),
+        nodes=nodes,
+        parts=parts,
+        pitch=camera.lenslet_array.pitch,
+        by_band=by_band,
+    )
+
+
+def _lenslet_matrix(artefact: "Artefact", path: Path, *, by_band: bool) -> LensletMatrix:
+    """As read_lenslet_matrix, of an artefact of kind pif."""
     if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError(
             (
@@ -91,7 +147,8 @@ def _origin(
 ) -> MatrixOrigin | None:
     """What a pif was computed from; None where it does not say, or for a lenslet off the axis."""
     about = artefact.attrs.get("pif", {})
-    if camera is None or "first_pixel" in (about.get("notes") or {}):
+    notes = about.get("notes") or {}
+    if camera is None or "first_pixel" in notes or any(notes.get("chief", ())):
         return None
     return MatrixOrigin(
         camera=camera,

@@ -53,7 +53,8 @@ def what_limits(
             if capture.model == matrix.model
             else max(matrix.model_error or 0.0, capture.model_error or 0.0)
         )
-        error = math.hypot(matrix.estimated, capture.estimated, models)
+        field = (matrix.field_error or 0.0) - (capture.field_error or 0.0)
+        error = math.hypot(matrix.estimated, capture.estimated, models, field)
         reason = (
             f"capture simulated by the {capture.model} model, explained by the {matrix.model} one"
         )

@@ -19,17 +19,22 @@ from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summari
 from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
 from plenocli.files.read.captures import read_superpixels, read_white
 from plenocli.files.read.dictionaries import read_dictionary
-from plenocli.files.read.system_matrices import read_lenslet_matrix
+from plenocli.files.read.system_matrices import (
+    FieldMatrix,
+    read_field_matrix,
+    read_lenslet_matrix,
+)
 from plenocli.files.read.training import files_of, read_training
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
-from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
+from plenocli.stages.inverse.field_classes import estimate_by_class
 from plenocli.stages.inverse.fitted_matrix import likely_cause, with_fitted_camera
 
 if TYPE_CHECKING:
@@ -264,7 +269,7 @@ def run_reconstruct(
 
     try:
         if pif:  # a broken one ends the run here, before any capture
-            _estimators(recipe) if split or not pooled else read_lenslet_matrix(pif, by_band=True)
+            _estimators(recipe) if split or not pooled else _system(recipe)
         with open_pool(workers, scheduler) as pool:
             if split and pooled:
                 _estimators(recipe).elsewhere = partial(_solve_in_pool, recipe, pool)
@@ -274,6 +279,7 @@ def run_reconstruct(
     finally:
         _estimators.cache_clear()
         _finer.cache_clear()
+        _field.cache_clear()
 
 
 def _summary(done: BatchSummary) -> ReconstructSummary:
@@ -322,7 +328,7 @@ def _estimators(recipe: Recipe) -> Estimators:
     if recipe.pif is None:
         raise ValueError("without a pif there is nothing to estimate with")
     settings, learnt = recipe.settings, recipe.settings.dictionary
-    system = read_lenslet_matrix(recipe.pif, by_band=True)
+    system = _system(recipe)
 
     def read_pictures(scene: str | None) -> list[TrainingPicture]:
         return read_training(settings.training, system.object_shape, not_scene=scene)
@@ -334,6 +340,19 @@ def _estimators(recipe: Recipe) -> Estimators:
         None if learnt is None else partial(read_dictionary, learnt, system),
         threads=recipe.threads,
     )
+
+
+def _system(recipe: Recipe) -> LensletMatrix:
+    """The matrix of a recipe with a pif; of a whole array that on its axis."""
+    assert recipe.pif is not None
+    field = _field(recipe)
+    return read_lenslet_matrix(recipe.pif, by_band=True) if field is None else field.at((0.0, 0.0))
+
+
+@lru_cache(maxsize=1)
+def _field(recipe: Recipe) -> FieldMatrix | None:
+    """The matrices of a whole array, where the pif holds such."""
+    return None if recipe.pif is None else read_field_matrix(recipe.pif, by_band=True)
 
 
 @lru_cache(maxsize=1)
@@ -443,18 +462,42 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     )
     count = data.y.shape[:2]
     truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
-    fitted = False
+    field, fitted = _field(recipe), False
+    if settings.fit and field is not None:
+        raise UsageError(
+            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
+            "--fit",
+            "leave it out, or fit the camera first with fit-camera",
+        )
     if settings.fit:
         estimators, fit = with_fitted_camera(estimators, data, capture)
         fitted = fit.accepted
     limits = _limits(estimators, data)
-    if look and not fitted and limits is not None and limits.limited_by == "model":
+    plain = look and not fitted and field is None
+    if plain and limits is not None and limits.limited_by == "model":
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)
     off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
-    found, seen = estimate(
-        estimators, method, data, truth, model_error=off, explain=partial(likely_cause, estimators)
-    )
+    if field is not None:
+        noise = 0.0 if limits is None else limits.noise
+        found, seen = estimate_by_class(
+            field,
+            estimators,
+            method,
+            data,
+            truth,
+            tolerance=max(noise, field.nodes.error),
+            model_error=off,
+        )
+    else:
+        found, seen = estimate(
+            estimators,
+            method,
+            data,
+            truth,
+            model_error=off,
+            explain=partial(likely_cause, estimators),
+        )
     return _solved(
         found.as_picture(system.object_shape),
         settings,

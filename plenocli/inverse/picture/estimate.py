@@ -98,6 +98,7 @@ def estimate(
     *,
     model_error: float = 0.0,
     explain: Explain | None = None,
+    guard: bool = True,
 ) -> tuple[Reconstruction, Seen | None]:
     """The picture behind a capture by a method, and what of the objects can be seen.
 
@@ -105,6 +106,8 @@ def estimate(
     truth: (lenslet_row, lenslet_column, point) chooses the weight with hindsight.
     model_error: of the matrix against this capture by their records, relative.
     explain: says what is likely to be wrong with the camera, where the matrix is not believed.
+    guard: whether detail that does not go on across the lenslets' borders is given up: a few
+        lenslets are too few to tell.
 
     Raises NumericsError where the noise is not known and cannot be found.
     docs/model.md, "Spatial reconstruction".
@@ -141,7 +144,9 @@ def estimate(
         told = estimators.prior.lmmse(belief.level.sigma, data.scene)
         _, left = posterior(told, settled.own, estimators.system.object_shape)
         found = replace(found, sigma=np.maximum(found.sigma, left))
-    found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
+    kept = 1.0
+    if guard:
+        found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
     if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
         # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found
         sigma = of_picture(estimators, data, settled.own, found.value)

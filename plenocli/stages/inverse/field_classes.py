@@ -4,6 +4,7 @@ the matrix of its middle.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 LEAST = 3
 """Lenslets along a class's side, at least."""
-MARGIN = 2
+MARGIN = 6
 """Lenslets around a class that are looked at with it."""
 
 
@@ -62,7 +63,8 @@ def estimate_by_class(
     tolerance: relative change of a matrix that a class may hold.
     """
     count = data.y.shape[0], data.y.shape[1]
-    side = _fewest(field, count, tolerance)
+    side, change = _fewest(field, count, tolerance)
+    off = math.hypot(model_error, change) if change > tolerance else model_error
     classes = list(_classes(count, side))
     note(f"{len(classes)} classes of lenslets, each by the matrix of its middle")
     classes.sort(key=lambda c: np.hypot(*c.place(count, 1.0)))
@@ -71,7 +73,7 @@ def estimate_by_class(
     for each in bar(classes, len(classes), "classes of lenslets"):
         own = estimators.with_matrix(field.at(each.place(count, field.pitch)))
         part = None if truth is None else truth[each.around]
-        found, sees = estimate(own, method, _cut(data, each), part, model_error=model_error)
+        found, sees = estimate(own, method, _cut(data, each), part, model_error=off, guard=False)
         if whole is None:
             method, seen = METHODS[found.method], sees
             shape = (*count, found.value.shape[2])
@@ -84,11 +86,11 @@ def estimate_by_class(
     return whole, seen
 
 
-def _fewest(field: FieldMatrix, count: tuple[int, int], tolerance: float) -> int:
-    """The fewest classes along an axis that hold no more than the tolerance, at the array's corner
-    where matrices change most.
+def _fewest(field: FieldMatrix, count: tuple[int, int], tolerance: float) -> tuple[int, float]:
+    """The fewest classes along an axis that hold no more than the tolerance at the array's corner,
+    where matrices change most, and what they hold.
     """
-    most = max(1, max(count) // LEAST)
+    most, change = max(1, max(count) // LEAST), 0.0
     for side in range(1, most + 1):
         corner = next(_classes(count, side))
         middle = corner.place(count, field.pitch)
@@ -96,12 +98,12 @@ def _fewest(field: FieldMatrix, count: tuple[int, int], tolerance: float) -> int
         here, there = field.at(middle).own, field.at((edge[0], edge[1])).own
         change = float(np.linalg.norm(there - here) / np.linalg.norm(here))
         if change <= tolerance:
-            return side
+            return side, change
     note(
         f"even classes of {LEAST}x{LEAST} lenslets hold changes of {change:.1g} of a matrix, more "
         f"than {tolerance:.1g}"
     )
-    return most
+    return most, change
 
 
 def _classes(count: tuple[int, int], side: int) -> Iterator[_Class]:

@@ -6,6 +6,7 @@ kind pif-planes; or each a place of the field, and an index of kind pif-field.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -282,14 +283,14 @@ def read_field(
     """
     path = Path(path)
     artefact = artefact or read_artefact(path, "pif-field")
+    about = artefact.attrs.get("field", {})
     nodes = FieldNodes(
         rows=artefact.data["field/row"],
         columns=artefact.data["field/column"],
         file=artefact.data["field/file"],
         turn=artefact.data["field/turn"],
-        error=float(artefact.attrs["field"]["error"]),
+        error=float(about.get("error", math.nan)),
     )
-    about = artefact.attrs.get("field", {})
     listed = _named(path, about.get("files"), len(nodes.numbers))
     parts = [read_pif(_same_file(path, listed[number])) for number in nodes.numbers]
     same = ("lenslet_offset", "pixel_shape", "object_shape", "wavelength")

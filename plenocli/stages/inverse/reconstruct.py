@@ -30,7 +30,7 @@ from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.methods.method import Sees
+from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
@@ -477,27 +477,7 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     if plain and limits is not None and limits.limited_by == "model":
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)
-    off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
-    if field is not None:
-        noise = 0.0 if limits is None else limits.noise
-        found, seen = estimate_by_class(
-            field,
-            estimators,
-            method,
-            data,
-            truth,
-            tolerance=max(noise, field.nodes.error),
-            model_error=off,
-        )
-    else:
-        found, seen = estimate(
-            estimators,
-            method,
-            data,
-            truth,
-            model_error=off,
-            explain=partial(likely_cause, estimators),
-        )
+    found, seen = _estimate(field, estimators, method, data, truth, limits)
     return _solved(
         found.as_picture(system.object_shape),
         settings,
@@ -505,6 +485,31 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
         limits=limits,
         block=system.object_shape,
         bands=system.bands,
+    )
+
+
+def _estimate(
+    field: FieldMatrix | None,
+    estimators: Estimators,
+    method: Method,
+    data: Superpixels,
+    truth: np.ndarray | None,
+    limits: Limits | None,
+) -> tuple[Reconstruction, Seen | None]:
+    """The picture by one matrix, or by those of a whole array."""
+    off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+    if field is None:
+        cause = partial(likely_cause, estimators)
+        return estimate(estimators, method, data, truth, model_error=off, explain=cause)
+    noise = 0.0 if limits is None else limits.noise
+    return estimate_by_class(
+        field,
+        estimators,
+        method,
+        data,
+        truth,
+        tolerance=max(noise, field.nodes.error),
+        model_error=off,
     )
 
 

@@ -251,7 +251,7 @@ def test_a_pupil_that_changes_over_the_field_meets_the_oracle(degrees, turn, sha
     place = (middle + round(aside * math.sin(turn)), middle + round(aside * math.cos(turn)))
     chief = chief_ray(camera, *place)
     part = math.hypot(*chief) / corner
-    seen = cut_pupil(shift_of(1 - (1 - share) * part), math.atan2(*chief), coma * part)
+    seen = cut_pupil(shift_of(share) * part, math.atan2(*chief), coma * part)
     plan = plan_pif(
         camera, lenslet=place, accuracy=1e-3, superpixels=(1, 1), coherent_ring=0, dtype="float64"
     )

@@ -64,7 +64,7 @@ from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, sp
 from plenocli.inverse.sparse import dictionary as sparse
 from plenocli.inverse.sparse.dictionary import INCOHERENCE, PULL, Dictionary
 from plenocli.inverse.sparse.learning import advance, learner_for
-from plenocli.inverse.spectra.demultiplexer import Demultiplexer
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
 from plenocli.inverse.spectra.spectra import Spectra
 
 __all__ = [
@@ -290,14 +290,17 @@ def demultiplex(
     white: Capture | SimulatedCapture | None = None,
     reflectance: float = REFERENCE_REFLECTANCE,
     register: str = "auto",
+    camera: Camera | None = None,
 ) -> Spectra:
     """Spectra behind every lenslet of a capture, with their standard deviations.
 
     calibration: with a response.
-    method: "pinv", "single-pixel", "wls", "lmmse", "nnls" or "auto".
+    method: "pinv", "single-pixel", "wls", "lmmse", "nnls", "coupled", "fine" or "auto".
     white: capture of the white reference, which makes reflectances of radiances.
     reflectance: of that reference.
     register: "auto", "on" or "off", whether motion since the calibration is looked for.
+    camera: description of the calibrated camera, from which light of neighbouring lenslets is
+        predicted and taken off; None: it stays.
 
     Raises UsageError for a calibration without a response, InputError where capture and calibration
     do not go together, NumericsError where no lenslet can be demultiplexed.
@@ -307,14 +310,17 @@ def demultiplex(
         raise UsageError("the calibration holds no response", fix="give calibrate narrow bands")
     with one_thread():
         solver = Demultiplexer(
-            calibration, method=method, register=register, ratio=white is not None
+            calibration,
+            method=method,
+            register=register,
+            ratio=white is not None,
+            camera=camera,
         )
         found = solver.estimate(_capture(capture), "capture")
         if white is None:
             return found
-        # without a prior, whose pull would not divide out
-        plain = {"auto": "pinv", "lmmse": "wls"}.get(method, method)
-        return found.relative_to(solver.estimate(_capture(white), "white", plain), reflectance)
+        reference = solver.estimate(_capture(white), "white", method_of_white(method))
+        return found.relative_to(reference, reflectance)
 
 
 def reconstruct(

@@ -20,10 +20,21 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 )
 @click.option(
     "--method",
-    type=click.Choice(["auto", "pinv", "single-pixel", "wls", "lmmse", "nnls"]),
+    type=click.Choice(["auto", "pinv", "single-pixel", "wls", "lmmse", "nnls", "coupled", "fine"]),
     default="auto",
     show_default=True,
-    help="auto takes the one with the least predicted error and says so.",
+    help=(
+        "auto takes the one with the least predicted error and says so; coupled and fine solve "
+        "all lenslets together, with one value or 3x3 behind each."
+    ),
+)
+@click.option(
+    "--camera",
+    type=options.FILE,
+    help=(
+        "Description (.toml) of the calibrated camera, from which the light that lenslets throw "
+        "on their neighbours is predicted and taken off (default: as the calibration has it)."
+    ),
 )
 @click.option(
     "--reference",
@@ -61,6 +72,7 @@ def command(
     *,
     calibration: Path,
     method: str,
+    camera: Path | None,
     reference: Path | None,
     reference_reflectance: float,
     register: str,
@@ -78,12 +90,17 @@ def command(
     Finished ones are skipped on a rerun, a bad one is reported and does not stop the others.
     Lenslets partly off the sensor are NaN.
 
+    A lenslet's light reaches its neighbours' superpixels, which is wrong by one part in a hundred
+    where neighbours differ. Where the camera's description is known (calibrate --camera keeps it,
+    simulate-response too), that light is predicted and taken off.
+
     \b
     Examples:
       plenocli demux chart.NEF --calibration cal.h5 --reference white.NEF -o chart.exr
       plenocli demux captures/*.NEF --calibration cal.h5 --method wls --workers 2 -o spectra/
       plenocli demux captures/*.NEF --calibration cal.h5 --scheduler tcp://10.0.0.1:8786 -o spectra/
       plenocli demux chart.dng --calibration cal.h5 --method single-pixel -o chart.h5
+      plenocli demux chart.dng --calibration cal.h5 --camera camera.toml -o chart.h5
     """
     from plenocli.stages.inverse.demux import Settings, run_demux
 
@@ -96,6 +113,7 @@ def command(
             reference=reference,
             reference_reflectance=reference_reflectance,
             register=register,
+            camera=camera,
         ),
         suffix=f".{suffix}",
         workers=workers,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.read.cameras import described_camera
 from plenocli.forward.sensor.frames import Dark
 from plenocli.inverse.calibration.calibration import (
     Calibration,
@@ -20,6 +21,9 @@ from plenocli.inverse.calibration.calibration import (
     Windows,
 )
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
 
 Datasets = dict[str, np.ndarray]
 Attributes = dict[str, Any]
@@ -51,12 +55,28 @@ def read_calibration(
 
     Raises InputError where the file cannot be read or lacks what is needed.
     """
+    return calibration_of(_read(path, needs, white_image), response=response)
+
+
+def read_described(
+    path: str | Path, *, needs: tuple[str, ...]
+) -> tuple[Calibration, Camera | None]:
+    """A Calibration without its white image, and the camera as it was described to whoever made
+    the file; None: it was not, or by more files than one.
+
+    path, needs: as read_calibration's.
+    """
+    artefact = _read(path, needs, white_image=False)
+    return calibration_of(artefact), described_camera(artefact, path)
+
+
+def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefact:
     artefact = read_artefact(path, "calibration", skip=() if white_image else WHITE_IMAGE)
     for part in needs:
         for name in PARTS[part]:
             if name not in artefact.data:
                 raise _lacks(name, path)
-    return calibration_of(artefact, response=response)
+    return artefact
 
 
 def calibration_of(artefact: Artefact, *, response: bool = True) -> Calibration:

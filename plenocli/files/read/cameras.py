@@ -67,6 +67,22 @@ def require_same_files(camera_path: Name, camera: Camera, artefact: Artefact, wh
             )
 
 
+def described_camera(artefact: Artefact, where: Name) -> Camera | None:
+    """The camera that an artefact says it was made for; None where it does not, or the description
+    needs other files.
+
+    where: the artefact's file.
+    """
+    from plenocli.files.config.camera_file import parse_camera
+
+    try:
+        config = artefact.provenance.config
+        camera = parse_camera(config, where) if config else None
+    except ConfigError:
+        return None
+    return None if camera is None or _named(where, camera) else camera
+
+
 def _named(path: Name, camera: Camera) -> dict[str, Path]:
     lens = camera.main_lens
     return {

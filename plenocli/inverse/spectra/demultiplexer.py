@@ -8,20 +8,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.errors import NumericsError
+from plenocli.base.errors import ConfigError, NumericsError, UsageError
+from plenocli.base.progress import note
 from plenocli.inverse.registration.alignment import align, believed, doubtful, warn_of_misfit
+from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
+from plenocli.inverse.spectra.crosstalk import (
+    Crosstalk,
+    moved_light,
+    require_noise,
+    sensor_of,
+    windows_of,
+)
 from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
 from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
     from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.calibration.calibration import Calibration
-    from plenocli.inverse.registration.alignment import Registration
+    from plenocli.inverse.registration.alignment import Aligned, Registration
+    from plenocli.inverse.registration.motion import Motion
+    from plenocli.inverse.spectra.neighbours import NeighbourLight
     from plenocli.inverse.spectra.spectra import Spectra
 
 Name = str | Path
+TURNS = 2
+"""Looks for motion, each with the neighbours' light as the last left it."""
 
 
 class Demultiplexer:
@@ -38,21 +52,54 @@ class Demultiplexer:
         method: str = "auto",
         register: str = "auto",
         ratio: bool = False,
+        camera: Camera | None = None,
         threads: int = 1,
     ) -> None:
         """Factor a calibration.
 
         calibration: with windows, white, dark and response.
-        method: pinv, single-pixel, wls, lmmse, nnls or auto.
+        method: pinv, single-pixel, wls, lmmse, nnls, coupled, fine or auto.
         register: auto, on or off, whether captures are brought into line with the calibration.
         ratio: whether spectra will be divided by those of a white reference, which a prior's pull
             must not spoil.
+        camera: description of the calibrated camera, from which neighbours' light is predicted;
+            None: lenslets are demultiplexed one by one.
         threads: for factoring the response.
+
+        Raises UsageError where a method needs a camera that there is none of, ConfigError for one
+            that tells no neighbours' light.
         """
         self.method, self.register, self.ratio = method, register, ratio
+        self.neighbours = self._neighbours(calibration, camera)
         self.prior = light_prior(LensletResponses.of(calibration))
         # its superpixels, one for every lenslet, have served
         self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
+
+    def _neighbours(self, calibration: Calibration, camera: Camera | None) -> NeighbourLight | None:
+        """Neighbours' light; a note where there is no telling and nobody insists."""
+        from plenocli.inverse.spectra.neighbours import neighbour_light
+
+        if self.method not in (*NEIGHBOURLY, "auto"):
+            return None
+        if camera is None:
+            if self.method in NEIGHBOURLY:
+                raise UsageError(
+                    f"--method {self.method} predicts neighbours' light from the camera's "
+                    "description, and the calibration holds none",
+                    fix="give --camera",
+                )
+            note(
+                "no description of the camera: neighbours' light is not taken off, and where "
+                "neighbouring lenslets differ errors are larger than stated; give --camera"
+            )
+            return None
+        try:
+            return neighbour_light(camera, calibration)
+        except ConfigError as error:
+            if self.method in NEIGHBOURLY:
+                raise
+            note(f"warning: {error}: lenslets are demultiplexed one by one")
+            return None
 
     def estimate(self, capture: Capture, path: Name, method: str | None = None) -> Spectra:
         """Radiances of one capture, registered to the calibration.
@@ -65,16 +112,74 @@ class Demultiplexer:
         """
         method = method or self.method
         signal, noise = readout(capture, self.responses, path)
-        found = self._aligned(signal, noise, method, path, self.register)
-        tried = found.trace.registration
-        if tried and self.register == "auto" and doubtful(found.residual, tried):
-            found = self._believed(found, tried, signal, noise, method, path)
+        require_noise(noise, method)
+        if self.neighbours is None or noise is None or method not in (*NEIGHBOURLY, "auto"):
+            found = self._alone(signal, noise, method, path)
+        else:
+            found = self._together(self.neighbours, signal, noise, method, path)
         if not np.isfinite(found.value).any():
             raise NumericsError(
                 "no lenslet could be demultiplexed", path, "check exposure and calibration"
             )
         warning = warn_of_misfit(found.residual, found.trace.registration, path)
         return replace(found, trace=replace(found.trace, warning=warning))
+
+    def _alone(self, signal: Readout, noise: Noise | None, method: str, path: Name) -> Spectra:
+        """Lenslet by lenslet."""
+        found = self._aligned(signal, noise, method, path, self.register)
+        tried = found.trace.registration
+        if tried and self.register == "auto" and doubtful(found.residual, tried):
+            return self._believed(found, tried, signal, noise, method, path)
+        return found
+
+    def _together(
+        self, light: NeighbourLight, signal: Readout, noise: Noise, method: str, path: Name
+    ) -> Spectra:
+        """All lenslets at once; motion is looked for in what neighbours did not do, and taken where
+        it explains more.
+        """
+        c = self.responses
+        best = self._crosstalk(c, light, windows_of(c, signal), noise)
+        found: Registration | None = None
+        last = best
+        for _ in range(TURNS if self.register != "off" else 0):
+            aligned = align(c, sensor_of(last.c, last.freed()), noise, self.register, path)
+            tried = aligned.registration
+            if tried is None or tried.motion is None or not tried.corrected:
+                found = found or tried
+                break
+            last = self._moved(light, aligned, tried.motion, signal, noise)
+            if last.first.misfit >= best.first.misfit and self.register == "auto":
+                found = found or replace(tried, corrected=())
+                break
+            best, found = last, tried
+        spectra = best.spectra(method)
+        return replace(spectra, trace=replace(spectra.trace, registration=found))
+
+    def _moved(
+        self,
+        light: NeighbourLight,
+        aligned: Aligned,
+        motion: Motion,
+        signal: Readout,
+        noise: Noise,
+    ) -> Crosstalk:
+        """The capture where its lenslets are, without what else stands between it and the
+        calibration.
+        """
+        c = aligned.responses
+        corrected = aligned.registration.corrected if aligned.registration else ()
+        values = windows_of(c, signal - motion.offset if "offset" in corrected else signal)
+        if "stray light" in corrected:
+            values -= motion.stray * np.nanmean(values, axis=-1, keepdims=True)
+        if "motion" in corrected:
+            light = moved_light(light, self.responses, c, motion)
+        return self._crosstalk(c, light, values, noise)
+
+    def _crosstalk(
+        self, c: LensletResponses, light: NeighbourLight, values: np.ndarray, noise: Noise
+    ) -> Crosstalk:
+        return Crosstalk(c, light, values, noise, prior=self.prior, ratio=self.ratio)
 
     def _believed(
         self,
@@ -122,3 +227,8 @@ class Demultiplexer:
             aligned.stray,
         )
         return replace(found, trace=replace(found.trace, registration=aligned.registration))
+
+
+def method_of_white(method: str) -> str:
+    """The method for a white reference beside captures demultiplexed by `method`."""
+    return {"auto": "pinv", "coupled": "pinv", "fine": "pinv", "lmmse": "wls"}.get(method, method)

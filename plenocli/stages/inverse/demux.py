@@ -18,7 +18,7 @@ from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.inverse.spectra.demultiplexer import Demultiplexer
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary
@@ -32,17 +32,20 @@ Name = str | Path
 class Settings:
     """How captures are demultiplexed.
 
-    method: pinv, single-pixel, wls, lmmse, nnls or auto.
+    method: pinv, single-pixel, wls, lmmse, nnls, coupled, fine or auto.
     reference: capture of the white reference that makes reflectances of radiances, or None.
     reference_reflectance: of the white reference.
     register: auto, on or off, whether captures are brought into line with the calibration
         (plenocli.inverse.registration.alignment).
+    camera: description of the calibrated camera, from which neighbours' light is predicted; None:
+        as the calibration describes it, if it does.
     """
 
     method: str = "auto"
     reference: Path | None = None
     reference_reflectance: float = REFERENCE_REFLECTANCE
     register: str = "auto"
+    camera: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +139,7 @@ def run_demux(
         suffix,
         "spectra are",
         overwrite=overwrite,
-        inputs=[*captures, calibration, settings.reference],
+        inputs=[*captures, calibration, settings.reference, settings.camera],
     )
     # captures are what runs side by side, and the bytes must not depend on how many
     with threadpool_limits(1, "blas"):
@@ -158,7 +161,11 @@ def run_demux(
                 demux_elsewhere,
                 Setup(
                     absolute(calibration),
-                    replace(settings, reference=absolute(settings.reference)),
+                    replace(
+                        settings,
+                        reference=absolute(settings.reference),
+                        camera=absolute(settings.camera),
+                    ),
                     tuple(i["sha256"] for i in job.inputs.values()),
                 ),
             )
@@ -183,7 +190,7 @@ def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> Non
     if not kept:
         return
     ours = _recipe(
-        describe_inputs({"calibration": calibration, "reference": settings.reference}),
+        describe_inputs(_roles(calibration, settings)),
         settings.method,
         settings.register == "off",
     )
@@ -191,7 +198,8 @@ def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> Non
     if old:
         note(
             f"warning: {len(old)} of {len(kept)} finished results in {batch.output} were made "
-            "with another calibration, reference or method, or are damaged, and stay as they are "
+            "with another calibration, reference, camera or method, or are damaged, and stay as "
+            "they are "
             f"({', '.join(old[:3])}{', ...' if len(old) > 3 else ''}): delete them, or pass "
             "--overwrite to make all anew"
         )
@@ -199,21 +207,31 @@ def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> Non
 
 @dataclass(frozen=True)
 class Recipe:
-    """What makes two results of one capture differ: digests of the calibration and the reference,
-    the method asked for, and whether nobody looked for motion.
+    """What makes two results of one capture differ: digests of the calibration, the reference and
+    the camera, the method asked for, and whether nobody looked for motion.
     """
 
     calibration: str | None
     reference: str | None
+    camera: str | None
     method: str
     unregistered: bool
 
 
 def _recipe(inputs: dict[str, Any], method: str, unregistered: bool) -> Recipe:
-    calibration, reference = (
-        inputs.get(role, {}).get("sha256") for role in ("calibration", "reference")
+    calibration, reference, camera = (
+        inputs.get(role, {}).get("sha256") for role in ("calibration", "reference", "camera")
     )
-    return Recipe(calibration, reference, method, unregistered)
+    return Recipe(calibration, reference, camera, method, unregistered)
+
+
+def _roles(calibration: Name, settings: Settings) -> dict[str, Any]:
+    """Files that a result is made from beside its capture."""
+    return {
+        "calibration": calibration,
+        "reference": settings.reference,
+        "camera": settings.camera,
+    }
 
 
 def _recipe_of(target: Path) -> Recipe | None:
@@ -271,18 +289,20 @@ class CaptureDemultiplexer:
         threads: int = 1,
     ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
-        from plenocli.files.read.calibrations import read_calibration
+        from plenocli.files.read.calibrations import read_described
+        from plenocli.files.read.cameras import read_camera
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
-        self.inputs = describe_inputs({"calibration": calibration, "reference": settings.reference})
-        found = read_calibration(
-            calibration, needs=("response", "windows", "white", "dark"), white_image=False
+        self.inputs = describe_inputs(_roles(calibration, settings))
+        found, described = read_described(
+            calibration, needs=("response", "windows", "white", "dark")
         )
         self.solver = Demultiplexer(
             found,
             method=settings.method,
             register=settings.register,
             ratio=settings.reference is not None,
+            camera=described if settings.camera is None else read_camera(settings.camera),
             threads=threads,
         )
         self.reference: Spectra | None = None
@@ -290,11 +310,10 @@ class CaptureDemultiplexer:
             self.reference = self.demux(settings.reference, self._method_of_reference())[0]
 
     def _method_of_reference(self) -> str:
-        """The white reference is demultiplexed without a prior: a prior's pull
-        would not divide out.
+        """The white reference is even, so that lenslets need not know of each other, and is
+        demultiplexed without a prior, whose pull would not divide out.
         """
-        method = self.settings.method
-        return {"auto": "pinv", "lmmse": "wls"}.get(method, method)
+        return method_of_white(self.settings.method)
 
     def demux(self, path: Name, method: str | None = None) -> tuple[Spectra, dict[str, Any]]:
         """Radiances of one capture, registered to the calibration, and its name and digest.

@@ -1,0 +1,317 @@
+"""Radiances of all lenslets together, each with its light on its neighbours' superpixels.
+
+`coupled` has one radiance a lenslet and band, `fine` one for each of 3 x 3 points of its field, the
+answer being their mean: neighbours' light comes from their near edges, which differ from their
+means where edges lie inside fields. docs/model.md, section 9, "Neighbours".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
+from plenocli.inverse.spectra.neighbours import POINTS, NeighbourLight
+
+STEPS = 12
+"""Of a solution, at most: the border and lost pixels take more than one."""
+ENOUGH = 0.02
+"""Standard deviations by which the last step may still have moved an answer."""
+LEAST_CORRELATION = 0.05
+"""Of lenslets beside each other, as the prior takes it."""
+MOST_CORRELATION = 0.98
+FACTOR_SPREAD = 0.5
+"""Standard deviation of a factor of the neighbours' light before a capture is looked at."""
+FACTORS = 0.0, 3.0
+FACTOR_TURNS = 3
+KNOWN_TO = 0.025
+"""Share of what the neighbours' light changes by which the change may be wrong."""
+FINER = 4.0
+"""By which more points than three a side would change an answer less than three instead of one
+did: edges between points.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatticeCapture:
+    """One capture on its lattice.
+
+    values: (lenslet_row, lenslet_column, pixel), NaN where unknown.
+    response: F (pixel, band), of all lenslets or the mean of their own.
+    own: from radiances (lenslet_row, lenslet_column, band), what responses of the lenslets' own add
+        to superpixels by `response`, NaN where one is not known; None: one serves all.
+    response_variance: (pixel, band) of F's entries, or None.
+    noise: of the values.
+    start: (lenslet_row, lenslet_column, band), a first answer without neighbours; NaN: none.
+    """
+
+    values: np.ndarray
+    response: np.ndarray
+    own: Callable[[np.ndarray], np.ndarray] | None
+    response_variance: np.ndarray | None
+    noise: Noise
+    start: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(lenslet_row, lenslet_column, pixel), which values count."""
+        return np.isfinite(self.values) & np.isfinite(self.response).all(axis=-1)
+
+    def variance(self, radiance: np.ndarray) -> np.ndarray:
+        """Of pixels (..., pixel) at radiances (..., band)."""
+        b = np.clip(radiance, 0, None)
+        out = np.asarray(self.noise.variance(b @ np.nan_to_num(self.response).T))
+        if self.response_variance is not None:
+            out = out + b**2 @ np.nan_to_num(self.response_variance).T
+        return np.maximum(out, 1e-12)
+
+    def first(self) -> np.ndarray:
+        """`start`, the mean where it is not known."""
+        middle = np.nanmean(self.start, axis=(0, 1))
+        return np.where(np.isfinite(self.start), self.start, np.nan_to_num(middle))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatticeAnswer:
+    """Radiances of one capture.
+
+    value, sigma: (lenslet_row, lenslet_column, band).
+    points: (lenslet_row, lenslet_column, point * band), of which `value` is the mean.
+    residual: (lenslet_row, lenslet_column), mean square over the expected one.
+    left: (lenslet_row, lenslet_column, pixel), of the values; 0 where unknown.
+    system: that was solved.
+    light: of the neighbours, as it was taken.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray
+    points: np.ndarray
+    residual: np.ndarray
+    left: np.ndarray
+    system: LatticeSystem
+    light: NeighbourLight
+
+    @property
+    def misfit(self) -> float:
+        """Median of the residual."""
+        return float(np.nanmedian(self.residual)) if np.isfinite(self.residual).any() else 0.0
+
+
+def coupled(capture: LatticeCapture, light: NeighbourLight, fit: bool = True) -> LatticeAnswer:
+    """One radiance a lenslet and band, and no prior.
+
+    capture: with its first answer.
+    light: predicted, of the neighbours.
+    fit: whether factors of the neighbours' light are found from the capture.
+    """
+    factors, start = np.ones(len(light.rings)), capture.first()
+    taken = light
+    for _ in range(FACTOR_TURNS if fit else 0):
+        system = _coupled_system(capture, taken)
+        start, left = _solved(system, capture, start)
+        step = _factor_step(system, capture, light, start, left, factors)
+        factors = np.clip(factors + step, *FACTORS)
+        taken = light.weighted(factors)
+        if np.abs(step).max() < 0.01:
+            break
+    system = _coupled_system(capture, taken)
+    points, left = _solved(system, capture, start)
+    return _answer(system, capture, points, left, taken)
+
+
+def fine(capture: LatticeCapture, first: LatticeAnswer) -> LatticeAnswer:
+    """One radiance for each point of a field and band, with the prior that the first answer shows.
+
+    first: by `coupled`.
+    """
+    light = first.light
+    blocks = light.fine(capture.response)
+    blocks = blocks.reshape(*blocks.shape[:2], -1)
+    variance = _stationary(capture, first.value)
+    system = LatticeSystem(blocks, light.offsets, variance, first.value.shape[:2], _prior(first))
+    points, left = _solved(system, capture, np.tile(first.value, (1, 1, POINTS**2)))
+    found = _answer(system, capture, points, left, light)
+    between = (found.value - first.value) / FINER
+    return replace(found, sigma=np.hypot(found.sigma, between))
+
+
+def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAnswer) -> bool:
+    """Whether the capture speaks for points in the fields, by the evidence of both models with the
+    same statistics of lenslets.
+
+    first, second: by `coupled` and by `fine`.
+    """
+    points = second.system.prior
+    assert points is not None
+    lenslets = replace(points, points=1, rho=points.rho**POINTS)
+    scale = np.sqrt(_stationary(capture, first.value) * max(1.0, second.misfit))
+    one, many = (
+        answer.system.surprise(answer.left / scale, answer.points, prior)
+        for answer, prior in ((first, lenslets), (second, points))
+    )
+    return many < one
+
+
+def neighbour_part(answer: LatticeAnswer, response: np.ndarray) -> np.ndarray:
+    """What the neighbours' being other than a lenslet adds to its superpixel, (lenslet_row,
+    lenslet_column, pixel): without it a capture is as if all were alike.
+    """
+    system = answer.system
+    return system.forward(system.mirrored(answer.points)) - answer.value @ np.nan_to_num(response).T
+
+
+def _coupled_system(capture: LatticeCapture, light: NeighbourLight) -> LatticeSystem:
+    start = capture.first()
+    return LatticeSystem(
+        light.coupled(capture.response),
+        light.offsets,
+        _stationary(capture, start),
+        start.shape[:2],
+    )
+
+
+def _stationary(capture: LatticeCapture, radiance: np.ndarray) -> np.ndarray:
+    """Variance (pixel,) at the mean radiance, inf where F is not known."""
+    variance = capture.variance(radiance.mean(axis=(0, 1)))
+    return np.where(np.isfinite(capture.response).all(axis=-1), variance, np.inf)
+
+
+def _left(
+    system: LatticeSystem, capture: LatticeCapture, padded: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """What unknowns do not explain of the superpixels, 0 where nothing is known."""
+    left = capture.values - system.forward(padded)
+    if capture.own is not None:
+        left -= capture.own(_mean(system, points))
+    return np.where(np.isfinite(left) & capture.known, left, 0)
+
+
+def _solved(
+    system: LatticeSystem, capture: LatticeCapture, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(unknowns, what they leave of the superpixels): steps from `points` until they are small
+    beside the noise.
+    """
+    scale = np.sqrt(system.impulse[2]).min()
+    padded = system.mirrored(points)
+    left = _left(system, capture, padded, points)
+    for _ in range(STEPS):
+        step = system.step(left, padded)
+        points = points + step
+        padded = system.mirrored(points)
+        left = _left(system, capture, padded, points)
+        if np.abs(_mean(system, step)).max() < ENOUGH * scale:
+            break
+    return points, left
+
+
+def _mean(system: LatticeSystem, points: np.ndarray) -> np.ndarray:
+    count = system.points**2
+    return points.reshape(*points.shape[:2], count, -1).mean(axis=2)
+
+
+def _answer(
+    system: LatticeSystem,
+    capture: LatticeCapture,
+    points: np.ndarray,
+    left: np.ndarray,
+    light: NeighbourLight,
+) -> LatticeAnswer:
+    value, known = _mean(system, points), capture.known
+    expected = capture.variance(value)
+    count = known.sum(axis=-1)
+    bands = value.shape[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = np.where(count > bands, count - bands, np.nan)
+        residual = np.where(known, left**2 / expected, 0).sum(axis=-1) / freedom
+        # fewer pixels tell less
+        share = capture.response.shape[0] / np.where(count > bands, count, np.nan)
+    power = _error_power(system, capture, value) * share[..., None]
+    power *= max(1.0, float(np.nanmedian(residual)))
+    power += (KNOWN_TO * np.nan_to_num(value - capture.start)) ** 2
+    return LatticeAnswer(
+        value=value,
+        sigma=np.sqrt(power),
+        points=points,
+        residual=residual,
+        left=left,
+        system=system,
+        light=light,
+    )
+
+
+def _error_power(system: LatticeSystem, capture: LatticeCapture, value: np.ndarray) -> np.ndarray:
+    """Variance of each answer: the noise of all pixels that it is made of at their own light, and
+    what a prior leaves.
+    """
+    where, h, posterior = system.impulse
+    squared, radiance = h**2, np.clip(value, 0, None)
+    f, noise = np.nan_to_num(capture.response), capture.noise
+    reach = np.abs(where).max()
+    wide = np.pad(radiance, [(reach, reach), (reach, reach), (0, 0)], mode="symmetric")
+    rows, columns = value.shape[:2]
+    dark = float(np.asarray(noise.variance(np.zeros(1)))[0])
+    out = np.zeros_like(value)
+    for (down, across), part in zip(where, squared):
+        top, left = reach + down, reach + across
+        light = wide[top : top + rows, left : left + columns]
+        out += noise.gain * light @ (part @ f).T + dark * part.sum(axis=-1)
+    if capture.response_variance is not None:
+        own = squared[(where == 0).all(axis=1)][0] @ np.nan_to_num(capture.response_variance)
+        out += radiance**2 @ own.T
+    v = _stationary(capture, value)
+    stationary = (squared * np.where(np.isfinite(v), v, 0)).sum(axis=(0, 2))
+    return out + np.maximum(posterior - stationary, 0)
+
+
+def _factor_step(
+    system: LatticeSystem,
+    capture: LatticeCapture,
+    light: NeighbourLight,
+    points: np.ndarray,
+    left: np.ndarray,
+    factors: np.ndarray,
+) -> np.ndarray:
+    """Gauss-Newton step (ring,) of the factors, radiances eliminated; drawn to 1 where the capture
+    tells little.
+    """
+    padded, weight = system.mirrored(points), capture.known / _stationary(capture, points)
+    blocks, directions = light.coupled(capture.response), []
+    for ring in light.rings:
+        part = np.where(ring[:, None, None], blocks, 0)
+        part[light.own] = -part.sum(axis=0)
+        seen = LatticeSystem(part, light.offsets, np.ones(len(blocks[0])), system.shape)
+        change = np.where(capture.known, seen.forward(padded), 0)
+        lost = system.forward(system.mirrored(system.step(change, padded)))
+        directions.append((change - lost).ravel())
+    j, w = np.array(directions), weight.ravel()
+    chi = max(1.0, float((left.ravel() ** 2 * w).sum() / max(np.count_nonzero(w), 1)))
+    normal = (j * w) @ j.T / chi + np.eye(len(j)) / FACTOR_SPREAD**2
+    right = (j * w) @ left.ravel() / chi + (1 - factors) / FACTOR_SPREAD**2
+    return np.linalg.solve(normal, right)
+
+
+def _prior(first: LatticeAnswer) -> PointPrior:
+    """Of object points, from the radiances of lenslets: their mean, the covariance of bands, and
+    how alike neighbouring lenslets are.
+    """
+    value = first.value
+    mean = value.mean(axis=(0, 1))
+    apart = value - mean
+    flat = apart.reshape(-1, value.shape[-1])
+    noise = np.nan_to_num(first.sigma).reshape(flat.shape) ** 2
+    covariance = flat.T @ flat / len(flat) - np.diag(noise.mean(axis=0))
+    power = (apart**2).mean() or 1.0
+    lag = np.concatenate([(apart[1:] * apart[:-1]).ravel(), (apart[:, 1:] * apart[:, :-1]).ravel()])
+    alike = np.clip(lag.mean() / power if lag.size else 0, LEAST_CORRELATION, MOST_CORRELATION)
+    size, basis = np.linalg.eigh(covariance)
+    size = np.maximum(size, max(1e-4 * size.max(), noise.mean() * 0.01, 1e-12))
+    return PointPrior(
+        mean=mean,
+        inverse=basis @ np.diag(1 / size) @ basis.T,
+        rho=float(alike ** (1 / POINTS)),
+        points=POINTS,
+    )

@@ -1,0 +1,203 @@
+"""Spectra of a capture freed from neighbours' light, and whether that is worth it: methods are
+rehearsed on the capture that the found picture would make. docs/model.md, section 9, "Neighbours".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.base.errors import NumericsError
+from plenocli.inverse.spectra.coupled import (
+    LatticeAnswer,
+    LatticeCapture,
+    coupled,
+    fine,
+    more_likely,
+    neighbour_part,
+)
+from plenocli.inverse.spectra.radiance import Prior, estimate
+from plenocli.inverse.spectra.spectra import Spectra, Trace
+
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.noise import Noise
+    from plenocli.forward.sensor.readout import Readout
+    from plenocli.inverse.registration.motion import Motion
+    from plenocli.inverse.spectra.neighbours import NeighbourLight
+    from plenocli.inverse.spectra.responses import LensletResponses
+
+METHODS = ("coupled", "fine")
+WHOLE = 0.75
+"""Share of its pixels that a lenslet needs to be solved with the others; the rest are solved alone,
+their neighbours' light taken off.
+"""
+BATCH_NUMBERS = 4_000_000
+
+
+class Crosstalk:
+    """One capture with responses, and the neighbours' light of its lenslets.
+
+    c: the responses where the lenslets are.
+    light: of the neighbours, there.
+    values: (lenslet_row, lenslet_column, pixel), NaN where unknown.
+    noise: of the values.
+    prior: of radiance, for the methods without neighbours; None: none.
+    ratio: whether errors of F divide out, as plenocli.inverse.spectra.radiance.estimate has it.
+
+    first: the answer with one radiance a lenslet.
+    """
+
+    def __init__(
+        self,
+        c: LensletResponses,
+        light: NeighbourLight,
+        values: np.ndarray,
+        noise: Noise,
+        *,
+        prior: Prior | None = None,
+        ratio: bool = False,
+    ) -> None:
+        """Solve for one radiance a lenslet."""
+        self.c, self.values, self.noise, self.prior, self.ratio = c, values, noise, prior, ratio
+        response, own = _common(c)
+        self.capture = LatticeCapture(
+            values=values,
+            response=response,
+            own=own,
+            response_variance=None if ratio else c.variance,
+            noise=noise,
+            start=np.moveaxis(self._alone(values, "pinv").value, 0, -1),
+        )
+        self.first: LatticeAnswer = coupled(self.capture, light)
+
+    def _alone(self, values: np.ndarray, method: str) -> Spectra:
+        prior = self.prior if method == "lmmse" else None
+        return estimate(self.c, values, self.noise, method, prior, self.ratio)
+
+    def freed(self) -> np.ndarray:
+        """The values as if every lenslet's neighbours were like itself."""
+        return self.values - neighbour_part(self.first, self.capture.response)
+
+    def spectra(self, method: str) -> Spectra:
+        """By "coupled", "fine" or the best of all, "auto"."""
+        many = self.first if method == "coupled" else fine(self.capture, self.first)
+        if method in METHODS:
+            return self._told(many, method, method, "asked for")
+        finer = more_likely(self.capture, self.first, many)
+        name, answer = ("fine", many) if finer else ("coupled", self.first)
+        error = {name: float(np.nanmean(answer.sigma[self.c.valid] ** 2))}
+        biases = {}
+        for other in ("pinv", "wls", *(["lmmse"] if self.prior else []), "single-pixel"):
+            guess = self._alone(self._noiseless(answer), other)
+            biases[other] = guess.value - np.moveaxis(answer.value, -1, 0)
+            error[other] = float(np.nanmean(guess.sigma**2 + biases[other] ** 2))
+        used = min(error, key=lambda one: error[one])
+        why = "predicted rms error " + ", ".join(f"{m} {np.sqrt(e):.3g}" for m, e in error.items())
+        if used == name:
+            return self._told(answer, "auto", name, why)
+        found = self._alone(self.values, used)
+        sigma = np.hypot(found.sigma, biases[used]).astype(found.sigma.dtype)
+        return _spectra(found, found.value, sigma, found.residual, Trace(asked="auto", reason=why))
+
+    def _noiseless(self, answer: LatticeAnswer) -> np.ndarray:
+        """The capture that an answer makes, as far as it was looked at."""
+        seen = answer.system.forward(answer.system.mirrored(answer.points))
+        if self.capture.own is not None:
+            seen = seen + self.capture.own(answer.value)
+        return np.where(np.isfinite(self.values), seen, np.nan).astype(np.float32)
+
+    def _told(self, answer: LatticeAnswer, asked: str, used: str, why: str) -> Spectra:
+        """An answer as Spectra; lenslets that lost many pixels are solved alone."""
+        share = self.capture.known.mean(axis=-1)
+        value, sigma = (np.moveaxis(part, -1, 0).copy() for part in (answer.value, answer.sigma))
+        part = neighbour_part(answer, self.capture.response)
+        alone = self._alone(self.values - part, "pinv")
+        few = (share < WHOLE) | ~self.c.valid
+        value[:, few], sigma[:, few] = alone.value[:, few], alone.sigma[:, few]
+        residual = answer.residual.astype(np.float32)
+        residual[few] = np.nan if alone.residual is None else alone.residual[few]
+        trace = Trace(asked=asked, reason=why)
+        return _spectra(alone, value, sigma, residual, trace, used)
+
+
+def _spectra(
+    like: Spectra,
+    value: np.ndarray,
+    sigma: np.ndarray,
+    residual: np.ndarray | None,
+    trace: Trace,
+    method: str | None = None,
+) -> Spectra:
+    return Spectra(
+        value=value,
+        sigma=sigma,
+        wavelength=like.wavelength,
+        quantity=like.quantity,
+        method=method or like.method,
+        trace=trace,
+        residual=residual,
+    )
+
+
+def _common(
+    c: LensletResponses,
+) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray] | None]:
+    """(F (pixel, band) of all lenslets, or the mean of a sample of their own; what their own add
+    to superpixels, or None).
+    """
+    from plenocli.inverse.calibration.quality import mean_of_known
+
+    if c.shared:
+        return np.asarray(c.common, float), None
+    mean = np.asarray(mean_of_known(c.at(tuple(part[c.sample] for part in c.sites))), float)
+    step = max(1, BATCH_NUMBERS // mean.size)
+
+    def own(radiance: np.ndarray) -> np.ndarray:
+        out = np.full((*c.valid.shape, len(mean)), np.nan, np.float32)
+        for first in range(0, len(c.sites[0]), step):
+            places = tuple(part[first : first + step] for part in c.sites)
+            apart = c.at(places) - mean
+            out[places] = (apart @ radiance[places][..., None])[..., 0]
+        return out
+
+    return mean, own
+
+
+def windows_of(c: LensletResponses, signal: Readout | np.ndarray) -> np.ndarray:
+    """Superpixels (lenslet_row, lenslet_column, pixel) float32 of a capture, NaN where unknown."""
+    from plenocli.forward.sensor.superpixel import extract
+
+    out = np.full((*c.valid.shape, c.window[0] * c.window[1]), np.nan, np.float32)
+    out[c.sites] = extract(signal, c.corners[:, None], c.window)[:, 0]
+    return out
+
+
+def sensor_of(c: LensletResponses, values: np.ndarray) -> np.ndarray:
+    """The sensor (row, column) that superpixels lie on, NaN between them."""
+    out = np.full(c.dark.mean.shape, np.nan, np.float32)
+    rows, columns = c.window
+    for (row, column), part in zip(c.corners, values[c.sites]):
+        inside = out[max(row, 0) : row + rows, max(column, 0) : column + columns]
+        if inside.shape == (rows, columns):
+            inside[:] = part.reshape(rows, columns)
+    return out
+
+
+def moved_light(
+    light: NeighbourLight, before: LensletResponses, after: LensletResponses, motion: Motion
+) -> NeighbourLight:
+    """Neighbours' light after a motion, as far as whole pixels of the windows did not follow it."""
+    sites = before.sites
+    whole = (after.origin - before.origin)[sites]
+    return light.moved((motion.at(before.centres[sites]) - whole).mean(axis=0), before.window)
+
+
+def require_noise(noise: Noise | None, method: str) -> None:
+    """Refuse a method that weighs pixels where their noise is not known."""
+    if noise is None and method in METHODS:
+        raise NumericsError(
+            f"{method} weighs pixels by their noise, which is not known",
+            fix="give the sensor's gain and read noise (calibrate --camera) or use pinv",
+        )

@@ -23,12 +23,11 @@ ENOUGH = 0.02
 LEAST_CORRELATION = 0.05
 """Of lenslets beside each other, as the prior takes it."""
 MOST_CORRELATION = 0.98
-FACTOR_SPREAD = 0.5
-"""Standard deviation of a factor of the neighbours' light before a capture is looked at."""
-FACTORS = 0.0, 3.0
-FACTOR_TURNS = 3
-KNOWN_TO = 0.025
-"""Share of what the neighbours' light changes by which the change may be wrong."""
+MOST = 2.0
+"""Standard deviations by which neighbours' light is changed at most."""
+TURNS = 3
+KNOWN_TO = 0.035
+"""Share of what neighbours' light changes, over the array, by which the change may be wrong."""
 FINER = 4.0
 """By which more points than three a side would change an answer less than three instead of one
 did: edges between points.
@@ -105,17 +104,16 @@ def coupled(capture: LatticeCapture, light: NeighbourLight, fit: bool = True) ->
 
     capture: with its first answer.
     light: predicted, of the neighbours.
-    fit: whether factors of the neighbours' light are found from the capture.
+    fit: whether its changes are fitted to the capture.
     """
-    factors, start = np.ones(len(light.rings)), capture.first()
-    taken = light
-    for _ in range(FACTOR_TURNS if fit else 0):
+    amounts, start, taken = np.zeros(len(light.changes)), capture.first(), light
+    for _ in range(TURNS if fit else 0):
         system = _coupled_system(capture, taken)
         start, left = _solved(system, capture, start)
-        step = _factor_step(system, capture, light, start, left, factors)
-        factors = np.clip(factors + step, *FACTORS)
-        taken = light.weighted(factors)
-        if np.abs(step).max() < 0.01:
+        step = _change_step(system, capture, light, start, left, amounts)
+        amounts = np.clip(amounts + step, -MOST, MOST)
+        taken = light.changed(amounts)
+        if np.abs(step).max() < 0.02:
             break
     system = _coupled_system(capture, taken)
     points, left = _solved(system, capture, start)
@@ -231,7 +229,8 @@ def _answer(
         share = capture.response.shape[0] / np.where(count > bands, count, np.nan)
     power = _error_power(system, capture, value) * share[..., None]
     power *= max(1.0, float(np.nanmedian(residual)))
-    power += (KNOWN_TO * np.nan_to_num(value - capture.start)) ** 2
+    taken_off = np.nan_to_num(value - capture.start)
+    power += KNOWN_TO**2 * (taken_off**2).mean(axis=(0, 1))
     return LatticeAnswer(
         value=value,
         sigma=np.sqrt(power),
@@ -267,31 +266,28 @@ def _error_power(system: LatticeSystem, capture: LatticeCapture, value: np.ndarr
     return out + np.maximum(posterior - stationary, 0)
 
 
-def _factor_step(
+def _change_step(
     system: LatticeSystem,
     capture: LatticeCapture,
     light: NeighbourLight,
     points: np.ndarray,
     left: np.ndarray,
-    factors: np.ndarray,
+    amounts: np.ndarray,
 ) -> np.ndarray:
-    """Gauss-Newton step (ring,) of the factors, radiances eliminated; drawn to 1 where the capture
-    tells little.
+    """Gauss-Newton step (change,) of the amounts by which light is changed, radiances eliminated;
+    drawn to none where the capture tells little.
     """
-    padded, weight = system.mirrored(points), capture.known / _stationary(capture, points)
-    blocks, directions = light.coupled(capture.response), []
-    for ring in light.rings:
-        part = np.where(ring[:, None, None], blocks, 0)
-        part[light.own] = -part.sum(axis=0)
-        seen = LatticeSystem(part, light.offsets, np.ones(len(blocks[0])), system.shape)
-        change = np.where(capture.known, seen.forward(padded), 0)
+    padded, variance = system.mirrored(points), _stationary(capture, points)
+    seen, directions = np.ones(len(variance)), []
+    for blocks in light.coupled_changes():
+        change = LatticeSystem(blocks, light.offsets, seen, system.shape).forward(padded)
+        change = np.where(capture.known, change, 0)
         lost = system.forward(system.mirrored(system.step(change, padded)))
         directions.append((change - lost).ravel())
-    j, w = np.array(directions), weight.ravel()
+    j, w = np.array(directions), (capture.known / variance).ravel()
     chi = max(1.0, float((left.ravel() ** 2 * w).sum() / max(np.count_nonzero(w), 1)))
-    normal = (j * w) @ j.T / chi + np.eye(len(j)) / FACTOR_SPREAD**2
-    right = (j * w) @ left.ravel() / chi + (1 - factors) / FACTOR_SPREAD**2
-    return np.linalg.solve(normal, right)
+    normal = (j * w) @ j.T / chi + np.eye(len(j))
+    return np.linalg.solve(normal, (j * w) @ left.ravel() / chi - amounts)
 
 
 def _prior(first: LatticeAnswer) -> PointPrior:

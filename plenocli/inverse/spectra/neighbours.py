@@ -28,6 +28,12 @@ DIM = 0.01
 """Share of a band's brightest pixel below which nothing is scaled."""
 KNOWN_TO = 0.03
 """Accuracy that is asked of the prediction."""
+FACTOR_SPREAD = 0.5
+"""Of the neighbours' light, near and far: standard deviation of a factor before a capture is looked
+at.
+"""
+OPTICS_SPREAD = 0.01
+"""The same of the sensor's distance and the filters' size, relative."""
 UNLIKE = 0.5
 """Relative (L2) difference of predicted and measured F from which the description is another's."""
 
@@ -39,30 +45,22 @@ class NeighbourLight:
 
     offsets: (superpixel, 2), rows and columns from the lenslet's own, which is among them.
     light: (superpixel, pixel, point, band), points of the field row by row.
+    changes: (change, superpixel, pixel, point, band), what may be wrong with it, by one standard
+        deviation.
     """
 
     offsets: np.ndarray
     light: np.ndarray
+    changes: np.ndarray
 
     @property
-    def own(self) -> np.ndarray:
-        """(superpixel,), which of them is the lenslet's own."""
-        return (self.offsets == 0).all(axis=1)
+    def own(self) -> int:
+        """Which superpixel is the lenslet's own."""
+        return int(np.flatnonzero((self.offsets == 0).all(axis=1))[0])
 
-    @property
-    def rings(self) -> np.ndarray:
-        """(ring, superpixel): those beside the own one, and those further away."""
-        far = np.abs(self.offsets).max(axis=1)
-        return np.stack([far == 1, far > 1])
-
-    def weighted(self, factors: np.ndarray) -> NeighbourLight:
-        """With factors (ring,) of the neighbours' light, the sum over superpixels kept."""
-        weight = 1 + (np.asarray(factors) - 1) @ self.rings
-        light = self.light * weight[:, None, None, None]
-        own = np.flatnonzero(self.own)[0]
-        lost = (self.light - light).sum(axis=(0, 2)) / light.shape[2]
-        light[own] = light[own] + lost[:, None]
-        return replace(self, light=light)
+    def changed(self, amounts: np.ndarray) -> NeighbourLight:
+        """With `changes` by amounts (change,), in standard deviations."""
+        return replace(self, light=self.light + np.tensordot(amounts, self.changes, 1))
 
     def moved(self, shift: np.ndarray, window: tuple[int, int]) -> NeighbourLight:
         """Displaced by parts of a pixel.
@@ -77,19 +75,24 @@ class NeighbourLight:
         reach = np.abs(self.offsets).max(axis=0)
         first = (self.offsets + reach) * np.array(window)
         tall, wide = (2 * reach + 1) * np.array(window)
-        light = np.empty_like(self.light)
-        for place in np.ndindex(self.light.shape[2:]):
-            picture = np.zeros((tall, wide))
-            parts = [
-                (slice(row, row + window[0]), slice(column, column + window[1]))
-                for row, column in first
-            ]
-            for k, part in enumerate(parts):
-                picture[part] = self.light[(k, slice(None), *place)].reshape(window)
-            picture = displaced(picture, shift, order=DEGREE)
-            for k, part in enumerate(parts):
-                light[(k, slice(None), *place)] = picture[part].ravel()
-        return replace(self, light=light)
+        parts = [
+            (slice(row, row + window[0]), slice(column, column + window[1]))
+            for row, column in first
+        ]
+
+        def moved(light: np.ndarray) -> np.ndarray:
+            out = np.empty_like(light)
+            for place in np.ndindex(light.shape[2:]):
+                picture = np.zeros((tall, wide))
+                for k, part in enumerate(parts):
+                    picture[part] = light[(k, slice(None), *place)].reshape(window)
+                picture = displaced(picture, shift, order=DEGREE)
+                for k, part in enumerate(parts):
+                    out[(k, slice(None), *place)] = picture[part].ravel()
+            return out
+
+        changes = np.stack([moved(change) for change in self.changes])
+        return replace(self, light=moved(self.light), changes=changes)
 
     def coupled(self, response: np.ndarray) -> np.ndarray:
         """F of each superpixel for one radiance a lenslet, F being their sum.
@@ -98,9 +101,16 @@ class NeighbourLight:
 
         Returns (superpixel, pixel, band).
         """
-        blocks = self.light.sum(axis=2)
+        return self._kept(self.light.sum(axis=2), np.nan_to_num(response))
+
+    def coupled_changes(self) -> np.ndarray:
+        """What `changes` do to `coupled`: (change, superpixel, pixel, band)."""
+        return np.stack([self._kept(change.sum(axis=2), 0.0) for change in self.changes])
+
+    def _kept(self, blocks: np.ndarray, total: np.ndarray | float) -> np.ndarray:
+        """Blocks whose sum is `total` by what the own one has."""
         blocks[self.own] = 0
-        blocks[self.own] = np.nan_to_num(response) - blocks.sum(axis=0)
+        blocks[self.own] = total - blocks.sum(axis=0)
         return blocks
 
     def fine(self, response: np.ndarray) -> np.ndarray:
@@ -121,27 +131,10 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
 
     Raises ConfigError where there is no prediction for these lenslets, or it is none of them.
     """
-    from plenocli.forward.accuracy.dial import pif_builder
-    from plenocli.inverse.calibration.calibration import there
-
-    wavelengths = there(calibration.response).wavelengths
-    measured = _typical(calibration)
     _check(camera, calibration)
-    sampled = _in_thirds(camera)
-    bands, offsets = [], np.zeros((0, 2), int)
-    for wavelength in wavelengths:
-        builder = pif_builder(
-            sampled, float(wavelength), superpixels=(REACH, REACH), accuracy=KNOWN_TO
-        )
-        offsets = builder.offsets
-        matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
-        bands.append(_thirds(matrix, sampled))
-    light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
+    measured = _typical(calibration)
+    offsets, light = _predicted(camera, calibration)
     total = light.sum(axis=(0, 2))
-    scale = np.nansum(measured, axis=0) / np.maximum(
-        np.where(np.isfinite(measured), total, 0).sum(axis=0), 1e-300
-    )
-    light, total = light * scale, total * scale
     apart = np.linalg.norm(np.nan_to_num(measured - total)) / np.linalg.norm(
         np.nan_to_num(measured)
     )
@@ -151,9 +144,52 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
             "camera",
             "give the description of the camera that was calibrated",
         )
+    changes = [
+        np.where((far == ring)[:, None, None, None], FACTOR_SPREAD * light, 0)
+        for far in [np.minimum(np.abs(offsets).max(axis=1), 2)]
+        for ring in (1, 2)
+    ]
+    changes += [_predicted(other, calibration)[1] - light for other in _other_optics(camera)]
     share = light.sum(axis=(1, 2)) / light.sum(axis=(0, 1, 2))
     kept = (share.max(axis=1) >= LEAST_SHARE) | (offsets == 0).all(axis=1)
-    return NeighbourLight(offsets=offsets[kept], light=light[kept])
+    return NeighbourLight(
+        offsets=offsets[kept], light=light[kept], changes=np.stack(changes)[:, kept]
+    )
+
+
+def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
+    band as the calibrated response.
+    """
+    from plenocli.forward.accuracy.dial import pif_builder
+    from plenocli.inverse.calibration.calibration import there
+
+    sampled, measured, bands = _in_thirds(camera), _typical(calibration), []
+    offsets = np.zeros((0, 2), int)
+    for wavelength in there(calibration.response).wavelengths:
+        builder = pif_builder(
+            sampled, float(wavelength), superpixels=(REACH, REACH), accuracy=KNOWN_TO
+        )
+        offsets = builder.offsets
+        matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
+        bands.append(_thirds(matrix, sampled))
+    light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
+    known = np.where(np.isfinite(measured), light.sum(axis=(0, 2)), 0).sum(axis=0)
+    return offsets, light * (np.nansum(measured, axis=0) / np.maximum(known, 1e-300))
+
+
+def _other_optics(camera: Camera) -> list[Camera]:
+    """The camera with a sensor a little further away, and with a little larger filters or pupil."""
+    filters, lens = camera.filter_array, camera.main_lens
+    pupil = (
+        {"main_lens.aperture_diameter": lens.aperture_diameter * (1 + OPTICS_SPREAD)}
+        if filters is None or filters.size is None
+        else {"filter_array.size": filters.size * (1 + OPTICS_SPREAD)}
+    )
+    return [
+        camera.replace(**{"sensor.distance": camera.sensor.distance * (1 + OPTICS_SPREAD)}),
+        camera.replace(**pupil),
+    ]
 
 
 def _typical(calibration: Calibration) -> np.ndarray:

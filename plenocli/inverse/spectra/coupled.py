@@ -274,20 +274,48 @@ def _change_step(
     left: np.ndarray,
     amounts: np.ndarray,
 ) -> np.ndarray:
-    """Gauss-Newton step (change,) of the amounts by which light is changed, radiances eliminated;
-    drawn to none where the capture tells little.
+    """Gauss-Newton step (change,) of the amounts by which light is changed; drawn to none where the
+    capture tells little.
+    """
+    normal, right = _directions(
+        system, capture, points, left, light.coupled_changes(), light.offsets
+    )
+    return np.linalg.solve(normal + np.eye(len(normal)), right - amounts)
+
+
+def shift_step(capture: LatticeCapture, answer: LatticeAnswer, slopes: np.ndarray) -> np.ndarray:
+    """Gauss-Newton step (rows, columns) px of the superpixels' displacement.
+
+    slopes: (2, pixel, band), of F by displacement, per px.
+    """
+    own = np.zeros((1, 2), int)
+    normal, right = _directions(
+        answer.system, capture, answer.points, answer.left, slopes[:, None], own
+    )
+    return np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+
+
+def _directions(
+    system: LatticeSystem,
+    capture: LatticeCapture,
+    points: np.ndarray,
+    left: np.ndarray,
+    directions: np.ndarray,
+    offsets: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of amounts of directions (direction, block, pixel, unknown) in which blocks
+    may be changed, radiances eliminated.
     """
     padded, variance = system.mirrored(points), _stationary(capture, points)
-    seen, directions = np.ones(len(variance)), []
-    for blocks in light.coupled_changes():
-        change = LatticeSystem(blocks, light.offsets, seen, system.shape).forward(padded)
+    seen, lines = np.ones(len(variance)), []
+    for blocks in directions:
+        change = LatticeSystem(blocks, offsets, seen, system.shape).forward(padded)
         change = np.where(capture.known, change, 0)
         lost = system.forward(system.mirrored(system.step(change, padded)))
-        directions.append((change - lost).ravel())
-    j, w = np.array(directions), (capture.known / variance).ravel()
+        lines.append((change - lost).ravel())
+    j, w = np.array(lines), (capture.known / variance).ravel()
     chi = max(1.0, float((left.ravel() ** 2 * w).sum() / max(np.count_nonzero(w), 1)))
-    normal = (j * w) @ j.T / chi + np.eye(len(j))
-    return np.linalg.solve(normal, (j * w) @ left.ravel() / chi - amounts)
+    return (j * w) @ j.T / chi, (j * w) @ left.ravel() / chi
 
 
 def _prior(first: LatticeAnswer) -> PointPrior:

@@ -17,6 +17,7 @@ from plenocli.inverse.spectra.coupled import (
     fine,
     more_likely,
     neighbour_part,
+    shift_step,
 )
 from plenocli.inverse.spectra.radiance import Prior, estimate
 from plenocli.inverse.spectra.spectra import Spectra, Trace
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.registration.motion import Motion
-    from plenocli.inverse.spectra.neighbours import NeighbourLight
+    from plenocli.inverse.spectra.neighbours import MovingResponse, NeighbourLight
     from plenocli.inverse.spectra.responses import LensletResponses
 
 METHODS = ("coupled", "fine")
@@ -75,6 +76,10 @@ class Crosstalk:
     def _alone(self, values: np.ndarray, method: str) -> Spectra:
         prior = self.prior if method == "lmmse" else None
         return estimate(self.c, values, self.noise, method, prior, self.ratio)
+
+    def shift_step(self, moving: MovingResponse, shift: np.ndarray) -> np.ndarray:
+        """By how much (2,) px the superpixels lie elsewhere than at `shift`."""
+        return shift_step(self.capture, self.first, np.nan_to_num(moving.slopes(shift)))
 
     def freed(self) -> np.ndarray:
         """The values as if every lenslet's neighbours were like itself."""
@@ -185,13 +190,11 @@ def sensor_of(c: LensletResponses, values: np.ndarray) -> np.ndarray:
     return out
 
 
-def moved_light(
-    light: NeighbourLight, before: LensletResponses, after: LensletResponses, motion: Motion
-) -> NeighbourLight:
-    """Neighbours' light after a motion, as far as whole pixels of the windows did not follow it."""
+def displacement(before: LensletResponses, after: LensletResponses, motion: Motion) -> np.ndarray:
+    """Mean displacement (2,) px of a motion that whole pixels of the windows did not follow."""
     sites = before.sites
     whole = (after.origin - before.origin)[sites]
-    return light.moved((motion.at(before.centres[sites]) - whole).mean(axis=0), before.window)
+    return (motion.at(before.centres[sites]) - whole).mean(axis=0)
 
 
 def require_noise(noise: Noise | None, method: str) -> None:

@@ -14,7 +14,7 @@ from plenocli.inverse.registration.alignment import align, believed, doubtful, w
 from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
 from plenocli.inverse.spectra.crosstalk import (
     Crosstalk,
-    moved_light,
+    displacement,
     require_noise,
     sensor_of,
     windows_of,
@@ -30,10 +30,12 @@ if TYPE_CHECKING:
     from plenocli.inverse.calibration.calibration import Calibration
     from plenocli.inverse.registration.alignment import Aligned, Registration
     from plenocli.inverse.registration.motion import Motion
-    from plenocli.inverse.spectra.neighbours import NeighbourLight
+    from plenocli.inverse.spectra.neighbours import MovingResponse, NeighbourLight
     from plenocli.inverse.spectra.spectra import Spectra
 
 Name = str | Path
+LEAST_STEP = 0.002
+"""px, of a displacement that is worth another solution."""
 TURNS = 2
 """Looks for motion, each with the neighbours' light as the last left it."""
 
@@ -71,6 +73,7 @@ class Demultiplexer:
         """
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
+        self.moving = _moving(calibration, camera) if self.neighbours else None
         self.prior = light_prior(LensletResponses.of(calibration))
         # its superpixels, one for every lenslet, have served
         self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
@@ -143,7 +146,11 @@ class Demultiplexer:
         found: Registration | None = None
         last = best
         for _ in range(TURNS if self.register != "off" else 0):
-            aligned = align(c, sensor_of(last.c, last.freed()), noise, self.register, path)
+            plane = sensor_of(last.c, last.freed())
+            aligned = align(c, plane, noise, self.register, path)
+            if aligned.registration and "motion" in aligned.registration.corrected:
+                # what moved responses have wrong in shape passes for an offset and stray light
+                aligned = align(c, plane, noise, self.register, path, levels=False)
             tried = aligned.registration
             if tried is None or tried.motion is None or not tried.corrected:
                 found = found or tried
@@ -172,9 +179,19 @@ class Demultiplexer:
         values = windows_of(c, signal - motion.offset if "offset" in corrected else signal)
         if "stray light" in corrected:
             values -= motion.stray * np.nanmean(values, axis=-1, keepdims=True)
-        if "motion" in corrected:
-            light = moved_light(light, self.responses, c, motion)
-        return self._crosstalk(c, light, values, noise)
+        if "motion" not in corrected:
+            return self._crosstalk(c, light, values, noise)
+        shift = displacement(self.responses, c, motion)
+        if self.moving is None or not c.shared:
+            return self._crosstalk(c, light.moved(shift, c.window), values, noise)
+        for last in (False, False, True):
+            c = replace(c, response=self.moving.at(shift).astype(np.float32))
+            found = self._crosstalk(c, light.moved(shift, c.window), values, noise)
+            step = np.clip(found.shift_step(self.moving, shift), -0.1, 0.1)
+            if last or np.abs(step).max() < LEAST_STEP:
+                break
+            shift = shift + step
+        return found
 
     def _crosstalk(
         self, c: LensletResponses, light: NeighbourLight, values: np.ndarray, noise: Noise
@@ -227,6 +244,18 @@ class Demultiplexer:
             aligned.stray,
         )
         return replace(found, trace=replace(found.trace, registration=aligned.registration))
+
+
+def _moving(calibration: Calibration, camera: Camera | None) -> MovingResponse | None:
+    """The response of all lenslets where it can be displaced by prediction."""
+    from plenocli.inverse.spectra.neighbours import MovingResponse
+
+    if camera is None or not LensletResponses.of(calibration).shared:
+        return None
+    try:
+        return MovingResponse(camera, calibration)
+    except ConfigError:
+        return None
 
 
 def method_of_white(method: str) -> str:

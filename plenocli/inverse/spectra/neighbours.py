@@ -192,6 +192,52 @@ def _other_optics(camera: Camera) -> list[Camera]:
     ]
 
 
+class MovingResponse:
+    """What one response of all lenslets becomes where the light is displaced by parts of a pixel:
+    predicted in closed form, as sampled edges of filters tell too little to be interpolated.
+
+    camera: its description.
+    calibration: with one response for all.
+
+    Raises ConfigError where there is no closed form.
+    """
+
+    def __init__(self, camera: Camera, calibration: Calibration) -> None:
+        """Predict the response where it is."""
+        from plenocli.forward.propagation.response import valid_for
+
+        why = valid_for(camera, "fresnel")
+        if why is not None or calibration.sensor.cfa != "mono":
+            raise ConfigError(why or "a colour filter array", "camera", "leave it to splines")
+        self.camera, self.measured = camera, _typical(calibration)
+        from plenocli.inverse.calibration.calibration import there
+
+        self.wavelengths = there(calibration.response).wavelengths
+        here = self._even(np.zeros(2))
+        self.scale = np.nansum(self.measured, axis=0) / here.sum(axis=0)
+        self.here = here * self.scale
+
+    def _even(self, displacement: np.ndarray) -> np.ndarray:
+        from plenocli.forward.propagation.response import uniform_response
+
+        found = [
+            uniform_response(self.camera, float(w), "fresnel", [-displacement])[0]
+            for w in self.wavelengths
+        ]
+        return np.stack(found, axis=-1)
+
+    def at(self, displacement: np.ndarray) -> np.ndarray:
+        """F (pixel, band) with the light displaced by (rows, columns) px."""
+        return self.measured + self._even(displacement) * self.scale - self.here
+
+    def slopes(self, displacement: np.ndarray, step: float = 0.02) -> np.ndarray:
+        """Derivatives (2, pixel, band) of `at` by rows and columns, per px."""
+        ways = step * np.eye(2)
+        return np.stack(
+            [(self.at(displacement + w) - self.at(displacement - w)) / (2 * step) for w in ways]
+        )
+
+
 def _typical(calibration: Calibration) -> np.ndarray:
     """F (pixel, band) of all lenslets, or the mean of their own ones."""
     from plenocli.inverse.calibration.calibration import there

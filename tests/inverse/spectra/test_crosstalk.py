@@ -1,0 +1,206 @@
+"""Checkerboards of spectra through a simulated camera, demultiplexed with a description that is not
+quite its own.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plenocli.api as pc
+from plenocli.base.errors import ConfigError, NumericsError, UsageError
+from plenocli.forward.accuracy.dial import pif_builder
+from plenocli.forward.scene.light import Quadrature, narrow_band
+from plenocli.forward.scene.scenes import Uniform
+from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
+from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simulate_capture
+from plenocli.inverse.calibration.measure import NarrowBands, calibrate
+from plenocli.inverse.spectra.crosstalk import METHODS, Crosstalk, windows_of
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer
+from plenocli.inverse.spectra.neighbours import neighbour_light
+from plenocli.inverse.spectra.radiance import readout
+from plenocli.inverse.spectra.responses import LensletResponses
+
+SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
+COUNT = (10, 12)
+
+
+class Mosaic:
+    """Every lenslet another reflectance in each band; `offset` lenslets moves its edges."""
+
+    spectral = True
+
+    def __init__(self, bands, seed, offset=0.0):
+        self.bands, self.offset = list(bands), offset
+        size = (len(self.bands), COUNT[0] + 1, COUNT[1] + 1)
+        self.values = np.random.default_rng(seed).uniform(0.05, 0.9, size)
+
+    def at(self, wavelength, rows, columns):
+        i, j = (
+            np.floor((np.arange(n) + 0.5) / n * count + self.offset).astype(int)
+            for n, count in zip((rows, columns), COUNT)
+        )
+        return self.values[self.bands.index(wavelength)][i][:, j].astype(np.float32)
+
+    def truth(self):
+        fine = 30
+        pictures = [self.at(w, COUNT[0] * fine, COUNT[1] * fine) for w in self.bands]
+        return np.array(
+            [one.reshape(COUNT[0], fine, COUNT[1], fine).mean((1, 3)) for one in pictures]
+        )
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """(camera, calibration, white, shoot): a real camera whose fields have more points, filters 0.5
+    % larger and the sensor 0.5 % further away than its description says.
+    """
+    described = pc.read_camera(SAMPLES / "seed_spectral.toml").replace(
+        **{
+            "lenslet_array.count": COUNT,
+            "sensor.pixels_per_lenslet": (20, 20),
+            "sensor.pixel_pitch": 5.2e-6,
+        }
+    )
+    camera = described.replace(
+        **{
+            "object.samples_per_lenslet": (15, 15),
+            "sensor.distance": described.sensor.distance * 1.005,
+            "filter_array.size": described.filter_array.size * 1.005,
+        }
+    )
+    bands, matrices = camera.light.wavelengths, {}
+    for wavelength in bands:
+        builder = pif_builder(camera, wavelength, superpixels=(3, 3), model="fresnel")
+        blocks = np.concatenate([block for _, block in builder.blocks()], axis=2)
+        matrices[wavelength] = StoredMatrix(blocks, builder.offsets)
+    light = Quadrature(wavelengths=np.array(bands), photons=np.ones(len(bands)))
+
+    def shoot(scene, source=light, seed=0, exposure=1.0):
+        options = ExposureOptions(seed=seed, exposure=exposure * camera.light.white_exposure)
+        return simulate_capture(camera, source, scene, options, matrices=matrices).capture
+
+    white = shoot(Uniform(REFERENCE_REFLECTANCE), seed=1)
+    narrow = {
+        w: [shoot(Uniform(REFERENCE_REFLECTANCE), narrow_band(w, 0.0), 10 * k + n) for n in (2, 3)]
+        for k, w in enumerate(bands)
+    }
+    calibration = calibrate(
+        [white],
+        darks=[shoot(Uniform(0.0), seed=99)],
+        bands=NarrowBands(wavelengths=bands, captures=lambda w: narrow[w]),
+        camera=described,
+    ).calibration
+    return described, calibration, white, shoot
+
+
+@pytest.fixture(scope="module")
+def solve(bench):
+    """solve(shot, method): reflectances, by one prediction for all."""
+    camera, calibration, white, _ = bench
+    solver = Demultiplexer(calibration, camera=camera, ratio=True)
+    reference = solver.estimate(white, "white", "pinv")
+
+    def solved(shot, method="auto"):
+        return solver.estimate(shot, "x", method).relative_to(reference, REFERENCE_REFLECTANCE)
+
+    return solved
+
+
+@pytest.fixture(scope="module")
+def checkerboard(bench):
+    camera, _, _, shoot = bench
+    scene = Mosaic(camera.light.wavelengths, 5)
+    return scene.truth(), shoot(scene, seed=7)
+
+
+def errors(found, truth):
+    """(root mean square error, that over the stated one) of lenslets that are not at the border."""
+    inner = (slice(None), slice(1, -1), slice(1, -1))
+    error = (found.value - truth)[inner]
+    return np.sqrt((error**2).mean()), np.sqrt(((error / found.sigma[inner]) ** 2).mean())
+
+
+def test_a_checkerboard_is_five_times_better_and_says_how_good(solve, checkerboard):
+    truth, shot = checkerboard
+    plain, found = solve(shot, "pinv"), solve(shot)
+    worse, z_worse = errors(plain, truth)
+    error, z = errors(found, truth)
+    assert found.method == "coupled" and "single-pixel" in found.trace.reason
+    assert error < worse / 5 and error < 0.004
+    assert 0.6 < z < 2.5 < z_worse
+
+
+def test_the_rehearsal_knows_the_error_of_other_methods(solve, bench, checkerboard):
+    truth, shot = checkerboard
+    reason = solve(shot).trace.reason
+    told = {name: float(reason.split(name + " ")[1].split(",")[0]) for name in ("pinv", "coupled")}
+    ratio = errors(solve(shot, "pinv"), truth)[0] / errors(solve(shot, "coupled"), truth)[0]
+    assert told["pinv"] / told["coupled"] == pytest.approx(ratio, rel=0.8)
+
+
+def test_edges_inside_fields_are_told(bench, solve):
+    camera, _, _, shoot = bench
+    scene = Mosaic(camera.light.wavelengths, 6, offset=0.4)
+    shot = shoot(scene, seed=8)
+    found = {method: solve(shot, method) for method in ("auto", "pinv", "coupled")}
+    rms = {method: errors(one, scene.truth())[0] for method, one in found.items()}
+    assert found["auto"].method == "fine"
+    assert rms["auto"] < 0.7 * min(rms["pinv"], rms["coupled"])
+
+
+def test_lost_lenslets_and_saturated_pixels_stay_where_they_are(solve, checkerboard):
+    _, shot = checkerboard
+    mosaic = np.array(shot.mosaic)
+    mosaic[60:80, 80:100] = shot.levels.white  # a lenslet
+    mosaic[123, 45] = shot.levels.white
+    whole, found = (solve(one, "coupled") for one in (shot, replace(shot, mosaic=mosaic)))
+    assert np.isnan(found.value[:, 3, 4]).all() and np.isfinite(found.value[:, 0]).all()
+    apart = np.abs(found.value - whole.value) / whole.sigma
+    apart[:, 2:5, 3:6] = 0
+    assert np.nanmax(apart) < 1.0
+
+
+def test_own_responses_of_lenslets_give_what_a_shared_one_does(bench, solve, checkerboard):
+    """Lenslets whose gains differ by 3 %, and a calibration that knows."""
+    camera, calibration, _, _ = bench
+    _, shot = checkerboard
+    gain = np.random.default_rng(1).uniform(0.97, 1.03, (*COUNT, 1, 1))
+    own = replace(
+        calibration,
+        response=replace(calibration.response, matrix=calibration.response.matrix * gain),
+    )
+    one, many = LensletResponses.of(calibration), LensletResponses.of(own)
+    light = neighbour_light(camera, calibration)
+    signal, noise = readout(shot, one, "x")
+    values = windows_of(one, signal)
+    shared = Crosstalk(one, light, values, noise).first.value
+    each = Crosstalk(many, light, values * gain[..., 0], noise).first.value
+    assert np.abs(each - shared).max() < 0.01 * shared.max()
+    wrong = Crosstalk(one, light, values * gain[..., 0], noise).first.value
+    assert np.abs(wrong - shared).max() > 0.02 * shared.max()
+
+
+def test_what_cannot_be_predicted_is_said(bench, capsys):
+    camera, calibration, _, shoot = bench
+    for method in METHODS:
+        with pytest.raises(UsageError, match="camera's description"):
+            Demultiplexer(calibration, method=method)
+    other = camera.replace(**{"sensor.pixels_per_lenslet": (26, 26), "sensor.pixel_pitch": 4e-6})
+    with pytest.raises(ConfigError, match="26 x 26 px"):
+        Demultiplexer(calibration, method="fine", camera=other)
+    Demultiplexer(calibration, camera=other)
+    assert "one by one" in capsys.readouterr().err
+    turned = camera.replace(**{"filter_array.filters": camera.filter_array.filters[::-1]})
+    with pytest.raises(ConfigError, match="differs by"):
+        neighbour_light(turned, calibration)
+
+
+def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):
+    camera, calibration, _, _ = bench
+    _, shot = checkerboard
+    blind = replace(calibration, sensor=replace(calibration.sensor, gain_e_per_dn=None))
+    shot = replace(shot, noise=None, levels=replace(shot.levels, gain=None))
+    with pytest.raises(NumericsError, match="not known"):
+        Demultiplexer(blind, method="coupled", camera=camera).estimate(shot, "x")

@@ -246,7 +246,7 @@ def test_lenslets_share_a_response_where_one_noisy_capture_a_band_cannot_tell_th
 
 
 def demux(path, calibration, target, method, **settings):
-    run_demux([path], target, calibration=calibration, settings=Settings(method, **settings))
+    run_demux([path], target, calibration=calibration, settings=Settings(method=method, **settings))
     data = read_artefact(target, "spectra").data
     value, sigma = data["spectra/value"], data["spectra/sigma"]
     good = np.isfinite(value).all(axis=0)
@@ -312,7 +312,9 @@ def test_bayer_mosaic_is_part_of_the_response(tmp_path):
     bands = [(w, paint(f"b{k}.h5", narrow(k), 3 + k)) for k, w in enumerate(BANDS)]
     report = run_calibrate(tmp_path / "c.h5", whites=[white], darks=[dark], bands=bands)
     assert report.window == [15, 15] and report.lenslets == 81
-    run_demux([scene], tmp_path / "o.h5", calibration=tmp_path / "c.h5", settings=Settings("wls"))
+    run_demux(
+        [scene], tmp_path / "o.h5", calibration=tmp_path / "c.h5", settings=Settings(method="wls")
+    )
     data = read_artefact(tmp_path / "o.h5", "spectra").data
     error = np.moveaxis(data["spectra/value"], 0, -1) - truth
     assert np.sqrt((error**2).mean()) < 0.004 and (

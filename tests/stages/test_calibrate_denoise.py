@@ -88,7 +88,7 @@ def test_one_shot_denoised_does_what_four_do(bench):
             [capture],
             folder / "out.h5",
             calibration=folder / f"{name}.h5",
-            settings=Settings("pinv", register="off"),
+            settings=Settings(method="pinv", register="off"),
             overwrite=True,
         )
         found = np.moveaxis(

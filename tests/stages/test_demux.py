@@ -105,7 +105,7 @@ def test_exr_holds_value_and_preview(files, tmp_path):
         [files["shots"][1]],
         tmp_path / "s.exr",
         calibration=files["calibration"],
-        settings=Settings("pinv", files["white"]),
+        settings=Settings(method="pinv", reference=files["white"]),
     )
     found = read_spectral_exr(tmp_path / "s.exr")
     assert report.captures[0].quantity == "reflectance"
@@ -164,7 +164,7 @@ def test_noise_unknown_is_taken_from_the_residual_and_weights_are_refused(files,
             [files["shots"][0]],
             tmp_path / "w.h5",
             calibration=files["calibration"],
-            settings=Settings("wls"),
+            settings=Settings(method="wls"),
         )
 
 
@@ -197,7 +197,7 @@ def test_lmmse_without_known_light_is_refused(files, tmp_path):
             [files["shots"][0]],
             tmp_path / "s.h5",
             calibration=tmp_path / "c.h5",
-            settings=Settings("lmmse"),
+            settings=Settings(method="lmmse"),
         )
     assert run(["demux", str(files["shots"][0]), *words, "-o", str(tmp_path / "s.h5")]) == 5
 

@@ -96,7 +96,9 @@ def demultiplexed(folder, capture, method, reference, calibration="calibration.h
         folder / "out.h5",
         calibration=folder / calibration,
         overwrite=True,
-        settings=Settings(method, reference, 1.0, **settings),
+        settings=Settings(
+            method=method, reference=reference, reference_reflectance=1.0, **settings
+        ),
     )
     assert report.captures[0].quantity == "reflectance"
     out = read_artefact(folder / "out.h5", "spectra")

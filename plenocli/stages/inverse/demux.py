@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Name = str | Path
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """How captures are demultiplexed.
 
@@ -205,7 +205,7 @@ def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> Non
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recipe:
     """What makes two results of one capture differ: digests of the calibration, the reference and
     the camera, the method asked for, and whether nobody looked for motion.
@@ -222,7 +222,13 @@ def _recipe(inputs: dict[str, Any], method: str, unregistered: bool) -> Recipe:
     calibration, reference, camera = (
         inputs.get(role, {}).get("sha256") for role in ("calibration", "reference", "camera")
     )
-    return Recipe(calibration, reference, camera, method, unregistered)
+    return Recipe(
+        calibration=calibration,
+        reference=reference,
+        camera=camera,
+        method=method,
+        unregistered=unregistered,
+    )
 
 
 def _roles(calibration: Name, settings: Settings) -> dict[str, Any]:

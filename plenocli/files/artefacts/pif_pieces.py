@@ -14,6 +14,7 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import NumericsError
 from plenocli.files.artefacts.container import READING
+from plenocli.forward.propagation import diagnosis
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -47,7 +48,10 @@ def cost(plan: PifPlan) -> tuple[bool, int]:
     bands, superpixels = plan.shape[:2]
     slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
     streamed = plan.bytes > min(WHOLE_BYTES, budget().memory // 4)
-    return streamed, (5 * slab if streamed else plan.bytes) + work
+    diagnosed = diagnosis.memory(plan.shape)
+    if streamed:  # piece by piece, while the fields are there
+        return streamed, 5 * slab + work + diagnosed
+    return streamed, plan.bytes + max(work, diagnosed)
 
 
 def layout(plan: PifPlan, where: object) -> Layout:

@@ -214,6 +214,16 @@ def seconds(camera: Camera, plan: PifPlan) -> float:
     return len(plan.bands) * priced(law("diagnosis").seconds, features(camera, plan))
 
 
+def memory(shape: tuple[int, int, int, int]) -> int:
+    """Bytes that the diagnosis of a matrix takes beside it: rows with their even and odd parts, and
+    what they are reduced to.
+
+    shape: (band, superpixel, pixel, point).
+    """
+    _, _, pixels, points = shape
+    return 8 * points * (5 * min(_ROWS, pixels) + points) if points <= LARGEST else 0
+
+
 def features(camera: Camera, plan: PifPlan) -> dict[str, float]:
     """What the diagnosis of one band of a planned matrix consists of, for costs.toml: `values` that
     are looked at, `reduced` operations of orthogonal reductions, `decomposed` cubes of the sides of

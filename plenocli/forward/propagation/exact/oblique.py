@@ -30,12 +30,12 @@ import numpy as np
 from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.exact.debye import APODISATION, aperture_norm
+from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.fresnel.spread_function import (
     SeparableField,
     legendre,
     psf_nodes,
-    terms_within,
 )
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ BAND = 1e-9
 """Root mean square that functions of the band of h may miss of it."""
 SHARP = 1e-6
 """Blur of a point, in lenslets, below which it is in focus."""
+SKETCH = 64
+"""Columns of the first sketch of a field's singular vectors."""
 SLAB = 1 << 20
 """Numbers in a slab of pupil nodes x field points."""
 
@@ -121,18 +123,12 @@ def oblique_field(
             for a in range(ORDERS)
         ]
     )
-    u, s, v = _leading(matrix, tolerance)
-    terms = terms_within(s, tolerance)
-    s_root = np.sqrt(s[:terms])
+    unit = np.eye(len(matrix), dtype=matrix.dtype)
+    factors = Product([matrix], [unit], {(0, 0): unit}, False).factors(tolerance, SKETCH)
     project = legendre(t, count, 1).T * w * ((2 * np.arange(count) + 1) / 2)[:, None]
     rows, columns = (
-        np.hstack(
-            [
-                project @ (part / root[:, None])
-                for part in np.split(vectors[:, :terms] * s_root, ORDERS)
-            ]
-        )
-        for vectors in (u, v)
+        np.hstack([project @ (part / root[:, None]) for part in np.split(factor, ORDERS)])
+        for factor in factors
     )
     return ObliqueField(
         half=half,
@@ -140,7 +136,7 @@ def oblique_field(
         columns=columns,
         even=False,
         symmetry=(*flips, turn),
-        tail=float(np.linalg.norm(s[terms:])),
+        tail=tolerance,
         scale=scale,
     )
 
@@ -328,20 +324,3 @@ def _differentiation(d: np.ndarray) -> np.ndarray:
     np.fill_diagonal(out, 0.0)
     np.fill_diagonal(out, -out.sum(axis=1))
     return out
-
-
-def _leading(matrix: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(U, s, V) of the largest singular values of a matrix, matrix = U diag(s) V^T, all but
-    `tolerance` of it: through random combinations of its columns (Halko, Martinsson, Tropp 2011).
-    """
-    rng, count = np.random.default_rng(20130701), 64
-    power = float(np.linalg.norm(matrix)) ** 2
-    while True:
-        q = np.linalg.qr(matrix @ rng.standard_normal((len(matrix), min(count, len(matrix)))))[0]
-        q = np.linalg.qr(matrix @ (matrix.conj().T @ q))[0]
-        seen = q.conj().T @ matrix
-        rest = float(power - np.linalg.norm(seen) ** 2)
-        if rest < max((tolerance / 3) ** 2, 1e-14 * power) or count >= len(matrix):
-            u, s, vh = np.linalg.svd(seen, full_matrices=False)
-            return q @ u, s, vh.T
-        count *= 2

@@ -120,7 +120,7 @@ def test_demux_takes_a_prediction_as_it_stands(bench):
                 [folder / f"mono-{round(wavelength * 1e9)}nm.h5"],
                 folder / "radiance.h5",
                 calibration=folder / f"{name}.h5",
-                settings=Demux("wls"),
+                settings=Demux(method="wls"),
                 overwrite=True,
             )
             found[name] = (
@@ -135,7 +135,7 @@ def test_demux_takes_a_prediction_as_it_stands(bench):
             [folder / "white.h5"],
             folder / "white-spectra.h5",
             calibration=folder / "predicted.h5",
-            settings=Demux(method, folder / "white.h5"),
+            settings=Demux(method=method, reference=folder / "white.h5"),
             overwrite=True,
         )
         # within what the prediction is said to be known to, and its errors in shape are not

@@ -45,6 +45,7 @@ class LatticeCapture:
     response_variance: (pixel, band) of F's entries, or None.
     noise: of the values.
     start: (lenslet_row, lenslet_column, band), a first answer without neighbours; NaN: none.
+    ratio: whether errors of F divide out of the answer.
     """
 
     values: np.ndarray
@@ -53,6 +54,7 @@ class LatticeCapture:
     response_variance: np.ndarray | None
     noise: Noise
     start: np.ndarray
+    ratio: bool = False
 
     @property
     def known(self) -> np.ndarray:
@@ -258,7 +260,7 @@ def _error_power(system: LatticeSystem, capture: LatticeCapture, value: np.ndarr
         top, left = reach + down, reach + across
         light = wide[top : top + rows, left : left + columns]
         out += noise.gain * light @ (part @ f).T + dark * part.sum(axis=-1)
-    if capture.response_variance is not None:
+    if capture.response_variance is not None and not capture.ratio:
         own = squared[(where == 0).all(axis=1)][0] @ np.nan_to_num(capture.response_variance)
         out += radiance**2 @ own.T
     v = _stationary(capture, value)

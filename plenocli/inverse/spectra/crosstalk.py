@@ -67,9 +67,10 @@ class Crosstalk:
             values=values,
             response=response,
             own=own,
-            response_variance=None if ratio else c.variance,
+            response_variance=c.variance,
             noise=noise,
             start=np.moveaxis(self._alone(values, "pinv").value, 0, -1),
+            ratio=ratio,
         )
         self.first: LatticeAnswer = coupled(self.capture, light)
 

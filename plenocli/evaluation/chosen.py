@@ -5,6 +5,7 @@ from types import ModuleType
 
 from plenocli.base.errors import UsageError
 from plenocli.evaluation.metrics import (
+    classes,
     classify,
     coherence,
     depth,
@@ -32,6 +33,14 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "spectral-angle": ("spectral_angle_deg",),
     "delta-e": ("delta_e_2000",),
     "classification": ("classification_accuracy", "nearest_patch_accuracy"),
+    "classes": (
+        "classes_seen",
+        "class_accuracy",
+        "class_accuracy_low",
+        "class_accuracy_high",
+        "class_accuracy_predicted",
+        "class_distance",
+    ),
     "single-pixel": (
         "rmse_over_single_pixel",
         "six_patch_rmse_over_single_pixel",
@@ -78,6 +87,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "coherence_effective_mean",
         "welch_bound",
         "exact_recovery_sparsity",
+        "random_candes_romberg",
+        "random_effective_mean",
         "dead_atoms",
         "invisible_atoms",
         "atoms",
@@ -102,6 +113,7 @@ _NEEDED = {
         "give a spectral result and its --patches, two or more; one of the two numbers "
         "needs scikit-learn"
     ),
+    "classes": "give spectra and the table of --classes",
     "single-pixel": "give spectra of demux --method single-pixel among the results",
 }
 
@@ -145,7 +157,7 @@ def definitions_of(results: Iterable[ResultScore]) -> dict[str, str]:
         if result.wavelengths_nm and result.kind != "calibration":
             home = (spectral, quality)
         for name in result.figures:
-            for module in (*home, snr, classify):
+            for module in (*home, snr, classify, classes):
                 if name in module.DEFINITIONS:
                     found[name] = module.DEFINITIONS[name]
                     break

@@ -7,6 +7,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
+from plenocli.evaluation.metrics.classes import Classes, ClassScore, score_classes
 from plenocli.evaluation.metrics.classify import ClassificationScore, score_classification
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
 from plenocli.evaluation.metrics.snr import SnrScore, score_snr
@@ -39,6 +40,7 @@ class SpectraScore:
     picture: PictureScore | None
     patches: PatchesScore | None
     classification: ClassificationScore | None
+    classes: ClassScore | None
     snr: SnrScore | None
 
     @property
@@ -70,6 +72,7 @@ def score_spectra(
     light: str = "D65",
     whites: Mapping[str, WhiteTarget] | None = None,
     needs_reflectance: bool = False,
+    classes: Classes | None = None,
 ) -> tuple[SpectraScore, tuple[PatchScore, ...]]:
     """Figures of a spectral cube, and what each patch shows.
 
@@ -78,6 +81,7 @@ def score_spectra(
     light: name of the illuminant for colour differences.
     whites: method -> spectra of a white target.
     needs_reflectance: the truth is reflectance for sure; radiance without a white is refused.
+    classes: what a user wants told apart, in the bands of the result.
 
     Raises InputError where no lenslet has values, UsageError where no white target fits.
     docs/model.md, "Measures".
@@ -107,8 +111,19 @@ def score_spectra(
         picture=picture,
         patches=patches,
         classification=classification,
+        classes=None
+        if classes is None
+        else score_classes(values, truth, _relative_sigma(result, values), classes),
         snr=_snr(result, labels, white),
     ), listed
+
+
+def _relative_sigma(result: Result, values: np.ndarray) -> np.ndarray | None:
+    """Standard deviation in the units of `values`, which are the result's over a white's."""
+    if result.sigma is None:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return result.sigma * np.abs(values / result.values)
 
 
 def _patches(

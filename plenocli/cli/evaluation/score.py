@@ -17,6 +17,7 @@ METRICS = (
     "delta-e",
     "snr",
     "classification",
+    "classes",
     "single-pixel",
     "coherence",
     "response",
@@ -89,6 +90,14 @@ METRICS = (
         "of at their centres."
     ),
 )
+@click.option(
+    "--classes",
+    type=options.FILE,
+    help=(
+        "Table of spectra to be told apart (.csv: wavelengths in nm, then a column of reflectances "
+        "a spectrum below the name of its class): how often lenslets tell their class."
+    ),
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
@@ -109,6 +118,7 @@ def command(
     sampling: str,
     light: str,
     camera: Path | None,
+    classes: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -128,6 +138,7 @@ def command(
       plenocli score tikhonov.h5 lmmse.h5 --truth capture.h5 -o score.json --report report.html
       plenocli score chart.exr --truth colorchecker --white white1.h5 \\
           --white white2.h5 -o score.json
+      plenocli score spectra.h5 --truth capture.h5 --classes paints.csv -o told.json
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
       plenocli score planes.h5 --truth 620mm -o depth.json
@@ -149,6 +160,7 @@ def command(
         sampling=sampling,
         light=light,
         camera=camera,
+        classes=classes,
         overwrite=overwrite,
     )
     options.summary(document.as_json(), as_json, table(document))

@@ -32,6 +32,7 @@ from plenocli.evaluation.spectra_score import (
     score_spectra,
 )
 from plenocli.execution.batch import failed_together
+from plenocli.files.read.class_table import read_classes
 from plenocli.files.results.matrices import matrix_of
 from plenocli.files.results.results import (
     read_block,
@@ -61,6 +62,7 @@ class _Comparison:
     block: (rows, columns) of object samples under a lenslet, where they are given.
     object_shape: the same as the system matrix tells it.
     sensor_snr: of the capture, dB, or None.
+    classes: table of labelled spectra, or None.
     """
 
     truth: Path | str | None
@@ -73,6 +75,7 @@ class _Comparison:
     light: str
     camera: Camera | None
     sensor_snr: float | None
+    classes: Path | str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +103,7 @@ def run_score(
     sampling: str = "fit",
     light: str = "D65",
     camera: Path | str | None = None,
+    classes: Path | str | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> ScoreDocument:
@@ -116,6 +120,7 @@ def run_score(
     sampling: how a photograph became the object, "fit" or "crop".
     light: for colour differences.
     camera: TOML, through whose filters spectra see the truth.
+    classes: table of labelled spectra (plenocli.files.read.class_table).
 
     One bad result does not stop the others: its message is printed and stands in its place.
     Raises the error of the worst one at the end.
@@ -123,12 +128,13 @@ def run_score(
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.atomic import check_output, publish
 
-    inputs = [*results, truth, *whites, patches, pif, capture, camera]
+    inputs = [*results, truth, *whites, patches, pif, capture, camera, classes]
     files = [path for path in inputs if _is_file(path)]
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
     comparison = _comparison(truth, whites, patches, pif, capture, block, sampling, light, camera)
+    comparison = replace(comparison, classes=classes)
     scored = _score_all(results, comparison, tuple(metrics))
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
@@ -140,6 +146,7 @@ def run_score(
         "truth": truth if _is_file(truth) else None,
         "white": list(whites),
         "camera": camera,
+        "classes": classes,
         "patches": patches if _is_file(patches) else None,
         "pif": pif,
         "capture": capture,
@@ -373,6 +380,9 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             light=comparison.light,
             whites=comparison.whites,
             needs_reflectance=str(comparison.truth) == CHART,
+            classes=read_classes(Path(comparison.classes), result.bands)
+            if comparison.classes
+            else None,
         )
         spectra = own
     sensor = comparison.sensor_snr

@@ -1,0 +1,98 @@
+"""Classes of a user's own: what is predicted of them against draws, and tables of spectra."""
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from plenocli.base.errors import InputError
+from plenocli.evaluation.metrics import classes
+from plenocli.files.read.class_table import read_classes
+
+BANDS = np.array([450e-9, 550e-9, 650e-9])
+
+
+def library(count, within=0.05, apart=0.08, samples=40, seed=0):
+    """Spectra of normally distributed classes: (labels, spectra)."""
+    rng = np.random.default_rng(seed)
+    means = 0.5 + apart * rng.standard_normal((count, 3))
+    root = within * rng.standard_normal((3, 3))
+    labels = tuple(f"class {k}" for k in range(count) for _ in range(samples))
+    return labels, np.repeat(means, samples, axis=0) + rng.standard_normal(
+        (count * samples, 3)
+    ) @ root
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_what_is_predicted_is_what_draws_show(count):
+    """Of two classes to the digit; of several a bound from below that is no more than 0.1 off."""
+    known = classes.Classes.of_spectra(*library(count))
+    sigma = np.array([0.02, 0.05, 0.03])
+    rng = np.random.default_rng(3)
+    size = (count, 20000)
+    truth = known.means[:, None] + rng.multivariate_normal(np.zeros(3), known.covariance, size)
+    said = classes.assigned(
+        (truth + sigma * rng.standard_normal(truth.shape)).reshape(-1, 3),
+        known.means,
+        known.covariance + np.diag(sigma**2),
+    )
+    hits = np.mean(said.reshape(size) == np.arange(count)[:, None], axis=1)
+    distances = classes.distances_between(known.means, known.covariance + np.diag(sigma**2))
+    predicted = classes.predicted_accuracy(distances)
+    if count == 2:
+        np.testing.assert_allclose(hits, predicted, atol=0.01)
+    else:
+        assert (predicted < hits + 0.01).all() and (predicted > hits - 0.25).all()
+        assert predicted.mean() > hits.mean() - 0.15
+
+
+def test_lenslets_are_told_by_truth_and_noise():
+    """Constant classes, noise as predicted: the share is that of the distance, and its interval."""
+    means = np.array([[0.2, 0.2, 0.2], [0.3, 0.2, 0.2]])
+    known = classes.Classes(("a", "b"), means, np.zeros((3, 3)))
+    rng = np.random.default_rng(1)
+    label = rng.integers(2, size=(60, 70))
+    truth = means[label].transpose(2, 0, 1)
+    sigma = np.full(truth.shape, 0.04)
+    values = truth + sigma * rng.standard_normal(truth.shape)
+    values[:, :5] = np.nan
+    score = classes.score_classes(values, truth, sigma, known)
+    assert score.classes_seen == 2 and score.class_distance == pytest.approx(2.5)
+    assert score.class_accuracy_predicted == pytest.approx(0.8944, abs=1e-4)  # Phi(1.25)
+    assert score.class_accuracy_low < 0.8944 < score.class_accuracy_high
+    hits = round(score.class_accuracy * 55 * 70)
+    interval = binomtest(hits, 55 * 70).proportion_ci(method="wilson")
+    assert score.class_accuracy_low == pytest.approx(interval.low)
+    assert score.class_accuracy_high == pytest.approx(interval.high)
+    blind = classes.score_classes(values, truth, None, known)
+    assert blind.class_accuracy_predicted is None and blind.class_accuracy > 0.85
+    assert classes.score_classes(np.full_like(truth, np.nan), truth, sigma, known) is None
+
+
+def test_a_table_is_read_in_the_bands_of_a_result(tmp_path):
+    (tmp_path / "c.csv").write_text("nm,leaf,soil,leaf\n700,0.5,0.3,0.7\n400,0.1,0.3,0.3\n")
+    found = read_classes(tmp_path / "c.csv", BANDS)
+    assert found.names == ("leaf", "soil")
+    np.testing.assert_allclose(found.means, [[4 / 15, 0.4, 8 / 15], [0.3, 0.3, 0.3]])
+    np.testing.assert_allclose(found.covariance, 0.02 * np.ones((3, 3)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("", "names 0 classes"),
+        ("nm,leaf,leaf\n400,1,1\n700,1,1\n", "names 1 classes"),
+        ("nm,leaf,\n400,1,1\n700,1,1\n", "names 2 classes"),
+        ("nm,leaf,soil\n400,1,high\n700,1,1\n", "no table of numbers"),
+        ("nm,leaf,soil\n400,1\n700,1\n", "different length"),
+        ("nm,leaf,soil\n400,1,1\n", "fewer than three"),
+        ("nm,leaf,soil\n400,1,1\n400,1,1\n", "twice"),
+        ("nm,leaf,soil\n400,1,nan\n700,1,1\n", "not finite"),
+        ("nm,leaf,soil\n500,1,1\n700,1,1\n", "the result has a band at 450 nm"),
+    ],
+)
+def test_what_is_no_table_of_classes_is_refused(tmp_path, text, words):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_classes(tmp_path / "c.csv", BANDS)
+    with pytest.raises(InputError, match="first column are wavelengths"):
+        read_classes(tmp_path / "missing.csv", BANDS)

@@ -58,7 +58,7 @@ class Classes:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ClassScore:
     """How well classes are told apart, see DEFINITIONS; None where the noise is not known."""
 

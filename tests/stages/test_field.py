@@ -95,12 +95,14 @@ def test_classes_of_lenslets_see_more_than_one_matrix(folder):
          "--field-nodes computes its own"),
         (["reconstruct", "capture.h5", "--pif", "F", "--fit"], "not by those of a whole array"),
         (["learn-dict", "x.png", "--pif", "F"], "places of the field, of which one is due"),
+        (["show", "F"], "places of the field, of which one is due"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(folder, capsys, words, message):
     names = {"C": "camera.toml", "F": "field.h5", "capture.h5": "capture.h5"}
     words = [str(folder / names[w]) if w in names else w for w in words]
-    assert run([*words, "-o", str(folder / "out.h5")]) in (2, 3)
+    out = "out.png" if words[0] == "show" else "out.h5"
+    assert run([*words, "-o", str(folder / out)]) in (2, 3)
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (folder / "out.h5").exists()
 

@@ -124,7 +124,7 @@ def _open(path: Path) -> _File:
     """A file of any kind that can be drawn; InputError where it is none."""
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import require_file
-    from plenocli.files.artefacts.shards import read_pif
+    from plenocli.files.artefacts.shards import PIF_KINDS, read_pif
     from plenocli.files.images.exr import read_exr
     from plenocli.files.images.mosaic import CAPTURE, is_hdf5
     from plenocli.files.images.pictures import file_type
@@ -133,7 +133,7 @@ def _open(path: Path) -> _File:
     require_file(path)
     if is_hdf5(path):
         artefact = read_artefact(path)
-        if artefact.kind == "pif-index":
+        if artefact.kind != "pif" and artefact.kind in PIF_KINDS:
             return _File(path=path, kind="pif", artefact=read_pif(path))
         return _File(path=path, kind=artefact.kind, artefact=artefact)
     kind = "capture"

@@ -132,7 +132,7 @@ class Nodes(click.ParamType):
             return value
         if value not in {str(n) for n in range(3, 34, 2)}:
             known = "auto or an odd number" if self._auto else "an odd number"
-            self.fail(f"{value!r} is not {known} from 3 to 33", param, ctx)
+            self.fail(f"{value!r} is not {known} from 3 to 33, such as 5", param, ctx)
         return int(value)
 
 

@@ -76,6 +76,10 @@ def make_all(folder, runner):
     pif += ["--superpixels", "1x1", "--coherent-ring", "0"]
     outcome = runner.run([*pif, "-o", "stack.h5"], folder, limit=120)
     assert outcome.code == 0, outcome.text
+    field = ["simulate-pif", "camera.toml", "--field-nodes", "3", "--accuracy", "0.1"]
+    field += ["--superpixels", "1x1", "--coherent-ring", "0", "-o", "field.h5"]
+    outcome = runner.run(field, folder, limit=120)
+    assert outcome.code == 0, outcome.text
     write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
     (folder / "done").touch()
 

@@ -59,6 +59,8 @@ def senseless(kind):
         return ("", "nonsense", "nan", "-1", kind.choices[0] + "x")
     if isinstance(kind, options.Grid):
         return ("", "abc", "3", "0x3", "-1x3", "3x", "nanx3", "99999999x9", "1.5x2")
+    if isinstance(kind, options.Nodes):
+        return ("", "abc", "4", "1", "35", "-3", "1.5", "nan", "9" * 30)
     if isinstance(kind, options.Place):
         return ("", "abc", "3", "-1,0", "1.5,2", "nan,0", "9" * 30 + ",0")
     if isinstance(kind, options.Pair):

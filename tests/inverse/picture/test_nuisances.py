@@ -43,10 +43,12 @@ def statistics():
 
 
 def drawn(count, rng, matrix=None, scale=1.0):
-    """(true fields (point, signal), superpixels without noise (pixel, signal))."""
+    """(true fields (point, signal), no darker than light can be; superpixels without noise (pixel,
+    signal)).
+    """
     mean, covariance = statistics()
     field = np.sqrt(scale) * np.linalg.cholesky(covariance) @ rng.standard_normal((N * N, count))
-    x = mean[:, None] + field + rng.uniform(0.2, 0.9, count)
+    x = np.maximum(mean[:, None] + field + rng.uniform(0.2, 0.9, count), 0.0)
     return x, (blurred() if matrix is None else matrix) @ x
 
 
@@ -160,6 +162,25 @@ def test_an_error_of_the_matrix_is_not_taken_for_a_veil():
         found, own = find_veil(model, y)
         assert np.abs(np.median(feigned)) > 2 * SIGMA
         assert not found.removed and not own.any()
+
+
+def test_a_veil_is_no_brighter_than_the_darkest_pixels_and_negative_only_where_pixels_are():
+    """Lenslets that are all alike, so that an error of the matrix does not show by its going with
+    their brightness: what it feigns is below zero, and no pixel is. A black level that is too high
+    leaves pixels there, and is one.
+    """
+    model, _ = model_and_lmmse()
+    rng = np.random.default_rng(3)
+    x = 0.5 + 0.02 * rng.standard_normal((N * N, 64))
+    noise = SIGMA * rng.standard_normal((PIXELS**2, 64))
+    feigned, own = find_veil(model, blurred(fade=3.7) @ x + noise)
+    assert feigned.level < -10 * feigned.sigma and not feigned.removed and not own.any()
+    found, own = find_veil(model, blurred() @ x + noise - 0.02)
+    assert found.removed and np.abs(own + 0.02).max() < 0.001
+    veiled = blurred() @ x + noise + 0.02
+    assert find_veil(model, veiled)[0].removed
+    shadows = np.where(rng.random(veiled.shape) < 0.02, noise, veiled)
+    assert not find_veil(model, shadows)[0].removed
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.08])

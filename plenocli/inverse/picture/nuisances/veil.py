@@ -18,6 +18,8 @@ EXPLAINED = 1.3
 """Noise found over noise expected, median of the lenslets, up to which the model explains a
 capture but for its veil.
 """
+DARKEST = 0.01
+"""Share of the pixels that count as the darkest."""
 LOUD = 3.0
 """Variance of lenslets' own offsets, over that of their noise, from which on they are believed."""
 NOT_STRAIGHT = 0.1
@@ -92,6 +94,8 @@ def find_veil(
     towards the common one by how far they differ beyond their noise. Where it does not, or where
     the offsets go with the lenslets' brightness, the matrix is wrong: its error looks like an
     offset in proportion to the brightness. Then only what is there without brightness is a veil.
+    Light has no negative values: an offset that is brighter than the darkest pixels, or below zero
+    where no pixel is, is an error of the matrix.
 
     model: veiled.
     y: (pixel, signal) without defects.
@@ -113,7 +117,7 @@ def find_veil(
         extra = _beyond_noise(value - np.median(value), variance)
         level, sigma = _mean(value, variance + extra)
         extra, sigma = 0.0 if unsure else extra, float(np.hypot(sigma, unsure))
-    removed = abs(level) > SURE * sigma or extra > 0
+    removed = _possible(level, y, model.sigma) and (abs(level) > SURE * sigma or extra > 0)
     told_of = VeilFound(
         level=level,
         sigma=sigma,
@@ -126,6 +130,15 @@ def find_veil(
     own = np.full(y.shape[1], level)
     own[told] += extra / (extra + variance) * (value - level)
     return told_of, own
+
+
+def _possible(level: float, y: np.ndarray, sigma: float) -> bool:
+    """Whether a veil can be on top of light, which is nowhere negative: pixels hold at least the
+    veil, but for their noise, and where it is negative, a black level that is too high, some are
+    below zero.
+    """
+    darkest, noise = float(np.quantile(y, DARKEST)), SURE * sigma
+    return level <= max(0.0, darkest) + noise and (level >= -noise or darkest < -noise)
 
 
 def _offsets(model: PixelModel, y: np.ndarray) -> _Offsets:

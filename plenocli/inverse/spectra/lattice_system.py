@@ -38,15 +38,11 @@ class PointPrior:
         """Inverse covariance at frequencies (n,) and (m,), radians a lenslet: (n, m, unknown,
         unknown) complex64.
         """
-        out = np.einsum(
-            "rij,ckl,ab->rcikajlb",
-            self._axis(rows),
-            self._axis(columns),
-            self.inverse,
-            optimize=True,
-        )
+        down, across = (self._axis(one).astype(np.complex64) for one in (rows, columns))
+        bands = np.einsum("ckl,ab->ckalb", across, self.inverse.astype(np.float32))
+        out = down[:, None, :, None, None, :, None, None] * bands[None, :, None, :, :, None]
         size = self.points**2 * len(self.mean)
-        return out.reshape(len(rows), len(columns), size, size).astype(np.complex64)
+        return out.reshape(len(rows), len(columns), size, size)
 
     def _axis(self, frequency: np.ndarray) -> np.ndarray:
         """Precision of one axis at frequencies (n,) in radians a lenslet: (n, point, point)."""
@@ -157,16 +153,21 @@ class LatticeSystem:
         return out.reshape(len(rows), len(columns), self.unknowns, self.unknowns)
 
     @cached_property
-    def _normal(self) -> np.ndarray:
+    def _inverse(self) -> np.ndarray:
+        """Of `normal`, at the frequencies of the padded array: every step takes it, and what its
+        rounding leaves, the next one finds.
+        """
         rows, columns = self.padded
-        return self.normal(2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns))
+        return np.linalg.inv(
+            self.normal(2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns))
+        )
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """N^-1 of a padded array."""
         from scipy.fft import irfft2, rfft2
 
         spectrum = rfft2(right.astype(np.float32), axes=(0, 1))
-        found = np.linalg.solve(self._normal, spectrum[..., None])[..., 0]
+        found = (self._inverse @ spectrum[..., None])[..., 0]
         return irfft2(found, s=self.padded, axes=(0, 1)).astype(float)
 
     def step(self, residual: np.ndarray, b: np.ndarray) -> np.ndarray:

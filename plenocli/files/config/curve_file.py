@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import InputError
-from plenocli.base.units import LENGTHS, format_length
+from plenocli.base.units import LENGTHS
 from plenocli.files.config.toml_file import read_text
 
 WANTED = "give a text file of two columns, wavelength in nm and transmittance from 0 to 1"
@@ -27,33 +28,34 @@ def read_curve(path: Path) -> dict[str, Any]:
     """
     lines = [
         (number, line.strip())
-        for number, line in enumerate(read_text(path, "filter", WANTED).splitlines(), 1)
+        for number, line in enumerate(
+            read_text(path, "filter", WANTED).removeprefix("\ufeff").splitlines(), 1
+        )
         if line.strip() and not line.lstrip().startswith("#")
     ]
     rows, unit, percent = [], "nm", False
     for number, line in lines:
-        cells = _cells(line)
         try:
-            row = float(cells[0]), float(cells[1])
-            if not (math.isfinite(row[0]) and math.isfinite(row[1])):
+            wavelength, value = (float(cell) for cell in _cells(line))
+            if not math.isfinite(wavelength + value):
                 raise ValueError
-            rows.append(row)
-        except (IndexError, ValueError):
-            if rows or number != lines[0][0]:
+            rows.append((wavelength, value))
+        except ValueError:
+            # a header has no figures at its start: what has is a row that was mistyped
+            if rows or number != lines[0][0] or line[0] in "+-.0123456789":
                 raise InputError(
                     f"line {number} is no wavelength and transmittance: {line[:60]!r}",
                     path,
                     WANTED,
                 ) from None
-            words = line.lower().replace("(", " ").replace(")", " ")
-            words = words.replace("[", " ").replace("]", " ").replace(",", " ")
-            unit = next((word for word in words.split() if word in LENGTHS), unit)
+            words = re.split(r"[\s()\[\],;]+", line.lower())
+            unit = next((word for word in words if word in LENGTHS), unit)
             percent = "%" in line
     rows.sort()
     _check(rows, percent, unit, path)
     scale = 0.01 if percent else 1.0
     return {
-        "wavelength": [format_length(w * LENGTHS[unit]) for w, _ in rows],
+        "wavelength": [f"{w!r} {unit}" for w, _ in rows],
         "transmittance": [min(1.0, max(0.0, scale * t)) for _, t in rows],
     }
 

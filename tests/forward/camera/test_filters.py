@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import ConfigError, InputError
+from plenocli.base.units import parse_length
 from plenocli.files.config.camera_file import load_camera, parse_camera, to_toml
 from plenocli.files.config.curve_file import read_curve
 from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
@@ -149,6 +150,9 @@ def test_what_is_no_filter_is_refused(one, words):
         ("nm,T\n500,-0.5\n510,0.9", "from -0.5 to 0.9"),
         ("500,0.5\n500,0.6", "has 500 nm twice"),
         ("PK\x03\x04", "holds 0 rows"),
+        ("4O0,0.1\n410,0.2\n420,0.3", "line 1 is no wavelength"),
+        ("nm,450 nm,540 nm\n400,0.1,0.2\n410,0.2,0.3", "line 2 is no wavelength"),
+        ("nm;T\n400,5;0,9\n410,5;0,8", "line 2 is no wavelength"),
     ],
 )
 def test_files_that_hold_no_curve_are_refused(tmp_path, text, words):
@@ -162,7 +166,15 @@ def test_files_that_hold_no_curve_are_refused(tmp_path, text, words):
 def test_units_of_a_header_count_and_noise_about_nothing_is_cut(tmp_path):
     (tmp_path / "f.csv").write_text("wavelength (um)\ttransmittance\n0.5\t-0.001\n0.55\t0.9\n")
     found = read_curve(tmp_path / "f.csv")
-    assert found == {"wavelength": ["500 nm", "550 nm"], "transmittance": [0.0, 0.9]}
+    assert [parse_length(w) for w in found["wavelength"]] == [500e-9, 550e-9]
+    assert found["transmittance"] == [0.0, 0.9]
+
+
+def test_a_byte_order_mark_is_no_header(tmp_path):
+    """Spreadsheets put one before what they save as UTF-8."""
+    (tmp_path / "f.csv").write_text("400,0.1\n410,0.2\n", encoding="utf-8-sig")
+    found = read_curve(tmp_path / "f.csv")
+    assert [parse_length(w) for w in found["wavelength"]] == [400e-9, 410e-9]
 
 
 def test_single_wavelengths_do_not_stand_for_bands_behind_a_clear_cell():

@@ -48,7 +48,7 @@ def test_an_example_is_parsed(line, arguments, command, tmp_path, monkeypatch):
                 path.touch()
             elif not path.suffix:
                 path.mkdir(exist_ok=True)
-    command.make_context(" ".join(line), arguments)
+    assert command.make_context(" ".join(line), arguments).params
 
 
 DEMUX = [line for line, *_ in EXAMPLES if line[0] == "demux" and "--scheduler" not in line]

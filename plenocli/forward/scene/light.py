@@ -68,7 +68,7 @@ def broadband(
         width = None if band is None else band.fwhm * (GAUSSIAN if band.shape == "gaussian" else 1)
         return Quadrature(lines, np.full(len(lines), 1 / len(lines)), width)
     if step is None:
-        step = (_finest(camera) if camera.filter_array else COARSEST) / 2
+        step = _finest(camera) / 2
     low = min(VISIBLE[0], *camera.light.wavelengths)
     high = max(VISIBLE[1], *camera.light.wavelengths)
     if not 0 < step <= (high - low) / 2:
@@ -180,8 +180,9 @@ def band_weights(
 
 def _finest(camera: Camera) -> float:
     """Width (m) of the finest band of the camera's filters."""
-    finest = min(f.detail for f in camera.filter_array.filters) if camera.filter_array else np.inf
-    return min(finest, COARSEST) if np.isinf(finest) else finest
+    filters = camera.filter_array.filters if camera.filter_array else ()
+    finest = min((f.detail for f in filters), default=np.inf)
+    return COARSEST if np.isinf(finest) else finest
 
 
 def has_colour(camera: Camera) -> bool:

@@ -75,7 +75,7 @@ class _Comparison:
     light: str
     camera: Camera | None
     sensor_snr: float | None
-    classes: Path | str | None = None
+    classes: Path | str | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +133,9 @@ def run_score(
     for target, suffix in ((output, ".json"), (report, ".html")):
         if target is not None:
             check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
-    comparison = _comparison(truth, whites, patches, pif, capture, block, sampling, light, camera)
-    comparison = replace(comparison, classes=classes)
+    comparison = _comparison(
+        truth, whites, patches, pif, capture, block, sampling, light, camera, classes
+    )
     scored = _score_all(results, comparison, tuple(metrics))
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
@@ -201,6 +202,7 @@ def _comparison(
     sampling: str,
     light: str,
     camera: Path | str | None,
+    classes: Path | str | None,
 ) -> _Comparison:
     from plenocli.files.artefacts.shards import read_pif
     from plenocli.files.read.cameras import read_camera
@@ -222,6 +224,7 @@ def _comparison(
         light=light,
         camera=read_camera(camera) if camera else None,
         sensor_snr=_sensor_snr(capture) if capture else None,
+        classes=classes,
     )
 
 

@@ -63,6 +63,10 @@ def test_lenslets_are_told_by_truth_and_noise():
     interval = binomtest(hits, 55 * 70).proportion_ci(method="wilson")
     assert score.class_accuracy_low == pytest.approx(interval.low)
     assert score.class_accuracy_high == pytest.approx(interval.high)
+    # the two shares whose own standard error puts the one seen at 1.96 of it
+    for end in (interval.low, interval.high):
+        away = abs(hits / (55 * 70) - end) / np.sqrt(end * (1 - end) / (55 * 70))
+        assert away == pytest.approx(1.959964, rel=1e-6)
     blind = classes.score_classes(values, truth, None, known)
     assert blind.class_accuracy_predicted is None and blind.class_accuracy > 0.85
     assert classes.score_classes(np.full_like(truth, np.nan), truth, sigma, known) is None

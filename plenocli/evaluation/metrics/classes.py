@@ -4,7 +4,6 @@ the noise, and how often that should succeed.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +24,6 @@ DEFINITIONS = {
     ),
     "class_distance": "distance of the two classes that are hardest to tell, standard deviations",
 }
-_Z = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -139,10 +137,10 @@ def predicted_accuracy(distances: np.ndarray) -> np.ndarray:
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % confidence interval of a share (Wilson 1927)."""
-    share, z2 = hits / count, _Z**2 / count
-    middle = (share + z2 / 2) / (1 + z2)
-    half = _Z / (1 + z2) * math.sqrt(share * (1 - share) / count + z2 / (4 * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    from scipy.stats import binomtest
+
+    found = binomtest(hits, count).proportion_ci(0.95, "wilson")
+    return float(found.low), float(found.high)
 
 
 def _whitening(covariance: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
 """Linear maps between named spaces: a dense matrix, and a matrix that repeats from
-lenslet to lenslet.
+lenslet to lenslet, offset by offset or lattice frequency by lattice frequency.
 
 Every map has `domain` and `range` (Space), `dtype`, `forward(x)` and `adjoint(y)`; both directions
 keep leading axes out: x has exactly `domain.shape` and y exactly `range.shape`.
@@ -7,12 +7,18 @@ keep leading axes out: x has exactly `domain.shape` and y exactly `range.shape`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from math import prod
 from typing import Protocol
 
 import numpy as np
+
+from plenocli.base.budget import spread
+
+CHUNK = 1 << 25
+"""Bytes of kernels that are transformed at a time."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,182 @@ class BlockToeplitz:
         other = copy(self)
         other.terms = [(block, offset) for block, offset in self.terms if np.any(offset != 0)]
         return other
+
+
+class BlockCirculant:
+    """The whole array when every lenslet answers alike, on a torus: y[l] = sum_parts sum_o
+    A_o x[(l - o) mod torus], kept where lenslets are. After a Fourier transform over the
+    lenslets it is one small dense matrix a lattice frequency, so that kernels may reach far.
+
+    parts: (blocks (offset, pixel, point), offsets (offset, 2) integers, row then column) of each
+        object plane, as in BlockToeplitz; planes may have offsets of their own. Their points
+        one after the other are the unknowns.
+    count: (rows, columns) of lenslets that are seen, from [0, 0] of the torus.
+    torus: (rows, columns) of lenslets that have unknowns. No light goes round it as long as it
+        has `count` and the farthest offset; what lies outside on the left is what lies outside
+        on the right, unless it has that offset twice (see torus_for).
+
+    `spectrum` (frequency, pixel, unknown) has the frequencies of rfft2, row by row, complex64 for
+    single precision and complex128 for double. Arrays are worked on in that precision.
+
+    Raises ValueError where parts do not fit together, and where the torus is too small.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[tuple[np.ndarray, np.ndarray]],
+        count: tuple[int, int],
+        torus: tuple[int, int],
+    ) -> None:
+        pairs = [(np.asarray(b), np.asarray(o, dtype=int)) for b, o in parts]
+        if not pairs:
+            raise ValueError("a map needs at least one part")
+        pixels = pairs[0][0].shape[1] if pairs[0][0].ndim == 3 else -1
+        for blocks, offsets in pairs:
+            if blocks.ndim != 3 or offsets.shape != (len(blocks), 2) or blocks.shape[1] != pixels:
+                raise ValueError(
+                    f"blocks {blocks.shape} need offsets ({len(blocks)}, 2), not {offsets.shape}, "
+                    f"and {pixels} pixels as the others"
+                )
+            if len({tuple(o) for o in offsets.tolist()}) != len(offsets):
+                raise ValueError("an offset appears twice")
+        self.reach = tuple(int(max(abs(o[:, a]).max() for _, o in pairs)) for a in (0, 1))
+        (rows, columns), self.torus = count, (int(torus[0]), int(torus[1]))
+        if any(p < n + r for p, n, r in zip(self.torus, count, self.reach)):
+            raise ValueError(
+                f"light of {self.reach} lenslets beside {tuple(count)} goes round a torus of "
+                f"{self.torus}"
+            )
+        unknowns = sum(blocks.shape[2] for blocks, _ in pairs)
+        self.dtype = np.result_type(np.float32, *(blocks for blocks, _ in pairs))
+        self.domain = Space(("lenslet_row", "lenslet_column", "unknown"), (*self.torus, unknowns))
+        self.range = Space(("lenslet_row", "lenslet_column", "pixel"), (rows, columns, pixels))
+        self.frequencies = (self.torus[0], self.torus[1] // 2 + 1)
+        self.spectrum = np.empty(
+            (prod(self.frequencies), pixels, unknowns), np.result_type(self.dtype, np.complex64)
+        )
+        first = 0
+        for blocks, offsets in pairs:
+            self._transform(blocks, offsets, slice(first, first + blocks.shape[2]))
+            first += blocks.shape[2]
+
+    @staticmethod
+    def needed(pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4) -> int:
+        """Bytes of a spectrum, and of making it.
+
+        pixels, unknowns: of a lenslet.
+        torus: (rows, columns) of lenslets.
+        itemsize: of the kernels' numbers.
+        """
+        frequencies = torus[0] * (torus[1] // 2 + 1)
+        return 2 * itemsize * pixels * unknowns * frequencies + 4 * CHUNK
+
+    def _transform(self, blocks: np.ndarray, offsets: np.ndarray, unknowns: slice) -> None:
+        """Fill the columns of a part: rows of pixels at a time, as many as CHUNK has room for."""
+        from scipy.fft import rfft2
+
+        (rows, columns), points = self.torus, blocks.shape[2]
+        step = max(1, CHUNK // (rows * columns * points * self.dtype.itemsize))
+        for low in range(0, blocks.shape[1], step):
+            some = blocks[:, low : low + step]
+            kernel = np.zeros((rows, columns, *some.shape[1:]), self.dtype)
+            kernel[offsets[:, 0] % rows, offsets[:, 1] % columns] = some
+            moved = rfft2(kernel, axes=(0, 1), overwrite_x=True)
+            self.spectrum[:, low : low + step, unknowns] = moved.reshape(-1, *some.shape[1:])
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        """(lenslet_row, lenslet_column, unknown) -> (lenslet_row, lenslet_column, pixel):
+        A_k x_k at every frequency.
+        """
+        rows, columns = self.range.shape[:2]
+        of_x = self.to_frequencies(_checked(x, self.domain))
+        return self.from_frequencies(self.at_frequencies(of_x))[:rows, :columns]
+
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
+        """(lenslet_row, lenslet_column, pixel) -> (lenslet_row, lenslet_column, unknown):
+        A_k^H y_k at every frequency, y = 0 where no lenslet is.
+        """
+        y = _checked(y, self.range)
+        rows, columns = self.range.shape[:2]
+        if self.torus != (rows, columns):
+            padded = np.zeros((*self.torus, y.shape[2]), self.dtype)
+            padded[:rows, :columns] = y
+            y = padded
+        return self.from_frequencies(self.back_at_frequencies(self.to_frequencies(y)))
+
+    def on_torus(self) -> BlockCirculant:
+        """The same map, with lenslets wherever there are unknowns: what a lenslet outside the
+        array would see.
+        """
+        other = copy(self)
+        other.range = Space(self.range.axes, (*self.torus, self.range.shape[2]))
+        return other
+
+    def to_frequencies(self, array: np.ndarray) -> np.ndarray:
+        """(row, column, n) on the torus -> (frequency, n), neither sum nor root divided out."""
+        from scipy.fft import rfft2
+
+        moved = rfft2(np.asarray(array, self.dtype), axes=(0, 1))
+        return moved.reshape(-1, array.shape[2])
+
+    def from_frequencies(self, array: np.ndarray) -> np.ndarray:
+        """(frequency, n) -> (row, column, n) on the torus, the inverse of to_frequencies."""
+        from scipy.fft import irfft2
+
+        whole = array.reshape(*self.frequencies, array.shape[1])
+        return irfft2(whole, s=self.torus, axes=(0, 1))
+
+    def at_frequencies(self, x: np.ndarray) -> np.ndarray:
+        """(frequency, unknown) -> (frequency, pixel): A_k x_k."""
+        return times(self.spectrum, x)
+
+    def back_at_frequencies(self, y: np.ndarray) -> np.ndarray:
+        """(frequency, pixel) -> (frequency, unknown): A_k^H y_k."""
+        return times_adjoint(self.spectrum, y)
+
+
+def times(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Each of (frequency, m, n) times its own of (frequency, n), on the threads of the budget."""
+    y = np.empty(matrices.shape[:2], np.result_type(matrices, x))
+
+    def work(part: slice) -> None:
+        np.matmul(matrices[part], x[part, :, None], out=y[part, :, None])
+
+    spread(_shares(len(matrices)), work)
+    return y
+
+
+def times_adjoint(matrices: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The conjugate transpose of each of (frequency, m, n) times its own of (frequency, m)."""
+    x = np.empty((len(matrices), matrices.shape[2]), np.result_type(matrices, y))
+
+    def work(part: slice) -> None:
+        np.matmul(y[part, None, :].conj(), matrices[part], out=x[part, None, :])
+        np.conj(x[part], out=x[part])
+
+    spread(_shares(len(matrices)), work)
+    return x
+
+
+def _shares(count: int) -> list[tuple[slice]]:
+    step = max(1, -(-count // 16))
+    return [(slice(low, low + step),) for low in range(0, count, step)]
+
+
+def torus_for(
+    count: tuple[int, int], reach: tuple[int, int], beyond: bool = False
+) -> tuple[int, int]:
+    """(rows, columns) of a torus for `count` lenslets whose light reaches `reach` of them.
+
+    count, reach: (rows, columns).
+    beyond: give what lies outside on the left unknowns other than what lies on the right.
+
+    The next sizes that are quick to transform.
+    """
+    from scipy.fft import next_fast_len
+
+    least = [n + (2 if beyond else 1) * r for n, r in zip(count, reach)]
+    return next_fast_len(least[0]), next_fast_len(least[1], real=True)
 
 
 def adjoint_gap(op: LinearMap, seed: int = 0) -> float:

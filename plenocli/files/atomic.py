@@ -1,5 +1,5 @@
 """Results appear whole or not at all: temporary file beside the target, fsync, rename,
-fsync of the folder.
+fsync of the folder; the several results of one command together (`together`).
 """
 
 from __future__ import annotations
@@ -8,7 +8,10 @@ import contextlib
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Iterator
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +23,34 @@ def check_output(
     *,
     overwrite: bool = False,
     inputs: Iterable[str | os.PathLike | None] = (),
+    others: Iterable[str | os.PathLike | None] = (),
     suffixes: tuple[str, ...] = (),
 ) -> None:
     """Refuse an output path that cannot work, before any long computation.
 
-    path: file to be written.
+    path: file to be written; of a link, what it leads to is written.
     overwrite: whether it may exist.
     inputs: files that are read, which it may not replace.
+    others: files that the same command writes too.
     suffixes: allowed ones; any where there are none.
 
-    Raises UsageError if the file exists and `overwrite` is not set, or its suffix is none of
-    `suffixes` (where given); OutputError if `path` is a folder or not an ordinary file, its name is
-    impossible, its folder is missing or read-only, or it is one of `inputs`.
+    Raises UsageError if the file exists and `overwrite` is not set, it is one of `others`, or its
+    suffix is none of `suffixes` (where given); OutputError if `path` is a folder or not an ordinary
+    file, its name is impossible, its folder is missing or read-only, or it is one of `inputs`.
     """
-    path = Path(path)
-    folder = path.parent
+    path, target = Path(path), _target(path)
+    folder = target.parent
     try:
-        os.lstat(partial_path(path))
+        os.lstat(partial_path(target))
     except (FileNotFoundError, NotADirectoryError):
         pass
     except OSError as error:
         raise OutputError(
             f"is no possible file name ({error.strerror})", path, "choose another name"
         ) from None
-    if path.is_dir():
+    if target.is_symlink():
+        raise OutputError("is a link that leads nowhere", path, "remove it or name a file")
+    if target.is_dir():
         raise OutputError("is a folder", path, "name a file for the result")
     if suffixes and path.suffix not in suffixes:
         raise UsageError(
@@ -56,18 +63,35 @@ def check_output(
         )
     if not folder.is_dir():
         raise OutputError(f"the folder {folder} does not exist", path, "make it first")
-    if path.exists():
-        for other in inputs:
-            if other is not None and os.path.exists(other) and os.path.samefile(path, other):
-                raise OutputError(
-                    "is also an input of this command", path, "give the result another name"
-                )
-        if not path.is_file():
+    if any(_is_one_file(target, other) for other in others):
+        raise UsageError(
+            "is another output of this command too", path, "give each result a name of its own"
+        )
+    if target.exists():
+        if any(_is_one_file(target, other) for other in inputs):
+            raise OutputError(
+                "is also an input of this command", path, "give the result another name"
+            )
+        if not target.is_file():
             raise OutputError("is not an ordinary file", path, "name a file for the result")
         if not overwrite:
             raise UsageError("exists already", path, "pass --overwrite or choose another name")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"the folder {folder} is read-only", path, "choose another folder")
+
+
+def _target(path: str | os.PathLike) -> Path:
+    """The file that is written: where a link leads."""
+    return Path(os.path.realpath(path) if os.path.islink(path) else path)
+
+
+def _is_one_file(path: Path, other: str | os.PathLike | None) -> bool:
+    """Whether two names, of files that need not exist, are those of one file."""
+    if other is None:
+        return False
+    if os.path.realpath(path) == os.path.realpath(other):
+        return True
+    return path.exists() and os.path.exists(other) and os.path.samefile(path, other)
 
 
 def partial_path(path: str | os.PathLike) -> Path:
@@ -94,51 +118,182 @@ def publish(path: str | os.PathLike, data: Any, *, overwrite: bool = False) -> N
             _write_all(descriptor, memoryview(piece).cast("B"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Staged:
+    """A file that is written but does not stand under its name yet.
+
+    path: as the user named it.
+    target: where it will stand, links followed.
+    partial, descriptor: where it is, open and locked.
+    overwrite: whether the target may exist.
+    """
+
+    path: Path
+    target: Path
+    partial: Path
+    descriptor: int
+    overwrite: bool
+
+    def discard(self) -> None:
+        """Let go of the temporary file; it is removed where it has not taken its place."""
+        if _is_same_file(self.descriptor, self.partial):
+            self.partial.unlink(missing_ok=True)
+        os.close(self.descriptor)
+
+
+_transaction: ContextVar[list[_Staged] | None] = ContextVar("transaction", default=None)
+
+
+@contextlib.contextmanager
+def together() -> Iterator[list[_Staged]]:
+    """All files that are written within the block appear when it ends well; of a failure, of one
+    of them or between them, every file stays as it was and nothing is left.
+
+    A block within another is part of that. Files of several names cannot appear at one instant: a
+    process that is killed just while they take their places leaves some of them old.
+
+    Raises UsageError where a file appeared meanwhile, OutputError where one cannot take its place.
+    """
+    outer = _transaction.get()
+    if outer is not None:
+        yield outer
+        return
+    staged: list[_Staged] = []
+    token = _transaction.set(staged)
+    try:
+        yield staged
+        _commit(staged)
+    finally:
+        _transaction.reset(token)
+        for file in staged:
+            file.discard()
+
+
 @contextlib.contextmanager
 def replacement(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[tuple[Path, int]]:
     """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when
-    the block ends well.
+    the block ends well, and with it the block of `together` around it.
 
     For libraries that write by name; they must write into the file that is there.
-    Errors as `publish`.
+    Errors as `publish`. A file that is replaced passes its owner and permissions on.
     """
-    path = Path(path)
     check_output(path, overwrite=overwrite)
-    partial = partial_path(path)
+    with together() as staged:
+        file = _stage(Path(path), overwrite)
+        staged.append(file)
+        try:
+            with _told(file.path):
+                yield file.partial, file.descriptor
+                _keep_rights(file)
+                os.fsync(file.descriptor)
+        except BaseException:
+            staged.remove(file)
+            file.discard()
+            raise
+
+
+def staged_path(path: str | os.PathLike) -> Path:
+    """Where the bytes of a file are that the open block of `together` has written: they do not
+    stand under its name yet. Any other path stays as it is.
+    """
+    target = _target(path)
+    known = (file.partial for file in _transaction.get() or () if file.target == target)
+    return next(known, Path(path))
+
+
+@contextlib.contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """OSError within the block becomes the OutputError for a file."""
     try:
-        descriptor = _open_partial(partial)
-    except OSError as error:
-        raise OutputError(f"cannot be written ({error.strerror})", path, remedy(error)) from error
-    try:
-        yield partial, descriptor
-        os.fsync(descriptor)
-        if not overwrite and path.exists():
-            raise UsageError(
-                "appeared while the result was computed",
-                path,
-                "pass --overwrite or choose another name",
-            )
-        os.replace(partial, path)
-        _sync_folder(path.parent)
+        yield
     except OSError as error:
         raise OutputError(
             f"cannot be written ({error.strerror})",
             path,
             "free some space or choose another folder; what was there before is untouched",
         ) from error
-    finally:
-        if _is_same_file(descriptor, partial):
-            partial.unlink(missing_ok=True)
-        os.close(descriptor)
 
 
-def _open_partial(partial: Path) -> int:
-    """Open and lock the temporary file, empty.
+def _stage(path: Path, overwrite: bool) -> _Staged:
+    target = _target(path)
+    partial = partial_path(target)
+    try:
+        # what replaces a file is no more open than that while it is written
+        descriptor = _open_partial(partial, 0o600 if target.exists() else 0o666)
+    except OSError as error:
+        raise OutputError(f"cannot be written ({error.strerror})", path, remedy(error)) from error
+    return _Staged(
+        path=path, target=target, partial=partial, descriptor=descriptor, overwrite=overwrite
+    )
+
+
+def _keep_rights(file: _Staged) -> None:
+    """Give a file the owner and the permissions of the one that it replaces."""
+    try:
+        before = os.stat(file.target)
+    except FileNotFoundError:
+        return
+    with contextlib.suppress(PermissionError):
+        os.fchown(file.descriptor, before.st_uid, before.st_gid)
+    os.fchmod(file.descriptor, stat.S_IMODE(before.st_mode))
+
+
+def _commit(staged: Sequence[_Staged]) -> None:
+    """Let all files take their places, or none."""
+    for file in staged:
+        if not file.overwrite and file.target.exists():
+            raise UsageError(
+                "appeared while the result was computed",
+                file.path,
+                "pass --overwrite or choose another name",
+            )
+    placed: list[tuple[_Staged, Path | None]] = []
+    try:
+        for file in staged:
+            with _told(file.path):
+                # a single file needs no way back
+                placed.append((file, _kept(file.target) if len(staged) > 1 else None))
+                os.replace(file.partial, file.target)
+    except BaseException:
+        for file, before in placed:
+            _put_back(file, before)
+        raise
+    for _, before in placed:
+        if before is not None:
+            before.unlink(missing_ok=True)
+    for folder in dict.fromkeys(file.target.parent for file in staged):
+        _sync_folder(folder)
+
+
+def _kept(target: Path) -> Path | None:
+    """A second name for a file that is there, by which it can be put back."""
+    if not target.exists():
+        return None
+    before = target.with_name(f".{target.name}.before")
+    before.unlink(missing_ok=True)
+    try:
+        os.link(target, before)
+    except OSError:  # a file system without hard links
+        os.rename(target, before)
+    return before
+
+
+def _put_back(file: _Staged, before: Path | None) -> None:
+    """Undo what `_commit` did to one file, as far as it came."""
+    if before is not None:
+        os.rename(before, file.target)
+        before.unlink(missing_ok=True)  # two names of one file are not renamed
+    elif _is_same_file(file.descriptor, file.target):
+        file.target.unlink()
+
+
+def _open_partial(partial: Path, mode: int = 0o666) -> int:
+    """Open and lock the temporary file, empty; `mode` of a new one, less the umask.
 
     The lock keeps two runs with one target from mixing their bytes.
     """
     while True:
-        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -6,11 +6,13 @@ faults) does all of it.
 
 import fcntl
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from plenocli.files.artefacts.container import read_artefact, write_artefact
 from tests.faults.harness import Runner
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_configs"
@@ -81,10 +83,12 @@ def make_all(folder, runner):
     outcome = runner.run(field, folder, limit=120)
     assert outcome.code == 0, outcome.text
     write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
+    learnt = read_artefact(folder / "dictionary.h5")
+    write_artefact(folder / "unfinished.h5", replace(learnt, kind="checkpoint"))
     (folder / "done").touch()
 
 
-def write_shards(folder, name, groups):
+def write_shards(folder, name, groups, overwrite=False):
     """The 3x3 matrix in a file for each group of its lenslets, and their index: cameras for
     which the stage does so are too large for these tests.
     """
@@ -92,7 +96,7 @@ def write_shards(folder, name, groups):
 
     whole = read_pif(folder / "pif-3x3.h5")
     A = whole.data["pif/A"]
-    with writing_pif(folder / name, A.shape, A.dtype, groups=groups) as writer:
+    with writing_pif(folder / name, A.shape, A.dtype, groups=groups, overwrite=overwrite) as writer:
         for band in range(A.shape[0]):
             for lenslet in range(9):
                 writer.put(band, lenslet, A[band, lenslet])

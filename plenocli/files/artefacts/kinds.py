@@ -5,6 +5,8 @@ Pixels, points and lenslets are numbered row by row, rows downwards; positions a
 pixel centres at integers.
 """
 
+from dataclasses import replace
+
 from plenocli.files.artefacts.schema import Schema, attribute, dataset
 
 _NOTES = attribute("notes", "json", "", "anything else worth keeping")
@@ -618,6 +620,10 @@ DICTIONARY = Schema(
     default=("dictionary",),
 )
 
+CHECKPOINT = replace(
+    DICTIONARY, kind="checkpoint", doc="A dictionary that is still being learnt (--checkpoint)."
+)
+
 IMAGE = Schema(
     kind="image",
     version=1,
@@ -889,6 +895,7 @@ SCHEMAS = {
         CALIBRATION,
         SPECTRA,
         DICTIONARY,
+        CHECKPOINT,
         IMAGE,
         SWEEP,
         LIGHTFIELD,

@@ -21,7 +21,7 @@ from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance, file_digest
 from plenocli.files.artefacts.stream import streamed_artefact
-from plenocli.files.atomic import check_output
+from plenocli.files.atomic import check_output, staged_path, together
 from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.accuracy.depth_planes import plane_weights
 from plenocli.forward.accuracy.field_nodes import FieldNodes, Place, turned_blocks
@@ -111,11 +111,11 @@ class PifWriter:
         self._index = artefact
 
     def index(self) -> None:
-        """Write the index, once the shards stand under their names."""
+        """Write the index, once the shards are written."""
         if self._groups is None:
             return
         home = np.array([self._home[lenslet][0] for lenslet in sorted(self._home)], np.int32)
-        shards = [{"name": file.name, "sha256": file_digest(file)} for file in self.files]
+        shards = _described(self.files)
         artefact = self._index
         write_artefact(
             self.path,
@@ -138,25 +138,16 @@ def writing_pif(
     groups: Sequence[Sequence[int]] | None = None,
     overwrite: bool = False,
 ) -> Iterator[PifWriter]:
-    """Yield a PifWriter; all files appear when the block ends well, the index last.
-
-    After a failure no new file is left.
+    """Yield a PifWriter; all files appear together when the block ends well.
 
     Errors as write_artefact.
     """
     check_output(path, overwrite=overwrite)
-    writer, before = None, set()
-    try:
+    with together():
         with contextlib.ExitStack() as stack:
-            before = {n for n in range(len(groups or ())) if shard_path(path, n).exists()}
             writer = PifWriter(path, shape, dtype, groups, stack, overwrite)
             yield writer
         writer.index()
-    except BaseException:
-        for n in range(len(groups or ())):
-            if n not in before:
-                shard_path(path, n).unlink(missing_ok=True)
-        raise
 
 
 PIF_KINDS = ("pif", "pif-index", "pif-planes", "pif-field")
@@ -234,15 +225,14 @@ def write_planes(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write the index of planes whose files stand at shard_path(path, 0), 1, ... already.
+    """Write the index of planes whose files are written to shard_path(path, 0), 1, ... already.
 
     distances: m, nearest first;
     error: relative, of a column in between.
 
     Errors as write_artefact.
     """
-    files = [shard_path(path, number) for number in range(len(distances))]
-    named = [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    named = _described([shard_path(path, number) for number in range(len(distances))])
     write_artefact(
         path,
         Artefact(
@@ -258,12 +248,11 @@ def write_planes(
 def write_field(
     path: str | os.PathLike, nodes: FieldNodes, provenance: Provenance, *, overwrite: bool = False
 ) -> None:
-    """Write the index of places whose files stand at shard_path(path, 0), 1, ... already.
+    """Write the index of places whose files are written to shard_path(path, 0), 1, ... already.
 
     Errors as write_artefact.
     """
-    files = [shard_path(path, number) for number in nodes.numbers]
-    named = [{"name": file.name, "sha256": file_digest(file)} for file in files]
+    named = _described([shard_path(path, number) for number in nodes.numbers])
     data = {
         "field/row": nodes.rows,
         "field/column": nodes.columns,
@@ -272,6 +261,11 @@ def write_field(
     }
     attrs = {"field": {"files": named, "error": nodes.error}}
     write_artefact(path, Artefact("pif-field", data, attrs, provenance), overwrite=overwrite)
+
+
+def _described(files: Sequence[Path]) -> list[dict[str, str]]:
+    """Name and digest of the files that an index holds."""
+    return [{"name": file.name, "sha256": file_digest(staged_path(file))} for file in files]
 
 
 def read_field(

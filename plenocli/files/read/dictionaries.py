@@ -63,18 +63,19 @@ class Unfinished:
     training: tuple[str, ...]
 
 
-def read_unfinished(path: Path, system: LensletMatrix) -> Unfinished:
+def read_unfinished(path: Path, system: LensletMatrix, *, kept: bool) -> Unfinished:
     """What learning goes on from.
 
-    path: of a dictionary artefact.
+    path: of a dictionary artefact, or of a checkpoint.
     system: the matrix that it is learnt for.
+    kept: only a checkpoint will do: it is written anew, and removed at the end.
 
     Raises InputError where it belongs to another system matrix, or lacks what a resumed run needs.
     """
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
 
-    artefact = read_artefact(path, "dictionary")
+    artefact = read_artefact(path, "checkpoint" if kept else ("dictionary", "checkpoint"))
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
         raise InputError(
             f"was learnt for another system matrix than {system.path.name}",

@@ -49,7 +49,7 @@ def run_colorchecker(
     """
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output, publish
+    from plenocli.files.atomic import check_output, publish, together
 
     found = read_chart_folder(
         folder, cfa=settings.cfa, labels=settings.labels, spectra=settings.spectra
@@ -57,7 +57,9 @@ def run_colorchecker(
     inputs = found.files.paths()
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".h5",))
     if measures is not None:
-        check_output(measures, overwrite=overwrite, inputs=inputs, suffixes=(".json",))
+        check_output(
+            measures, overwrite=overwrite, inputs=inputs, others=[output], suffixes=(".json",)
+        )
     try:
         rates = band_rates(found.data)
         measured = measure_chart(found.data, rates, settings.flatten == "paper", settings.grid)
@@ -72,19 +74,17 @@ def run_colorchecker(
     )
     notes = {"flatten": settings.flatten, "patches": "colorchecker"}
     wavelengths, values = denser(found.data.bands, measured.cube)
-    write_artefact(
-        output,
-        Artefact(
-            "image",
-            {"image/wavelength": wavelengths, "image/value": values},
-            {"image": {"method": "measured", "notes": notes}},
-            Provenance(command=command, inputs=described),
-        ),
-        overwrite=overwrite,
+    chart = Artefact(
+        "image",
+        {"image/wavelength": wavelengths, "image/value": values},
+        {"image": {"method": "measured", "notes": notes}},
+        Provenance(command=command, inputs=described),
     )
-    if measures is not None:
-        text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
-        publish(measures, text.encode(), overwrite=overwrite)
+    with together():
+        write_artefact(output, chart, overwrite=overwrite)
+        if measures is not None:
+            text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
+            publish(measures, text.encode(), overwrite=overwrite)
     return document
 
 

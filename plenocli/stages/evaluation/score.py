@@ -126,13 +126,15 @@ def run_score(
     Raises the error of the worst one at the end.
     """
     from plenocli.files.artefacts.provenance import describe_inputs
-    from plenocli.files.atomic import check_output, publish
+    from plenocli.files.atomic import check_output, publish, together
 
     inputs = [*results, truth, *whites, patches, pif, capture, camera, classes]
     files = [path for path in inputs if _is_file(path)]
-    for target, suffix in ((output, ".json"), (report, ".html")):
-        if target is not None:
-            check_output(target, overwrite=overwrite, inputs=files, suffixes=(suffix,))
+    check_output(output, overwrite=overwrite, inputs=files, suffixes=(".json",))
+    if report is not None:
+        check_output(
+            report, overwrite=overwrite, inputs=files, others=[output], suffixes=(".html",)
+        )
     comparison = _comparison(
         truth, whites, patches, pif, capture, block, sampling, light, camera, classes
     )
@@ -154,9 +156,10 @@ def run_score(
     }
     document = _document(results, scored, describe_inputs(roles), command)
     text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
-    publish(output, text.encode(), overwrite=overwrite)
-    if report is not None:
-        publish(report, _page(document, scored), overwrite=overwrite)
+    with together():
+        publish(output, text.encode(), overwrite=overwrite)
+        if report is not None:
+            publish(report, _page(document, scored), overwrite=overwrite)
     if errors:
         raise failed_together(
             errors, len(results), "results", output, "the others are scored; see the messages above"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +90,8 @@ def run_show(
     from plenocli.report.drawing import stacked
 
     output = Path(output) if output is not None else Path(f"{Path(files[0]).stem}.png")
-    check_output(output, overwrite=overwrite, suffixes=(".png",))
+    inputs = [*files, truth, calibration]
+    check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".png",))
     centres = None if calibration is None else _centres(calibration)
     found = [_open(Path(file)) for file in files]
     kinds = [file.kind for file in found]
@@ -190,7 +191,8 @@ def _dictionary(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.results import result_of
     from plenocli.report.figures import dictionary_figures
 
-    return dictionary_figures(result_of(file.stored(), file.path), file.path.name, choice.matrix)
+    learnt = replace(file.stored(), kind="dictionary")  # a checkpoint holds the same
+    return dictionary_figures(result_of(learnt, file.path), file.path.name, choice.matrix)
 
 
 def _spectra(file: _File, choice: _Choice) -> Figures:
@@ -240,6 +242,7 @@ _FIGURES = {
     "capture": _capture,
     "calibration": _calibration,
     "dictionary": _dictionary,
+    "checkpoint": _dictionary,
     "spectra": _spectra,
     "image": _image,
     "sweep": _sweep,

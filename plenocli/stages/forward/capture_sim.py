@@ -152,6 +152,7 @@ def run_capture_sim(
     options, InputError for files, OutputError where one cannot be written.
     """
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.atomic import together
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import camera_files, read_camera
@@ -185,11 +186,12 @@ def run_capture_sim(
         accuracy=accuracy,
     )
     truth, bands = found.scene, found.wavelengths
-    write_capture(
-        output, found.capture, provenance, scene=truth, wavelengths=bands, overwrite=overwrite
-    )
-    if scene_out:
-        _write_scene(scene_out, truth, bands, provenance, overwrite)
+    with together():
+        write_capture(
+            output, found.capture, provenance, scene=truth, wavelengths=bands, overwrite=overwrite
+        )
+        if scene_out:
+            _write_scene(scene_out, truth, bands, provenance, overwrite)
     return _summary(output, found, len(source.wavelengths))
 
 
@@ -217,7 +219,13 @@ def _check_outputs(
         )
     check_output(output, overwrite=overwrite, inputs=inputs)
     if scene_out:
-        check_output(scene_out, overwrite=overwrite, inputs=inputs, suffixes=(".h5", ".exr"))
+        check_output(
+            scene_out,
+            overwrite=overwrite,
+            inputs=inputs,
+            others=[output],
+            suffixes=(".h5", ".exr"),
+        )
 
 
 def _summary(output: Path, found: SimulatedCapture, wavelengths: int) -> CaptureSummary:

@@ -41,7 +41,7 @@ def run_init(folder: Path, *, overwrite: bool = False) -> InitSummary:
 
     Raises UsageError where a file exists, OutputError where one cannot be written.
     """
-    from plenocli.files.atomic import check_output, publish
+    from plenocli.files.atomic import check_output, publish, together
 
     found = samples()
     targets = {sample.name: folder / sample.name for sample in found}
@@ -58,8 +58,9 @@ def run_init(folder: Path, *, overwrite: bool = False) -> InitSummary:
         except OSError as error:
             fix = "check its name, and that the folder around it is there and writable"
             raise OutputError(f"the folder cannot be made ({error.strerror})", place, fix) from None
-    for sample in found:
-        publish(targets[sample.name], sample.content, overwrite=overwrite)
+    with together():
+        for sample in found:
+            publish(targets[sample.name], sample.content, overwrite=overwrite)
     return InitSummary(folder=str(folder), files=[sample.name for sample in found])
 
 

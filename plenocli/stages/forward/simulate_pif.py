@@ -429,21 +429,20 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
 def _write_several(
     task: _Task, jobs: list[_Job], several: DepthPlanes | FieldNodes, output: Path | str
 ) -> PlanesSummary | FieldSummary:
-    """Compute the matrices of all planes or places into files of their own, then the index; of a
-    failure no new file is left.
+    """Compute the matrices of all planes or places into files of their own, then the index; all
+    appear together.
     """
     from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.shards import shard_path, write_field, write_planes
-    from plenocli.files.atomic import check_output
+    from plenocli.files.atomic import check_output, together
     from plenocli.forward.accuracy.field_nodes import FieldNodes
 
     files = [shard_path(output, number) for number in range(len(jobs))]
     for job, file in zip(jobs, files):
         check_output(file, overwrite=task.overwrite, inputs=[task.camera_path], suffixes=(".h5",))
         pif_pieces.layout(job.plan, task.camera_path)  # refused before the first is computed
-    before = {file for file in files if file.exists()}
     note(several.line())
-    try:
+    with together():
         made = [_write(task, job, file) for job, file in zip(jobs, files)]
         provenance = _provenance(
             task.camera_path, jobs[0].camera, task.settings, jobs[0].plan, task.command
@@ -454,11 +453,6 @@ def _write_several(
             write_planes(
                 output, several.distances, several.error, provenance, overwrite=task.overwrite
             )
-    except BaseException:
-        for file in files:
-            if file not in before:
-                file.unlink(missing_ok=True)
-        raise
     if isinstance(several, FieldNodes):
         return FieldSummary(
             output=str(output),

@@ -82,7 +82,7 @@ def run_fit_camera(
     Raises UsageError, InputError, OutputError; NumericsError where no camera near the described one
     explains the captures: then nothing is written.
     """
-    from plenocli.files.atomic import publish
+    from plenocli.files.atomic import publish, together
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.captures import read_white
     from plenocli.files.read.training import files_of
@@ -115,10 +115,11 @@ def run_fit_camera(
             Path(camera).name,
             "check its distances, the calibration and --noise-sigma, or give more captures",
         )
-    if details is not None:
-        origin = {**named, "capture": captures, "calibration": calibration}
-        _write_details(fit, details, origin, command=command, seed=seed, overwrite=overwrite)
-    publish(output, fitted_toml(fit, camera, captures).encode(), overwrite=overwrite)
+    with together():
+        if details is not None:
+            origin = {**named, "capture": captures, "calibration": calibration}
+            _write_details(fit, details, origin, command=command, seed=seed, overwrite=overwrite)
+        publish(output, fitted_toml(fit, camera, captures).encode(), overwrite=overwrite)
     return CameraFitSummary(output=str(output), captures=len(captures), fit=fit)
 
 
@@ -160,7 +161,9 @@ def _check_outputs(
 
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".toml",))
     if details is not None:
-        check_output(details, overwrite=overwrite, inputs=[*inputs, output], suffixes=(".h5",))
+        check_output(
+            details, overwrite=overwrite, inputs=inputs, others=[output], suffixes=(".h5",)
+        )
 
 
 def _described(camera: Path, output: Path) -> tuple[Camera, dict[str, Any]]:

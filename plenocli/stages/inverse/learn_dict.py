@@ -186,7 +186,7 @@ def run_learn_dict(
         machine, state = advance(machine, state)
         _tell(state)
         if checkpoint is not None:
-            _write(checkpoint, state, machine, scenes, origin, overwrite=True)
+            _write(checkpoint, state, machine, scenes, origin, kind="checkpoint", overwrite=True)
     synthesis = machine.synthesis(state) if settings.synthesis else None
     summary = _judge(replace(learning, machine=machine), state, synthesis, output)
     _write(
@@ -231,7 +231,7 @@ def _begin(
     system = read_lenslet_matrix(pif)
     pictures = split_by_scene(read_training(images, system.object_shape))
     scenes = Scenes(*(at_scales(part, system.object_shape) for part in pictures))
-    earlier = read_unfinished(resume, system) if resume else None
+    earlier = read_unfinished(resume, system, kept=same) if resume else None
     chosen = _resolve(settings, system, earlier, same=same)
     if earlier and scenes.training_names != list(earlier.training):
         raise UsageError(
@@ -280,16 +280,11 @@ def _check_files(
     if checkpoint is None:
         return False
     kept = Path(checkpoint).exists()
-    if Path(checkpoint).resolve() == Path(output).resolve():
-        raise UsageError(
-            f"{Path(checkpoint).name} is the result too",
-            "--checkpoint",
-            "give it another name; it is removed at the end",
-        )
     check_output(
         checkpoint,
         overwrite=True,
-        inputs=[*read, output, *([resume] if resume else [])],
+        inputs=[*read, resume],
+        others=[output],
         suffixes=(".h5",),
     )
     return kept
@@ -439,12 +434,14 @@ def _write(
     scenes: Scenes,
     origin: Origin,
     *,
+    kind: str = "dictionary",
     synthesis: np.ndarray | None = None,
     summary: LearnSummary | None = None,
     overwrite: bool,
 ) -> None:
     """The artefact of a state.
 
+    kind: dictionary or checkpoint.
     synthesis: atoms that paint.
     summary: None where the run goes on.
     """
@@ -478,7 +475,7 @@ def _write(
     )
     attrs = {k: v for k, v in attrs.items() if v is not None}
     write_artefact(
-        output, Artefact("dictionary", data, {"dictionary": attrs}, provenance), overwrite=overwrite
+        output, Artefact(kind, data, {"dictionary": attrs}, provenance), overwrite=overwrite
     )
 
 

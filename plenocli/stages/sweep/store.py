@@ -57,7 +57,7 @@ def open_store(
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".h5",))
     folder = output.with_suffix(".parts")
     again = overwrite or folder.is_dir()  # what an unfinished run left is ours
-    check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs)
+    check_output(output.with_suffix(".csv"), overwrite=again, inputs=inputs, others=[output])
     if plot is not None:
         if find_spec("matplotlib") is None:
             raise UsageError(
@@ -65,7 +65,8 @@ def open_store(
                 "--plot",
                 f"{how_to_install('plot')}, or leave it out",
             )
-        check_output(plot, overwrite=again, inputs=inputs, suffixes=(".png",))
+        others = [output, output.with_suffix(".csv")]
+        check_output(plot, overwrite=again, inputs=inputs, others=others, suffixes=(".png",))
     store = Store(folder, output, plot, overwrite, again)
     try:
         yield store

@@ -215,7 +215,7 @@ def finish(
     """
     from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import publish
+    from plenocli.files.atomic import publish, together
     from plenocli.files.results.design_tables import design_artefact
 
     table = design_table(space, points, objectives)
@@ -223,19 +223,20 @@ def finish(
     provenance = Provenance(
         command=command, inputs=describe_inputs(inputs), seed=space.seed, config=_base_text(space)
     )
-    publish(
-        store.output.with_suffix(".csv"),
-        _csv(points, table).encode(),
-        overwrite=store.again,
-    )
-    publish(measured_path(store.output), _measured(points).encode(), overwrite=True)
-    if store.plot is not None and not table.ahead.any():
-        note("no point has all figures of the front: there is nothing to draw")
-    elif store.plot is not None:
-        from plenocli.report.front import front_picture
+    with together():
+        publish(
+            store.output.with_suffix(".csv"),
+            _csv(points, table).encode(),
+            overwrite=store.again,
+        )
+        publish(measured_path(store.output), _measured(points).encode(), overwrite=True)
+        if store.plot is not None and not table.ahead.any():
+            note("no point has all figures of the front: there is nothing to draw")
+        elif store.plot is not None:
+            from plenocli.report.front import front_picture
 
-        publish(store.plot, front_picture(table), overwrite=store.again)
-    write_artefact(store.output, design_artefact(table, provenance), overwrite=store.overwrite)
+            publish(store.plot, front_picture(table), overwrite=store.again)
+        write_artefact(store.output, design_artefact(table, provenance), overwrite=store.overwrite)
     for shared in SHARED:
         shutil.rmtree(store.folder / shared, ignore_errors=True)
     results = [result_of(point) for point in points]

@@ -9,6 +9,7 @@ SHELL := bash
 PYTHON ?= python3
 VENV ?= .venv
 RUNS ?= runs
+include pipelines/names.mk
 BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f

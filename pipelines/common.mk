@@ -6,8 +6,11 @@ SHELL := bash
 
 P := plenocli
 RUN ?= runs/experiment
+include $(dir $(lastword $(MAKEFILE_LIST)))names.mk
 
 $(RUN):
 	@mkdir -p $@
 $(RUN)/%/:
 	@mkdir -p $@
+# else Make takes them for files of its own and tries to remove them at the end
+.PRECIOUS: $(RUN)/%/

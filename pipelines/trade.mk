@@ -2,7 +2,7 @@
 # and inverted in many ways. Tables, their measured seconds and a page with plots in RUN. Your own: make -f pipelines/trade.mk TRADES=my.toml
 TRADES ?= $(foreach s,trade trade_iterations trade_spectral trade_depth,sample_configs/sweeps/$s.toml)
 RUN ?= runs/trade
-SWEEPS := $(TRADES)
+SWEEPS = $(TRADES)
 
 page: all
 	$(P) report $(RUN) --title "What accuracy buys, and what it costs" -o $(RUN)/trade.html --overwrite

@@ -1,0 +1,25 @@
+# Included before anything is expanded: a setting that Make or the shell would read as more than names ends the run. Quotes cannot
+# help, for Make itself takes lists apart at spaces and runs $(shell ...); plenocli, called without Make, takes any name.
+SETTINGS := BANDS BATCH BUDGET CAMERA CAPTURES CFA CONFIG COUNT DARK DATA EXPERIMENTS FIT ITERATIONS LEARN LONG METHODS PHOTO PITCH \
+	PLAN PYTHON REFINE RIGHT RUN RUNS SAMPLING SCENE SCENES SCHEDULER SEED SHORT SIZE SNR SUPERPIXELS SWEEPS TRADES TRAINING VENV \
+	WHITE WORKERS
+ONE_NAME := CAMERA CONFIG DATA PHOTO RUN RUNS SCENE VENV
+# prerequisites of rules, where Make reads : and = as its own
+NAMES := $(ONE_NAME) CAPTURES DARK SWEEPS TRADES WHITE
+
+HASH := \#
+BEYOND_NAMES := $$ & ; | < > ( ) { } [ ] " ' ` \ ! % $(HASH)
+define NEWLINE
+
+
+endef
+found = $(strip $(foreach c,$(BEYOND_NAMES),$(findstring $c,$(value $1))) $(if $(findstring $(NEWLINE),$(value $1)),line break) \
+	$(if $(filter $1,$(NAMES)),$(foreach c,: =,$(findstring $c,$(subst skimage:,,$(value $1))))) \
+	$(if $(filter BANDS,$1),$(foreach b,$(value $1),$(if $(word 3,$(subst =, ,$b)),= twice))))
+
+given := $(foreach v,$(SETTINGS),$(if $(filter command environment,$(firstword $(origin $v))),$v))
+$(foreach v,$(given),$(if $(call found,$v),$(error $v holds $(call found,$v), which Make or the shell would read as more than a name; \
+	rename the file, or call plenocli without make)))
+$(foreach v,$(filter $(ONE_NAME),$(given)),$(if $(word 2,$(value $v)),$(error $v holds a space, where Make ends a name; \
+	rename the file or folder, or call plenocli without make)))
+$(foreach v,$(filter RUN RUNS VENV,$(given)),$(if $(strip $(value $v)),,$(error $v is empty, where a folder is due)))

@@ -41,6 +41,13 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "class_accuracy_predicted",
         "class_distance",
     ),
+    "detection": (
+        "detection_auc",
+        "detection_auc_low",
+        "detection_auc_high",
+        "detection_auc_predicted",
+        "target_contrast",
+    ),
     "single-pixel": (
         "rmse_over_single_pixel",
         "six_patch_rmse_over_single_pixel",
@@ -113,7 +120,8 @@ _NEEDED = {
         "give a spectral result and its --patches, two or more; one of the two numbers "
         "needs scikit-learn"
     ),
-    "classes": "give spectra and the table of --classes",
+    "classes": "give spectra and the spectra of --classes",
+    "detection": "give --classes, and with --detect the one that is looked for",
     "single-pixel": "give spectra of demux --method single-pixel among the results",
 }
 
@@ -147,6 +155,12 @@ _HOMES: Mapping[str, tuple[ModuleType, ...]] = {
     "lightfield": (depth,),
     "calibration": (response,),
 }
+
+
+def every_definition() -> dict[str, str]:
+    """What each figure of pictures, spectra and planes means, by its name."""
+    homes = (quality, spectral, snr, classify, classes, depth)
+    return {name: text for home in homes for name, text in home.DEFINITIONS.items()}
 
 
 def definitions_of(results: Iterable[ResultScore]) -> dict[str, str]:

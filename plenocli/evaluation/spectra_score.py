@@ -73,6 +73,7 @@ def score_spectra(
     whites: Mapping[str, WhiteTarget] | None = None,
     needs_reflectance: bool = False,
     classes: Classes | None = None,
+    detect: str | None = None,
 ) -> tuple[SpectraScore, tuple[PatchScore, ...]]:
     """Figures of a spectral cube, and what each patch shows.
 
@@ -81,7 +82,8 @@ def score_spectra(
     light: name of the illuminant for colour differences.
     whites: method -> spectra of a white target.
     needs_reflectance: the truth is reflectance for sure; radiance without a white is refused.
-    classes: what a user wants told apart, in the bands of the result.
+    classes: what a user wants told apart, in the bands of the result; detect: the one of them
+        that is looked for.
 
     Raises InputError where no lenslet has values, UsageError where no white target fits.
     docs/model.md, "Measures".
@@ -113,7 +115,7 @@ def score_spectra(
         classification=classification,
         classes=None
         if classes is None
-        else score_classes(values, truth, _relative_sigma(result, values), classes),
+        else score_classes(values, truth, _relative_sigma(result, values), classes, detect),
         snr=_snr(result, labels, white),
     ), listed
 

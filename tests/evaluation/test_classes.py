@@ -6,7 +6,10 @@ from scipy.stats import binomtest
 
 from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics import classes
-from plenocli.files.read.class_table import read_classes
+from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.read.class_table import read_labelled
+from plenocli.forward.scene.labelled import LabelledSpectra, SpectraChart
 
 BANDS = np.array([450e-9, 550e-9, 650e-9])
 
@@ -74,7 +77,8 @@ def test_lenslets_are_told_by_truth_and_noise():
 
 def test_a_table_is_read_in_the_bands_of_a_result(tmp_path):
     (tmp_path / "c.csv").write_text("nm,leaf,soil,leaf\n700,0.5,0.3,0.7\n400,0.1,0.3,0.3\n")
-    found = read_classes(tmp_path / "c.csv", BANDS)
+    read = read_labelled(tmp_path / "c.csv", BANDS)
+    found = classes.Classes.of_spectra(read.labels, read.at(BANDS))
     assert found.names == ("leaf", "soil")
     np.testing.assert_allclose(found.means, [[4 / 15, 0.4, 8 / 15], [0.3, 0.3, 0.3]])
     np.testing.assert_allclose(found.covariance, 0.02 * np.ones((3, 3)), atol=1e-12)
@@ -91,12 +95,78 @@ def test_a_table_is_read_in_the_bands_of_a_result(tmp_path):
         ("nm,leaf,soil\n400,1,1\n", "fewer than three"),
         ("nm,leaf,soil\n400,1,1\n400,1,1\n", "twice"),
         ("nm,leaf,soil\n400,1,nan\n700,1,1\n", "not finite"),
-        ("nm,leaf,soil\n500,1,1\n700,1,1\n", "the result has a band at 450 nm"),
+        ("nm,leaf,soil\n500,1,1\n700,1,1\n", "there is a band at 450 nm"),
     ],
 )
 def test_what_is_no_table_of_classes_is_refused(tmp_path, text, words):
     (tmp_path / "c.csv").write_text(text)
     with pytest.raises(InputError, match=words):
-        read_classes(tmp_path / "c.csv", BANDS)
+        read_labelled(tmp_path / "c.csv", BANDS)
     with pytest.raises(InputError, match="first column are wavelengths"):
-        read_classes(tmp_path / "missing.csv", BANDS)
+        read_labelled(tmp_path / "missing.csv", BANDS)
+
+
+def test_a_folder_is_read_as_its_tables_and_images(tmp_path):
+    """Folders, tables and spectral images by the names of their classes, on shared wavelengths."""
+    rng = np.random.default_rng(0)
+    image = rng.random((3, 4, 5))
+    nodes = np.array([450e-9, 550e-9, 660e-9])
+    (tmp_path / "leaf").mkdir()
+    (tmp_path / "leaf" / "a.csv").write_text("nm,x,y\n400,0.1,0.3\n700,0.5,0.7\n")
+    (tmp_path / "leaf" / "b.csv").write_text("nm,z\n440,0.2\n680,0.2\n")
+    origin = Provenance(command="")
+    data = {"image/value": image, "image/wavelength": nodes}
+    write_artefact(tmp_path / "soil.h5", Artefact("image", data, {"image": {}}, origin))
+    (tmp_path / "notes.txt").write_text("not a spectrum")
+    read = read_labelled(tmp_path, np.array([500e-9, 550e-9]))
+    assert read.labels == ("leaf",) * 3 + ("soil",) * 20
+    np.testing.assert_allclose(read.wavelengths, nodes)
+    np.testing.assert_allclose(read.at(550e-9)[:, 0], [0.3, 0.5, 0.2, *image[1].ravel()])
+    np.testing.assert_allclose(read.at(500e-9)[3:, 0], image[:2].mean(axis=0).ravel())
+    with pytest.raises(InputError, match="from 450 to 660 nm, there is a band at 440 nm"):
+        read_labelled(tmp_path, np.array([440e-9]))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no spectra"):
+        read_labelled(tmp_path / "empty")
+
+
+def test_a_chart_shows_every_spectrum_and_tells_mixed_cells(tmp_path):
+    labels = ("a", "a", "b", "b", "c", "c")
+    nodes = np.array([400e-9, 700e-9])
+    spectra = np.linspace(0, 1, 6)[:, None] * [1.0, 0.5]
+    chart = SpectraChart(LabelledSpectra(labels, nodes, spectra))
+    seen = chart.at(400e-9, 20, 30)  # 2 x 3 patches of 10 x 10
+    np.testing.assert_allclose(seen[::10, ::10].ravel(), spectra[:, 0], rtol=1e-6)
+    assert chart.whole(2, 3).all() and not chart.whole(3, 3)[1].any()
+    np.testing.assert_allclose(chart.at(550e-9, 2, 3), 0.75 * chart.at(400e-9, 2, 3), rtol=1e-6)
+    many = SpectraChart(LabelledSpectra(("a", "b") * 500, nodes, np.ones((1000, 2))))
+    assert len(many.spectra.labels) <= 48 and many.spectra.labels.count("a") == 24
+
+
+def test_one_class_stands_out_as_the_filter_predicts():
+    """Against draws and scikit-learn's area under the curve; the interval by its own coverage."""
+    metrics = pytest.importorskip("sklearn.metrics")
+    rng = np.random.default_rng(5)
+    known = classes.Classes.of_spectra(*library(4, apart=0.04))
+    sigma = 0.03
+    spread = known.covariance + sigma**2 * np.eye(3)
+    inside, found = 0, None
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        label = np.repeat(np.arange(4), 60)
+        values = known.means[label] + rng.multivariate_normal(np.zeros(3), spread, 240)
+        lens = classes.Filter.of(known, "class 2", spread)
+        found = classes.score_detection(values, label == 2, lens)
+        want = metrics.roc_auc_score(label == 2, values @ lens.weights)
+        assert found.detection_auc == pytest.approx(want, abs=1e-12)
+        big = known.means[np.repeat(np.arange(4), 5000)] if seed == 0 else None
+        if big is not None:
+            draws = big + rng.multivariate_normal(np.zeros(3), spread, len(big))
+            true = classes.score_detection(draws, np.repeat(np.arange(4), 5000) == 2, lens)
+            assert true.detection_auc == pytest.approx(lens.auc, abs=0.03)
+            assert true.target_contrast == pytest.approx(
+                lens.contrast / np.sqrt(lens.variances[1]), rel=0.05
+            )
+        inside += found.detection_auc_low <= true.detection_auc <= found.detection_auc_high
+    assert 88 <= inside <= 100
+    assert classes.score_detection(values, label < 9, lens) is None

@@ -543,6 +543,87 @@ def test_a_spectral_sweep_with_predicted_and_with_measured_responses(tmp_path):
     )
 
 
+PAINTS = "nm,rust,moss,rust,moss\n400,0.06,0.05,0.08,0.06\n500,0.1,0.15,0.12,0.13\n" + (
+    "600,0.4,0.1,0.44,0.09\n700,0.6,0.2,0.64,0.22\n"
+)
+
+
+def test_a_joint_point_has_picture_spectra_classes_cost_and_light(tmp_path):
+    """All figures of one camera in one row, each what the stages say by hand; light halves."""
+    from plenocli.stages.evaluation.score import run_score
+    from plenocli.stages.forward import capture_sim, simulate_pif, simulate_response
+    from plenocli.stages.inverse import demux
+
+    text = (
+        (ROOT / "sample_configs" / "demo_spectral.toml")
+        .read_text()
+        .replace("[20, 30]", "[12, 18]")
+        .replace("[20, 20]", "[12, 12]")
+        .replace('"80 um"', '"48 um"')
+        .replace('"640 um"', '"384 um"')
+        .replace("[light]", '[light]\nilluminance = "2 klx"')
+    )
+    (tmp_path / "camera.toml").write_text(text)
+    (tmp_path / "paints.csv").write_text(PAINTS)
+    (tmp_path / "sweep.toml").write_text(
+        'camera = "camera.toml"\nchain = "joint"\n'
+        '[vary]\n"sensor.exposure" = ["10 ms", "20 ms"]\n'
+        '[simulate-pif]\nmodel = "ray"\naccuracy = 1e-2\nsuperpixels = "3x3"\n'
+        '[demux]\nmethod = "pinv"\n'
+        '[score]\nclasses = "paints.csv"\ndetect = "rust"\n'
+        '[front]\npsnr_db = "max"\nclass_accuracy = "max"\nexposure_s = "min"\n'
+    )
+    sweep(tmp_path / "sweep.toml", tmp_path / "s.h5")
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in (
+        "psnr_db spectral_angle_deg six_patch_rmse snr_predicted_mean_db class_accuracy "
+        "class_accuracy_low detection_auc target_contrast matrix_seconds matrix_bytes "
+        "electrons_per_pixel exposure_s"
+    ).split():
+        assert all(row[name] != "" for row in rows), name
+    light = [float(row["electrons_per_pixel"]) for row in rows]
+    assert light[1] == pytest.approx(2 * light[0], rel=0.01)
+    (tmp_path / "hand.toml").write_text(text.replace("[sensor]", '[sensor]\nexposure = "10 ms"'))
+    camera, options = tmp_path / "hand.toml", {"model": "ray", "accuracy": 1e-2}
+    simulate_pif.run_simulate_pif(
+        camera,
+        tmp_path / "pif.h5",
+        simulate_pif.Settings(superpixels=(3, 3), spectral_step="auto", **options),
+    )
+    for name, seed, settings, scene in (
+        ("white", 1_000_001, {"target": "white"}, None),
+        ("shown", 2_000_001, {}, tmp_path / "paints.csv"),
+    ):
+        capture_sim.run_capture_sim(
+            camera,
+            tmp_path / f"{name}.h5",
+            capture_sim.Settings(seed=seed, **settings),
+            scene=scene,
+            pif=tmp_path / "pif.h5",
+        )
+    simulate_response.run_simulate_response(
+        camera, tmp_path / "response.h5", simulate_response.Settings()
+    )
+    demux.run_demux(
+        [tmp_path / "shown.h5"],
+        tmp_path / "told.h5",
+        calibration=tmp_path / "response.h5",
+        settings=demux.Settings(method="pinv", reference=tmp_path / "white.h5"),
+        suffix=".h5",
+    )
+    figures = run_score(
+        [tmp_path / "told.h5"],
+        tmp_path / "told.json",
+        truth=tmp_path / "paints.csv",
+        camera=camera,
+        classes=tmp_path / "paints.csv",
+        detect="rust",
+    ).figures
+    for name in ("class_accuracy", "class_distance", "detection_auc", "target_contrast"):
+        assert float(rows[0][name]) == pytest.approx(figures[name], rel=1e-9)
+
+
 def test_values_are_written_as_given_and_read_as_numbers(whole):
     with open(whole[1].with_suffix(".csv"), newline="") as file:
         rows = list(csv.DictReader(file))

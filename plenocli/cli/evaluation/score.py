@@ -18,6 +18,7 @@ METRICS = (
     "snr",
     "classification",
     "classes",
+    "detection",
     "single-pixel",
     "coherence",
     "response",
@@ -94,9 +95,16 @@ METRICS = (
     "--classes",
     type=options.FILE,
     help=(
-        "Table of spectra to be told apart (.csv: wavelengths in nm, then a column of reflectances "
-        "a spectrum below the name of its class): how often lenslets tell their class."
+        "Spectra to be told apart: how often lenslets tell their class. A table (.csv: wavelengths "
+        "in nm, then a column of reflectances a spectrum below the name of its class), or a folder "
+        "with a folder, a .csv or a spectral image named after each class. As --truth they stand "
+        "for the chart of them that capture-sim --scene shows."
     ),
+)
+@click.option(
+    "--detect",
+    metavar="CLASS",
+    help="The class of --classes to look for: how well it stands out from the others.",
 )
 @options.mem_limit
 @options.overwrite
@@ -119,6 +127,7 @@ def command(
     light: str,
     camera: Path | None,
     classes: Path | None,
+    detect: str | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -139,6 +148,8 @@ def command(
       plenocli score chart.exr --truth colorchecker --white white1.h5 \\
           --white white2.h5 -o score.json
       plenocli score spectra.h5 --truth capture.h5 --classes paints.csv -o told.json
+      plenocli score shown.h5 --truth paints.csv --camera camera.toml --classes paints.csv \\
+          --detect rust -o found.json
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
       plenocli score planes.h5 --truth 620mm -o depth.json
@@ -161,6 +172,7 @@ def command(
         light=light,
         camera=camera,
         classes=classes,
+        detect=detect,
         overwrite=overwrite,
     )
     options.summary(document.as_json(), as_json, table(document))

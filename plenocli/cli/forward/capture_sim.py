@@ -14,7 +14,8 @@ from plenocli.cli import options
     metavar="SCENE",
     help=(
         "Photograph, spectral EXR, image .h5, skimage:astronaut (a photograph that ships with "
-        "scikit-image) or colorchecker."
+        "scikit-image), colorchecker, or labelled spectra as score --classes takes them, which "
+        "make a chart."
     ),
 )
 @click.option(

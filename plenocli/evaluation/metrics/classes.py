@@ -4,6 +4,7 @@ the noise, and how often that should succeed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,21 @@ DEFINITIONS = {
         "what class_accuracy is at least expected to be from the classes and the predicted noise "
         "alone: 1 less the sum over the other classes of Phi(-d/2), d their distance in standard "
         "deviations (union bound; exact for two classes)"
+    ),
+    "detection_auc": (
+        "how often a lenslet of the class of --detect looks more like it than one of another class "
+        "(area under the receiver operating characteristic) to the linear filter that its mean, "
+        "the others' means and covariance and the predicted noise call for"
+    ),
+    "detection_auc_low": "lower end of its 95 % confidence interval (Hanley and McNeil 1982)",
+    "detection_auc_high": "upper end of its 95 % confidence interval",
+    "detection_auc_predicted": (
+        "what detection_auc is expected to be from the classes and the predicted noise alone: "
+        "Phi(difference of the filter's means / root of the sum of its variances)"
+    ),
+    "target_contrast": (
+        "mean answer of that filter on the class of --detect less that on the others, over the "
+        "standard deviation on the others"
     ),
     "class_distance": "distance of the two classes that are hardest to tell, standard deviations",
 }
@@ -40,7 +56,7 @@ class Classes:
     covariance: np.ndarray
 
     @classmethod
-    def of_spectra(cls, labels: tuple[str, ...], spectra: np.ndarray) -> Classes:
+    def of_spectra(cls, labels: Sequence[str], spectra: np.ndarray) -> Classes:
         """The classes of labelled spectra.
 
         labels: (spectrum,) names; those that are equal are one class.
@@ -57,8 +73,21 @@ class Classes:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DetectionScore:
+    """How well one class stands out from the others, see DEFINITIONS."""
+
+    detection_auc: float
+    detection_auc_low: float
+    detection_auc_high: float
+    detection_auc_predicted: float
+    target_contrast: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class ClassScore:
-    """How well classes are told apart, see DEFINITIONS; None where the noise is not known."""
+    """How well classes are told apart, see DEFINITIONS; None where the noise is not known, and
+    detection where no class is looked for or the truth shows it alone or not at all.
+    """
 
     classes_seen: int
     class_accuracy: float
@@ -66,16 +95,22 @@ class ClassScore:
     class_accuracy_high: float
     class_accuracy_predicted: float | None
     class_distance: float | None
+    detection: DetectionScore | None = None
 
 
 def score_classes(
-    values: np.ndarray, truth: np.ndarray, sigma: np.ndarray | None, classes: Classes
+    values: np.ndarray,
+    truth: np.ndarray,
+    sigma: np.ndarray | None,
+    classes: Classes,
+    detect: str | None = None,
 ) -> ClassScore | None:
     """Spectra told apart.
 
     values, truth: (band, row, column).
     sigma: predicted standard deviation, like values; None: not known.
     classes: of spectra in the same bands.
+    detect: name of the class that is looked for, one of theirs.
 
     Returns None where no lenslet has values, truth and, if any has, noise.
     """
@@ -103,6 +138,87 @@ def score_classes(
         if distances is None
         else float(np.average(predicted_accuracy(distances)[seen], weights=counts)),
         class_distance=None if distances is None else float(np.min(distances)),
+        detection=None
+        if detect is None
+        else score_detection(
+            found, right == classes.names.index(detect), Filter.of(classes, detect, spread)
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filter:
+    """The linear filter that one class stands out by.
+
+    weights: (band,).
+    contrast: expected difference of its answers on the class and on the others.
+    variances: of its answers, on the class and on the others.
+    """
+
+    weights: np.ndarray
+    contrast: float
+    variances: tuple[float, float]
+
+    @classmethod
+    def of(cls, classes: Classes, name: str, spread: np.ndarray) -> Filter:
+        """The filter for the class `name`.
+
+        spread: (band, band) covariance of spectra of one class, with noise.
+
+        Fisher's discriminant between it and the mixture of the others in equal parts.
+        """
+        place = classes.names.index(name)
+        others = np.delete(classes.means, place, axis=0)
+        apart = classes.means[place] - others.mean(axis=0)
+        mixed = spread + np.cov(others.T, ddof=0) if len(others) > 1 else spread
+        root = _whitening((spread + mixed) / 2)
+        weights = root @ (root.T @ apart)
+        return cls(
+            weights=weights,
+            contrast=float(weights @ apart),
+            variances=(float(weights @ spread @ weights), float(weights @ mixed @ weights)),
+        )
+
+    @property
+    def auc(self) -> float:
+        """Expected area under the receiver operating characteristic of normal answers."""
+        from scipy.special import ndtr
+
+        spread = np.sqrt(sum(self.variances))
+        return float(ndtr(self.contrast / spread)) if spread > 0 else 1.0
+
+
+def score_detection(
+    spectra: np.ndarray, target: np.ndarray, known: Filter
+) -> DetectionScore | None:
+    """How well a filter's answers tell one class.
+
+    spectra: (spectrum, band).
+    target: (spectrum,) bool, which of them are of the class.
+
+    Returns None where all or none are.
+    """
+    from scipy.stats import rankdata
+
+    count = int(target.sum())
+    rest = len(target) - count
+    if not count or not rest:
+        return None
+    answers = spectra @ known.weights
+    ranks = rankdata(answers)
+    auc = float((ranks[target].sum() - count * (count + 1) / 2) / (count * rest))
+    # of pairs that share a member, as exponential answers have it
+    one, two = auc / (2 - auc) - auc**2, 2 * auc**2 / (1 + auc) - auc**2
+    variance = (auc * (1 - auc) + (count - 1) * one + (rest - 1) * two) / (count * rest)
+    reach = 1.959964 * np.sqrt(max(variance, 0.0))
+    deviation = float(answers[~target].std())
+    apart = float(answers[target].mean() - answers[~target].mean())
+    return DetectionScore(
+        detection_auc=auc,
+        detection_auc_low=max(auc - reach, 0.0),
+        detection_auc_high=min(auc + reach, 1.0),
+        detection_auc_predicted=known.auc,
+        target_contrast=apart / deviation if deviation > 0 else np.inf,
     )
 
 

@@ -38,7 +38,7 @@ def describe_inputs(roles: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """Name and SHA-256 of each input file, for Provenance.inputs.
 
     roles: role -> path, or role -> sequence of paths (they become "role 1", "role 2", ...); a
-        None path is left out.
+        None path is left out; a folder stands for the files in it and in its folders.
     Raises InputError for a file that cannot be read.
     """
     described = {}
@@ -49,7 +49,7 @@ def describe_inputs(roles: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         for number, path in enumerate(paths if several else [paths], start=1):
             described[f"{role} {number}" if several else role] = {
                 "name": Path(path).name,
-                "sha256": file_digest(path),
+                "sha256": content_digest(path),
             }
     return described
 
@@ -93,6 +93,21 @@ def read_provenance_texts(attrs: Mapping[str, str]) -> Provenance:
         config=found["config"],
         accuracy=accuracy,
     )
+
+
+def content_digest(path: str | os.PathLike) -> str:
+    """SHA-256 of a file's bytes, or of the names and digests of the files in a folder and in its
+    folders, hex. Raises InputError.
+    """
+    if not os.path.isdir(path):
+        return file_digest(path)
+    parts = [
+        f"{file.relative_to(path)} {file_digest(file)}"
+        for pattern in ("*", "*/*")
+        for file in sorted(Path(path).glob(pattern))
+        if file.is_file()
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def file_digest(path: str | os.PathLike) -> str:

@@ -130,7 +130,8 @@ class Sweep(Section):
     camera: the file that all points start from, relative to this one.
     chain: "spatial" (simulate-pif, capture-sim, reconstruct, score) or "spectral" (simulate-pif,
         capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
-        has a filter array. "depth" (capture-sim, refocus, score) only where it is named.
+        has a filter array. "joint" (both: a chart demultiplexed and a picture reconstructed in
+        bands) and "depth" (capture-sim, refocus, score) only where it is named.
     design: how points are chosen.
     samples: how many points a Latin hypercube has.
     vary: key -> values or range.
@@ -142,7 +143,7 @@ class Sweep(Section):
     """
 
     camera: FileName
-    chain: Literal["spatial", "spectral", "depth"] | None = None
+    chain: Literal["spatial", "spectral", "joint", "depth"] | None = None
     design: Literal["grid", "latin-hypercube", "list"] = "grid"
     samples: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
     vary: dict[str, Any] = {}
@@ -305,6 +306,8 @@ def changed(
     values: dotted key -> value; the options of stages among them are left alone.
     follow: dotted key -> product or quotient of keys and numbers.
 
+    Of the filters a changed layout takes as many as it has cells.
+
     Returns the nested description.
     Raises ConfigError where a key is not there or an expression cannot be computed.
     """
@@ -312,6 +315,8 @@ def changed(
     for key, value in values.items():
         if key.partition(".")[0] not in STAGES:
             _put(copy, key, value)
+    if "filter_array.layout" in values:
+        _fill(copy["filter_array"])
     for key, expression in follow.items():
         _put(copy, key, _computed(copy, key, expression))
     return copy
@@ -450,6 +455,14 @@ def _put(data: dict[str, Any], key: str, value: Any) -> None:
                 for other in names:
                     if other != last:
                         target.pop(other, None)
+
+
+def _fill(array: dict[str, Any]) -> None:
+    """Leave as many filters as the layout has cells; what is no layout is told later."""
+    layout, filters = array.get("layout"), array.get("filters")
+    if isinstance(layout, list) and isinstance(filters, list):
+        if len(layout) == 2 and all(type(n) is int and n > 0 for n in layout):
+            array["filters"] = filters[: layout[0] * layout[1]]
 
 
 def _entries(

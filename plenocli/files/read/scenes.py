@@ -1,5 +1,5 @@
 """Where scenes come from: photographs, spectral EXR files, image artefacts, the
-ColorChecker, uniform targets.
+ColorChecker, labelled spectra, uniform targets.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.errors import UsageError
+from plenocli.files.read.class_table import read_labelled
+from plenocli.forward.scene.labelled import SpectraChart
 from plenocli.forward.scene.scenes import Chart, Cube, Photograph
 
 EMBEDDED = "skimage:"
@@ -17,11 +19,11 @@ EMBEDDED = "skimage:"
 
 def read_scene(
     name: str | Path, *, sampling: str = "fit", spectral: bool = False
-) -> Photograph | Cube | Chart:
+) -> Photograph | Cube | Chart | SpectraChart:
     """The scene called `name`.
 
     name: "colorchecker", "skimage:astronaut", or the path of a photograph, a spectral EXR or an
-        image artefact.
+        image artefact; or of labelled spectra (a .csv or a folder), which make a chart.
     sampling: "fit" a photograph to the object points by area averages, or "crop" it.
     spectral: whether the camera tells wavelengths apart; if not, a colour photograph counts by its
         luminance.
@@ -36,6 +38,8 @@ def read_scene(
     from plenocli.files.images.pictures import read_picture
 
     path = Path(name)
+    if path.suffix.lower() == ".csv" or path.is_dir():
+        return SpectraChart(read_labelled(path))
     if path.suffix == ".h5":
         artefact = read_artefact(path, "image")
         values = artefact.data["image/value"]

@@ -62,6 +62,7 @@ def _scene_truth(
 ) -> np.ndarray:
     """The truth of a scene, which has values at any wavelength."""
     from plenocli.files.read.scenes import read_scene
+    from plenocli.forward.scene.labelled import SpectraChart
     from plenocli.forward.scene.scenes import Chart
 
     rows, cols = result.grid
@@ -74,12 +75,14 @@ def _scene_truth(
             "compare with a photograph or with the capture's own scene",
         )
     fine = _CHART_OVERSAMPLING if isinstance(scene, Chart) else 1
+    whole = scene.whole(rows, cols) if isinstance(scene, SpectraChart) else np.array(True)
 
     def plane(wavelength: float) -> np.ndarray:
-        return _coarser(scene.at(wavelength, rows * fine, cols * fine), rows, cols)
+        seen = _coarser(scene.at(wavelength, rows * fine, cols * fine), rows, cols)
+        return np.where(whole, seen, np.nan)
 
     if spectral and camera is not None:
-        return _through_filters(plane, camera, result.bands)
+        return through_filters(plane, camera, result.bands)
     planes = [plane(w) for w in (result.bands if spectral else [550e-9])]
     return np.array(planes) if spectral else planes[0]
 
@@ -92,12 +95,17 @@ def _is_scene(path: Path | str) -> bool:
     return artefact.kind == "image" and artefact.data["image/value"].ndim == 3
 
 
-def _through_filters(
+def through_filters(
     plane: Callable[[float], np.ndarray], camera: Camera, bands: np.ndarray
 ) -> np.ndarray:
     """Reflectance (band, row, column) as a camera with one filter a band sees it: mean of
     plane(wavelength), weighted with the light's photons, the filter's transmittance and the
     sensor's sensitivity (mean of its colours).
+
+    plane: wavelength (m) -> reflectance (row, column).
+    bands: (band,) m.
+
+    Raises UsageError for a camera without filters, or without one at a band.
     """
     from plenocli.forward.camera.pupil import filter_transmittance
     from plenocli.forward.scene.light import broadband

@@ -38,7 +38,7 @@ from plenocli.base.quantities import (
 )
 from plenocli.base.text import by
 from plenocli.base.toml import violations
-from plenocli.base.units import format_length, parse_length
+from plenocli.base.units import UnitError, format_length, parse_length, parse_wavelength
 from plenocli.forward.camera.plausible import Lengths, implausible
 from plenocli.forward.camera.quadrature import Disc
 
@@ -372,7 +372,7 @@ class Light(Section):
     narrow band that --target mono shows has a lamp of its own, whose exposure is always relative.
 
     Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths`
-    resolves to its centre.
+    resolves to its centre. A camera with filters may leave both out: its bands are their centres.
     """
 
     wavelengths: Resolved[
@@ -522,6 +522,10 @@ GAUSSIAN_FLANK = 2 * math.sqrt(2 * math.log(2)) * math.exp(-0.5)
 """Steepest slope of a Gaussian band of unit peak and full width at half maximum."""
 
 
+SAME_BAND = 1e-9
+"""m; filters whose centres are nearer have one band."""
+_OF_BANDS = ("light", "filter_array")
+
 PixelShift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
@@ -585,6 +589,26 @@ class Camera(Section):
     filter_array: FilterArray | None = None
     fitted: Fitted | None = None
     _text: str = PrivateAttr("")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bands_of_filters(cls, data: Any) -> Any:
+        """Bands that [light] does not name are the centres of the filters, each once."""
+        sections = [data.get(name) if isinstance(data, dict) else None for name in _OF_BANDS]
+        light, cells = (section if isinstance(section, dict) else None for section in sections)
+        if light is None or cells is None or light.keys() & {"wavelengths", "band"}:
+            return data
+        found: list[float] = []
+        given = [f.get("center") for f in cells.get("filters") or () if isinstance(f, dict)]
+        try:
+            centres = sorted(parse_wavelength(c) if isinstance(c, str) else c for c in given if c)
+        except (UnitError, TypeError):
+            return data  # which is told where it stands
+        for centre in centres:
+            if not found or centre - found[-1] > SAME_BAND:
+                found.append(centre)
+        bands = [format_length(centre) for centre in found]
+        return {**data, "light": {**light, "wavelengths": bands}} if bands else data
 
     @model_validator(mode="after")
     def _resolve(self) -> Self:

@@ -11,7 +11,7 @@ PATCH_ROWS, PATCH_COLS = 4, 6
 FRAME_REFLECTANCE = 0.03  # the chart's black frame, spectrally flat
 
 
-def _patch_of(count: int, patches: int, gap: float, whole: bool) -> np.ndarray:
+def patch_of(count: int, patches: int, gap: float, whole: bool) -> np.ndarray:
     """Which patch of a row or column of patches each cell sees.
 
     count: cells that tile the edge of the chart.
@@ -45,8 +45,8 @@ def chart_labels(rows: int, cols: int, gap: float = 0.1, whole_cells: bool = Fal
     if not 0 <= gap < 1:
         raise ValueError(f"gap is a share of the patch pitch, 0 to below 1, not {gap}")
     row, col = (
-        _patch_of(rows, PATCH_ROWS, gap, whole_cells),
-        _patch_of(cols, PATCH_COLS, gap, whole_cells),
+        patch_of(rows, PATCH_ROWS, gap, whole_cells),
+        patch_of(cols, PATCH_COLS, gap, whole_cells),
     )
     label = row[:, None] * PATCH_COLS + col[None, :] + 1
     return np.where((row[:, None] < 0) | (col[None, :] < 0), 0, label).astype(np.uint8)

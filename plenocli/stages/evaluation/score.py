@@ -32,7 +32,6 @@ from plenocli.evaluation.spectra_score import (
     score_spectra,
 )
 from plenocli.execution.batch import failed_together
-from plenocli.files.read.class_table import read_classes
 from plenocli.files.results.matrices import matrix_of
 from plenocli.files.results.results import (
     read_block,
@@ -44,6 +43,7 @@ from plenocli.files.results.truths import CHART, read_labels, read_truth
 from plenocli.inverse.lightfield.planes import LightField
 
 if TYPE_CHECKING:
+    from plenocli.evaluation.metrics.classes import Classes
     from plenocli.forward.camera.model import Camera
     from plenocli.report.score_page import Compared
 
@@ -62,7 +62,7 @@ class _Comparison:
     block: (rows, columns) of object samples under a lenslet, where they are given.
     object_shape: the same as the system matrix tells it.
     sensor_snr: of the capture, dB, or None.
-    classes: table of labelled spectra, or None.
+    classes: labelled spectra, or None; detect: the class that is looked for.
     """
 
     truth: Path | str | None
@@ -76,6 +76,7 @@ class _Comparison:
     camera: Camera | None
     sensor_snr: float | None
     classes: Path | str | None
+    detect: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +105,7 @@ def run_score(
     light: str = "D65",
     camera: Path | str | None = None,
     classes: Path | str | None = None,
+    detect: str | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> ScoreDocument:
@@ -120,7 +122,8 @@ def run_score(
     sampling: how a photograph became the object, "fit" or "crop".
     light: for colour differences.
     camera: TOML, through whose filters spectra see the truth.
-    classes: table of labelled spectra (plenocli.files.read.class_table).
+    classes: labelled spectra, a table or a folder (plenocli.files.read.class_table).
+    detect: name of the one of them that is looked for.
 
     One bad result does not stop the others: its message is printed and stands in its place.
     Raises the error of the worst one at the end.
@@ -136,7 +139,7 @@ def run_score(
             report, overwrite=overwrite, inputs=files, others=[output], suffixes=(".html",)
         )
     comparison = _comparison(
-        truth, whites, patches, pif, capture, block, sampling, light, camera, classes
+        truth, whites, patches, pif, capture, block, sampling, light, camera, classes, detect
     )
     scored = _score_all(results, comparison, tuple(metrics))
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
@@ -168,8 +171,8 @@ def run_score(
 
 
 def _is_file(name: Path | str | None) -> bool:
-    """Whether a truth or a label map is a file and not a name."""
-    return name is not None and Path(name).is_file()
+    """Whether a truth or a label map is a file, or a folder of spectra, and not a name."""
+    return name is not None and Path(name).exists()
 
 
 def _page(document: ScoreDocument, scored: Sequence[_Scored]) -> bytes:
@@ -206,6 +209,7 @@ def _comparison(
     light: str,
     camera: Path | str | None,
     classes: Path | str | None,
+    detect: str | None,
 ) -> _Comparison:
     from plenocli.files.artefacts.shards import read_pif
     from plenocli.files.read.cameras import read_camera
@@ -228,6 +232,7 @@ def _comparison(
         camera=read_camera(camera) if camera else None,
         sensor_snr=_sensor_snr(capture) if capture else None,
         classes=classes,
+        detect=detect,
     )
 
 
@@ -386,9 +391,8 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             light=comparison.light,
             whites=comparison.whites,
             needs_reflectance=str(comparison.truth) == CHART,
-            classes=read_classes(Path(comparison.classes), result.bands)
-            if comparison.classes
-            else None,
+            classes=_classes(comparison, result.bands),
+            detect=comparison.detect,
         )
         spectra = own
     sensor = comparison.sensor_snr
@@ -408,6 +412,35 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
         drawn=Compared(result=result, truth=truth, block=block),
         spectra=spectra,
     )
+
+
+def _classes(comparison: _Comparison, bands: np.ndarray) -> Classes | None:
+    """What is to be told apart, in bands (m), seen as the truth is: at their centres, or through
+    the filters of the camera.
+    """
+    from plenocli.evaluation.metrics.classes import Classes
+    from plenocli.files.read.class_table import read_labelled
+    from plenocli.files.results.truths import through_filters
+
+    if comparison.classes is None:
+        if comparison.detect is not None:
+            raise UsageError(
+                "looks for one of the classes of --classes", "--detect", "give --classes"
+            )
+        return None
+    known, camera = read_labelled(comparison.classes, bands), comparison.camera
+    if comparison.detect not in (None, *known.labels):
+        raise UsageError(
+            f"{comparison.detect} is no class of {comparison.classes}",
+            "--detect",
+            f"choose one of {', '.join(dict.fromkeys(known.labels))}",
+        )
+    seen = (
+        known.at(bands)
+        if camera is None
+        else through_filters(lambda w: known.at(w).T, camera, bands)[:, 0].T
+    )
+    return Classes.of_spectra(known.labels, seen)
 
 
 def _nanometres(wavelengths: np.ndarray) -> tuple[float, ...]:

@@ -176,7 +176,7 @@ def run_capture_sim(
     )
     roles = camera_files(camera_path, camera) | {
         "pif": pif,
-        "scene": scene if scene and Path(scene).is_file() else None,
+        "scene": scene if scene and Path(scene).exists() else None,
     }
     provenance = Provenance(
         command=command,

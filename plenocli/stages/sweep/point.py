@@ -16,8 +16,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from plenocli.base.errors import OutputError, PlenoError
 from plenocli.base.progress import collected_notes
+from plenocli.evaluation.metrics.classes import DEFINITIONS as CLASSES
 from plenocli.stages.sweep.task import (
     OWN_MATRIX,
     Job,
@@ -30,8 +33,9 @@ from plenocli.stages.sweep.task import (
     refused,
 )
 
-_WHITE, _DARK, _BAND = 1_000_001, 1_000_002, 1_000_003
-"""Seeds of the captures beside the one of the scene, over its seed: no two draw the same noise."""
+_SEEDS = {"white": 1_000_001, "classes": 2_000_001, "picture": 2_000_002}
+_DARK, _BAND = 1_000_002, 1_000_003
+"""Seeds of the captures beside the first, over its seed: no two draw the same noise."""
 
 
 def _require_files(job: Job) -> None:
@@ -41,7 +45,7 @@ def _require_files(job: Job) -> None:
     shared = [job.matrix.path] if job.matrix else []
     shared += job.capture.paths if job.capture else []
     for path in (*job.files, *shared):
-        if not os.path.isfile(path):
+        if not os.path.exists(path):
             raise OutputError(
                 f"{socket.gethostname()} does not see this file",
                 path,
@@ -100,7 +104,8 @@ def run_point(job: Job) -> PointResult:
         run = _Run(job=job, folder=folder)
         try:
             metrics = _CHAINS[job.task.chain](run)
-            found = PointResult(metrics=_design(folder / "camera.toml", run.cost) | metrics)
+            design = _design(folder / "camera.toml", run.cost)
+            found = PointResult(metrics=design | run.light | metrics)
         except OutputError:
             raise
         except PlenoError as error:
@@ -122,12 +127,14 @@ class _Run:
     """A job under way in its folder.
 
     cost: of its matrix, None before there is one.
+    light: figures of the first capture.
     seconds: of the processor, by stage.
     """
 
     job: Job
     folder: Path
     cost: MatrixCost | None = None
+    light: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -155,21 +162,37 @@ class _Run:
         self.seconds["simulate-pif"] = self.cost.cpu_seconds
         return self.folder / "pif.h5"
 
-    def captures(self, pif: Path | None) -> list[Path]:
-        """The captures of the chain, that of the scene first, simulated here unless they are
+    def captures(self, pif: Path | None) -> dict[str, Path]:
+        """The captures of the chain by their names in Task.shown, simulated here unless they are
         shared.
         """
         shared = self.job.capture
         if shared is not None:
             self.seconds["capture-sim"] = shared.cpu_seconds
-            return [Path(path) for path in shared.paths]
-        with self.stage("capture-sim"):
-            return _captures(self.task, self.folder, pif)
+            paths = [Path(path) for path in shared.paths]
+        else:
+            with self.stage("capture-sim"):
+                paths = _captures(self.task, self.folder, pif)
+        self.light = _light(paths[0])
+        return dict(zip(self.task.shown, paths, strict=True))
 
     def score(self, result: str, **truth: Any) -> dict[str, float]:
         """Figures of a result that are numbers."""
+        from plenocli.stages.evaluation.score import run_score
+
+        options = dict(self.task.options("score"))
+        names = [name for name in options if name in ("classes", "detect")]
+        classes: dict[str, Any] = {name: options.pop(name) for name in names}
+        if truth.get("truth") == classes.get("classes"):
+            options |= classes  # a chart of them
+        output = (self.folder / result).with_suffix(".json")
         with self.stage("score"):
-            return _score(self.task, self.folder, result, **truth)
+            document = run_score([self.folder / result], output, **truth, **options)
+        return {
+            name: float(value)
+            for name, value in document.figures.items()
+            if isinstance(value, (int, float)) and not isinstance(value, bool)
+        }
 
 
 def _elsewhere(error: PlenoError, folder: Path) -> PlenoError:
@@ -253,18 +276,40 @@ def _capture(
 
 
 def _captures(task: Task, folder: Path, pif: Path | None) -> list[Path]:
-    """The captures that a chain begins with: of the scene, and for spectra of a white target."""
-    found = [_capture(task, folder, "capture.h5", pif)]
-    if task.chain == "spectral":
-        found.append(_capture(task, folder, "white.h5", pif, target="white", seed=_WHITE))
-    return found
+    """The captures that a chain begins with."""
+    return [
+        _capture(task, folder, f"{name}.h5", pif, seed=_SEEDS.get(name, 0), **changes)
+        for name, changes in task.shown.items()
+    ]
+
+
+def _light(capture: Path) -> dict[str, float]:
+    """Figures of a capture that was simulated with the sensor's own noise."""
+    from plenocli.files.images.mosaic import read_capture
+
+    found = read_capture(capture)
+    if found.units != "DN" or not found.levels.gain:
+        return {}
+    light = {"electrons_per_pixel": float(np.nanmean(found.signal())) / found.levels.gain}
+    return light | ({} if found.exposure_s is None else {"exposure_s": found.exposure_s})
 
 
 def _spatial(run: _Run) -> dict[str, float]:
+    pif = run.matrix()
+    [capture] = run.captures(pif).values()
+    return _picture(run, capture, pif)
+
+
+def _joint(run: _Run) -> dict[str, float]:
+    """Figures of spectra count by their names where a picture in bands has the same."""
+    pif = run.matrix()
+    captures = run.captures(pif)
+    return _picture(run, captures["picture"], pif) | _spectra(run, captures, pif)
+
+
+def _picture(run: _Run, capture: Path, pif: Path) -> dict[str, float]:
     from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
 
-    pif = run.matrix()
-    [capture] = run.captures(pif)
     options = dict(run.task.options("reconstruct"))
     if dictionary := options.get("dictionary"):
         options |= {"dictionary": Path(dictionary)}
@@ -281,43 +326,58 @@ def _depth(run: _Run) -> dict[str, float]:
     from plenocli.stages.inverse.refocus import run_refocus
 
     camera = run.folder / "camera.toml"
-    [capture] = run.captures(None)
+    [capture] = run.captures(None).values()
     with run.stage("refocus"):
         run_refocus(capture, run.folder / "planes.h5", camera=camera, **run.task.options("refocus"))
     return run.score("planes.h5", truth=format_length(load_camera(camera).object.distance))
 
 
 def _spectral(run: _Run) -> dict[str, float]:
+    pif = run.matrix() if run.task.needs_matrix else None
+    return _spectra(run, run.captures(pif), pif)
+
+
+def _spectra(run: _Run, captures: dict[str, Path], pif: Path | None) -> dict[str, float]:
+    """Figures of the chart, and of the chart of classes where there is one."""
     from plenocli.stages.inverse.demux import Settings, run_demux
 
-    task, folder = run.task, run.folder
-    pif = run.matrix() if task.needs_matrix else None
-    scene, white = run.captures(pif)
+    task, folder, white = run.task, run.folder, captures["white"]
     by = "calibrate" if "calibrate" in task.settings else "simulate-response"
     with run.stage(by):
         response = (
             _measured(task, folder, pif, white) if by == "calibrate" else _predicted(task, folder)
         )
+    options = dict(task.options("demux"))
+    if prior := options.get("prior"):
+        options |= {"prior": Path(prior)}
+    (folder / "spectra").mkdir()
     with run.stage("demux"):
+        wanted = [captures[name] for name in ("chart", "classes") if name in captures]
+        single = folder / f"spectra/{wanted[0].stem}.h5"
         run_demux(
-            [scene],
-            folder / "spectra.h5",
+            wanted,
+            single if len(wanted) == 1 else folder / "spectra",
+            suffix=".h5",
             calibration=response,
-            settings=_settings(Settings, {**task.options("demux"), "reference": white}),
+            settings=_settings(Settings, {**options, "reference": white}),
         )
-    captured = task.options("capture-sim")
+    camera = folder / "camera.toml"
+    captured = {**task.options("capture-sim"), **task.shown["chart"]}
     shown = captured.get("target") or captured.get("scene")
+    chart = f"spectra/{captures['chart'].stem}.h5"
     if shown == "colorchecker":
-        return run.score(
-            "spectra.h5",
-            truth=shown,
-            patches=shown,
-            camera=folder / "camera.toml",
-        )
-    return run.score("spectra.h5", truth=scene)
+        found = run.score(chart, truth=shown, patches=shown, camera=camera)
+    else:
+        found = run.score(chart, truth=captures["chart"])
+    if "classes" in captures:
+        told = f"spectra/{captures['classes'].stem}.h5"
+        known = task.options("score")["classes"]
+        figures = run.score(told, truth=known, camera=camera)
+        found |= {name: figures[name] for name in CLASSES if name in figures}
+    return found
 
 
-_CHAINS = {"spatial": _spatial, "spectral": _spectral, "depth": _depth}
+_CHAINS = {"spatial": _spatial, "spectral": _spectral, "joint": _joint, "depth": _depth}
 
 
 def _predicted(task: Task, folder: Path) -> Path:
@@ -368,18 +428,6 @@ def _measured(task: Task, folder: Path, pif: Path | None, white: Path) -> Path:
         **task.options("calibrate"),
     )
     return folder / "response.h5"
-
-
-def _score(task: Task, folder: Path, result: str, **truth: Any) -> dict[str, float]:
-    """Figures of a result that are numbers."""
-    from plenocli.stages.evaluation.score import run_score
-
-    document = run_score([folder / result], folder / "score.json", **truth, **task.options("score"))
-    return {
-        name: float(value)
-        for name, value in document.figures.items()
-        if isinstance(value, (int, float)) and not isinstance(value, bool)
-    }
 
 
 def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:

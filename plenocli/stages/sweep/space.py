@@ -32,8 +32,8 @@ ReadOptions = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 
 _FILES = ("aperture_image", "wavefront", "prescription")
 """Keys of the main lens that name files."""
-_EXTERNAL = ("scene", "dictionary", "training")
-"""Options that may name files."""
+_EXTERNAL = ("scene", "dictionary", "training", "classes", "prior")
+"""Options that may name files, or folders of spectra."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -131,10 +131,10 @@ class Space:
 
     def _digested(self, path: Path) -> str:
         """The path as text; its content is known from now on."""
-        from plenocli.files.artefacts.provenance import file_digest
+        from plenocli.files.artefacts.provenance import content_digest
 
         if str(path) not in self.files:
-            self.files[str(path)] = file_digest(path)
+            self.files[str(path)] = content_digest(path)
         return str(path)
 
     def _located(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class Space:
         def place(value: Any) -> Any:
             if isinstance(value, list):
                 return [place(v) for v in value]
-            known = isinstance(value, str) and (self.path.parent / value).is_file()
+            known = isinstance(value, str) and (self.path.parent / value).exists()
             return str((self.path.parent / value).resolve()) if known else value
 
         return {
@@ -155,7 +155,7 @@ class Space:
         for values in options.values():
             for name in _EXTERNAL:
                 for value in np.ravel(values.get(name) or []):
-                    if Path(str(value)).is_file():
+                    if Path(str(value)).exists():
                         self._digested(Path(str(value)))
 
 

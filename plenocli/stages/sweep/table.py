@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 FRONTS = {
     "spatial": {"psnr_db": "max", "sensor_pixels": "min"},
     "spectral": {"six_patch_rmse": "min", "lenslet_field_m": "min"},
+    "joint": {"psnr_db": "max", "six_patch_rmse": "min"},
     "depth": {"depth_slope_error": "min", "sensor_pixels": "min"},
 }
 """What counts as better where the file does not say."""
@@ -78,13 +79,9 @@ class SweepSummary:
 
 def _definitions() -> dict[str, str]:
     """What the figures of a point mean."""
-    from plenocli.evaluation.metrics import classify, depth, quality, snr, spectral
+    from plenocli.evaluation.chosen import every_definition
 
-    return {
-        name: text
-        for module in (quality, spectral, snr, classify, depth)
-        for name, text in module.DEFINITIONS.items()
-    } | DESIGN
+    return every_definition() | DESIGN
 
 
 def objectives_of(space: Space, points: Sequence[DesignPoint]) -> dict[str, str]:

@@ -20,6 +20,15 @@ Options = Mapping[str, Any]
 CHAINS = {
     "spatial": ("simulate-pif", "capture-sim", "reconstruct", "score"),
     "spectral": ("simulate-pif", "capture-sim", "simulate-response", "calibrate", "demux", "score"),
+    "joint": (
+        "simulate-pif",
+        "capture-sim",
+        "simulate-response",
+        "calibrate",
+        "demux",
+        "reconstruct",
+        "score",
+    ),
     "depth": ("capture-sim", "refocus", "score"),
 }
 """Stages of each chain, whose options may be set."""
@@ -36,6 +45,10 @@ OWN_MATRIX = {
 """Options of capture-sim with which it computes a matrix of its own."""
 
 DESIGN = {
+    "electrons_per_pixel": (
+        "photo-electrons that the first capture of the chain has in a pixel, mean over the sensor"
+    ),
+    "exposure_s": "exposure time of that capture, s",
     "matrix_seconds": (
         "time to compute the system matrix on one core at nominal speed, as its plan counts it, s"
     ),
@@ -76,7 +89,27 @@ class Task:
     @property
     def needs_matrix(self) -> bool:
         """Whether something is captured, or inverted, with the matrix of simulate-pif."""
-        return self.chain == "spatial" or not self.foreign_capture
+        return "reconstruct" in CHAINS[self.chain] or not self.foreign_capture
+
+    @property
+    def shown(self) -> dict[str, Options]:
+        """What the chain captures, the first thing first: name -> options of capture-sim instead
+        of those given.
+
+        Where pictures and spectra are captured, --scene is the picture and --target has the
+        spectra; classes that are to be told apart have a chart of their own.
+        """
+        given = self.options("capture-sim")
+        if "demux" not in CHAINS[self.chain]:
+            return {"capture": {}}
+        picture = "reconstruct" in CHAINS[self.chain]
+        found: dict[str, Options] = {"chart": {"scene": None} if picture else {}}
+        found["white"] = {"scene": None, "target": "white"}
+        if self.options("score").get("classes"):
+            found["classes"] = {"scene": self.options("score")["classes"], "target": None}
+        if picture:
+            found["picture"] = {"scene": given.get("scene"), "target": None}
+        return found
 
     def as_json(self) -> dict[str, Any]:
         """What the point is known by."""
@@ -226,12 +259,13 @@ def task_of(chain: str, camera: Camera, options: Mapping[str, Options], seed: in
     """
     from plenocli.files.config.camera_file import to_toml
 
+    spectra = "demux" in CHAINS[chain]
     capture: dict[str, Any] = {"seed": seed}
-    if not options.get("capture-sim", {}).keys() & {"scene", "target"}:
-        capture |= (
-            {"target": "colorchecker"} if chain == "spectral" else {"scene": "skimage:astronaut"}
-        )
-    banded = chain == "spectral" and "wavelengths" not in options.get("simulate-pif", {})
+    if chain == "joint":
+        capture |= {"target": "colorchecker", "scene": "skimage:astronaut"}
+    elif not options.get("capture-sim", {}).keys() & {"scene", "target"}:
+        capture |= {"target": "colorchecker"} if spectra else {"scene": "skimage:astronaut"}
+    banded = spectra and "wavelengths" not in options.get("simulate-pif", {})
     supposed: dict[str, Options] = {
         "capture-sim": capture,
         "simulate-pif": {"spectral_step": "auto"} if banded else {},
@@ -261,7 +295,7 @@ def capture_key(task: Task, files: Mapping[str, str]) -> str:
     files: path -> SHA-256 of the files it names.
     """
     options = task.options("capture-sim")
-    asked = {"chain": task.chain, "camera": task.camera, "capture": options}
+    asked = {"shown": task.shown, "camera": task.camera, "capture": options}
     return digest_of(asked, files) if task.foreign_capture else ""
 
 
@@ -279,7 +313,7 @@ def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
     kept = camera.model_dump(mode="json")
     # without an accuracy asked for, the sensor's noise decides how exact the matrix is
     noise = set() if settings.get("accuracy") is not None else {"full_well", "read_noise"}
-    colour = {"cfa"} if task.chain == "spectral" else set()
+    colour = {"cfa"} if "demux" in CHAINS[task.chain] else set()
     for section, names in (
         ("lenslet_array", {"count"}),
         ("light", {"illuminant", "white_exposure", *Light.STRENGTHS}),

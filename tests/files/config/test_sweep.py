@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from plenocli.base.errors import ConfigError
 from plenocli.files.config.camera_file import load_camera, parse_camera, to_toml
@@ -137,6 +138,26 @@ def test_every_filter_or_one_of_them():
         == list(camera.light.wavelengths)
         == [450e-9, 530e-9, 570e-9, 650e-9]
     )
+
+
+def test_bands_that_nobody_names_are_those_of_the_filters_that_a_layout_has():
+    """The camera names three bands of four filters; without them they follow what is changed."""
+    spectral = tomllib.loads((ROOT / "sample_configs" / "demo_spectral.toml").read_text())
+    del spectral["light"]["wavelengths"]
+    assert Camera.model_validate(spectral).light.wavelengths == (450e-9, 540e-9, 570e-9, 650e-9)
+    data = changed(
+        spectral,
+        {"filter_array.layout": [1, 3], "filter_array.filters.0.center": "620 nm"},
+        {},
+    )
+    camera = Camera.model_validate(data)
+    assert camera.light.wavelengths == (540e-9, 570e-9, 620e-9)
+    assert [f.center for f in camera.filter_array.filters] == [620e-9, 540e-9, 570e-9]
+    alike = changed(spectral, {"filter_array.filters.*.center": "550 nm"}, {})
+    assert Camera.model_validate(alike).light.wavelengths == (550e-9,)
+    too_many = changed(spectral, {"filter_array.layout": [3, 3]}, {})
+    with pytest.raises(ValidationError, match="needs 9 filters"):
+        Camera.model_validate(too_many)
 
 
 def test_a_changed_camera_survives_its_own_text():

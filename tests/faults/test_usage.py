@@ -150,6 +150,7 @@ def test_every_option_has_a_type_that_refuses_something():
     assert free <= {
         "--scheduler",
         "--fix",
+        "--detect",
         "--patches",
         "--illuminant",
         "--scene",

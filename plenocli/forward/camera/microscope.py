@@ -1,0 +1,156 @@
+"""A light-field microscope: an objective whose image falls on lenslets, and a volume before it.
+
+The image side is telecentric, as that of an objective with its tube lens is: superpixels have the
+pitch of the lenslets. Depth is measured from the plane that is focused on the lenslets, positive
+away from the objective.
+"""
+
+import math
+import re
+from typing import Annotated, Any, Self
+
+from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+
+from plenocli.base.quantities import Length, Pair, Section, SignedLength, Unit
+from plenocli.base.units import format_length, parse_length
+from plenocli.forward.camera.model import Aberration, Light, Sensor
+
+MOST_PLANES = 1000
+"""Planes of a volume."""
+Samples = Annotated[int, Field(ge=1, le=64)]
+Index = Annotated[float, Field(ge=1.0, le=5.0)]
+_RANGE = re.compile(r"\s*(\S+ ?\S+)\s+to\s+(\S+ ?\S+)\s+step\s+(\S+ ?\S+)\s*")
+
+
+def _planes(value: Any) -> Any:
+    """The planes of "-12 um to 12 um step 1 um" as a list; what is no text stays."""
+    if not isinstance(value, str):
+        return value
+    found = _RANGE.fullmatch(value)
+    if found is None:
+        raise ValueError(
+            f'{value!r} is no range of planes; write for example "-12 um to 12 um step 1 um", or a '
+            'list such as ["-5 um", "0 um", "5 um"]'
+        )
+    start, end, step = (parse_length(part) for part in found.groups())
+    if not step > 0 or end < start:
+        raise ValueError(f"{value!r} must rise in steps above 0")
+    count = math.floor((end - start) / step * (1 + 1e-12) + 1e-9) + 1
+    if count > MOST_PLANES:
+        raise ValueError(f"{value!r} has {count} planes; at most {MOST_PLANES} are possible")
+    return [format_length(start + step * i) for i in range(count)]
+
+
+Planes = Annotated[
+    tuple[SignedLength, ...],
+    Field(min_length=1, max_length=MOST_PLANES),
+    BeforeValidator(_planes),
+]
+
+
+class Objective(Section):
+    """The objective with its tube lens.
+
+    magnification: from the specimen to the lenslet array.
+    medium_index: of the immersion that it was made for.
+    specimen_index: of the specimen, where it is another; the light then crosses from one into the
+        other `specimen_depth` before the focused plane.
+    aberrations: Zernike terms of the pupil (Noll), of unit radius at the numerical aperture.
+    rings: measured intensity over the pupil, at equal steps of the sine from the middle to the
+        edge, relative; without them the amplitude is that of a lens with Abbe's sine condition.
+    """
+
+    magnification: Annotated[float, Field(ge=0.1, le=1000.0)]
+    numerical_aperture: Annotated[float, Field(gt=0.0, lt=2.0)]
+    medium_index: Index = 1.0
+    specimen_index: Index | None = None
+    specimen_depth: Length | None = None
+    aberrations: tuple[Aberration, ...] = ()
+    rings: Annotated[tuple[Annotated[float, Field(ge=0.0)], ...], Field(max_length=200)] = ()
+
+    @model_validator(mode="after")
+    def _within(self) -> Self:
+        least = min(self.medium_index, self.specimen_index or self.medium_index)
+        if self.numerical_aperture >= least:
+            raise ValueError(
+                f"numerical_aperture {self.numerical_aperture:g} is not below the refractive index "
+                f"{least:g}: light in such directions stays in the specimen; give medium_index "
+                "(such as 1.33 for water, 1.515 for oil)"
+            )
+        if (self.specimen_index is None) != (self.specimen_depth is None):
+            raise ValueError("specimen_index and specimen_depth go together")
+        if self.rings and (len(self.rings) < 2 or not max(self.rings) > 0):
+            raise ValueError("rings needs two values or more, one of them above 0")
+        return self
+
+
+class Specimen(Section):
+    """The volume before the objective.
+
+    planes: depths, rising: a list, or "-12 um to 12 um step 1 um".
+    samples_per_lenslet: voxels (rows, columns) under one lenslet.
+    """
+
+    planes: Planes
+    samples_per_lenslet: tuple[Samples, Samples] = (3, 3)
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if any(b <= a for a, b in zip(self.planes, self.planes[1:])):
+            raise ValueError("planes must rise without repetition")
+        return self
+
+
+class MicroscopeArray(Section):
+    """The lenslets, squares side by side; `fill_factor` is the open share of their area."""
+
+    pitch: Length
+    focal_length: Length
+    fill_factor: Unit = 1.0
+    count: Pair = (11, 11)
+
+
+class Microscope(Section):
+    """A light-field microscope in SI units."""
+
+    objective: Objective
+    object: Specimen
+    lenslet_array: MicroscopeArray
+    sensor: Sensor
+    light: Light
+    _text: str = PrivateAttr("")
+
+    @model_validator(mode="after")
+    def _resolve(self) -> Self:
+        light = self.light
+        if light.design_wavelength is None:
+            middle = light.wavelengths[len(light.wavelengths) // 2]
+            self.__dict__.update(light=light.model_copy(update={"design_wavelength": middle}))
+        if self.sensor.cfa != "mono":
+            raise ValueError(
+                f'sensor.cfa = "{self.sensor.cfa}": volumes are of monochrome sensors; leave it out'
+            )
+        for axis, pixels in enumerate(self.sensor.pixels_per_lenslet):
+            spacing = self.lenslet_array.pitch / self.sensor.pixel_pitch
+            if abs(pixels / spacing - 1) > 0.1:
+                raise ValueError(
+                    f"sensor.pixels_per_lenslet {pixels} in {('rows', 'columns')[axis]}, but "
+                    f"{spacing:.4g} pixels of {format_length(self.sensor.pixel_pitch)} fit under a "
+                    f"lenslet of {format_length(self.lenslet_array.pitch)}; captures are resampled "
+                    "to whole pixels, by at most a tenth"
+                )
+        deepest = max(abs(plane) for plane in self.object.planes)
+        lens = self.objective
+        index = lens.specimen_index or lens.medium_index
+        slope = lens.numerical_aperture / math.sqrt(index**2 - lens.numerical_aperture**2)
+        blur = deepest * slope * lens.magnification / self.lenslet_array.pitch
+        if blur > MOST_BLUR:
+            raise ValueError(
+                f"object.planes: a point {format_length(deepest)} out of focus is spread over "
+                f"{blur:.0f} lenslets on each side; at most {MOST_BLUR} are possible"
+            )
+        return self
+
+
+MOST_BLUR = 60
+"""Lenslets on each side of its own that a point may be spread over."""

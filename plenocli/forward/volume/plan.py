@@ -1,0 +1,247 @@
+"""How finely the light of a volume is followed: the dial of its kernels.
+
+Rungs are tried on points against settings much finer than theirs; the cheapest that meets the
+accuracy is taken. Errors are shares of a column's light that is elsewhere, half the L1 distance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plenocli.base.errors import NumericsError
+from plenocli.forward.accuracy.machine_rate import product_rate
+from plenocli.forward.volume.arriving import ArrivingField
+from plenocli.forward.volume.lenslets import terms_for
+from plenocli.forward.volume.optics import VolumeOptics
+from plenocli.forward.volume.rays import RayPlane
+from plenocli.forward.volume.waves import WavePlane, WaveSettings
+
+WAVES = ((1, 2), (2, 3), (3, 4), (4, 4), (6, 5), (9, 7))
+"""Rungs of wave optics: neighbours on each side whose fields interfere, nodes across a pixel."""
+FINEST = (12, 9)
+"""What rungs are held against."""
+RAYS = 8
+"""Rays across a pixel."""
+LEAST_LOST = 5e-3
+"""Share of a point's light beyond the superpixels kept, at the least: it falls off with the reach
+alone, as round an Airy disc.
+"""
+MOST_REACH = 80
+"""Superpixels on each side of a point's own."""
+TRIED_BLUR = 4.0
+"""Lenslets on each side that the deepest point that is tried lights."""
+DEEPER = 1.6
+"""Error of deeper points over that of the deepest that is tried (measured to 17 lenslets)."""
+OVERHEAD = 1.8
+"""Time over that of the products."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumePlan:
+    """How the kernels of a volume are computed.
+
+    model: "ray" or "fresnel".
+    neighbours, pixel_nodes, terms: as WaveSettings; nodes are rays across a pixel for rays.
+    reach: (plane,) superpixels on each side of a point's own.
+    lost: (plane,) share of light beyond them, as expected.
+    error: share of a column's light that is elsewhere among the superpixels kept, as tried.
+    asked: the same, asked for.
+    samples: voxels (rows, columns) of a lenslet; box: points (rows, columns) that stand for one.
+    seconds, bytes: of one core of this machine, and of the kernels.
+    considered: (rung, error) of all that were tried.
+    """
+
+    model: str
+    neighbours: int
+    pixel_nodes: int
+    terms: int
+    reach: tuple[int, ...]
+    lost: tuple[float, ...]
+    error: float
+    asked: float
+    samples: tuple[int, int]
+    box: int
+    seconds: float
+    bytes: int
+    considered: tuple[tuple[str, float], ...]
+
+    @property
+    def rung(self) -> str:
+        """Name of what was chosen."""
+        if self.model == "ray":
+            return "rays"
+        return f"waves, {self.neighbours} neighbours on each side"
+
+    def settings(self, plane: int) -> WaveSettings:
+        """Of the plane with this number."""
+        return WaveSettings(
+            neighbours=self.neighbours,
+            pixel_nodes=self.pixel_nodes,
+            terms=self.terms,
+            reach=self.reach[plane],
+        )
+
+    def plane(self, optics: VolumeOptics, number: int) -> WavePlane | RayPlane:
+        """Columns of the plane with this number."""
+        if self.model == "ray":
+            return RayPlane(optics, optics.depths[number], self.reach[number], self.pixel_nodes)
+        return WavePlane(optics, optics.depths[number], self.settings(number))
+
+
+def plan_volume(
+    optics: VolumeOptics,
+    samples: tuple[int, int],
+    *,
+    accuracy: float = 5e-3,
+    model: str = "auto",
+    box: int = 2,
+) -> VolumePlan:
+    """The cheapest plan that meets an accuracy.
+
+    samples: voxels (rows, columns) of a lenslet.
+    accuracy: share of a column's light that may be elsewhere.
+    model: "auto", "ray" or "fresnel".
+    box: points along each side of a voxel that stand for it.
+
+    Raises NumericsError where no rung meets it, or light is spread too far.
+    """
+    spread = [_reach(optics, depth, max(accuracy, LEAST_LOST)) for depth in optics.depths]
+    reach = tuple(r for r, _ in spread)
+    if max(reach) > MOST_REACH:
+        raise NumericsError(
+            f"the light of a point in the deepest plane is spread over {max(reach)} superpixels "
+            f"on each side, more than {MOST_REACH}",
+            "object.planes",
+            "keep to planes nearer the focus, or ask for less accuracy",
+        )
+    terms = terms_for(optics, min(1e-3, accuracy / 10))
+    considered: list[tuple[str, float]] = []
+    found = None
+    for name, candidate in _rungs(model, terms):
+        error = max(_error(optics, candidate, depth) for depth in _tried(optics))
+        considered.append((name, error))
+        if error <= accuracy or (model == "ray"):
+            found = candidate, error
+            break
+    if found is None:
+        raise NumericsError(
+            f"no wave model meets {accuracy:g}: the finest is within {considered[-1][1]:.1g}",
+            "--accuracy",
+            f"ask for {considered[-1][1] * 1.1:.1g}",
+        )
+    (nodes, neighbours), error = found
+    plan = VolumePlan(
+        model="ray" if neighbours == 0 else "fresnel",
+        neighbours=neighbours,
+        pixel_nodes=nodes,
+        terms=terms,
+        reach=reach,
+        lost=tuple(lost for _, lost in spread),
+        error=error,
+        asked=accuracy,
+        samples=samples,
+        box=box,
+        seconds=0.0,
+        bytes=4
+        * math.prod(optics.pixels)
+        * math.prod(samples)
+        * sum((2 * r + 1) ** 2 for r in reach),
+        considered=tuple(considered),
+    )
+    return replace(plan, seconds=_seconds(optics, plan))
+
+
+def _rungs(model: str, terms: int) -> list[tuple[str, tuple[int, int]]]:
+    """Names, and (nodes across a pixel, neighbours; 0: rays), cheapest first."""
+    rays = [("rays", (RAYS, 0))]
+    waves = [(f"waves, {j} neighbours", (nodes, j)) for j, nodes in WAVES]
+    return {"auto": rays + waves, "ray": rays, "fresnel": waves}[model]
+
+
+def _tried(optics: VolumeOptics) -> list[float]:
+    """Depths at which rungs are tried: nearest to the focus, and with some blur, where errors are
+    nearly as large as deeper and a point costs less.
+    """
+    nearest, deepest = min(optics.depths, key=abs), max(optics.depths, key=abs)
+    blur = _blur(optics, deepest) / optics.object_pitch
+    return sorted({nearest, deepest * min(1.0, TRIED_BLUR / blur) if blur > 0 else deepest})
+
+
+def _blur(optics: VolumeOptics, depth: float) -> float:
+    """Radius (m, on the object's side) of the geometric blur of a point at `depth`."""
+    s = np.linspace(0, optics.aperture, 400)
+    return float(np.abs(np.gradient(optics.path(s, depth), s)).max())
+
+
+def _error(optics: VolumeOptics, candidate: tuple[int, int], depth: float) -> float:
+    """Of a rung for one point, against the finest."""
+    nodes, neighbours = candidate
+    reach = math.ceil(_blur(optics, depth) / optics.object_pitch) + 2
+    terms = terms_for(optics, 1e-5)
+    finest = WaveSettings(neighbours=FINEST[0], pixel_nodes=FINEST[1], terms=terms, reach=reach)
+    deepest = max(_blur(optics, z) for z in optics.depths)
+    deeper = DEEPER if deepest > 1.01 * TRIED_BLUR * optics.object_pitch else 1.0
+    place = 0.31 * optics.object_pitch, 0.17 * optics.object_pitch
+    truth, _ = WavePlane(optics, depth, finest).column(*place)
+    if neighbours == 0:
+        tried, _ = RayPlane(optics, depth, reach, nodes).column(*place)
+    else:
+        settings = replace(finest, neighbours=neighbours, pixel_nodes=nodes)
+        tried, _ = WavePlane(optics, depth, settings).column(*place)
+    return deeper * float(0.5 * np.abs(tried - truth).sum(dtype=float))
+
+
+def _reach(optics: VolumeOptics, depth: float, lost: float) -> tuple[int, float]:
+    """Superpixels on each side that hold all light of a point but the share `lost`, and the share
+    that is lost then.
+    """
+    pitch = optics.object_pitch
+    reach = _blur(optics, depth) / pitch + 2
+    while True:
+        field = ArrivingField(optics, depth, (reach + 1) * pitch, error=1e-4)
+        near = math.ceil(_blur(optics, depth) / pitch)
+        for tried in range(near, math.floor(reach) + 1):
+            kept = field.kept(max(tried, 0.5) * pitch)
+            if 1 - kept <= lost:
+                return tried, 1 - kept
+        if reach > MOST_REACH:
+            return math.ceil(reach), 1 - kept
+        reach *= 1.5
+
+
+def unique_places(
+    optics: VolumeOptics, samples: tuple[int, int], box: int
+) -> list[tuple[int, int]]:
+    """Points (row, column) of a lenslet, of samples x box along each axis, from which symmetry
+    gives all others.
+    """
+    rows, columns = (n * box for n in samples)
+    if not optics.round:
+        return [(i, j) for i in range(rows) for j in range(columns)]
+    turn = rows == columns and optics.pixels[0] == optics.pixels[1]
+    return [
+        (i, j)
+        for i in range((rows + 1) // 2)
+        for j in range((columns + 1) // 2)
+        if not turn or j <= i
+    ]
+
+
+def _seconds(optics: VolumeOptics, plan: VolumePlan) -> float:
+    """Of one core of this machine."""
+    places = len(unique_places(optics, plan.samples, plan.box))
+    if plan.model == "ray":
+        count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
+        per_plane = places * count * 4e-7
+        return per_plane * len(plan.reach)
+    total = 0.0
+    window = (2 * plan.neighbours + 1) * plan.terms
+    for reach in plan.reach:
+        lenslets = 2 * reach + 1
+        rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
+        wide = (lenslets + 2 * plan.neighbours) * plan.terms
+        total += 8.0 * rows * window * (wide + columns)
+    return OVERHEAD * places * total / product_rate(False)

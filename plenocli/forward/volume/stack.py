@@ -1,0 +1,178 @@
+"""The kernels of a volume, A(z): where the light of a voxel of each plane lands, the same for all
+lenslets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from plenocli.base.budget import budget, spread
+from plenocli.base.errors import NumericsError
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.volume.optics import VolumeOptics
+from plenocli.forward.volume.plan import VolumePlan, unique_places
+
+SUM_SLACK = 5e-3
+"""By which a column may miss, or exceed, the light that enters the lenslets."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stack:
+    """Kernels of a volume.
+
+    A: (entry, pixel, point) float32, share of a voxel's light that lands on a pixel.
+    plane: (entry,) number of the plane; ascending.
+    lenslet_offset: (entry, 2) superpixel (row, column) relative to the voxel's own lenslet.
+    depth: (plane,) m from the focused plane, away from the objective.
+    spacing: (plane, 2) m between voxels (rows, columns).
+    pixel_shape, point_shape: pixels of a superpixel, voxels of a lenslet (rows, columns).
+    wavelength: m.
+    column_energy: (plane, point) share of the light on the superpixels kept.
+    accuracy: how accurate the kernels are.
+    """
+
+    A: np.ndarray
+    plane: np.ndarray
+    lenslet_offset: np.ndarray
+    depth: np.ndarray
+    spacing: np.ndarray
+    pixel_shape: tuple[int, int]
+    point_shape: tuple[int, int]
+    wavelength: float
+    column_energy: np.ndarray
+    accuracy: AccuracyRecord
+
+    @property
+    def reach(self) -> tuple[int, int]:
+        """Farthest offsets (rows, columns)."""
+        rows, columns = np.abs(self.lenslet_offset).max(axis=0).tolist()
+        return rows, columns
+
+    def parts(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(kernels (offset, pixel, point), offsets (offset, 2)) plane by plane."""
+        return [
+            (self.A[self.plane == z], self.lenslet_offset[self.plane == z])
+            for z in range(len(self.depth))
+        ]
+
+
+def build_stack(
+    optics: VolumeOptics, plan: VolumePlan, progress: Callable[[int], None] | None = None
+) -> Stack:
+    """Compute the kernels of all planes.
+
+    progress: called with 1 for every plane that is done.
+
+    Raises NumericsError where memory does not suffice, or where a voxel's light on the sensor is
+    not what entered its lenslets.
+    """
+    budget().require(
+        2 * plan.bytes + _working(optics, plan),
+        "the kernels of this volume",
+        "object.planes",
+        "take fewer planes, pixels or voxels",
+    )
+    found: list[_Plane | None] = [None] * len(plan.reach)
+
+    def one(number: int) -> None:
+        found[number] = _plane(optics, plan, number)
+        if progress:
+            progress(1)
+
+    spread([(number,) for number in range(len(plan.reach))], one)
+    planes = [plane for plane in found if plane is not None]
+    rows, columns = plan.samples
+    pitch = optics.object_pitch
+    return Stack(
+        A=np.concatenate([plane.kernels for plane in planes]),
+        plane=np.repeat(np.arange(len(planes)), [len(plane.kernels) for plane in planes]),
+        lenslet_offset=np.concatenate([plane.offsets for plane in planes]),
+        depth=np.array(optics.depths),
+        spacing=np.tile([pitch / rows, pitch / columns], (len(planes), 1)),
+        pixel_shape=optics.pixels,
+        point_shape=plan.samples,
+        wavelength=optics.wavelength,
+        column_energy=np.stack([plane.energy for plane in planes]),
+        accuracy=AccuracyRecord(
+            asked=plan.asked,
+            estimated=plan.error,
+            model=plan.model,
+            rung=plan.rung,
+            by_source={"light beyond the superpixels kept": max(plan.lost)},
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Plane:
+    kernels: np.ndarray
+    offsets: np.ndarray
+    energy: np.ndarray
+
+
+def _plane(optics: VolumeOptics, plan: VolumePlan, number: int) -> _Plane:
+    """Kernels of one plane: points at the unique places, the others by symmetry, averaged over the
+    voxels' boxes.
+    """
+    plane, half = plan.plane(optics, number), 2 * plan.reach[number] + 1
+    fine = tuple(n * plan.box for n in plan.samples)
+    rows, columns = optics.pixels
+    total = np.zeros((*plan.samples, half, rows, half, columns), np.float32)
+    for i, j in unique_places(optics, plan.samples, plan.box):
+        places = [((k + 0.5) / n - 0.5) * optics.object_pitch for k, n in zip((i, j), fine)]
+        column, entered = plane.column(*places)
+        _guard(optics, number, float(column.sum(dtype=float)), entered, plan)
+        for (a, b), image in _images((i, j), column, fine, optics).items():
+            total[a // plan.box, b // plan.box] += image
+    total /= plan.box**2
+    kernels = total.transpose(2, 4, 3, 5, 0, 1).reshape(half**2, rows * columns, -1)
+    side = np.arange(half) - plan.reach[number]
+    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    return _Plane(np.ascontiguousarray(kernels), offsets, kernels.sum((0, 1), dtype=float))
+
+
+def _images(
+    place: tuple[int, int], column: np.ndarray, fine: tuple[int, ...], optics: VolumeOptics
+) -> dict[tuple[int, int], np.ndarray]:
+    """The column at a place (row, column), and those that symmetry makes of it, by place."""
+    found = {place: column}
+    if not optics.round:
+        return found
+    (i, j), (rows, columns) = place, fine
+    found |= {(rows - 1 - i, j): column[::-1, ::-1]}
+    found |= {(a, columns - 1 - b): c[:, :, ::-1, ::-1] for (a, b), c in found.items()}
+    if rows == columns and optics.pixels[0] == optics.pixels[1]:
+        # a place on the diagonal is its own image
+        turned = {(b, a): c.transpose(2, 3, 0, 1) for (a, b), c in found.items()}
+        found = turned | found
+    return found
+
+
+def _guard(
+    optics: VolumeOptics, number: int, light: float, entered: float, plan: VolumePlan
+) -> None:
+    """NumericsError where the light on the sensor is not what entered the lenslets."""
+    expected = entered * optics.pixel_width**2
+    away = light / expected - 1
+    slack = max(SUM_SLACK, plan.error) if plan.model == "fresnel" else 0.05
+    # pixels in part blind miss fringes; light is spread beyond the last superpixel as well
+    if away > slack or (away < -max(slack, 0.05) and optics.pixel_width == 1):
+        raise NumericsError(
+            f"of a point in plane {number} {light:.4f} of the light reaches the pixels, where "
+            f"{expected:.4f} is expected",
+            "object.planes",
+            "ask for a finer accuracy, or check sensor.distance and the lenslets' focal_length",
+        )
+
+
+def _working(optics: VolumeOptics, plan: VolumePlan) -> int:
+    """Bytes at work on the deepest plane, beside the kernels."""
+    lenslets = 2 * max(plan.reach) + 1
+    rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
+    wide = (lenslets + 2 * plan.neighbours) * max(plan.terms, 1)
+    fields = 8 * (2 * rows * wide + 2 * wide**2 + rows * optics.pixels[1] * plan.pixel_nodes)
+    columns_of_plane = 4 * lenslets**2 * optics.pixels[0] * optics.pixels[1]
+    return budget().threads * (fields + (2 + plan.samples[0] * plan.samples[1]) * columns_of_plane)

@@ -8,6 +8,7 @@ pixel centres at integers.
 from dataclasses import replace
 
 from plenocli.files.artefacts.schema import Schema, attribute, dataset
+from plenocli.files.artefacts.volume_kinds import PIF_STACK, VOLUME
 
 _NOTES = attribute("notes", "json", "", "anything else worth keeping")
 
@@ -900,5 +901,7 @@ SCHEMAS = {
         SWEEP,
         LIGHTFIELD,
         FIT,
+        PIF_STACK,
+        VOLUME,
     )
 }

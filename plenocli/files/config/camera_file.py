@@ -73,6 +73,11 @@ _UNITS = {
 
 
 _NUMBERS = {
+    "magnification",
+    "numerical_aperture",
+    "medium_index",
+    "specimen_index",
+    "rings",
     "f_number",
     "obscuration",
     "fill_factor",
@@ -93,8 +98,13 @@ _NUMBERS = {
 
 def to_toml(camera: Camera) -> str:
     """TOML text of a resolved camera, one key a line, lengths with units; deterministic."""
+    return section_lines(camera.model_dump(exclude_none=True))
+
+
+def section_lines(sections: dict[str, Any]) -> str:
+    """TOML text of the sections of a description in SI units, one key a line."""
     lines = []
-    for section, values in camera.model_dump(exclude_none=True).items():
+    for section, values in sections.items():
         lines.append(f"[{section}]")
         lines += [f"{key} = {_toml(key, value)}" for key, value in values.items()]
         lines.append("")

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.diagnosis import Diagnosis
     from plenocli.forward.propagation.plan import PifPlan
     from plenocli.forward.propagation.system_matrix import LensletWindow, SystemMatrix
+    from plenocli.stages.forward.simulate_stack import StackSummary
 
 
 DARK = 1e-9
@@ -257,9 +258,9 @@ def run_simulate_pif(
     overwrite: bool = False,
     workers: int = 1,
     command: str = "",
-) -> PifSummary | PlanesSummary | FieldSummary | PlanSummary:
+) -> PifSummary | PlanesSummary | FieldSummary | PlanSummary | StackSummary:
     """Compute A and write it as a pif artefact; of a scene with depth one a plane, of a whole array
-    one a place of the field, and an index.
+    one a place of the field, and an index; of a microscope the kernels of its volume.
 
     camera_path: camera description (.toml);
     output: file to write (.h5), not needed with `explain`;
@@ -271,11 +272,24 @@ def run_simulate_pif(
     Raises InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
+    from plenocli.files.config.microscope_file import describes_microscope
     from plenocli.files.read.cameras import read_camera
     from plenocli.files.read.scene_needs import read_needs
+    from plenocli.stages.forward.simulate_stack import run_simulate_stack
 
     if not explain:
         _require_output(camera_path, output, overwrite)
+    if describes_microscope(camera_path):
+        return run_simulate_stack(
+            camera_path,
+            output,
+            accuracy=settings.accuracy,
+            model=_model_of_volume(settings),
+            explain=explain,
+            overwrite=overwrite,
+            workers=workers,
+            command=command,
+        )
     camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
     planes = _planes(camera, settings, needs)
@@ -297,6 +311,21 @@ def run_simulate_pif(
     several = planes or nodes
     assert several is not None
     return _write_several(task, jobs, several, output)
+
+
+def _model_of_volume(settings: Settings) -> str:
+    """The model; UsageError where settings ask for what the kernels of a volume do not have."""
+    plain = Settings(accuracy=settings.accuracy, model=settings.model)
+    for name in (field.name for field in fields(settings)):
+        if getattr(settings, name) != getattr(plain, name):
+            option = "--" + ("wavelength" if name == "wavelengths" else name.replace("_", "-"))
+            raise UsageError(
+                "does not go with an [objective], whose planes, voxels and wavelength are in its "
+                "description",
+                option,
+                "leave it out",
+            )
+    return settings.model
 
 
 @dataclass(frozen=True)

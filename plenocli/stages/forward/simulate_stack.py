@@ -1,0 +1,172 @@
+"""simulate-pif of a microscope: the kernels of a volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plenocli.base.errors import UsageError
+from plenocli.base.progress import bar, note
+from plenocli.base.text import by
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.microscope import Microscope
+    from plenocli.forward.volume.optics import VolumeOptics
+    from plenocli.forward.volume.plan import VolumePlan
+
+DEFAULT_ACCURACY = 5e-3
+"""Share of a voxel's light that may be elsewhere, where nothing is asked for."""
+LONG = 5.0
+"""Seconds from which on the work is announced."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackSummary:
+    """What simulate-pif planned, or wrote, for a volume.
+
+    output: None for a plan.
+    planes: how many; samples: voxels of a lenslet.
+    reach: superpixels on each side, least and most.
+    light_lost: largest share of a point's light beyond them.
+    considered: rungs that were tried, with their errors.
+    seconds: of one core of this machine, as planned.
+    """
+
+    output: str | None
+    planes: int
+    samples: tuple[int, int]
+    rung: str
+    accuracy: float
+    estimated_accuracy: float
+    reach: tuple[int, int]
+    light_lost: float
+    considered: tuple[tuple[str, float], ...]
+    seconds: float
+    bytes: int
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {
+            "output": self.output,
+            "planes": self.planes,
+            "samples": list(self.samples),
+            "rung": self.rung,
+            "accuracy": self.accuracy,
+            "estimated_accuracy": self.estimated_accuracy,
+            "reach": list(self.reach),
+            "light_lost": self.light_lost,
+            "considered": [list(one) for one in self.considered],
+            "seconds": self.seconds,
+            "bytes": self.bytes,
+        }
+
+    def line(self) -> str:
+        """What people read: one sentence, or the plan."""
+        from plenocli.base.memory import size_text
+
+        least, most = self.reach
+        text = (
+            f"kernels of {self.planes} planes, {by(self.samples)} voxels a lenslet, light of "
+            f"{least} to {most} lenslets on each side (at most {self.light_lost:.1%} falls beyond); "
+            f"{self.rung}, {self.estimated_accuracy:.1g} of a voxel's light is elsewhere"
+        )
+        if self.output is not None:
+            return f"{Path(self.output)}: {text}"
+        tried = ", ".join(f"{name} {error:.1g}" for name, error in self.considered)
+        return (
+            f"{text}\ntried: {tried}; asked {self.accuracy:g}\n"
+            f"about {self.seconds:.2g} s on one core, a file of {size_text(self.bytes)}"
+        )
+
+
+def run_simulate_stack(
+    path: Path | str,
+    output: Path | str | None,
+    *,
+    accuracy: float | None,
+    model: str,
+    explain: bool,
+    overwrite: bool,
+    workers: int,
+    command: str,
+) -> StackSummary:
+    """Compute the kernels of a microscope's volume and write them.
+
+    path: description with an [objective].
+    output: file to write (.h5), not needed with `explain`.
+    accuracy: share of a voxel's light that may be elsewhere.
+    model: "auto", "ray" or "fresnel".
+    workers: threads.
+
+    Raises InputError and ConfigError for the description, UsageError for options, NumericsError
+    where memory or accuracy do not suffice, OutputError where the file cannot be written.
+    """
+    from plenocli.base.budget import Budget, budget, within
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.config.microscope_file import load_microscope, microscope_toml
+    from plenocli.files.results.stacks import stack_artefact
+    from plenocli.forward.volume.stack import build_stack
+
+    microscope = load_microscope(path)
+    optics, plan = planned(microscope, accuracy, model)
+    if explain or output is None:
+        return _summary(None, plan)
+    if plan.seconds > LONG:
+        note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
+    with (
+        within(Budget(budget().memory, workers)),
+        bar(None, len(plan.reach), "planes") as shown,
+    ):
+        stack = build_stack(optics, plan, shown.update)
+    provenance = Provenance(
+        command=command,
+        inputs=describe_inputs({"camera": path}),
+        config=microscope_toml(microscope),
+        accuracy=stack.accuracy.as_json(),
+    )
+    write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
+    return _summary(str(output), plan)
+
+
+def planned(
+    microscope: Microscope, accuracy: float | None, model: str
+) -> tuple[VolumeOptics, VolumePlan]:
+    """Optics and plan of a microscope's volume.
+
+    Raises UsageError for a model that volumes do not have, NumericsError as plan_volume.
+    """
+    from plenocli.forward.volume.cameras import optics_of
+    from plenocli.forward.volume.plan import plan_volume
+
+    if model == "exact":
+        raise UsageError(
+            "volumes are computed by rays or by waves that are paraxial behind the lenslets",
+            "--model",
+            "take ray, fresnel or auto",
+        )
+    optics = optics_of(microscope)
+    plan = plan_volume(
+        optics,
+        microscope.object.samples_per_lenslet,
+        accuracy=DEFAULT_ACCURACY if accuracy is None else accuracy,
+        model=model,
+    )
+    return optics, plan
+
+
+def _summary(output: str | None, plan: VolumePlan) -> StackSummary:
+    return StackSummary(
+        output=output,
+        planes=len(plan.reach),
+        samples=plan.samples,
+        rung=plan.rung,
+        accuracy=plan.asked,
+        estimated_accuracy=plan.error,
+        reach=(min(plan.reach), max(plan.reach)),
+        light_lost=max(plan.lost),
+        considered=plan.considered,
+        seconds=plan.seconds,
+        bytes=plan.bytes,
+    )

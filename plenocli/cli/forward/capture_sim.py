@@ -26,6 +26,14 @@ from plenocli.cli import options
         "reference under narrow-band light) or colorchecker."
     ),
 )
+@click.option(
+    "--volume",
+    metavar="VOLUME",
+    help=(
+        "Instead, before a camera with an [objective]: a volume .h5, a TIFF stack with voxel "
+        "sizes, or phantom:beads, phantom:shells, phantom:filaments, phantom:target."
+    ),
+)
 @options.output
 @click.option("--pif", type=options.FILE, help="Use this system matrix instead of computing one.")
 @click.option(
@@ -120,6 +128,7 @@ def command(
     *,
     scene: str | None,
     target: str | None,
+    volume: str | None,
     output: Path,
     pif: Path | None,
     snr_db: float | None,
@@ -152,8 +161,11 @@ def command(
       plenocli capture-sim camera.toml --target colorchecker --exposure 2.5ms -o chart.dng
       plenocli capture-sim camera.toml --scene photo.png --refine 3 --superpixels 3x3 \\
           --snr 60dB -o fine.h5
+      plenocli capture-sim microscope.toml --volume phantom:shells --refine 2 --snr 40dB \\
+          --scene-out truth.h5 -o capture.h5
     """
-    from plenocli.stages.forward.capture_sim import Settings, run_capture_sim
+    from plenocli.stages.forward.capture_settings import Settings
+    from plenocli.stages.forward.capture_sim import run_capture_sim
 
     report = run_capture_sim(
         camera,
@@ -175,6 +187,7 @@ def command(
             seed=seed,
         ),
         scene=scene,
+        volume=volume,
         pif=pif,
         scene_out=scene_out,
         overwrite=overwrite,

@@ -25,8 +25,8 @@ PIF_STACK = Schema(
     kind="pif-stack",
     version=1,
     doc=(
-        "Kernels of a volume before lenslets, A(z), the same for all lenslets: entry by entry where "
-        "the light of the voxels of one plane over one lenslet lands on one superpixel."
+        "Kernels of a volume before lenslets, A(z), the same for all lenslets: entry by entry "
+        "where the light of the voxels of one plane over one lenslet lands on one superpixel."
     ),
     fields=(
         dataset(
@@ -39,7 +39,12 @@ PIF_STACK = Schema(
             compress=False,
         ),
         dataset(
-            "stack/plane", "entry", "i", "1", "number of the plane, from 0, never falling", minimum=0
+            "stack/plane",
+            "entry",
+            "i",
+            "1",
+            "number of the plane, from 0, never falling",
+            minimum=0,
         ),
         dataset(
             "stack/lenslet_offset",
@@ -56,9 +61,7 @@ PIF_STACK = Schema(
             "of each plane from the focused one, away from the objective",
             ascending=True,
         ),
-        dataset(
-            "stack/spacing", "plane 2", "f", "m", "between voxels (rows, columns)", minimum=0
-        ),
+        dataset("stack/spacing", "plane 2", "f", "m", "between voxels (rows, columns)", minimum=0),
         dataset("stack/wavelength", "1", "f", "m", "of the light", minimum=0),
         dataset("stack/pixel_shape", "2", "i", "1", "pixels of a superpixel", minimum=1),
         dataset("stack/point_shape", "2", "i", "1", "voxels of a lenslet", minimum=1),
@@ -79,8 +82,8 @@ VOLUME = Schema(
     kind="volume",
     version=1,
     doc=(
-        "A volume, made from a capture or given to one: rows and columns go as those of the sensor, "
-        "depth away from the objective."
+        "A volume, made from a capture or given to one: rows and columns go as those of the "
+        "sensor, depth away from the objective."
     ),
     fields=(
         dataset(
@@ -131,9 +134,7 @@ VOLUME = Schema(
             attribute("correlation_length", "number", "m", "of the prior"),
             attribute("prior_variance", "number", "1", "of a voxel in the prior"),
             attribute("noise_variance", "number", "1", "of a pixel, model error included"),
-            attribute(
-                "margin", "number", "1", "lenslets from the border where light is missing"
-            ),
+            attribute("margin", "number", "1", "lenslets from the border where light is missing"),
             attribute("point_shape", "number", "1", "voxels of a lenslet (rows, columns)"),
         ),
         "held_out": (

@@ -42,6 +42,13 @@ class SuperpixelGrid:
     count: tuple[int, ...] | None = None
     centre: np.ndarray | None = None
 
+    @classmethod
+    def tiled(cls, count: tuple[int, int], shape: tuple[int, int]) -> SuperpixelGrid:
+        """That of `count` superpixels of `shape` pixels side by side."""
+        first = (np.array(shape) - 1) / 2
+        index = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1)
+        return cls(shape=tuple(shape), count=tuple(count), centre=first + index * np.array(shape))
+
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureMetadata:

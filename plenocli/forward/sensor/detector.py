@@ -13,7 +13,7 @@ from plenocli.base.random_streams import stream
 from plenocli.forward.sensor.noise import Noise
 
 if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.model import Camera, Sensor
 
 ROUNDING = 1 / 12
 """Variance that rounding to whole numbers adds, DN^2."""
@@ -76,7 +76,11 @@ class SensorModel:
     @classmethod
     def from_camera(cls, camera: Camera) -> SensorModel:
         """The model of a camera description's [sensor]."""
-        s = camera.sensor
+        return cls.of(camera.sensor)
+
+    @classmethod
+    def of(cls, s: Sensor) -> SensorModel:
+        """The model of a sensor's description."""
         warmer = 0.0 if s.temperature is None else s.temperature - REFERENCE_TEMPERATURE
         growth = 2.0 ** (warmer / (s.dark_current_doubling or DOUBLING))
         return cls(

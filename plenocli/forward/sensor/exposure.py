@@ -18,7 +18,7 @@ from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, Su
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.field_nodes import FieldNodes
-    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.model import Camera, Sensor
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
     from plenocli.forward.scene.light import Quadrature
     from plenocli.forward.scene.scenes import Scene
@@ -408,10 +408,10 @@ def detect(
         )
     rng = stream(options.seed, "capture-sim")
     if options.snr_db is not None or options.noise == "none":
-        return _relative(camera, mosaic, options, rng), None
+        return relative_capture(camera.sensor, mosaic, options, rng), None
     brightest = float(light.white.max())
     electrons = exposure_scale(camera, source, brightest, options.exposure, lamp=lamp)
-    return _exposed(camera, mosaic, electrons, scene, rng)
+    return exposed_capture(camera.sensor, mosaic, electrons, scene, rng)
 
 
 def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
@@ -429,15 +429,15 @@ def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
     return sum(filtered, start=np.zeros(()))
 
 
-def _relative(
-    camera: Camera, mosaic: np.ndarray, options: ExposureOptions, rng: np.random.Generator
+def relative_capture(
+    sensor: Sensor, mosaic: np.ndarray, options: ExposureOptions, rng: np.random.Generator
 ) -> Capture:
     """A capture in relative units, with white noise or none: with one wavelength and no colour
     the mosaic is A x itself.
     """
     from plenocli.forward.sensor.noise import Noise, add_white_noise
 
-    sensor, noise = camera.sensor, Noise()
+    noise = Noise()
     mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
     if options.snr_db is not None:
         mosaic, noise = add_white_noise(mosaic, options.snr_db, rng)
@@ -504,8 +504,8 @@ def exposure_scale(
     return ExposureScale(rate * taken, taken)
 
 
-def _exposed(
-    camera: Camera,
+def exposed_capture(
+    sensor: Sensor,
     mosaic: np.ndarray,
     exposure: ExposureScale,
     scene: str,
@@ -514,8 +514,8 @@ def _exposed(
     """A capture in digital numbers, and the share of its pixels over full well."""
     from plenocli.forward.sensor.detector import SensorModel
 
-    sensor, scale = camera.sensor, exposure.electrons
-    model = SensorModel.from_camera(camera)
+    scale = exposure.electrons
+    model = SensorModel.of(sensor)
     if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
         raise InputError(
             "holds values below 0 or beyond all numbers, which no light has",
@@ -551,10 +551,6 @@ def _described(
     capture: Capture, camera: Camera, truth: np.ndarray, name: str, band_m: float | None
 ) -> Capture:
     """The capture with what later stages need to know beside the mosaic."""
-    rows, columns = camera.sensor.pixels_per_lenslet
-    count = camera.lenslet_array.count
-    first = np.array([(rows - 1) / 2, (columns - 1) / 2])
-    index = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij"), axis=-1)
     metadata = replace(
         capture.metadata,
         scene_shape=tuple(truth.shape[1:]),
@@ -562,9 +558,5 @@ def _described(
         illuminant=camera.light.illuminant,
         band_m=band_m,
     )
-    grid = SuperpixelGrid(
-        shape=(rows, columns),
-        count=tuple(count),
-        centre=first + index * np.array([rows, columns]),
-    )
+    grid = SuperpixelGrid.tiled(camera.lenslet_array.count, camera.sensor.pixels_per_lenslet)
     return replace(capture, grid=grid, metadata=metadata)

@@ -35,7 +35,7 @@ TRIED_BLUR = 4.0
 """Lenslets on each side that the deepest point that is tried lights."""
 DEEPER = 1.6
 """Error of deeper points over that of the deepest that is tried (measured to 17 lenslets)."""
-OVERHEAD = 1.8
+OVERHEAD = 3.6
 """Time over that of the products."""
 
 

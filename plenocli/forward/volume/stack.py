@@ -75,27 +75,27 @@ def build_stack(
         "object.planes",
         "take fewer planes, pixels or voxels",
     )
-    found: list[_Plane | None] = [None] * len(plan.reach)
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def one(number: int) -> None:
-        found[number] = _plane(optics, plan, number)
+        found[number] = plane_kernels(optics, plan, number)
         if progress:
             progress(1)
 
     spread([(number,) for number in range(len(plan.reach))], one)
-    planes = [plane for plane in found if plane is not None]
+    planes = [found[number] for number in range(len(plan.reach))]
     rows, columns = plan.samples
     pitch = optics.object_pitch
     return Stack(
-        A=np.concatenate([plane.kernels for plane in planes]),
-        plane=np.repeat(np.arange(len(planes)), [len(plane.kernels) for plane in planes]),
-        lenslet_offset=np.concatenate([plane.offsets for plane in planes]),
+        A=np.concatenate([kernels for kernels, _ in planes]),
+        plane=np.repeat(np.arange(len(planes)), [len(kernels) for kernels, _ in planes]),
+        lenslet_offset=np.concatenate([offsets for _, offsets in planes]),
         depth=np.array(optics.depths),
         spacing=np.tile([pitch / rows, pitch / columns], (len(planes), 1)),
         pixel_shape=optics.pixels,
         point_shape=plan.samples,
         wavelength=optics.wavelength,
-        column_energy=np.stack([plane.energy for plane in planes]),
+        column_energy=np.stack([kernels.sum((0, 1), dtype=float) for kernels, _ in planes]),
         accuracy=AccuracyRecord(
             asked=plan.asked,
             estimated=plan.error,
@@ -106,16 +106,16 @@ def build_stack(
     )
 
 
-@dataclass(frozen=True)
-class _Plane:
-    kernels: np.ndarray
-    offsets: np.ndarray
-    energy: np.ndarray
-
-
-def _plane(optics: VolumeOptics, plan: VolumePlan, number: int) -> _Plane:
+def plane_kernels(
+    optics: VolumeOptics, plan: VolumePlan, number: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Kernels of one plane: points at the unique places, the others by symmetry, averaged over the
     voxels' boxes.
+
+    number: of the plane.
+
+    Returns (entry, pixel, point) and lenslet offsets (entry, 2), as Stack has them.
+    Raises NumericsError where a point's light on the sensor is not what entered its lenslets.
     """
     plane, half = plan.plane(optics, number), 2 * plan.reach[number] + 1
     fine = tuple(n * plan.box for n in plan.samples)
@@ -131,7 +131,7 @@ def _plane(optics: VolumeOptics, plan: VolumePlan, number: int) -> _Plane:
     kernels = total.transpose(2, 4, 3, 5, 0, 1).reshape(half**2, rows * columns, -1)
     side = np.arange(half) - plan.reach[number]
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    return _Plane(np.ascontiguousarray(kernels), offsets, kernels.sum((0, 1), dtype=float))
+    return np.ascontiguousarray(kernels), offsets
 
 
 def _images(

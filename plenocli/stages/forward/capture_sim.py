@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,6 @@ from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.scene.scenes import Chart, Scene, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.forward.sensor.exposure import (
-    ExposureOptions,
     SimulatedCapture,
     StoredField,
     StoredMatrix,
@@ -26,104 +24,12 @@ from plenocli.forward.sensor.exposure import (
     simulate_capture,
     stored_field,
 )
+from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.scene.light import Quadrature
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What the command line says beyond the files.
-
-    target: "white", "dark", "mono:450nm" or "colorchecker", None where there is a scene.
-    sampling: "fit" or "crop", of a photograph.
-    refine: object points per side for each point of the camera description.
-    bandwidth: of the light, m.
-    spectral_step: m, None as the light needs.
-    superpixels: (rows, columns) that one lenslet's light may reach, or "auto".
-    coherent_ring: lenslets whose light interferes, or "auto".
-    accuracy: relative, None as the noise needs.
-    model: of the propagation, "auto" or a rung.
-    snr_db: of white noise instead of the sensor's own, dB.
-    noise: "sensor" or "none".
-    exposure: s, None for the camera's own.
-    field_nodes: places of the field along an axis whose matrices stand for all lenslets, None for
-        the axis alone.
-    seed: of the noise.
-    """
-
-    target: str | None = None
-    sampling: str = "fit"
-    refine: int = 1
-    bandwidth: float = 0.0
-    spectral_step: float | None = None
-    superpixels: str | tuple[int, int] = "auto"
-    coherent_ring: str | int = "auto"
-    accuracy: float | None = None
-    model: str = "auto"
-    snr_db: float | None = None
-    noise: str = "sensor"
-    exposure: float | None = None
-    field_nodes: int | None = None
-    seed: int = 0
-
-    @property
-    def options(self) -> ExposureOptions:
-        """What of them the simulation knows."""
-        return ExposureOptions(
-            refine=self.refine,
-            superpixels=self.superpixels,
-            coherent_ring=self.coherent_ring,
-            accuracy=self.accuracy,
-            model=self.model,
-            snr_db=self.snr_db,
-            noise=self.noise,
-            exposure=self.exposure,
-            field_nodes=self.field_nodes,
-            seed=self.seed,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureSummary:
-    """What capture-sim wrote.
-
-    output: the file.
-    rows, columns: of its mosaic.
-    wavelengths: how many the light was computed at.
-    units: of the mosaic.
-    peak: its largest value.
-    noise_sigma: standard deviation of the noise, None where the sensor's noise is simulated.
-    saturated: share of the pixels over full well, None in relative units.
-    exposure_s: s, None in relative units.
-    """
-
-    output: Path
-    rows: int
-    columns: int
-    wavelengths: int
-    units: str
-    peak: float | int
-    noise_sigma: float | None = None
-    saturated: float | None = None
-    exposure_s: float | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary for `--json`; what does not apply is left out."""
-        named = {
-            "units": self.units,
-            "noise_sigma": self.noise_sigma,
-            "peak": self.peak,
-            "saturated": self.saturated,
-            "exposure_s": self.exposure_s,
-            "output": str(self.output),
-            "rows": self.rows,
-            "columns": self.columns,
-            "wavelengths": self.wavelengths,
-        }
-        return {name: value for name, value in named.items() if value is not None}
 
 
 def run_capture_sim(
@@ -132,6 +38,7 @@ def run_capture_sim(
     settings: Settings,
     *,
     scene: str | Path | None = None,
+    volume: str | None = None,
     pif: str | Path | None = None,
     scene_out: str | Path | None = None,
     overwrite: bool = False,
@@ -142,6 +49,7 @@ def run_capture_sim(
     camera_path: description of the camera, .toml.
     output: .h5, .exr or .dng.
     scene: what read_scene takes; None where the settings have a target.
+    volume: what run_volume_capture takes, before a camera with an [objective].
     pif: artefact whose system matrix is used instead of a computed one.
     scene_out: also write the object as sampled, .h5 or .exr.
     overwrite: replace files that are there.
@@ -154,9 +62,21 @@ def run_capture_sim(
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import together
     from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.config.microscope_file import describes_microscope
     from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import camera_files, read_camera
 
+    if volume is not None or describes_microscope(camera_path):
+        return _of_volume(
+            camera_path,
+            output,
+            settings,
+            volume,
+            {"--scene": scene, "--pif": pif},
+            scene_out=scene_out,
+            overwrite=overwrite,
+            command=command,
+        )
     output = Path(output)
     _check_outputs(output, scene_out, settings, [camera_path, pif, scene], overwrite)
     camera = read_camera(camera_path)
@@ -193,6 +113,47 @@ def run_capture_sim(
         if scene_out:
             _write_scene(scene_out, truth, bands, provenance, overwrite)
     return _summary(output, found, len(source.wavelengths))
+
+
+def _of_volume(
+    camera_path: str | Path,
+    output: str | Path,
+    settings: Settings,
+    volume: str | None,
+    others: dict[str, str | Path | None],
+    *,
+    scene_out: str | Path | None,
+    overwrite: bool,
+    command: str,
+) -> CaptureSummary:
+    """The capture of a volume; UsageError where one is not what the other needs."""
+    from plenocli.files.config.microscope_file import describes_microscope
+    from plenocli.stages.forward.volume_capture import run_volume_capture
+
+    if volume is None:
+        raise UsageError(
+            "has an [objective], before which a volume lies",
+            camera_path,
+            "give --volume, for example --volume phantom:beads",
+        )
+    if not describes_microscope(camera_path):
+        raise UsageError(
+            "has no [objective], before which a volume would lie",
+            camera_path,
+            "give --scene or --target instead of --volume",
+        )
+    for option, value in others.items():
+        if value is not None:
+            raise UsageError("does not go with --volume", option, "leave one of them out")
+    return run_volume_capture(
+        camera_path,
+        output,
+        settings,
+        volume,
+        scene_out=scene_out,
+        overwrite=overwrite,
+        command=command,
+    )
 
 
 def _check_outputs(

@@ -316,8 +316,8 @@ def run_simulate_pif(
 def _model_of_volume(settings: Settings) -> str:
     """The model; UsageError where settings ask for what the kernels of a volume do not have."""
     plain = Settings(accuracy=settings.accuracy, model=settings.model)
-    for name in (field.name for field in fields(settings)):
-        if getattr(settings, name) != getattr(plain, name):
+    for name, value in asdict(settings).items():
+        if value != getattr(plain, name):
             option = "--" + ("wavelength" if name == "wavelengths" else name.replace("_", "-"))
             raise UsageError(
                 "does not go with an [objective], whose planes, voxels and wavelength are in its "

@@ -68,7 +68,7 @@ class StackSummary:
         least, most = self.reach
         text = (
             f"kernels of {self.planes} planes, {by(self.samples)} voxels a lenslet, light of "
-            f"{least} to {most} lenslets on each side (at most {self.light_lost:.1%} falls beyond); "
+            f"{least} to {most} lenslets on each side ({self.light_lost:.1%} or less beyond them); "
             f"{self.rung}, {self.estimated_accuracy:.1g} of a voxel's light is elsewhere"
         )
         if self.output is not None:

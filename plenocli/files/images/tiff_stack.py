@@ -1,0 +1,142 @@
+"""Volumes as TIFF: OME-TIFF with voxel sizes for Fiji and its kin, and stacks of any program."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.base.budget import budget
+from plenocli.base.errors import InputError
+from plenocli.files.atomic import publish
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile
+
+_METRES = {"nm": 1e-9, "µm": 1e-6, "um": 1e-6, "micron": 1e-6, "mm": 1e-3, "m": 1.0}
+"""Names of units in OME-XML and ImageJ's description."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiffVolume:
+    """A stack of pictures.
+
+    value: (plane, row, column).
+    step: m between planes; spacing: m between rows and columns; None where the file says nothing.
+    """
+
+    value: np.ndarray
+    step: float | None
+    spacing: tuple[float, float] | None
+
+
+def write_ome_tiff(
+    path: str | os.PathLike,
+    value: np.ndarray,
+    sigma: np.ndarray | None,
+    depth: np.ndarray,
+    spacing: tuple[float, float],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a volume as OME-TIFF: channel "volume", and "sigma" where there is one.
+
+    value, sigma: (plane, row, column).
+    depth: (plane,) m; spacing: (rows, columns) m.
+
+    Raises UsageError where the file exists, OutputError where it cannot be written.
+    """
+    import tifffile
+
+    channels = [value] if sigma is None else [value, sigma]
+    names = ["volume", "sigma"][: len(channels)]
+    metadata = {
+        "axes": "CZYX",
+        "PhysicalSizeX": spacing[1] * 1e6,
+        "PhysicalSizeXUnit": "µm",
+        "PhysicalSizeY": spacing[0] * 1e6,
+        "PhysicalSizeYUnit": "µm",
+        "Channel": {"Name": names},
+    }
+    if len(depth) > 1:
+        step = float(np.mean(np.diff(depth)))
+        metadata |= {"PhysicalSizeZ": step * 1e6, "PhysicalSizeZUnit": "µm"}
+    memory = BytesIO()
+    with tifffile.TiffWriter(memory, ome=True) as file:
+        file.write(
+            np.stack(channels).astype(np.float32), photometric="minisblack", metadata=metadata
+        )
+    publish(path, memory.getvalue(), overwrite=overwrite)
+
+
+def read_tiff_volume(path: str | os.PathLike) -> TiffVolume:
+    """The first channel of a TIFF stack, with what its OME-XML or ImageJ description says of sizes.
+
+    Raises InputError where the file cannot be read or is no stack.
+    """
+    import tifffile
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("is no file", path, "give a TIFF stack")
+    try:
+        with tifffile.TiffFile(path) as file:
+            series = file.series[0]
+            axes, shape = series.axes, series.shape
+            size = int(np.prod(shape, dtype=object)) * 8
+            budget().require_declared(path, size, size)
+            value, step, spacing = series.asarray(), *_sizes(file)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # tifffile raises many types for a damaged file
+        if type(error).__module__.startswith("plenocli"):
+            raise
+        raise InputError(
+            f"cannot be read as TIFF ({type(error).__name__}: {error})", path, "give a TIFF stack"
+        ) from None
+    for axis in (a for a in axes if a not in "ZIQYX"):
+        value, axes = np.take(value, 0, axes.index(axis)), axes.replace(axis, "", 1)
+    if value.ndim == 2:
+        value = value[None]
+    if value.ndim != 3 or not axes.endswith("YX") or value.dtype.kind not in "biuf":
+        raise InputError(
+            f"has the axes {axes or 'none'}, which are no stack of grey pictures",
+            path,
+            "save one channel and one time as a stack",
+        )
+    value = value.astype(np.float32)
+    if not np.isfinite(value).all():
+        raise InputError("holds values that are NaN or infinite", path, "mend them")
+    return TiffVolume(value=value, step=step, spacing=spacing)
+
+
+def _sizes(file: TiffFile) -> tuple[float | None, tuple[float, float] | None]:
+    """(m between planes, m between rows and columns) as far as the file says them."""
+    if file.ome_metadata:
+        import tifffile
+
+        image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+        pixels = (image[0] if isinstance(image, list) else image)["Pixels"]
+        found = [
+            float(pixels[f"PhysicalSize{axis}"])
+            * _METRES.get(pixels.get(f"PhysicalSize{axis}Unit", "µm"), 1e-6)
+            if f"PhysicalSize{axis}" in pixels
+            else None
+            for axis in "ZYX"
+        ]
+    elif file.imagej_metadata:
+        about = file.imagej_metadata
+        unit = _METRES.get(str(about.get("unit", "")).replace("\\u00B5", "µ"))
+        tags = file.pages.first.tags
+        found = [about["spacing"] * unit if unit and "spacing" in about else None]
+        for name in ("YResolution", "XResolution"):
+            many, over = tags[name].value if name in tags else (0, 1)
+            found.append(unit * over / many if unit and many else None)
+    else:
+        return None, None
+    step, rows, columns = found
+    return step, None if rows is None or columns is None else (rows, columns)

@@ -1,0 +1,115 @@
+"""Volumes, into their artefact and out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.inverse.volume.volume import Volume
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredVolume:
+    """What a file says of a volume.
+
+    value: (plane, row, column); sigma: likewise, or None.
+    depth: (plane,) m; spacing: (rows, columns) m.
+    facts: name of an attribute -> its value, those of held-out pixels with "held_out." before them.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None
+    depth: np.ndarray
+    spacing: tuple[float, float]
+    facts: dict[str, Any]
+
+
+def truth_artefact(
+    value: np.ndarray, depth: np.ndarray, spacing: np.ndarray, provenance: Provenance
+) -> Artefact:
+    """The artefact of a volume that is known.
+
+    value: (plane, row, column); depth: (plane,) m; spacing: (rows, columns) m.
+    """
+    from plenocli.files.artefacts.container import Artefact
+
+    data = {
+        "volume/value": value.astype(np.float32),
+        "volume/depth": np.asarray(depth, float),
+        "volume/spacing": np.asarray(spacing, float),
+    }
+    return Artefact("volume", data, {}, provenance)
+
+
+def volume_artefact(
+    volume: Volume,
+    depth: np.ndarray,
+    spacing: np.ndarray,
+    point_shape: tuple[int, int],
+    provenance: Provenance,
+) -> Artefact:
+    """The artefact of a volume that was made from a capture.
+
+    depth: (plane,) m; spacing: (rows, columns) m; point_shape: voxels of a lenslet.
+    """
+    made = truth_artefact(volume.value, depth, spacing, provenance)
+    if volume.sigma is not None:
+        made.data["volume/sigma"] = volume.sigma.astype(np.float32)
+    about: dict[str, Any] = {
+        "method": volume.method,
+        "trace": [[trial.what, trial.misfit] for trial in volume.trace],
+        "background": volume.background,
+        "margin": volume.margin,
+        "point_shape": list(point_shape),
+    }
+    if volume.prior is not None:
+        about |= {
+            "correlation_length": volume.prior.correlation_length,
+            "prior_variance": volume.prior.variance,
+            "noise_variance": volume.prior.noise_variance,
+        }
+    made.attrs["volume"] = about
+    if volume.held_out is not None:
+        held = volume.held_out
+        made.data |= {
+            "held_out/index": held.index.astype(np.int32),
+            "held_out/measured": held.measured,
+            "held_out/predicted": held.predicted,
+            "held_out/sigma": held.sigma,
+        }
+        made.attrs["held_out"] = {
+            "explained_db": held.explained_db,
+            "z_rms": list(held.z_rms),
+            "held_by_bars": list(held.held_by_bars),
+        }
+    return made
+
+
+def read_volume(path: Path | str) -> StoredVolume:
+    """The volume in a file of kind volume.
+
+    Raises InputError for another file.
+    """
+    from plenocli.files.artefacts.container import read_artefact
+
+    return volume_of(read_artefact(path, "volume"))
+
+
+def volume_of(artefact: Artefact) -> StoredVolume:
+    """What an artefact of kind volume holds."""
+    rows, columns = artefact.data["volume/spacing"].tolist()
+    held = artefact.attrs.get("held_out", {})
+    return StoredVolume(
+        value=artefact.data["volume/value"],
+        sigma=artefact.data.get("volume/sigma"),
+        depth=artefact.data["volume/depth"],
+        spacing=(rows, columns),
+        facts=artefact.attrs.get("volume", {})
+        | {f"held_out.{name}": value for name, value in held.items()},
+    )

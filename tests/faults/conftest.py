@@ -82,6 +82,14 @@ def make_all(folder, runner):
     field += ["--superpixels", "1x1", "--coherent-ring", "0", "-o", "field.h5"]
     outcome = runner.run(field, folder, limit=120)
     assert outcome.code == 0, outcome.text
+    (folder / "microscope.toml").write_text(_microscope())
+    for arguments in (
+        ["simulate-pif", "microscope.toml", "--model", "ray", "-o", "kernels.h5"],
+        ["capture-sim", "microscope.toml", "--model", "ray", "--volume", "phantom:beads"]
+        + ["--scene-out", "volume.h5", "-o", "volume-capture.h5"],
+    ):
+        outcome = runner.run(arguments, folder, limit=120)
+        assert outcome.code == 0, outcome.text
     write_shards(folder, "shards.h5", (tuple(range(5)), tuple(range(5, 9))))
     learnt = read_artefact(folder / "dictionary.h5")
     write_artefact(folder / "unfinished.h5", replace(learnt, kind="checkpoint"))
@@ -113,6 +121,21 @@ def _spectral_camera():
         .replace("samples_per_lenslet = [3, 3]", "samples_per_lenslet = [2, 2]")
     )
     assert "[6, 7]" in text and "[2, 2]" in text
+    return text
+
+
+def _microscope():
+    """The sample's microscope with few planes, pixels and lenslets."""
+    text = (
+        (SAMPLES / "microscope.toml")
+        .read_text()
+        .replace('"-12 um to 12 um step 1 um"', '["-2 um", "1 um"]')
+        .replace("count = [29, 29]", "count = [5, 6]")
+        .replace('pixel_pitch = "6.6666667 um"', 'pixel_pitch = "20 um"')
+        .replace("pixels_per_lenslet = [15, 15]", "pixels_per_lenslet = [5, 5]")
+        .replace("samples_per_lenslet = [3, 3]", "samples_per_lenslet = [2, 2]")
+    )
+    assert "[5, 6]" in text and "-2 um" in text and '"20 um"' in text
     return text
 
 

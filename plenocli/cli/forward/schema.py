@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @click.command("schema", short_help="Print the JSON Schema of a camera, scene or lens description.")
-@click.argument("kind", type=click.Choice(["camera", "scene", "lens"]))
+@click.argument("kind", type=click.Choice(["camera", "microscope", "scene", "lens"]))
 @options.mem_limit
 def command(
     kind: str,
@@ -27,7 +27,13 @@ def command(
     """
     from plenocli.files.config.lens_file import LensFile
     from plenocli.files.config.scene_file import Scene
+    from plenocli.forward.camera.microscope import Microscope
     from plenocli.forward.camera.model import Camera
 
-    models: dict[str, type[BaseModel]] = {"camera": Camera, "scene": Scene, "lens": LensFile}
+    models: dict[str, type[BaseModel]] = {
+        "camera": Camera,
+        "microscope": Microscope,
+        "scene": Scene,
+        "lens": LensFile,
+    }
     click.echo(json.dumps(models[kind].model_json_schema(), indent=2))

@@ -1,1 +1,3 @@
-"""Volumes before lenslets: how the light of points at several depths lands on the superpixels."""
+"""Volumes before lenslets: the field of a point at any depth, kernels by rays and waves, and what
+is recorded of specimens (docs/model.md, "Volumes").
+"""

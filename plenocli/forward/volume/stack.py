@@ -16,7 +16,11 @@ from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.plan import VolumePlan, unique_places
 
 SUM_SLACK = 5e-3
-"""By which a column may miss, or exceed, the light that enters the lenslets."""
+"""By which a column may exceed the light that enters the lenslets."""
+SPILLED = 0.02
+"""Share of the light that may be spread beyond the last superpixel."""
+RAY_SLACK = 0.05
+"""As SUM_SLACK, of a grid of rays."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,12 +161,15 @@ def _guard(
     """NumericsError where the light on the sensor is not what entered the lenslets."""
     expected = entered * optics.pixel_width**2
     away = light / expected - 1
-    slack = max(SUM_SLACK, plan.error) if plan.model == "fresnel" else 0.05
-    # pixels in part blind miss fringes; light is spread beyond the last superpixel as well
-    if away > slack or (away < -max(slack, 0.05) and optics.pixel_width == 1):
+    slack = max(SUM_SLACK, plan.error) if plan.model == "fresnel" else RAY_SLACK
+    # pixels in part blind miss fringes, light is spread beyond the last superpixel, and in gaps
+    # between lenslets some is lost
+    whole = optics.pixel_width == 1 and optics.open_width == optics.pitch
+    least = 1 - plan.lost[number] - slack - SPILLED
+    if away > slack or (whole and (away < -slack - SPILLED or entered < least)):
         raise NumericsError(
             f"of a point in plane {number} {light:.4f} of the light reaches the pixels, where "
-            f"{expected:.4f} is expected",
+            f"{expected:.4f} enters the lenslets, and at least {least:.4f} should",
             "object.planes",
             "ask for a finer accuracy, or check sensor.distance and the lenslets' focal_length",
         )

@@ -155,7 +155,11 @@ def test_kernels_touch_no_files(path):
 
 @pytest.mark.parametrize("path", modules("cli"), ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_commands_only_parse(path):
-    allowed = {"plenocli.forward.scene.white_reference", "plenocli.forward.camera.model"}
+    allowed = {
+        "plenocli.forward.scene.white_reference",
+        "plenocli.forward.camera.model",
+        "plenocli.forward.camera.microscope",
+    }
     names = {n for n in imported(path) if any(n == a or n.startswith(a + ".") for a in allowed)}
     assert not {room(name) for name in imported(path) - names if name.startswith("plenocli.")} & {
         *KERNELS,

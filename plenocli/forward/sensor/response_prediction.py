@@ -4,6 +4,7 @@ an even object in each band. docs/model.md, "The response predicted".
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,14 +183,43 @@ class ResponsePrediction:
         Returns (kind, pixel) DN, and the exposure in s.
         Raises ConfigError where no light reaches the sensor.
         """
-        from plenocli.forward.sensor.cfa import cfa_map, sensitivity
-
-        camera, kinds = self.camera, self.kinds
-        letters, efficiency = sensitivity(camera, source.wavelengths)
         light: Any = 0.0
+        for part in self._light(source):
+            light = light + part
+        scale, seconds = self._exposed(source, light, exposure, lamp)
+        return self._mosaicked(light) * scale, seconds
+
+    def spectral_signal(
+        self, source: Quadrature, exposure: float | None
+    ) -> tuple[np.ndarray, float]:
+        """Expected signal of a surface of reflectance one, wavelength by wavelength.
+
+        source, exposure: as white_signal's.
+
+        Returns (kind, pixel, node) DN, and the exposure in s.
+        Raises ConfigError where no light reaches the sensor.
+        """
+        parts = list(self._light(source))
+        scale, seconds = self._exposed(source, np.sum(parts, axis=0), exposure, False)
+        seen = np.stack([self._mosaicked(part) for part in parts], axis=-1)
+        return seen * (scale / REFERENCE_REFLECTANCE), seconds
+
+    def _light(self, source: Quadrature) -> Iterator[np.ndarray]:
+        """(letter, kind's shift, pixel) light of each wavelength, where every object point sends
+        one unit through the clear pupil.
+        """
+        from plenocli.forward.sensor.cfa import sensitivity
+
+        points = float(np.prod(self.camera.object.samples_per_lenslet))
+        efficiency = sensitivity(self.camera, source.wavelengths)[1]
         for index, wavelength in enumerate(source.wavelengths):
-            photons = source.photons[index] * efficiency[:, index]
-            light = light + photons[:, None, None] * self.at(wavelength)[None]
+            photons = points * source.photons[index] * efficiency[:, index]
+            yield photons[:, None, None] * self.at(wavelength)[None]
+
+    def _exposed(
+        self, source: Quadrature, light: np.ndarray, exposure: float | None, lamp: bool
+    ) -> tuple[float, float]:
+        """DN of the white reference for one unit of light, and the exposure in s."""
         peak = float(light.max())
         if not peak > DARK:
             raise ConfigError(
@@ -197,10 +227,19 @@ class ResponsePrediction:
                 "camera",
                 "check filters, wavelengths and sensitivities",
             )
+        scale = exposure_scale(self.camera, source, peak, exposure, lamp=lamp)
+        return scale.electrons * REFERENCE_REFLECTANCE * self.camera.sensor.gain, scale.seconds
+
+    def _mosaicked(self, light: np.ndarray) -> np.ndarray:
+        """(kind, pixel) of light (letter, kind's shift, pixel), as the colour filters see it."""
+        from plenocli.forward.sensor.cfa import cfa_map, sensitivity
+
+        camera, kinds = self.camera, self.kinds
+        letters = sensitivity(camera, np.array(camera.light.wavelengths))[0]
         mosaics = [
             cfa_map(kinds.window, camera.sensor.cfa, phase).ravel() for phase in kinds.phases
         ]
-        seen = np.stack(
+        return np.stack(
             [
                 sum(
                     np.where(mosaic == letter, light[n, kind], 0.0)
@@ -209,9 +248,6 @@ class ResponsePrediction:
                 for kind, mosaic in enumerate(mosaics)
             ]
         )
-        scale = exposure_scale(camera, source, peak, exposure, lamp=lamp)
-        signal = seen * (scale.electrons * REFERENCE_REFLECTANCE * camera.sensor.gain)
-        return signal, scale.seconds
 
     def notes(self, bands: tuple[float, ...]) -> PredictionNotes:
         """What is recorded of F in `bands` (m), once it was computed."""

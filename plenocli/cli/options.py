@@ -260,6 +260,14 @@ def input_path(name: str, **settings: Any) -> Callable:
     return click.argument(name, type=FILE, **settings)
 
 
+prior = click.option(
+    "--prior",
+    type=FILE,
+    help=(
+        "Labelled spectra (as score --classes takes them) whose mean and covariance lmmse starts "
+        "from, instead of those of many surfaces."
+    ),
+)
 output = click.option(
     "-o",
     "--output",

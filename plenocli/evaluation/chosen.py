@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from types import ModuleType
 
 from plenocli.base.errors import UsageError
+from plenocli.evaluation import expected
 from plenocli.evaluation.metrics import (
     classes,
     classify,
@@ -40,6 +41,15 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "class_accuracy_high",
         "class_accuracy_predicted",
         "class_distance",
+    ),
+    "expected": (
+        "rmse_expected",
+        "rmse_expected_per_band",
+        "noise_expected_per_band",
+        "class_accuracy_expected",
+        "class_accuracy_ideal",
+        "class_distance_ideal",
+        "detection_auc_expected",
     ),
     "detection": (
         "detection_auc",
@@ -121,6 +131,7 @@ _NEEDED = {
         "needs scikit-learn"
     ),
     "classes": "give spectra and the spectra of --classes",
+    "expected": "give a calibration of simulate-response and the spectra of --classes",
     "detection": "give --classes, and with --detect the one that is looked for",
     "single-pixel": "give spectra of demux --method single-pixel among the results",
 }
@@ -159,7 +170,7 @@ _HOMES: Mapping[str, tuple[ModuleType, ...]] = {
 
 def every_definition() -> dict[str, str]:
     """What each figure of pictures, spectra and planes means, by its name."""
-    homes = (quality, spectral, snr, classify, classes, depth)
+    homes = (quality, spectral, snr, classify, classes, expected, depth)
     return {name: text for home in homes for name, text in home.DEFINITIONS.items()}
 
 
@@ -171,7 +182,7 @@ def definitions_of(results: Iterable[ResultScore]) -> dict[str, str]:
         if result.wavelengths_nm and result.kind != "calibration":
             home = (spectral, quality)
         for name in result.figures:
-            for module in (*home, snr, classify, classes):
+            for module in (*home, snr, classify, classes, expected):
                 if name in module.DEFINITIONS:
                     found[name] = module.DEFINITIONS[name]
                     break

@@ -63,6 +63,7 @@ def test_an_example_of_demux_runs(line, stages, runner, tmp_path):
     shutil.copy(folder / "white.dng", tmp_path / "white.dng")
     for name in ("chart.dng", "captures/1.dng", "captures/2.dng"):
         shutil.copy(folder / "colorchecker.dng", tmp_path / name)
+    (tmp_path / "paints.csv").write_text("nm,rust,moss\n400,0.1,0.2\n700,0.6,0.3\n")
     words = [word.replace(".NEF", ".dng") for word in line]
     found = [p for w in words for p in (sorted(tmp_path.glob(w)) if "*" in w else [w])]
     outcome = runner.run(found, tmp_path, limit=120)

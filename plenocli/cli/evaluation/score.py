@@ -19,6 +19,7 @@ METRICS = (
     "classification",
     "classes",
     "detection",
+    "expected",
     "single-pixel",
     "coherence",
     "response",
@@ -106,6 +107,17 @@ METRICS = (
     metavar="CLASS",
     help="The class of --classes to look for: how well it stands out from the others.",
 )
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "pinv", "wls", "lmmse", "single-pixel"]),
+    default="auto",
+    show_default=True,
+    help=(
+        "How spectra of a calibration would be made, for what it lets expect of --classes; auto: "
+        "by the least expected error."
+    ),
+)
+@options.prior
 @options.mem_limit
 @options.overwrite
 @options.as_json
@@ -128,6 +140,8 @@ def command(
     camera: Path | None,
     classes: Path | None,
     detect: str | None,
+    method: str,
+    prior: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -139,8 +153,10 @@ def command(
     spectral angle, colour difference, SNR under three names, how often a lenslet tells its patch
     (with scikit-learn installed also by a trained classifier), and all against single pixel where
     one of the RESULTs is that. Dictionaries: coherence. Calibrations: response against response.
-    Refocused planes (made with --camera): depth over the geometric limit. OUT is JSON with the
-    definition of every number; null stands for "infinite" (no error at all) or "does not apply".
+    Of a calibration that simulate-response made, --classes says what it lets expect before
+    anything is captured. Refocused planes (made with --camera): depth over the geometric limit. OUT
+    is JSON with the definition of every number; null stands for "infinite" (no error at all) or
+    "does not apply".
 
     \b
     Examples:
@@ -150,6 +166,7 @@ def command(
       plenocli score spectra.h5 --truth capture.h5 --classes paints.csv -o told.json
       plenocli score shown.h5 --truth paints.csv --camera camera.toml --classes paints.csv \\
           --detect rust -o found.json
+      plenocli score response.h5 --classes paints.csv --method lmmse -o expected.json
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
       plenocli score planes.h5 --truth 620mm -o depth.json
@@ -173,6 +190,8 @@ def command(
         camera=camera,
         classes=classes,
         detect=detect,
+        method=method,
+        prior=prior,
         overwrite=overwrite,
     )
     options.summary(document.as_json(), as_json, table(document))

@@ -36,6 +36,7 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
         "on their neighbours is predicted and taken off (default: as the calibration has it)."
     ),
 )
+@options.prior
 @click.option(
     "--reference",
     type=options.FILE,
@@ -73,6 +74,7 @@ def command(
     calibration: Path,
     method: str,
     camera: Path | None,
+    prior: Path | None,
     reference: Path | None,
     reference_reflectance: float,
     register: str,
@@ -99,6 +101,7 @@ def command(
       plenocli demux chart.NEF --calibration cal.h5 --reference white.NEF -o chart.exr
       plenocli demux captures/*.NEF --calibration cal.h5 --method wls --workers 2 -o spectra/
       plenocli demux captures/*.NEF --calibration cal.h5 --scheduler tcp://10.0.0.1:8786 -o spectra/
+      plenocli demux chart.dng --calibration cal.h5 --method lmmse --prior paints.csv -o chart.h5
       plenocli demux chart.dng --calibration cal.h5 --method single-pixel -o chart.h5
       plenocli demux chart.dng --calibration cal.h5 --camera camera.toml -o chart.h5
     """
@@ -114,6 +117,7 @@ def command(
             reference_reflectance=reference_reflectance,
             register=register,
             camera=camera,
+            prior=prior,
         ),
         suffix=f".{suffix}",
         workers=workers,

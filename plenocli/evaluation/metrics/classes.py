@@ -167,17 +167,29 @@ class Filter:
 
         Fisher's discriminant between it and the mixture of the others in equal parts.
         """
-        place = classes.names.index(name)
-        others = np.delete(classes.means, place, axis=0)
-        apart = classes.means[place] - others.mean(axis=0)
-        mixed = spread + np.cov(others.T, ddof=0) if len(others) > 1 else spread
-        root = _whitening((spread + mixed) / 2)
-        weights = root @ (root.T @ apart)
+        apart, mixed = cls._beside(classes, name, spread)
+        root = whitening((spread + mixed) / 2)
+        return cls.answering(classes, name, spread, root @ (root.T @ apart))
+
+    @classmethod
+    def answering(
+        cls, classes: Classes, name: str, spread: np.ndarray, weights: np.ndarray
+    ) -> Filter:
+        """A filter of given weights (band,), and its answers as in `of`."""
+        apart, mixed = cls._beside(classes, name, spread)
         return cls(
             weights=weights,
             contrast=float(weights @ apart),
             variances=(float(weights @ spread @ weights), float(weights @ mixed @ weights)),
         )
+
+    @staticmethod
+    def _beside(classes: Classes, name: str, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean of a class less the others' (band,), and the covariance of these (band, band)."""
+        place = classes.names.index(name)
+        others = np.delete(classes.means, place, axis=0)
+        mixed = spread + np.cov(others.T, ddof=0) if len(others) > 1 else spread
+        return classes.means[place] - others.mean(axis=0), mixed
 
     @property
     def auc(self) -> float:
@@ -229,14 +241,14 @@ def assigned(spectra: np.ndarray, means: np.ndarray, covariance: np.ndarray) -> 
     means: (class, band).
     covariance: (band, band) that all classes share; where it is singular, plain distances count.
     """
-    root = _whitening(covariance)
+    root = whitening(covariance)
     distance = np.linalg.norm((spectra[:, None] - means[None]) @ root, axis=-1)
     return distance.argmin(axis=1)
 
 
 def distances_between(means: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """(class, class) Mahalanobis distances, infinite on the diagonal."""
-    root = _whitening(covariance)
+    root = whitening(covariance)
     found = np.linalg.norm((means[:, None] - means[None]) @ root, axis=-1)
     np.fill_diagonal(found, np.inf)
     return found
@@ -259,8 +271,8 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def _whitening(covariance: np.ndarray) -> np.ndarray:
-    """(band, band) W with W W^T the inverse; the identity where there is none."""
+def whitening(covariance: np.ndarray) -> np.ndarray:
+    """(band, band) W with W W^T the inverse of a covariance; the identity where there is none."""
     values, vectors = np.linalg.eigh(covariance)
     if not values[0] > 1e-12 * max(values[-1], 1e-300):
         return np.eye(len(covariance))

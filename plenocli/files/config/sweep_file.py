@@ -131,7 +131,8 @@ class Sweep(Section):
     chain: "spatial" (simulate-pif, capture-sim, reconstruct, score) or "spectral" (simulate-pif,
         capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
         has a filter array. "joint" (both: a chart demultiplexed and a picture reconstructed in
-        bands) and "depth" (capture-sim, refocus, score) only where it is named.
+        bands), "expected" (simulate-response and what it lets expect of score's classes, nothing
+        captured) and "depth" (capture-sim, refocus, score) only where it is named.
     design: how points are chosen.
     samples: how many points a Latin hypercube has.
     vary: key -> values or range.
@@ -143,7 +144,7 @@ class Sweep(Section):
     """
 
     camera: FileName
-    chain: Literal["spatial", "spectral", "joint", "depth"] | None = None
+    chain: Literal["spatial", "spectral", "joint", "expected", "depth"] | None = None
     design: Literal["grid", "latin-hypercube", "list"] = "grid"
     samples: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
     vary: dict[str, Any] = {}

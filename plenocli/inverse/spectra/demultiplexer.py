@@ -24,6 +24,7 @@ from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.noise import Noise
     from plenocli.forward.sensor.readout import Readout
@@ -55,6 +56,7 @@ class Demultiplexer:
         register: str = "auto",
         ratio: bool = False,
         camera: Camera | None = None,
+        known: LabelledSpectra | None = None,
         threads: int = 1,
     ) -> None:
         """Factor a calibration.
@@ -66,6 +68,7 @@ class Demultiplexer:
             must not spoil.
         camera: description of the calibrated camera, from which neighbours' light is predicted;
             None: lenslets are demultiplexed one by one.
+        known: spectra whose mean and covariance are the prior's; None: those of many surfaces.
         threads: for factoring the response.
 
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
@@ -74,7 +77,7 @@ class Demultiplexer:
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, camera) if self.neighbours else None
-        self.prior = light_prior(LensletResponses.of(calibration))
+        self.prior = light_prior(LensletResponses.of(calibration), known)
         # its superpixels, one for every lenslet, have served
         self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
 

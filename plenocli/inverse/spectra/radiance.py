@@ -18,6 +18,7 @@ from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
+    from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.forward.sensor.capture import Capture
     from plenocli.forward.sensor.readout import Readout
     from plenocli.inverse.spectra.factored import FactoredResponses, NormalEquations
@@ -97,9 +98,11 @@ def readout(
     return signal, Noise(gain=gain, read_variance=sensor.read_variance).scaled(scale)
 
 
-def light_prior(c: LensletResponses) -> Prior | None:
+def light_prior(c: LensletResponses, known: LabelledSpectra | None = None) -> Prior | None:
     """Mean and covariance of radiance for lmmse: reflectances of natural and man-made surfaces
     under the light of the calibration's white.
+
+    known: spectra that stand for the scene instead.
 
     Returns (band,) and (band, band), None where the white image cannot tell the light in every
     band.
@@ -118,7 +121,9 @@ def light_prior(c: LensletResponses) -> Prior | None:
     light = np.median(light, axis=0) if len(light) else np.zeros(1)
     if not (light > 0).all():
         return None
-    mean, covariance = reflectance_statistics(surfaces(c.wavelengths))
+    mean, covariance = reflectance_statistics(
+        surfaces(c.wavelengths) if known is None else known.at(c.wavelengths)
+    )
     # narrow neighbouring bands are nearly the same number on most surfaces
     covariance = covariance + 1e-4 * np.eye(len(mean))
     return radiance_statistics(mean, covariance, light)

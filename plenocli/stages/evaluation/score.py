@@ -32,6 +32,7 @@ from plenocli.evaluation.spectra_score import (
     score_spectra,
 )
 from plenocli.execution.batch import failed_together
+from plenocli.files.read.class_table import read_labelled
 from plenocli.files.results.matrices import matrix_of
 from plenocli.files.results.results import (
     read_block,
@@ -41,10 +42,12 @@ from plenocli.files.results.results import (
 )
 from plenocli.files.results.truths import CHART, read_labels, read_truth
 from plenocli.inverse.lightfield.planes import LightField
+from plenocli.stages.evaluation.expected import run_expected
 
 if TYPE_CHECKING:
     from plenocli.evaluation.metrics.classes import Classes
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.report.score_page import Compared
 
 POINT_BYTES = 128
@@ -63,6 +66,7 @@ class _Comparison:
     object_shape: the same as the system matrix tells it.
     sensor_snr: of the capture, dB, or None.
     classes: labelled spectra, or None; detect: the class that is looked for.
+    method, prior: how a calibration's spectra would be made, plenocli.stages.evaluation.expected.
     """
 
     truth: Path | str | None
@@ -75,8 +79,10 @@ class _Comparison:
     light: str
     camera: Camera | None
     sensor_snr: float | None
-    classes: Path | str | None
-    detect: str | None
+    classes: Path | str | None = None
+    detect: str | None = None
+    method: str = "auto"
+    prior: Path | str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +112,8 @@ def run_score(
     camera: Path | str | None = None,
     classes: Path | str | None = None,
     detect: str | None = None,
+    method: str = "auto",
+    prior: Path | str | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> ScoreDocument:
@@ -124,6 +132,8 @@ def run_score(
     camera: TOML, through whose filters spectra see the truth.
     classes: labelled spectra, a table or a folder (plenocli.files.read.class_table).
     detect: name of the one of them that is looked for.
+    method, prior: how spectra of a calibration would be made, for what it lets expect of classes
+        (plenocli.stages.evaluation.expected).
 
     One bad result does not stop the others: its message is printed and stands in its place.
     Raises the error of the worst one at the end.
@@ -131,16 +141,15 @@ def run_score(
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.atomic import check_output, publish, together
 
-    inputs = [*results, truth, *whites, patches, pif, capture, camera, classes]
+    inputs = [*results, truth, *whites, patches, pif, capture, camera, classes, prior]
     files = [path for path in inputs if _is_file(path)]
     check_output(output, overwrite=overwrite, inputs=files, suffixes=(".json",))
     if report is not None:
         check_output(
             report, overwrite=overwrite, inputs=files, others=[output], suffixes=(".html",)
         )
-    comparison = _comparison(
-        truth, whites, patches, pif, capture, block, sampling, light, camera, classes, detect
-    )
+    comparison = _comparison(truth, whites, patches, pif, capture, block, sampling, light, camera)
+    comparison = replace(comparison, classes=classes, detect=detect, method=method, prior=prior)
     scored = _score_all(results, comparison, tuple(metrics))
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
@@ -153,6 +162,7 @@ def run_score(
         "white": list(whites),
         "camera": camera,
         "classes": classes,
+        "prior": prior,
         "patches": patches if _is_file(patches) else None,
         "pif": pif,
         "capture": capture,
@@ -208,8 +218,6 @@ def _comparison(
     sampling: str,
     light: str,
     camera: Path | str | None,
-    classes: Path | str | None,
-    detect: str | None,
 ) -> _Comparison:
     from plenocli.files.artefacts.shards import read_pif
     from plenocli.files.read.cameras import read_camera
@@ -231,8 +239,6 @@ def _comparison(
         light=light,
         camera=read_camera(camera) if camera else None,
         sensor_snr=_sensor_snr(capture) if capture else None,
-        classes=classes,
-        detect=detect,
     )
 
 
@@ -300,19 +306,34 @@ def _score_one(path: Path | str, comparison: _Comparison) -> _Scored:
 
 
 def _score_calibration(response: ComparedResponse, comparison: _Comparison) -> _Scored:
-    if comparison.truth is None:
+    if comparison.truth is None and comparison.classes is None:
         raise UsageError(
             "the truth is missing",
             response.path,
-            "name with --truth the calibration to compare with",
+            "name with --truth the calibration to compare with, or with --classes spectra to be "
+            "told apart",
         )
-    pair = paired_responses(response, read_response(comparison.truth))
+    bands, found = response.wavelengths, {}
+    if comparison.truth is not None:
+        pair = paired_responses(response, read_response(comparison.truth))
+        bands, found = pair.wavelengths, figures(score_response(pair.first, pair.second))
+    if comparison.classes is not None:
+        _require_class(comparison, read_labelled(comparison.classes))
+        expected = run_expected(
+            response.path,
+            comparison.classes,
+            detect=comparison.detect,
+            camera=comparison.camera,
+            method=comparison.method,
+            prior=comparison.prior,
+        )
+        found |= figures(expected)
     return _Scored(
         score=ResultScore(
             name=response.path.name,
             kind="calibration",
-            wavelengths_nm=_nanometres(pair.wavelengths),
-            figures=figures(score_response(pair.first, pair.second)),
+            wavelengths_nm=_nanometres(bands),
+            figures=found,
         )
     )
 
@@ -419,7 +440,6 @@ def _classes(comparison: _Comparison, bands: np.ndarray) -> Classes | None:
     the filters of the camera.
     """
     from plenocli.evaluation.metrics.classes import Classes
-    from plenocli.files.read.class_table import read_labelled
     from plenocli.files.results.truths import through_filters
 
     if comparison.classes is None:
@@ -429,18 +449,23 @@ def _classes(comparison: _Comparison, bands: np.ndarray) -> Classes | None:
             )
         return None
     known, camera = read_labelled(comparison.classes, bands), comparison.camera
-    if comparison.detect not in (None, *known.labels):
-        raise UsageError(
-            f"{comparison.detect} is no class of {comparison.classes}",
-            "--detect",
-            f"choose one of {', '.join(dict.fromkeys(known.labels))}",
-        )
+    _require_class(comparison, known)
     seen = (
         known.at(bands)
         if camera is None
         else through_filters(lambda w: known.at(w).T, camera, bands)[:, 0].T
     )
     return Classes.of_spectra(known.labels, seen)
+
+
+def _require_class(comparison: _Comparison, known: LabelledSpectra) -> None:
+    """UsageError where a class is looked for that there is none of."""
+    if comparison.detect not in (None, *known.labels):
+        raise UsageError(
+            f"{comparison.detect} is no class of {comparison.classes}",
+            "--detect",
+            f"choose one of {', '.join(dict.fromkeys(known.labels))}",
+        )
 
 
 def _nanometres(wavelengths: np.ndarray) -> tuple[float, ...]:

@@ -39,6 +39,7 @@ class Settings:
         (plenocli.inverse.registration.alignment).
     camera: description of the calibrated camera, from which neighbours' light is predicted; None:
         as the calibration describes it, if it does.
+    prior: labelled spectra whose mean and covariance lmmse starts from; None: many surfaces.
     """
 
     method: str = "auto"
@@ -46,6 +47,7 @@ class Settings:
     reference_reflectance: float = REFERENCE_REFLECTANCE
     register: str = "auto"
     camera: Path | None = None
+    prior: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +141,7 @@ def run_demux(
         suffix,
         "spectra are",
         overwrite=overwrite,
-        inputs=[*captures, calibration, settings.reference, settings.camera],
+        inputs=[*captures, calibration, settings.reference, settings.camera, settings.prior],
     )
     # captures are what runs side by side, and the bytes must not depend on how many
     with threadpool_limits(1, "blas"):
@@ -165,6 +167,7 @@ def run_demux(
                         settings,
                         reference=absolute(settings.reference),
                         camera=absolute(settings.camera),
+                        prior=absolute(settings.prior),
                     ),
                     tuple(i["sha256"] for i in job.inputs.values()),
                 ),
@@ -207,25 +210,28 @@ def _say_what_is_old(batch: Batch, calibration: Name, settings: Settings) -> Non
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What makes two results of one capture differ: digests of the calibration, the reference and
-    the camera, the method asked for, and whether nobody looked for motion.
+    """What makes two results of one capture differ: digests of the calibration, the reference,
+    the camera and the prior, the method asked for, and whether nobody looked for motion.
     """
 
     calibration: str | None
     reference: str | None
     camera: str | None
+    prior: str | None
     method: str
     unregistered: bool
 
 
 def _recipe(inputs: dict[str, Any], method: str, unregistered: bool) -> Recipe:
-    calibration, reference, camera = (
-        inputs.get(role, {}).get("sha256") for role in ("calibration", "reference", "camera")
+    calibration, reference, camera, prior = (
+        inputs.get(role, {}).get("sha256")
+        for role in ("calibration", "reference", "camera", "prior")
     )
     return Recipe(
         calibration=calibration,
         reference=reference,
         camera=camera,
+        prior=prior,
         method=method,
         unregistered=unregistered,
     )
@@ -237,6 +243,7 @@ def _roles(calibration: Name, settings: Settings) -> dict[str, Any]:
         "calibration": calibration,
         "reference": settings.reference,
         "camera": settings.camera,
+        "prior": settings.prior,
     }
 
 
@@ -297,6 +304,8 @@ class CaptureDemultiplexer:
         from plenocli.files.artefacts.provenance import describe_inputs
         from plenocli.files.read.calibrations import read_described
         from plenocli.files.read.cameras import read_camera
+        from plenocli.files.read.class_table import read_labelled
+        from plenocli.inverse.calibration.calibration import there
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
         self.inputs = describe_inputs(_roles(calibration, settings))
@@ -309,6 +318,9 @@ class CaptureDemultiplexer:
             register=settings.register,
             ratio=settings.reference is not None,
             camera=described if settings.camera is None else read_camera(settings.camera),
+            known=None
+            if settings.prior is None
+            else read_labelled(settings.prior, there(found.response).wavelengths),
             threads=threads,
         )
         self.reference: Spectra | None = None

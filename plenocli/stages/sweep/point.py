@@ -183,8 +183,8 @@ class _Run:
         options = dict(self.task.options("score"))
         names = [name for name in options if name in ("classes", "detect")]
         classes: dict[str, Any] = {name: options.pop(name) for name in names}
-        if truth.get("truth") == classes.get("classes"):
-            options |= classes  # a chart of them
+        if truth.get("truth") in (None, classes.get("classes")):
+            options |= classes  # a chart of them, or what a response lets expect of them
         output = (self.folder / result).with_suffix(".json")
         with self.stage("score"):
             document = run_score([self.folder / result], output, **truth, **options)
@@ -377,7 +377,22 @@ def _spectra(run: _Run, captures: dict[str, Path], pif: Path | None) -> dict[str
     return found
 
 
-_CHAINS = {"spatial": _spatial, "spectral": _spectral, "joint": _joint, "depth": _depth}
+def _expected(run: _Run) -> dict[str, float]:
+    """What the predicted response lets expect; nothing is captured."""
+    with run.stage("simulate-response"):
+        response = _predicted(run.task, run.folder)
+    options = run.task.options("demux")
+    given = {name: options[name] for name in ("method", "prior") if name in options}
+    return run.score(response.name, **given)
+
+
+_CHAINS = {
+    "spatial": _spatial,
+    "spectral": _spectral,
+    "joint": _joint,
+    "expected": _expected,
+    "depth": _depth,
+}
 
 
 def _predicted(task: Task, folder: Path) -> Path:

@@ -30,6 +30,7 @@ FRONTS = {
     "spatial": {"psnr_db": "max", "sensor_pixels": "min"},
     "spectral": {"six_patch_rmse": "min", "lenslet_field_m": "min"},
     "joint": {"psnr_db": "max", "six_patch_rmse": "min"},
+    "expected": {"class_accuracy_expected": "max", "rmse_expected": "min"},
     "depth": {"depth_slope_error": "min", "sensor_pixels": "min"},
 }
 """What counts as better where the file does not say."""

@@ -29,6 +29,7 @@ CHAINS = {
         "reconstruct",
         "score",
     ),
+    "expected": ("simulate-response", "demux", "score"),
     "depth": ("capture-sim", "refocus", "score"),
 }
 """Stages of each chain, whose options may be set."""
@@ -84,11 +85,15 @@ class Task:
     @property
     def foreign_capture(self) -> bool:
         """Whether another matrix makes the capture than inverts it."""
+        if "capture-sim" not in CHAINS[self.chain]:
+            return False
         return self.chain == "depth" or bool(OWN_MATRIX & self.options("capture-sim").keys())
 
     @property
     def needs_matrix(self) -> bool:
         """Whether something is captured, or inverted, with the matrix of simulate-pif."""
+        if "simulate-pif" not in CHAINS[self.chain]:
+            return False
         return "reconstruct" in CHAINS[self.chain] or not self.foreign_capture
 
     @property

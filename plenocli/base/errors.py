@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import errno
 
+from plenocli.base.text import printable
+
 
 class PlenoError(Exception):
     """Root of all expected failures. `exit_code` is what the process returns."""
@@ -19,7 +21,8 @@ class PlenoError(Exception):
         fix: what to do about it.
         """
         super().__init__(what)
-        self.what, self.where, self.fix = str(what), None if where is None else str(where), fix
+        where = None if where is None else printable(str(where))
+        self.what, self.where, self.fix = str(what), where, fix
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
+
+from plenocli.base.errors import OutputError
+from plenocli.base.text import printable_lines
 
 quiet = False
 """Whether the person asked for silence: no bars, no notes."""
@@ -61,7 +65,32 @@ def note(text: str) -> None:
     if collected is not None:
         collected.append(text)
     elif not quiet:
-        print(f"plenocli: {text}", file=sys.stderr)
+        tell(f"plenocli: {text}", error=True)
+
+
+def tell(text: str, *, error: bool = False) -> None:
+    """Write lines to standard output or, for `error`, to stderr: text only, what would control a
+    terminal is escaped.
+
+    Nothing that was computed is lost by nobody reading: a reader that went away and a stderr that
+    takes nothing are no failure.
+
+    Raises OutputError where standard output cannot be written.
+    """
+    stream = sys.stderr if error else sys.stdout
+    if stream is None:  # closed before we started
+        return
+    try:
+        print(printable_lines(text), file=stream, flush=True)
+    except OSError as failure:
+        # what is left in its buffer would fail again when the process ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        if not error and not isinstance(failure, BrokenPipeError):
+            raise OutputError(
+                f"cannot be written ({failure.strerror})",
+                "standard output",
+                "files that were to be written are whole",
+            ) from None
 
 
 @contextlib.contextmanager

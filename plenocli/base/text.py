@@ -11,14 +11,41 @@ def json_value(value: Any) -> Any:
     finite None (an infinite PSNR: no error at all).
     """
     if isinstance(value, dict):
-        return {str(key): json_value(item) for key, item in value.items()}
+        return {printable(str(key)): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [json_value(item) for item in value]
     if hasattr(value, "tolist"):
         return json_value(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value if isinstance(value, (str, int, bool, type(None))) else str(value)
+    if isinstance(value, (int, type(None))):
+        return value
+    return printable_lines(str(value))
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Text that a terminal, a page or a file can take: what controls a terminal (ESC, line breaks,
+    marks that turn the direction of writing) and bytes of a name that are no UTF-8 are shown
+    escaped, as Python writes them; `keep`: characters that stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else _escaped(c) for c in text)
+
+
+def printable_lines(text: str) -> str:
+    """`printable`, but for line breaks and tabs."""
+    return printable(text, keep="\n\t")
+
+
+def utf8(text: str) -> bytes:
+    """Text for a file; bytes of a name that are no UTF-8 are written as \\udcXX."""
+    return text.encode("utf-8", "backslashreplace")
+
+
+def _escaped(character: str) -> str:
+    lone_byte = 0xDC80 <= ord(character) <= 0xDCFF  # how Python keeps a byte that is no UTF-8
+    return f"\\x{ord(character) - 0xDC00:02x}" if lone_byte else ascii(character)[1:-1]
 
 
 def by(shape: Iterable[int]) -> str:

@@ -4,6 +4,7 @@ errors become exit codes.
 
 import difflib
 import errno
+import io
 import os
 import sys
 import time
@@ -15,6 +16,7 @@ from plenocli import __version__
 from plenocli.base.budget import within
 from plenocli.base.errors import PlenoError
 from plenocli.base.memory import is_lack_of_memory, lack_of_memory, limits_restored, require_start
+from plenocli.base.progress import tell
 from plenocli.cli.commands import COMMANDS, load_command
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -82,7 +84,7 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     if ctx.invoked_subcommand is None:
         from plenocli.stages.next_step import next_step
 
-        click.echo(f"{ctx.get_help()}\n\nNext: {next_step('.')}")
+        tell(f"{ctx.get_help()}\n\nNext: {next_step('.')}")
 
 
 def _cost(start: float) -> None:
@@ -93,12 +95,12 @@ def _cost(start: float) -> None:
         sum(u.ru_utime + u.ru_stime for u in used),
         max(u.ru_maxrss for u in used) / 2**20,
     )
-    click.echo(
+    tell(
         (
             f"plenocli: {time.monotonic() - start:.2f} s, {seconds:.2f} s of processor time, at "
             f"most {peak:.2f} GiB of memory"
         ),
-        err=True,
+        error=True,
     )
 
 
@@ -112,26 +114,30 @@ def main(argv: list[str] | None = None) -> None:
 def run(argv: list[str] | None = None) -> int:
     """Run the command line with `argv` (default: the process's own) and return the exit code."""
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
+    stdout = sys.stdout
     try:
         with limits_restored(), within():
             require_start()
             code = cli.main(args=argv, prog_name="plenocli", standalone_mode=False)
-        sys.stdout.flush()
         return code if isinstance(code, int) else 0
-    except click.exceptions.Abort:
+    except SystemExit:
+        if sys.stdout is not stdout:  # click's way to end where nobody reads its help
+            return 0
+        raise
+    except click.exceptions.Abort as error:
+        if isinstance(error.__cause__, EOFError):  # click takes it for an end of what is typed
+            return _unexpected(error.__cause__)
         return _fail("interrupted", 130)
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except click.ClickException as error:
-        error.show()
-        return 2
+        shown = io.StringIO()
+        error.show(file=shown)
+        return _fail_with(shown.getvalue().rstrip("\n"), 2)
     except PlenoError as error:
         if debug:
             raise
         return _fail(str(error), error.exit_code)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except MemoryError as error:
         if debug:
             raise
@@ -139,24 +145,40 @@ def run(argv: list[str] | None = None) -> int:
     except Exception as error:  # the last line of defence: a bug must not look like a usage error
         if debug:
             raise
-        if is_lack_of_memory(error):
-            return _fail(lack_of_memory(error), 5)
-        if isinstance(error, OSError) and (error.filename or error.errno in _NO_SPACE):
-            where = error.filename or "standard output"
-            return _fail(
-                (
-                    f"{where}: {error.strerror}; check the name, the permissions and "
-                    "the space on the disk"
-                ),
-                4 if error.errno in _NO_SPACE else 3,
-            )
+        return _unexpected(error)
+
+
+def _unexpected(error: BaseException) -> int:
+    """The exit code for what no stage expected: of the machine, or a bug."""
+    if is_lack_of_memory(error):
+        return _fail(lack_of_memory(error), 5)
+    if isinstance(error, FileNotFoundError) and not _has_working_directory():
+        return _fail("the working directory is gone; run again in one that stays", 4)
+    if isinstance(error, OSError) and (error.filename or error.errno in _NO_SPACE):
         return _fail(
-            f"internal error, a bug of plenocli: {type(error).__name__}: {error}\n"
-            "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",
-            70,
+            f"{error.filename or 'a file'}: {error.strerror}; check the name, the permissions and "
+            "the space on the disk",
+            4 if error.errno in _NO_SPACE else 3,
         )
+    return _fail(
+        f"internal error, a bug of plenocli: {type(error).__name__}: {error}\n"
+        "Run again with PLENOCLI_DEBUG=1 for the traceback and report it with the command.",
+        70,
+    )
+
+
+def _has_working_directory() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(f"plenocli: error: {message}", err=True)
+    return _fail_with(f"plenocli: error: {message}", code)
+
+
+def _fail_with(text: str, code: int) -> int:
+    tell(text, error=True)
     return code

@@ -12,7 +12,8 @@ from typing import Any
 
 import click
 
-from plenocli.base.text import json_value
+from plenocli.base.progress import tell
+from plenocli.base.text import json_value, printable
 from plenocli.base.units import (
     UnitError,
     format_duration,
@@ -395,7 +396,7 @@ def command_line(ctx: click.Context) -> str:
         for one in value if parameter.multiple or parameter.nargs == -1 else [value]:
             flag = [] if isinstance(parameter, click.Argument) else [parameter.opts[-1]]
             words += flag if one is True else [*flag, _word(one, parameter.type)]
-    return " ".join(words)
+    return printable(" ".join(words))
 
 
 _UNRECORDED = {
@@ -431,6 +432,6 @@ def _word(value: Any, kind: click.ParamType | None) -> str:
 def summary(report: dict[str, Any], as_json: bool, line: str) -> None:
     """Print what a command did: `report` as JSON on request, else the one `line`."""
     if as_json:
-        click.echo(json.dumps(json_value(report), allow_nan=False, sort_keys=True))
+        tell(json.dumps(json_value(report), allow_nan=False, sort_keys=True))
     else:
-        click.echo(line)
+        tell(line)

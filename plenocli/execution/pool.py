@@ -11,6 +11,7 @@ last digits of its results depend on how many there are.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import threading
@@ -391,19 +392,9 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
         ) from error
-    file = not str(scheduler).startswith(("tcp://", "tls://", "ucx://"))
-    if file and not Path(scheduler).is_file():
-        raise UsageError(
-            f"{str(scheduler)!r} is no address of a Dask scheduler and no file that one wrote",
-            "--scheduler",
-            "write for example tcp://10.0.0.1:8786",
-        )
+    address = _address(scheduler)
     try:
-        client = Client(
-            **({"scheduler_file": str(scheduler)} if file else {"address": scheduler}),
-            timeout="10s",
-            set_as_default=False,
-        )
+        client = Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
             f"no Dask scheduler answers at {scheduler} ({type(error).__name__})",
@@ -415,6 +406,20 @@ def _cluster(scheduler: str) -> Iterator[Any]:
             note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
             client.wait_for_workers(1)
         yield client
+
+
+def _address(scheduler: str) -> str:
+    """Where a scheduler answers: the address, or that in the file which the scheduler wrote."""
+    address = scheduler
+    with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
+        address = str(json.loads(Path(scheduler).read_bytes())["address"])
+    if not address.startswith(("tcp://", "tls://", "ucx://")):
+        raise UsageError(
+            f"{scheduler!r} is no address of a Dask scheduler and no whole file that one wrote",
+            "--scheduler",
+            "write for example tcp://10.0.0.1:8786",
+        )
+    return address
 
 
 def _on_cluster(client: Any) -> _Executing:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from plenocli.base.errors import UsageError
 from plenocli.base.extras import how_to_install
+from plenocli.base.text import printable_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,7 +92,7 @@ def drawing(
     Raises UsageError where matplotlib is not installed.
     """
     try:
-        import matplotlib
+        import matplotlib.text
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -102,6 +103,9 @@ def drawing(
         made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout=layout))
         FigureCanvasAgg(made.figure)
         yield made
+        for text in made.figure.findobj(matplotlib.text.Text):
+            text.set_text(printable_lines(text.get_text()))
+            text.set_parse_math(False)  # a $ in the name of a file is no formula
         buffer = io.BytesIO()
         made.figure.savefig(buffer, format="png", metadata={"Software": None})
         made.png = buffer.getvalue()

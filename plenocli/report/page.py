@@ -5,6 +5,12 @@ import html
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
+from plenocli.base.text import printable_lines
+
+
+def _escaped(text: str) -> str:
+    return html.escape(printable_lines(text))
+
 
 class Page:
     """Collects blocks in order; `render` gives the HTML. Texts are plain text, never markup."""
@@ -18,31 +24,28 @@ class Page:
     def section(self, title: str, text: str = "") -> None:
         """A numbered-by-order main section with an entry in the list at the top."""
         self._sections.append(title)
-        self._blocks.append(f'<h2 id="s{len(self._sections)}">{html.escape(title)}</h2>')
+        self._blocks.append(f'<h2 id="s{len(self._sections)}">{_escaped(title)}</h2>')
         self.text(text)
 
     def heading(self, title: str, text: str = "") -> None:
         """A heading below a section."""
-        self._blocks.append(f"<h3>{html.escape(title)}</h3>")
+        self._blocks.append(f"<h3>{_escaped(title)}</h3>")
         self.text(text)
 
     def text(self, text: str) -> None:
         """One paragraph; nothing for an empty text."""
         if text:
-            self._blocks.append(f"<p>{html.escape(text)}</p>")
+            self._blocks.append(f"<p>{_escaped(text)}</p>")
 
     def warning(self, text: str) -> None:
         """A paragraph that stands out."""
-        self._blocks.append(f'<p class="warning">{html.escape(text)}</p>')
+        self._blocks.append(f'<p class="warning">{_escaped(text)}</p>')
 
     def cards(self, cards: Sequence[tuple[str, str]]) -> None:
         """Headline numbers: a sequence of (value, what it is)."""
         if cards:
             boxes = "".join(
-                (
-                    f'<div class="card"><b>{html.escape(value)}</b><span>'
-                    f"{html.escape(what)}</span></div>"
-                )
+                (f'<div class="card"><b>{_escaped(value)}</b><span>{_escaped(what)}</span></div>')
                 for value, what in cards
             )
             self._blocks.append(f'<div class="cards">{boxes}</div>')
@@ -54,8 +57,8 @@ class Page:
             width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
             self._blocks.append(
                 f'<figure><img src="data:image/png;base64,{data}" width="{width * 100 // 130}" '
-                f'height="{height * 100 // 130}" alt="{html.escape(caption or "picture")}">'
-                f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+                f'height="{height * 100 // 130}" alt="{_escaped(caption or "picture")}">'
+                f"<figcaption>{_escaped(caption)}</figcaption></figure>"
             )
 
     def figures(self, figures: Sequence[tuple[bytes, str]]) -> None:
@@ -80,20 +83,20 @@ class Page:
         text: cells are words, aligned left.
         """
         best = best or {}
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+        head = "".join(f"<th>{_escaped(cell)}</th>" for cell in header)
         body = "".join(
             "<tr>"
             + "".join(
                 (
                     f"<td{' class=best' if column in best.get(number, ()) else ''}>"
-                    f"{html.escape(cell)}</td>"
+                    f"{_escaped(cell)}</td>"
                 )
                 for column, cell in enumerate(row)
             )
             + "</tr>"
             for number, row in enumerate(rows)
         )
-        legend = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+        legend = f"<caption>{_escaped(caption)}</caption>" if caption else ""
         kind = ' class="text"' if text else ""
         self._blocks.append(
             f'<div class="scroll"><table{kind}>{legend}<thead><tr>{head}</tr></thead><tbody>{body}'
@@ -106,39 +109,38 @@ class Page:
         """Terms and what they mean, folded away: dict term -> text."""
         if entries:
             inner = "".join(
-                f"<dt>{html.escape(term)}</dt><dd>{html.escape(text)}</dd>"
+                f"<dt>{_escaped(term)}</dt><dd>{_escaped(text)}</dd>"
                 for term, text in entries.items()
             )
             self._blocks.append(
-                f"<details><summary>{html.escape(summary)}</summary><dl>{inner}</dl></details>"
+                f"<details><summary>{_escaped(summary)}</summary><dl>{inner}</dl></details>"
             )
 
     def code(self, text: str, summary: str) -> None:
         """Text in a fixed-width block, folded away."""
         self._blocks.append(
-            f"<details><summary>{html.escape(summary)}</summary><pre>"
-            f"{html.escape(text)}</pre></details>"
+            f"<details><summary>{_escaped(summary)}</summary><pre>{_escaped(text)}</pre></details>"
         )
 
     def render(self) -> str:
         """The page as text. The same blocks give the same bytes."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         links = "".join(
-            f'<a href="#s{i}">{html.escape(title)}</a>'
+            f'<a href="#s{i}">{_escaped(title)}</a>'
             for i, title in enumerate(self._sections, start=1)
         )
         nav = f"<nav>{links}</nav>" if len(self._sections) > 1 else ""
-        lead = f'<p class="lead">{html.escape(self._lead)}</p>' if self._lead else ""
+        lead = f'<p class="lead">{_escaped(self._lead)}</p>' if self._lead else ""
         return (
             (
                 "<!doctype html>\n"
                 '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
                 'content="width=device-width, initial-scale=1">'
-                f"<title>{html.escape(self._title)}</title>\n"
+                f"<title>{_escaped(self._title)}</title>\n"
                 "<style>\n"
                 f"{style}</style></head>\n"
                 "<body><main>\n"
-                f"<h1>{html.escape(self._title)}</h1>\n"
+                f"<h1>{_escaped(self._title)}</h1>\n"
                 f"{lead}{nav}\n"
             )
             + "\n".join(self._blocks)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from plenocli.base.progress import tell
 from plenocli.cli import options
 
 if TYPE_CHECKING:
@@ -36,4 +37,4 @@ def command(
         "scene": Scene,
         "lens": LensFile,
     }
-    click.echo(json.dumps(models[kind].model_json_schema(), indent=2))
+    tell(json.dumps(models[kind].model_json_schema(), indent=2))

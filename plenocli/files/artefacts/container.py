@@ -27,6 +27,7 @@ from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.memory import can_have
+from plenocli.base.text import utf8
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, require_file
@@ -283,9 +284,9 @@ def _json(value: Any) -> str:
 
 def _storable(value):
     if isinstance(value, str):
-        return value.encode("utf-8")
+        return utf8(value)
     if isinstance(value, list) and value and isinstance(value[0], str):
-        return np.array([v.encode("utf-8") for v in value])
+        return np.array([utf8(v) for v in value])
     values = np.asarray(value)
     return values.astype({"i": "i8", "u": "u8", "f": "f8", "b": "?"}[values.dtype.kind])
 

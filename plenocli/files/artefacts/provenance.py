@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import InputError
+from plenocli.base.text import printable, utf8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +49,7 @@ def describe_inputs(roles: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         several = not isinstance(paths, (str, os.PathLike))
         for number, path in enumerate(paths if several else [paths], start=1):
             described[f"{role} {number}" if several else role] = {
-                "name": Path(path).name,
+                "name": printable(Path(path).name),
                 "sha256": content_digest(path),
             }
     return described
@@ -107,7 +108,7 @@ def content_digest(path: str | os.PathLike) -> str:
         for file in sorted(Path(path).glob(pattern))
         if file.is_file()
     ]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    return hashlib.sha256(utf8("\n".join(parts))).hexdigest()
 
 
 def file_digest(path: str | os.PathLike) -> str:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from plenocli import __version__
 from plenocli.base.errors import OutputError
+from plenocli.base.text import utf8
 from plenocli.files.atomic import publish
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
@@ -233,13 +234,13 @@ def _directory(tags: list[_Packed], offset: int) -> bytes:
 
 def _packet(notes: dict[str, Any]) -> bytes:
     text = json.dumps(notes, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    return (
+    return utf8(
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta '
         'xmlns:x="adobe:ns:meta/"><rdf:RDF '
         'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
         f'xmlns:plenocli="https://plenocli.invalid/ns/1/">{_OPEN}{escape(text)}{_CLOSE}</'
         'rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="r"?>'
-    ).encode()
+    )
 
 
 def read_notes(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, OutputError
 from plenocli.base.memory import size_text
+from plenocli.base.text import printable, utf8
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
 
@@ -59,7 +60,9 @@ def write_exr(
         import OpenImageIO as oiio
 
         output = oiio.ImageOutput.create("exr")
-        if output is None or not output.open(str(partial), spec):
+        with oiio_name(partial) as name:
+            opened = output is not None and output.open(name, spec)
+        if output is None or not opened:
             raise OutputError(
                 f"OpenEXR cannot write it ({oiio_error(output)})",
                 path,
@@ -162,7 +165,7 @@ def _checked(
         )
     if compression not in _COMPRESSIONS:
         raise ValueError(f"EXR compression {compression!r} is none of {_COMPRESSIONS}")
-    return planes, dict(attrs)
+    return planes, {name: utf8(value).decode() for name, value in attrs.items()}
 
 
 def _spec(
@@ -202,7 +205,8 @@ def _verify(
     """
     import OpenImageIO as oiio
 
-    source = oiio.ImageInput.open(str(partial))
+    with oiio_name(partial) as name:
+        source = oiio.ImageInput.open(name)
     if source is None:
         raise OutputError(
             f"cannot be read back ({oiio_error(None)})",
@@ -252,7 +256,8 @@ def _opened(path: Name) -> Iterator[Any]:
     if first_bytes(path, len(_EXR_MAGIC)) != _EXR_MAGIC:
         raise InputError("is not an EXR file", path, "give an .exr")
     try:
-        source = oiio.ImageInput.open(str(path))
+        with oiio_name(path) as name:
+            source = oiio.ImageInput.open(name)
     except UnicodeError:
         source = None
     if source is None or source.format_name() != "openexr":
@@ -295,6 +300,20 @@ def require_at_most(path: Name, declared: int, most: int | None) -> None:
             path,
             "give a grid of at most 1024 x 1024 values",
         )
+
+
+@contextlib.contextmanager
+def oiio_name(path: Name) -> Iterator[str]:
+    """A name by which OpenImageIO, which knows UTF-8 only, can open a file that is there."""
+    name = os.fsdecode(path)
+    if name.isascii() or printable(name) == name:
+        yield name
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)
 
 
 def oiio_error(handle: Any) -> str:

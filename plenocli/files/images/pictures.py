@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import first_bytes
-from plenocli.files.images.exr import oiio_error, require_at_most
+from plenocli.files.images.exr import oiio_error, oiio_name, require_at_most
 
 _MAGIC = (
     (b"\x89PNG\r\n\x1a\n", "png"),
@@ -109,7 +109,8 @@ def read_stored(
 
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)  # else colours come multiplied with alpha
-    source = oiio.ImageInput.open(str(Path(path)), settings)
+    with oiio_name(path) as name:
+        source = oiio.ImageInput.open(name, settings)
     if source is None or source.format_name() != kind:
         raise InputError(
             f"is no readable {kind.upper()}: {oiio_error(source)}", path, "make or copy it again"

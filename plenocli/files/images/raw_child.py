@@ -37,6 +37,10 @@ def read(path: str, memory: int) -> tuple[dict[str, Any], bytes]:
     """
     import rawpy
 
+    try:
+        path.encode()
+    except UnicodeEncodeError:  # LibRaw is given UTF-8 only
+        path = f"/proc/self/fd/{os.open(path, os.O_RDONLY)}"
     with rawpy.imread(path) as raw:
         declared = 2 * raw.sizes.raw_width * raw.sizes.raw_height
         if COPIES * declared > memory:

@@ -9,13 +9,11 @@ over it a dozen times.
 import numpy as np
 
 try:
-    import numba
+    from plenocli.inverse.compiled import compiled
 except ImportError:
     superpixels = None
 else:
-    _jit = numba.njit(
-        cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True
-    )
+    _jit = compiled(nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 
     @_jit
     def _dot(a, b):

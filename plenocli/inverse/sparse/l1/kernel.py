@@ -14,8 +14,9 @@ which finds most of the support while the active set is small. Loops run over sl
 
 from collections import namedtuple
 
-import numba
 import numpy as np
+
+from plenocli.inverse.compiled import compiled
 
 JITTER = 1e-12
 """Added to the diagonal, relative to it: more than rounding can take away, so that dependent atoms
@@ -35,7 +36,7 @@ pass until it is the true one.
 """
 
 _FLAGS = {"reassoc", "contract", "nsz"}
-_jit = numba.njit(cache=True, fastmath=_FLAGS, forceinline=True)
+_jit = compiled(fastmath=_FLAGS, forceinline=True)
 
 Work = namedtuple("Work", "factor block x sign h d v crossing local active working")
 """Scratch of one thread, `capacity` long or square. factor: upper triangular U with U^T U = G over
@@ -509,7 +510,7 @@ def solve_signal(
     return True, objective, gap, passes
 
 
-@numba.njit(cache=True, fastmath=_FLAGS, nogil=True)
+@compiled(fastmath=_FLAGS, nogil=True)
 def solve_signals(
     gram: np.ndarray,
     b: np.ndarray,

@@ -1,0 +1,132 @@
+"""A volume with its error bars, and how well it foretells pixels that it was not made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BARS = 1.959964
+"""Standard deviations that hold 95 % of normal errors."""
+ROUNDS = 8
+"""Of reweighting, after which a law of variance stands still."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """Pixels that were put aside, and what was predicted of them.
+
+    index: (n, 3) lenslet row, lenslet column, pixel.
+    measured, predicted: (n,), units of the signal.
+    sigma: (n,) standard deviation of their difference, noise included: read off the other half of
+        the pixels, as it grows with brightness.
+    """
+
+    index: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def explained_db(self) -> float:
+        """Of the pixels' variance."""
+        error = np.mean((self.measured - self.predicted) ** 2)
+        return float(10 * np.log10(np.var(self.measured) / error))
+
+    @property
+    def z_rms(self) -> tuple[float, ...]:
+        """Root mean square of error over sigma by quartile of predicted brightness."""
+        return tuple(float(np.sqrt(np.mean(z**2))) for z in self._by_quartile())
+
+    @property
+    def held_by_bars(self) -> tuple[float, ...]:
+        """Share of the pixels within their 95 % bars, by quartile of predicted brightness."""
+        return tuple(float(np.mean(np.abs(z) < BARS)) for z in self._by_quartile())
+
+    def _by_quartile(self) -> list[np.ndarray]:
+        z = (self.measured - self.predicted) / self.sigma
+        return np.array_split(z[np.argsort(self.predicted, kind="stable")], 4)
+
+
+def predictive_sigma(measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Standard deviation of predictions, each half of the pixels by the errors of the other one:
+    variance a + b p + c p^2 with no coefficient below zero, p the prediction above the darkest.
+
+    measured, predicted: (n,).
+    """
+    sigma = np.empty(len(measured))
+    square = (measured - predicted).astype(float) ** 2
+    level = np.maximum(predicted - np.quantile(predicted, 0.01), 0).astype(float)
+    law = np.stack([np.ones_like(level), level, level**2], axis=1)
+    halves = np.arange(len(measured)) % 2 == 0
+    for half in (halves, ~halves):
+        sigma[half] = np.sqrt(law[half] @ variance_law(law[~half], square[~half]))
+    return sigma
+
+
+def variance_law(law: np.ndarray, square: np.ndarray) -> np.ndarray:
+    """Non-negative coefficients of a variance, by least squares weighted with the variance.
+
+    law: (n, term) values of the terms.
+    square: (n,) squared errors.
+    """
+    from scipy.optimize import nnls
+
+    if not len(square):
+        return np.zeros(law.shape[1])
+    scale = np.maximum(law.max(axis=0), np.finfo(float).tiny)
+    variance = np.full(len(square), max(square.mean(), np.finfo(float).tiny))
+    for _ in range(ROUNDS):
+        found = nnls(law / scale / variance[:, None], square / variance)[0]
+        variance = np.maximum(law / scale @ found, 1e-3 * variance.mean())
+    return found / scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """Of a Gaussian volume: covariance `variance` exp(-r / `correlation_length`).
+
+    correlation_length: m; 0 where voxels are independent.
+    variance: of a voxel.
+    noise_variance: mean over pixels, model error included.
+    mean: of a voxel.
+    """
+
+    correlation_length: float
+    variance: float
+    noise_variance: float
+    mean: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One thing that was tried: which, and the mean square error of held-out pixels over their
+    variance.
+    """
+
+    what: str
+    misfit: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Volume:
+    """A specimen, plane by plane.
+
+    value: (plane, row, column) on the fine lattice.
+    sigma: like value, its standard deviation; None where the method has none.
+    method: that made it.
+    trace: what was tried, in order.
+    background: signal that was taken for none of the specimen's.
+    prior: that was assumed; None where none was.
+    held_out: pixels that were put aside, predicted; None where none were.
+    margin: lenslets from the border on which light of some voxels was not seen.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None
+    method: str
+    trace: tuple[Trial, ...]
+    background: float
+    prior: Prior | None
+    held_out: HeldOut | None
+    margin: int

@@ -313,9 +313,7 @@ def _raws(folder):
     rng = np.random.default_rng(7)
     noise = rng.integers(1000, 3000, (40, 40)).astype(np.uint16)
 
-    def camera(
-        name, values, black=0, white=4095, tags=None, change=(b"mosaic_sha256", b"mosaic_sha25x")
-    ):
+    def camera(name, values, black=0, white=4095, tags=None, change=(b"plenocli", b"plenoclx")):
         real = dng._tags
         with mock.patch.object(
             dng,

@@ -93,7 +93,7 @@ def test_levels_of_a_dng_without_our_notes_are_put_in_their_positions(tmp_path, 
         white=16383,
         exposure_s=1 / 250,
     )
-    content = (tmp_path / "x.dng").read_bytes().replace(b"mosaic_sha256", b"mosaic_sha25x")
+    content = (tmp_path / "x.dng").read_bytes().replace(b"plenocli", b"plenoclx")
     (tmp_path / "x.dng").write_bytes(content)
     back = read_capture(tmp_path / "x.dng")
     assert (
@@ -142,13 +142,13 @@ def test_a_changed_pixel_of_ours_is_found(tmp_path):
     content = bytearray((tmp_path / "x.dng").read_bytes())
     content[-7] ^= 1
     (tmp_path / "x.dng").write_bytes(content)
-    with pytest.raises(InputError, match="not the one it was written with"):
+    with pytest.raises(InputError, match="not sealed as it stands"):
         read_capture(tmp_path / "x.dng")
 
 
 def unsigned(path):
     """Take our digest away, so that the file counts as anybody's."""
-    path.write_bytes(path.read_bytes().replace(b"mosaic_sha256", b"mosaic_sha25x"))
+    path.write_bytes(path.read_bytes().replace(b"plenocli", b"plenoclx"))
     return path
 
 

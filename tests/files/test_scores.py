@@ -10,7 +10,8 @@ from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.evaluation.metrics.quality import score_picture
 from plenocli.evaluation.scores import InputFile, PatchScore, ResultScore, ScoreDocument
-from plenocli.files.results.scores import read_scores
+from plenocli.files.results.scores import json_pieces, read_scores
+from plenocli.files.seal import publish_sealed
 from plenocli.stages.evaluation.report import run_report
 
 PATCH = PatchScore(
@@ -42,7 +43,11 @@ DOCUMENT = ScoreDocument(
 
 
 def put(path, document):
-    path.write_text(json.dumps(document))
+    """A document in a file, with a seal that holds where it says that it is ours."""
+    if "command" in document:
+        publish_sealed(path, json_pieces(document), overwrite=True)
+    else:
+        path.write_text(json.dumps(document))
     return path
 
 

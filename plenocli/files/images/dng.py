@@ -2,13 +2,12 @@
 specification 1.4).
 
 Uncompressed 16-bit container, one strip, little-endian, nothing but tags that follow from the
-arguments: same input, same bytes. What the tags cannot say (gain, band, seed, digest of the mosaic)
+arguments: same input, same bytes. What the tags cannot say (gain, band, seed, seal)
 travels as JSON in the XMP packet.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import struct
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike
 from plenocli import __version__
 from plenocli.base.errors import OutputError
 from plenocli.base.text import utf8
-from plenocli.files.atomic import publish
+from plenocli.files.seal import SEAL, publish_sealed
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _FORMAT = {_BYTE: "B", _SHORT: "H", _LONG: "I"}
@@ -60,7 +59,7 @@ def write_dng(
     exposure_s: s.
     iso: speed, for the EXIF tag.
     xmp_json: JSON-able dict or JSON text kept in the XMP packet (attributes of a capture artefact
-        by their names, "provenance"); black, white and the mosaic's SHA-256 are added to it.
+        by their names, "provenance"); black, white and the seal are added to it.
 
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
@@ -71,11 +70,11 @@ def write_dng(
     notes = json.loads(xmp_json) if isinstance(xmp_json, str) else dict(xmp_json or {})
     # in full: RAW readers round and merge them
     notes |= {"black": levels.tolist(), "white": float(white)}
-    notes["mosaic_sha256"] = hashlib.sha256(pixels).hexdigest()
+    notes["seal"] = SEAL
     head = _headers(
         values.shape, cfa, levels, int(round(white)), exposure_s, iso, notes, len(pixels)
     )
-    publish(path, [head, pixels], overwrite=overwrite)
+    publish_sealed(path, [head, pixels], overwrite=overwrite)
 
 
 def _check(path: str | os.PathLike[str], values: np.ndarray, cfa: str, white: float) -> None:
@@ -257,5 +256,5 @@ def read_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         notes = json.loads(unescape(head[start + len(_OPEN) : end].decode("utf-8")))
     except ValueError:
-        return {"mosaic_sha256": "unreadable"}
+        return {}
     return notes if isinstance(notes, dict) else {}

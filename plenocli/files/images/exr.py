@@ -1,16 +1,13 @@
 """OpenEXR in and out through OpenImageIO. Channels are always found by name,
 because EXR sorts them.
 
-What we write carries a SHA-256 of its channels and attributes, because EXR has no checksum of its
-own; the reader verifies it where it is there. The clock is kept out: the same channels
-give the same bytes.
+What we write is sealed (`files.seal`), because EXR has no checksum of its own. The clock is kept
+out: the same channels give the same bytes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,9 +22,10 @@ from plenocli.base.memory import size_text
 from plenocli.base.text import printable, utf8
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
+from plenocli.files.seal import SEAL, put_seal, require_seal
 
 Name = str | os.PathLike[str]
-DIGEST = "plenocli:sha256"
+SEALED = "plenocli:seal"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
 
@@ -54,9 +52,9 @@ def write_exr(
     names = sorted(planes)
     rows, columns = planes[names[0]].shape
     spec = _spec(names, rows, columns, attrs, compression)
-    spec.attribute(DIGEST, _digest(planes, attrs))
+    spec.attribute(SEALED, SEAL)
     pixels = np.ascontiguousarray(np.stack([planes[name] for name in names], axis=-1))
-    with replacement(path, overwrite=overwrite) as (partial, _):
+    with replacement(path, overwrite=overwrite) as (partial, descriptor):
         import OpenImageIO as oiio
 
         output = oiio.ImageOutput.create("exr")
@@ -77,6 +75,7 @@ def write_exr(
                 "free some space; nothing was changed",
             )
         _verify(path, partial, pixels, names, attrs, compression)
+        put_seal(descriptor)
 
 
 def read_exr(
@@ -90,6 +89,7 @@ def read_exr(
     Raises InputError for a file that is missing, damaged, above `most`, deep, in several parts, or
     holds integer channels.
     """
+    require_seal(path)
     with _opened(path) as source:
         spec = source.spec()
         _check_header(path, source, spec, most)
@@ -105,20 +105,7 @@ def read_exr(
         channels = {
             name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)
         }
-    if DIGEST in attrs:
-        ours = {
-            name: value
-            for name, value in attrs.items()
-            if name.startswith("plenocli:") or name in _listed(attrs)
-        }
-        ours.pop(DIGEST)
-        if _digest(channels, {n: v for n, v in ours.items() if n != _LIST}) != attrs[DIGEST]:
-            raise InputError(
-                "is damaged or was edited: its SHA-256 is not the one it was written with",
-                path,
-                "make it again",
-            )
-    return channels, {name: value for name, value in attrs.items() if name != _LIST}
+    return channels, attrs
 
 
 def channel_names(path: Name) -> list[str]:
@@ -131,16 +118,6 @@ def channel_names(path: Name) -> list[str]:
 
 
 # --- writing --------------------------------------------------------------------------------------
-
-# the names that the digest covers; OpenImageIO adds attributes of its own
-_LIST = "plenocli:attributes"
-
-
-def _listed(attrs: Mapping[str, str]) -> set[str]:
-    try:
-        return set(json.loads(attrs.get(_LIST, "[]")))
-    except ValueError:
-        return set()
 
 
 def _checked(
@@ -177,19 +154,10 @@ def _spec(
     spec.channelnames = names
     for name, value in attrs.items():
         spec.attribute(name, value)
-    spec.attribute(_LIST, json.dumps(sorted(attrs)))
     spec.attribute("compression", compression)
     spec.attribute("DateTime", "2000:01:01 00:00:00")  # left out, OpenImageIO writes the clock
     spec.attribute("Software", f"plenocli {__version__}")
     return spec
-
-
-def _digest(planes: Mapping[str, np.ndarray], attrs: Mapping[str, str]) -> str:
-    digest = hashlib.sha256(json.dumps(sorted(attrs.items())).encode())
-    for name in sorted(planes):
-        digest.update(f"{name} {planes[name].shape}".encode())
-        digest.update(np.ascontiguousarray(planes[name], dtype="<f4").data)
-    return digest.hexdigest()
 
 
 def _verify(

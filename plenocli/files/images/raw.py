@@ -6,7 +6,6 @@ anyone computes with it.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import subprocess
@@ -21,6 +20,7 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
+from plenocli.files.seal import require_seal
 
 CHILD = Path(__file__).with_name("raw_child.py")
 TIMEOUT_S = 120
@@ -69,6 +69,7 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
     path = Path(path)
     size = require_file(path)
     budget().require_reading(path, size)
+    ours = require_seal(path)
     found, pixels = _from_child(path, timeout_s)
     if "declared" in found:
         budget().require_declared(path, found["declared"], found["needed"])
@@ -85,7 +86,7 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
         if cfa != "mono"
         else np.full((2, 2), found["black"][0])
     )
-    notes = _own_notes(path, pixels)
+    notes = _own_notes(path) if ours else {}
     if notes:
         black, found["white"] = (
             np.broadcast_to(np.asarray(notes["black"]), (2, 2)).astype(float),
@@ -99,7 +100,7 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
         if found.get(key)
     }
     details |= {key: found["exif"][key] for key in ("make", "model") if key in found["exif"]}
-    details |= {key: value for key, value in notes.items() if key != "mosaic_sha256"} | {
+    details |= {key: value for key, value in notes.items() if key != "seal"} | {
         "verified": bool(notes)
     }
     return RawFile(
@@ -190,19 +191,9 @@ def _letters(path: Path, found: dict[str, Any]) -> str:
     return letters
 
 
-def _own_notes(path: Path, pixels: bytes) -> dict[str, Any]:
-    """What `write_dng` left in the file, if the mosaic is still the one it was written with;
-    {} for other files.
-    """
+def _own_notes(path: Path) -> dict[str, Any]:
+    """What `write_dng` left in a file of ours."""
     notes = read_notes(path)
-    if "mosaic_sha256" not in notes:
-        return {}
-    if notes["mosaic_sha256"] != hashlib.sha256(pixels).hexdigest():
-        raise InputError(
-            "is damaged or was edited: its mosaic is not the one it was written with",
-            path,
-            "make it again",
-        )
     black: Any = notes.get("black")
     numbers = [
         notes.get("white"),

@@ -11,6 +11,7 @@ from typing import Any
 from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics.figures import Figure
 from plenocli.evaluation.scores import InputFile, PatchScore, ResultScore, ScoreDocument
+from plenocli.files.seal import SEAL, require_seal
 
 PATCHES = 24
 """Of a ColorChecker."""
@@ -18,6 +19,12 @@ PATCHES = 24
 
 class _Nonsense(ValueError):
     """A part of a document that cannot be what it should be."""
+
+
+def json_pieces(document: Mapping[str, Any]) -> list[bytes]:
+    """A document as JSON, for publish_sealed."""
+    told = {"seal": SEAL, **document}
+    return [json.dumps(told, indent=1, allow_nan=False).encode() + b"\n"]
 
 
 def read_scores(path: Path | str) -> ScoreDocument | None:
@@ -30,7 +37,10 @@ def read_scores(path: Path | str) -> ScoreDocument | None:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"is no readable JSON ({error})", path, "run score again") from error
-    if not isinstance(document, dict) or not isinstance(document.get("results"), list):
+    if not isinstance(document, dict) or not {"results", "seal"} & document.keys():
+        return None
+    require_seal(path)
+    if not isinstance(document.get("results"), list):
         return None
     try:
         return _document(document)

@@ -2,7 +2,6 @@
 the chart as a scene.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,7 +48,9 @@ def run_colorchecker(
     """
     from plenocli.files.artefacts.container import Artefact, write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output, publish, together
+    from plenocli.files.atomic import check_output, together
+    from plenocli.files.results.scores import json_pieces
+    from plenocli.files.seal import publish_sealed
 
     found = read_chart_folder(
         folder, cfa=settings.cfa, labels=settings.labels, spectra=settings.spectra
@@ -83,8 +84,7 @@ def run_colorchecker(
     with together():
         write_artefact(output, chart, overwrite=overwrite)
         if measures is not None:
-            text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
-            publish(measures, text.encode(), overwrite=overwrite)
+            publish_sealed(measures, json_pieces(document.as_json()), overwrite=overwrite)
     return document
 
 

@@ -92,7 +92,7 @@ def _artefact(path: Path) -> ArtefactReport:
 
 
 def _exr(path: Path) -> ChannelsReport:
-    from plenocli.files.images.exr import DIGEST, read_exr
+    from plenocli.files.images.exr import SEALED, read_exr
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
     channels, attrs = read_exr(path)
@@ -109,7 +109,7 @@ def _exr(path: Path) -> ChannelsReport:
         type="exr" if bands is None else "spectral exr",
         rows=rows,
         columns=columns,
-        verified=DIGEST in attrs,
+        verified=SEALED in attrs,
         channels={name: statistics(plane) for name, plane in channels.items()},
         attributes=attrs,
         bands=bands,

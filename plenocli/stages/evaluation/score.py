@@ -4,7 +4,6 @@ page.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -140,6 +139,8 @@ def run_score(
     """
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.atomic import check_output, publish, together
+    from plenocli.files.results.scores import json_pieces
+    from plenocli.files.seal import publish_sealed
 
     inputs = [*results, truth, *whites, patches, pif, capture, camera, classes, prior]
     files = [path for path in inputs if _is_file(path)]
@@ -168,9 +169,8 @@ def run_score(
         "capture": capture,
     }
     document = _document(results, scored, describe_inputs(roles), command)
-    text = json.dumps(document.as_json(), indent=1, allow_nan=False) + "\n"
     with together():
-        publish(output, text.encode(), overwrite=overwrite)
+        publish_sealed(output, json_pieces(document.as_json()), overwrite=overwrite)
         if report is not None:
             publish(report, _page(document, scored), overwrite=overwrite)
     if errors:

@@ -1,0 +1,125 @@
+"""Least total variation against a primal-dual solver of the same problem in dense matrices."""
+
+import numpy as np
+import pytest
+
+from plenocli.base.budget import Budget, within
+from plenocli.base.errors import NumericsError
+from plenocli.base.linear_maps import BlockCirculant
+from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
+from plenocli.inverse.volume.total_variation import (
+    back_differences,
+    differences,
+    shrunk,
+    total_variation,
+)
+from tests.reference import volumes
+
+VOXELS = Voxels((2, 2), 1e-6, (-1e-6, 1e-6))
+COUNT, TORUS = (3, 4), (4, 5)
+
+
+def box(count=COUNT, torus=TORUS, noise=0.03, hold_out=0.0, dtype=float, pixels=9):
+    """A specimen of even parts, and what is seen of it."""
+    rng = np.random.default_rng(0)
+    parts = [(b.astype(dtype), o) for b, o in volumes.kernels(2, 4, pixels)]
+    op = BlockCirculant(parts, count, torus)
+    truth = np.zeros((2, torus[0] * 2, torus[1] * 2), dtype)
+    truth[0, 2:5, 3:7], truth[1, 1:4, 1:3] = 1, 0.7
+    light = op.forward(VOXELS.lenslets(truth))
+    signal = light + noise * rng.standard_normal(light.shape)
+    measurement = Measurement(
+        signal=signal, read_variance=noise**2, usable=rng.random(light.shape) > 0.1
+    )
+    return Problem(op, measurement, VOXELS, hold_out=hold_out), truth
+
+
+def gradients():
+    """(plane, row, column differences) as dense matrices of the map's unknowns."""
+    count = int(np.prod(TORUS)) * 8
+    columns = [differences(VOXELS.picture(one.reshape(*TORUS, 8))) for one in np.eye(count)]
+    return [np.array([c[axis].ravel() for c in columns]).T for axis in range(3)]
+
+
+def dense_terms(problem, strength):
+    a = volumes.matrix(volumes.kernels(2, 4, 9), COUNT, TORUS)
+    everywhere = volumes.matrix(volumes.kernels(2, 4, 9), TORUS, TORUS)
+    unit = np.sqrt(np.mean(np.sum(everywhere**2, axis=0)))
+    at = problem.counts.ravel()
+    y = problem.signal.ravel()[at]
+    return a[at] / unit, y / unit, strength * np.sqrt(np.mean(y**2)) / unit
+
+
+def lengths(v):
+    deep, down, right = v
+    square = down**2 + right**2
+    square[: len(deep)] += deep**2
+    return np.sqrt(square)
+
+
+def cost(x, a, y, weight, steps):
+    return 0.5 * np.sum((a @ x - y) ** 2) + weight * lengths([d @ x for d in steps]).sum()
+
+
+def primal_dual(a, y, weight, steps, rounds=5000):
+    """Chambolle and Pock 2011."""
+    d = np.concatenate(steps)
+    norm = np.linalg.norm(np.concatenate([a, d]), 2)
+    tau = sigma = 0.99 / norm
+    x = ahead = np.zeros(a.shape[1])
+    p, q = np.zeros(len(y)), np.zeros(len(d))
+    splits = np.cumsum([len(s) for s in steps])[:-1]
+    for _ in range(rounds):
+        p = (p + sigma * (a @ ahead - y)) / (1 + sigma)
+        q = q + sigma * (d @ ahead)
+        parts = np.split(q, splits)
+        long = np.maximum(lengths(parts) / weight, 1)
+        q = np.concatenate([parts[0] / long[: len(parts[0])], parts[1] / long, parts[2] / long])
+        new = np.maximum(x - tau * (a.T @ p + d.T @ q), 0)
+        x, ahead = new, 2 * new - x
+    return x
+
+
+@pytest.mark.parametrize("strength", [0.02, 0.2])
+def test_it_is_the_least(strength):
+    problem, _ = box()
+    volume = total_variation(problem, (strength,), 600)
+    terms = (*dense_terms(problem, strength), gradients())
+    expected = primal_dual(*terms)
+    inner = problem.inside(expected.reshape(problem.op.domain.shape))
+    least = cost(expected, *terms)
+    assert cost(1.02 * expected, *terms) > least < cost(0.98 * expected, *terms)
+    np.testing.assert_allclose(volume.value, inner, atol=5e-3 * inner.max())
+    assert np.all(volume.value >= 0) and volume.method == "tv"
+
+
+def test_differences_and_their_adjoint():
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((3, 6, 8))
+    v = tuple(rng.standard_normal(part.shape) for part in differences(x))
+    forward = sum(np.sum(a * b) for a, b in zip(differences(x), v))
+    assert forward == pytest.approx(np.sum(x * back_differences(v)), rel=1e-12)
+
+
+def test_shrinking_takes_the_same_length_off_everywhere():
+    v = differences(np.random.default_rng(2).standard_normal((3, 6, 8)))
+    before, after = lengths(v), lengths(shrunk(v, np.float64(0.5)))
+    np.testing.assert_allclose(after, np.maximum(before - 0.5, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_strength_is_chosen_by_held_out_pixels(dtype):
+    problem, truth = box((6, 6), (8, 8), noise=0.02, hold_out=0.1, dtype=dtype, pixels=25)
+    volume = total_variation(problem)
+    tried = [trial.misfit for trial in volume.trace[:-1]]
+    assert np.all(np.diff(tried[:-1]) < 0) and tried[-1] > 0.9 * tried[-2]
+    assert volume.trace[-1].what.startswith(volume.trace[-3].what)
+    assert volume.value.dtype == dtype
+    error = volume.value - truth[:, :12, :12]
+    assert np.linalg.norm(error) < 0.3 * np.linalg.norm(truth)
+
+
+def test_memory_is_asked_for():
+    problem, _ = box()
+    with within(Budget(1 << 10)), pytest.raises(NumericsError, match="mem-limit"):
+        total_variation(problem)

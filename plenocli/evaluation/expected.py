@@ -142,12 +142,14 @@ def expected_score(
     labels: Sequence[str],
     spectra: np.ndarray,
     detect: str | None = None,
+    learnt: bool = False,
 ) -> ExpectedScore:
     """What a camera and a way of processing should deliver of labelled spectra.
 
     labels: (spectrum,) names of classes.
     spectra: (spectrum, node) reflectances.
     detect: the class that is looked for.
+    learnt: whether classes are known by how the camera shows them, and not by what they are.
 
     Every class is taken as normal with its mean and the covariance about it that all share.
     """
@@ -160,16 +162,17 @@ def expected_score(
     classes = Classes.of_spectra(labels, spectra)
     share = np.array([labels.count(name) for name in classes.names]) / len(labels)
     pixels = _pixels(optics, classes, mean)
+    judged = _judged(optics, found, classes, learnt)
     return ExpectedScore(
         rmse_expected=float(rmse.mean()),
         rmse_expected_per_band=rmse.tolist(),
         noise_expected_per_band=np.sqrt(np.diag(found.noise)).tolist(),
-        class_accuracy_expected=float(share @ _told(optics, found, classes)),
+        class_accuracy_expected=float(share @ _told(judged, found, classes)),
         class_accuracy_ideal=float(share @ predicted_accuracy(pixels)),
         class_distance_ideal=float(pixels.min()),
         detection_auc_expected=None
         if detect is None
-        else _detected(optics, found, classes, detect),
+        else _detected(judged, found, classes, detect),
     )
 
 
@@ -184,18 +187,24 @@ def _pixels(optics: Optics, classes: Classes, mean: np.ndarray) -> np.ndarray:
     return distances_between(classes.means @ across.T, spread)
 
 
-def _judged(optics: Optics, found: Estimates, classes: Classes) -> tuple[Classes, np.ndarray]:
-    """The classes as a score knows them, and the covariance (band, band) that it reckons with."""
+_Judged = tuple[Classes, np.ndarray]
+"""The classes as a score knows them, and the covariance (band, band) that it reckons with."""
+
+
+def _judged(optics: Optics, found: Estimates, classes: Classes, learnt: bool) -> _Judged:
+    if learnt:
+        real = found.gain @ classes.covariance @ found.gain.T + found.noise
+        return Classes(classes.names, classes.means @ found.gain.T + found.offset, real), real
     truth = optics.truth
     known = Classes(classes.names, classes.means @ truth.T, truth @ classes.covariance @ truth.T)
     return known, known.covariance + np.diag(np.diag(found.noise))
 
 
-def _told(optics: Optics, found: Estimates, classes: Classes) -> np.ndarray:
+def _told(judged: _Judged, found: Estimates, classes: Classes) -> np.ndarray:
     """(class,) least share that a score tells rightly from estimates."""
     from scipy.special import ndtr
 
-    known, reckoned = _judged(optics, found, classes)
+    known, reckoned = judged
     real = found.gain @ classes.covariance @ found.gain.T + found.noise
     seen = classes.means @ found.gain.T + found.offset
     root = whitening(reckoned)
@@ -210,9 +219,9 @@ def _told(optics: Optics, found: Estimates, classes: Classes) -> np.ndarray:
     return np.clip(1 - lost.sum(axis=1), 0.0, 1.0)
 
 
-def _detected(optics: Optics, found: Estimates, classes: Classes, name: str) -> float:
+def _detected(judged: _Judged, found: Estimates, classes: Classes, name: str) -> float:
     """Expected area under the receiver operating characteristic of a score's filter."""
-    known, reckoned = _judged(optics, found, classes)
+    known, reckoned = judged
     weights = Filter.of(known, name, reckoned).weights
     real = found.gain @ classes.covariance @ found.gain.T + found.noise
     seen = classes.means @ found.gain.T + found.offset

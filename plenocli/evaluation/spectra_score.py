@@ -74,6 +74,7 @@ def score_spectra(
     needs_reflectance: bool = False,
     classes: Classes | None = None,
     detect: str | None = None,
+    learnt: bool = False,
 ) -> tuple[SpectraScore, tuple[PatchScore, ...]]:
     """Figures of a spectral cube, and what each patch shows.
 
@@ -83,7 +84,7 @@ def score_spectra(
     whites: method -> spectra of a white target.
     needs_reflectance: the truth is reflectance for sure; radiance without a white is refused.
     classes: what a user wants told apart, in the bands of the result; detect: the one of them
-        that is looked for.
+        that is looked for; learnt: whether they are judged by other lenslets of each.
 
     Raises InputError where no lenslet has values, UsageError where no white target fits.
     docs/model.md, "Measures".
@@ -115,7 +116,7 @@ def score_spectra(
         classification=classification,
         classes=None
         if classes is None
-        else score_classes(values, truth, _relative_sigma(result, values), classes, detect),
+        else score_classes(values, truth, _relative_sigma(result, values), classes, detect, learnt),
         snr=_snr(result, labels, white),
     ), listed
 

@@ -106,6 +106,28 @@ def test_what_is_no_table_of_classes_is_refused(tmp_path, text, words):
         read_labelled(tmp_path / "missing.csv", BANDS)
 
 
+def test_learnt_classes_are_those_of_a_discriminant_that_did_not_see_them():
+    """scikit-learn's, on the same folds; spectra that are off by a constant cost nothing."""
+    lda = pytest.importorskip("sklearn.discriminant_analysis").LinearDiscriminantAnalysis
+    labels, spectra = library(3)
+    number = np.array([int(name[-1]) for name in labels])
+    order = np.random.default_rng(2).permutation(len(number))
+    spectra, number = spectra[order] + 0.3, number[order]
+    said = classes.learnt_classes(spectra, number)
+    for part in range(5):
+        judged = np.arange(len(number)) % 5 == part
+        model = lda(solver="lsqr", priors=[1 / 3] * 3).fit(spectra[~judged], number[~judged])
+        np.testing.assert_array_equal(said[judged], model.predict(spectra[judged]))
+    right = classes.assigned(spectra - 0.3, *_known(labels, order, spectra - 0.3))
+    assert np.mean(said == number) > np.mean(right == number) - 0.05
+
+
+def _known(labels, order, spectra):
+    found = classes.Classes.of_spectra([labels[i] for i in order], spectra)
+    place = [int(name[-1]) for name in found.names]
+    return found.means[np.argsort(place)], found.covariance
+
+
 def test_a_folder_is_read_as_its_tables_and_images(tmp_path):
     """Folders, tables and spectral images by the names of their classes, on shared wavelengths."""
     rng = np.random.default_rng(0)

@@ -121,6 +121,12 @@ def test_errors_and_separability_are_those_of_captures(dim, method):
     low, high = classes.wilson(int(right.sum()), right.size)
     assert low - 0.02 < said["class_accuracy_expected"] < high + 0.02
     assert 0.6 < right.mean() < 0.98  # neither chance nor certainty, of which nothing is learnt
+    lenslets = found.transpose(1, 0, 2).reshape(-1, 4)
+    label = np.tile([0, 0, 1, 1], found.shape[1])
+    taught = classes.learnt_classes(lenslets, label) == label
+    low, high = classes.wilson(int(taught.sum()), taught.size)
+    said_taught = expected(dim, method, prior=prior, learnt=True)["class_accuracy_expected"]
+    assert low - 0.02 < said_taught < high + 0.02
     area = classes.score_detection(
         found.reshape(-1, 4),
         np.repeat([True, False], 2 * found.shape[1]),

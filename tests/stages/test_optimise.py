@@ -114,6 +114,25 @@ def test_refused_points_are_heard_as_failures(space, tmp_path):
     assert 0 < (status == 2).sum() < len(status)
 
 
+def test_the_search_keeps_away_from_what_is_refused(space, tmp_path, monkeypatch):
+    """Chance would have half of the points refused, those of one method."""
+
+    def figures(self, points, pool, files=(), label=""):
+        for point in points:
+            refused = point.values["reconstruct.method"] == "block-mean"
+            point.result = PointResult(
+                status=5 if refused else 0,
+                metrics={}
+                if refused
+                else {"psnr_db": -abs(point.values["main_lens.f_number"] - 7)},
+            )
+        return len(points)
+
+    monkeypatch.setattr(sweep_store.Store, "evaluate", figures)
+    assert run(["optimise", str(space), "--trials", "60", "-o", str(tmp_path / "out.h5")]) == 0
+    assert (table(tmp_path / "out.h5").data["sweep/status"][-30:] == 5).mean() < 0.2
+
+
 def test_what_cannot_be_searched_is_said(space, tmp_path, monkeypatch):
     def attempt(text):
         space.write_text(text)

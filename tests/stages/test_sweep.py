@@ -21,8 +21,9 @@ from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.config.sweep_file import number
 from plenocli.stages.sweep import task as chain
 from plenocli.stages.sweep.point import run_point
+from plenocli.stages.sweep.space import open_space
 from plenocli.stages.sweep.sweep import run_sweep
-from plenocli.stages.sweep.table import lines
+from plenocli.stages.sweep.table import lines, objectives_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -622,6 +623,42 @@ def test_a_joint_point_has_picture_spectra_classes_cost_and_light(tmp_path):
     ).figures
     for name in ("class_accuracy", "class_distance", "detection_auc", "target_contrast"):
         assert float(rows[0][name]) == pytest.approx(figures[name], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "sample_configs" / "sweeps").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_the_sweeps_that_come_along_describe_cameras(path):
+    """All figures of their fronts are known, and their points are cameras."""
+    space = open_space(path, read_options)
+    some = [
+        space.point(number, {key: axis.at(share) for key, axis in space.axes.items()})
+        for number, share in enumerate((0.0, 0.5))
+    ]
+    assert all(point.task is not None for point in some), [point.result for point in some]
+    objectives_of(space, some)
+
+
+def test_a_camera_is_expected_to_tell_classes_without_a_capture(tmp_path):
+    """Longer exposures and processing that was taught by the camera tell more."""
+    examples = ROOT / "sample_configs"
+    (tmp_path / "sweep.toml").write_text(
+        f'camera = "{examples}/codesign.toml"\nchain = "expected"\n'
+        '[set]\n"lenslet_array.count" = [4, 4]\n"sensor.pixels_per_lenslet" = [8, 8]\n'
+        '"sensor.pixel_pitch" = "12 um"\n"filter_array.layout" = [2, 2]\n'
+        '"filter_array.filters.*.fwhm" = "80 nm"\n'
+        '[vary]\n"sensor.exposure" = ["0.5 ms", "5 ms"]\n"score.learnt" = [false, true]\n'
+        f'[score]\nclasses = "{examples}/classes/leaves.csv"\n'
+        '[demux]\nmethod = "pinv"\n'
+    )
+    summary = sweep(tmp_path / "sweep.toml", tmp_path / "s.h5")
+    assert summary.objectives == {"class_accuracy_expected": "max", "rmse_expected": "min"}
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    short, taught, long, both = (float(row["class_accuracy_expected"]) for row in rows)
+    assert short < taught < both and short < long < both
+    ideal = [float(row["class_accuracy_ideal"]) for row in rows]
+    assert taught <= ideal[0] == ideal[1] and both <= ideal[2] == ideal[3]
 
 
 def test_values_are_written_as_given_and_read_as_numbers(whole):

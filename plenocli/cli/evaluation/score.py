@@ -118,6 +118,14 @@ METRICS = (
     ),
 )
 @options.prior
+@click.option(
+    "--learnt",
+    is_flag=True,
+    help=(
+        "Judge lenslets by how others of their class came out (four fifths teach, one fifth is "
+        "judged, in turn), not by what the --classes are."
+    ),
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
@@ -142,6 +150,7 @@ def command(
     detect: str | None,
     method: str,
     prior: Path | None,
+    learnt: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -192,6 +201,7 @@ def command(
         detect=detect,
         method=method,
         prior=prior,
+        learnt=learnt,
         overwrite=overwrite,
     )
     options.summary(document.as_json(), as_json, table(document))

@@ -31,6 +31,7 @@ def run_expected(
     camera: Camera | None = None,
     method: str = "auto",
     prior: Path | str | None = None,
+    learnt: bool = False,
 ) -> ExpectedScore:
     """Expected figures of a calibration that simulate-response made.
 
@@ -39,6 +40,7 @@ def run_expected(
     camera: the calibrated one; None: as the file describes it.
     method: pinv, wls, lmmse, single-pixel, or auto, which takes the one of least expected error.
     prior: labelled spectra whose mean and covariance lmmse starts from; None: many surfaces.
+    learnt: whether classes are known by how the camera shows them.
 
     Raises InputError where the file does not say what is needed.
     """
@@ -74,6 +76,7 @@ def run_expected(
             known.labels,
             spectra,
             detect,
+            learnt,
         )
         for one in tried
         if one != "lmmse" or start is not None or method == one

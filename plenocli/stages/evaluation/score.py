@@ -66,6 +66,7 @@ class _Comparison:
     sensor_snr: of the capture, dB, or None.
     classes: labelled spectra, or None; detect: the class that is looked for.
     method, prior: how a calibration's spectra would be made, plenocli.stages.evaluation.expected.
+    learnt: whether classes are known by how the camera shows them.
     """
 
     truth: Path | str | None
@@ -82,6 +83,7 @@ class _Comparison:
     detect: str | None = None
     method: str = "auto"
     prior: Path | str | None = None
+    learnt: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +115,7 @@ def run_score(
     detect: str | None = None,
     method: str = "auto",
     prior: Path | str | None = None,
+    learnt: bool = False,
     overwrite: bool = False,
     command: str = "",
 ) -> ScoreDocument:
@@ -133,6 +136,7 @@ def run_score(
     detect: name of the one of them that is looked for.
     method, prior: how spectra of a calibration would be made, for what it lets expect of classes
         (plenocli.stages.evaluation.expected).
+    learnt: whether lenslets are judged by how others of their class look.
 
     One bad result does not stop the others: its message is printed and stands in its place.
     Raises the error of the worst one at the end.
@@ -150,7 +154,9 @@ def run_score(
             report, overwrite=overwrite, inputs=files, others=[output], suffixes=(".html",)
         )
     comparison = _comparison(truth, whites, patches, pif, capture, block, sampling, light, camera)
-    comparison = replace(comparison, classes=classes, detect=detect, method=method, prior=prior)
+    comparison = replace(
+        comparison, classes=classes, detect=detect, method=method, prior=prior, learnt=learnt
+    )
     scored = _score_all(results, comparison, tuple(metrics))
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
@@ -326,6 +332,7 @@ def _score_calibration(response: ComparedResponse, comparison: _Comparison) -> _
             camera=comparison.camera,
             method=comparison.method,
             prior=comparison.prior,
+            learnt=comparison.learnt,
         )
         found |= figures(expected)
     return _Scored(
@@ -414,6 +421,7 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             needs_reflectance=str(comparison.truth) == CHART,
             classes=_classes(comparison, result.bands),
             detect=comparison.detect,
+            learnt=comparison.learnt,
         )
         spectra = own
     sensor = comparison.sensor_snr

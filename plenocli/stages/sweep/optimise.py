@@ -123,6 +123,9 @@ def _ask(study: Study, space: Space) -> tuple[Trial, dict[str, Any]]:
 
 
 def _tell(study: Study, trial: Trial, point: DesignPoint, objectives: Mapping[str, str]) -> None:
+    """Tell the sampler the figures of a point; one without figures counts as the worst of all that
+    were heard so far, so that the sampler keeps away from its like.
+    """
     from optuna.trial import TrialState
 
     from plenocli.files.config.sweep_file import number
@@ -130,7 +133,12 @@ def _tell(study: Study, trial: Trial, point: DesignPoint, objectives: Mapping[st
     result = result_of(point)
     figures = [result.metrics.get(name, number(point.values.get(name))) for name in objectives]
     known = [value for value in figures if value is not None]
-    if result.status or len(known) < len(figures):
-        study.tell(trial, state=TrialState.FAIL)
-    else:
+    if not result.status and len(known) == len(figures):
         study.tell(trial, known)
+        return
+    heard = [t.values for t in study.trials if t.state == TrialState.COMPLETE]
+    if not heard:
+        study.tell(trial, state=TrialState.FAIL)
+        return
+    worst = [min if aim == "max" else max for aim in objectives.values()]
+    study.tell(trial, [of(values) for of, values in zip(worst, zip(*heard), strict=True)])

@@ -181,7 +181,7 @@ class _Run:
         from plenocli.stages.evaluation.score import run_score
 
         options = dict(self.task.options("score"))
-        names = [name for name in options if name in ("classes", "detect")]
+        names = [name for name in options if name in ("classes", "detect", "learnt")]
         classes: dict[str, Any] = {name: options.pop(name) for name in names}
         if truth.get("truth") in (None, classes.get("classes")):
             options |= classes  # a chart of them, or what a response lets expect of them

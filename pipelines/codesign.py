@@ -120,6 +120,8 @@ def draw(run: Path, captured: dict[str, list[dict[str, str]]]) -> None:
                 label=f"{label}, captured",
             )
         axes.set(xscale="log", xlabel="exposure (ms)", ylabel="share told rightly", ylim=(0, 1))
+        axes.set_xticks([0.2, 0.5, 1, 2, 5, 10, 20], minor=False)
+        axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="lower right")
     (run / "codesign.png").write_bytes(made.png)
 

@@ -579,8 +579,8 @@ def test_a_joint_point_has_picture_spectra_classes_cost_and_light(tmp_path):
         rows = list(csv.DictReader(file))
     for name in (
         "psnr_db spectral_angle_deg six_patch_rmse snr_predicted_mean_db class_accuracy "
-        "class_accuracy_low detection_auc target_contrast matrix_seconds matrix_bytes "
-        "electrons_per_pixel exposure_s"
+        "class_accuracy_low class_delta_e_2000 detection_auc target_contrast matrix_seconds "
+        "matrix_bytes electrons_per_pixel exposure_s"
     ).split():
         assert all(row[name] != "" for row in rows), name
     light = [float(row["electrons_per_pixel"]) for row in rows]
@@ -623,6 +623,7 @@ def test_a_joint_point_has_picture_spectra_classes_cost_and_light(tmp_path):
     ).figures
     for name in ("class_accuracy", "class_distance", "detection_auc", "target_contrast"):
         assert float(rows[0][name]) == pytest.approx(figures[name], rel=1e-9)
+    assert float(rows[0]["class_rmse"]) == pytest.approx(figures["rmse"], rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -657,6 +658,8 @@ def test_a_camera_is_expected_to_tell_classes_without_a_capture(tmp_path):
         rows = list(csv.DictReader(file))
     short, taught, long, both = (float(row["class_accuracy_expected"]) for row in rows)
     assert short < taught < both and short < long < both
+    light = [float(row["electrons_per_pixel"]) for row in rows]
+    assert light[2] == pytest.approx(10 * light[0]) and float(rows[2]["exposure_s"]) == 5e-3
     ideal = [float(row["class_accuracy_ideal"]) for row in rows]
     assert taught <= ideal[0] == ideal[1] and both <= ideal[2] == ideal[3]
 

@@ -294,6 +294,18 @@ def _light(capture: Path) -> dict[str, float]:
     return light | ({} if found.exposure_s is None else {"exposure_s": found.exposure_s})
 
 
+def _expected_light(response: Path) -> dict[str, float]:
+    """The same figures of the white reference, as a predicted response has it."""
+    from plenocli.files.read.calibrations import read_described
+    from plenocli.inverse.calibration.calibration import there
+
+    found = read_described(response, needs=("response", "white"))[0]
+    gain, seconds = found.sensor.gain_e_per_dn, found.sensor.exposure
+    mean = float(np.nanmean(there(there(found.white).superpixels)))
+    light = {} if gain is None else {"electrons_per_pixel": mean * gain}
+    return light | ({} if seconds is None else {"exposure_s": seconds})
+
+
 def _spatial(run: _Run) -> dict[str, float]:
     pif = run.matrix()
     [capture] = run.captures(pif).values()
@@ -374,6 +386,8 @@ def _spectra(run: _Run, captures: dict[str, Path], pif: Path | None) -> dict[str
         known = task.options("score")["classes"]
         figures = run.score(told, truth=known, camera=camera)
         found |= {name: figures[name] for name in CLASSES if name in figures}
+        own = ("rmse", "spectral_angle_deg", "delta_e_2000")
+        found |= {f"class_{name}": figures[name] for name in own}
     return found
 
 
@@ -381,6 +395,7 @@ def _expected(run: _Run) -> dict[str, float]:
     """What the predicted response lets expect; nothing is captured."""
     with run.stage("simulate-response"):
         response = _predicted(run.task, run.folder)
+    run.light = _expected_light(response)
     options = run.task.options("demux")
     given = {name: options[name] for name in ("method", "prior") if name in options}
     return run.score(response.name, **given)

@@ -47,9 +47,13 @@ OWN_MATRIX = {
 
 DESIGN = {
     "electrons_per_pixel": (
-        "photo-electrons that the first capture of the chain has in a pixel, mean over the sensor"
+        "photo-electrons that the first capture of the chain has in a pixel, mean over the sensor; "
+        "where nothing is captured, those of the white reference, mean over a lenslet"
     ),
     "exposure_s": "exposure time of that capture, s",
+    "class_rmse": "rmse over the chart of the classes",
+    "class_spectral_angle_deg": "spectral_angle_deg over the chart of the classes",
+    "class_delta_e_2000": "delta_e_2000 over the chart of the classes",
     "matrix_seconds": (
         "time to compute the system matrix on one core at nominal speed, as its plan counts it, s"
     ),

@@ -13,7 +13,7 @@ from plenocli.inverse.volume.measurement import Problem
 
 FREQUENCIES = 24
 """Of the lattice, at which the likelihood is computed."""
-COMPLETING = 25
+COMPLETING = 20
 """Steps of least squares, whose prediction stands in for pixels that are missing."""
 LEAST_EIGENVALUE = 1e-12
 """Share of the largest one below which a direction is taken for noise alone."""
@@ -77,7 +77,7 @@ def fit_prior(
             lambda log: at(float(np.exp(log)))[0],
             bounds=bounds,
             method="bounded",
-            options={"xatol": 0.05},
+            options={"xatol": 0.15},
         )
         length = float(np.exp(found.x))
     return at(length)[1]

@@ -15,7 +15,7 @@ from plenocli.inverse.volume.volume import Prior, Trial, Volume
 
 TOLERANCE = 1e-3
 """Change of the volume in a round, relative, at which missing pixels count as filled."""
-ROUNDS = 100
+ROUNDS = 30
 """Of filling, at most."""
 MOST_WEIGHT = 3.0
 """Of a pixel that is darker than its fellows, whose noise is below theirs."""

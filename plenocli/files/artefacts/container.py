@@ -482,14 +482,23 @@ def _parse(
             path,
             f"make it again ({root['command']})",
         )
-    provenance = Provenance(
-        command=root["command"],
-        inputs=json.loads(root["inputs"]),
-        seed=None if root["seed"] == "none" else int(root["seed"]),
-        config=root["config"],
-        accuracy=json.loads(root["accuracy"]),
+    return Artefact(schema.kind, data, attrs, _provenance(path, root))
+
+
+def _provenance(path: Path, root: dict[str, Any]) -> Provenance:
+    try:
+        inputs, accuracy = json.loads(root["inputs"]), json.loads(root["accuracy"])
+        seed = None if root["seed"] == "none" else int(root["seed"])
+        sound = isinstance(accuracy, dict) and all(
+            isinstance(about[name], str) for about in inputs.values() for name in ("name", "sha256")
+        )
+    except (ValueError, TypeError, KeyError, AttributeError):
+        sound = False
+    if not sound:
+        raise InputError("says nonsense of where it comes from", path, "make it again")
+    return Provenance(
+        command=root["command"], inputs=inputs, seed=seed, config=root["config"], accuracy=accuracy
     )
-    return Artefact(schema.kind, data, attrs, provenance)
 
 
 def _schema_of(

@@ -5,7 +5,10 @@ Pixels, points and lenslets are numbered row by row, rows downwards; positions a
 pixel centres at integers.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
+
+import numpy as np
 
 from plenocli.files.artefacts.schema import Schema, attribute, dataset
 from plenocli.files.artefacts.volume_kinds import PIF_STACK, VOLUME
@@ -99,7 +102,13 @@ _PIF_ATTRS = (
     attribute("eps", "number", "1/m", "defocus of the main lens"),
     attribute("superpixel_pitch", "number", "m", "spacing of superpixel centres on the sensor"),
     attribute("model", "text", "", "propagation model"),
-    attribute("lattice", "text", "", "of the lenslets: square (if left out) or hexagonal"),
+    attribute(
+        "lattice",
+        "text",
+        "",
+        "of the lenslets: square (if left out) or hexagonal",
+        pattern="square|hexagonal",
+    ),
     _NOTES,
 )
 
@@ -285,23 +294,59 @@ CAPTURE = Schema(
                     "through the clear pupil"
                 ),
             ),
-            attribute("electrons_per_unit", "number", "e", "electrons for one unit of A x"),
+            attribute(
+                "electrons_per_unit",
+                "number",
+                "e",
+                "electrons for one unit of A x",
+                minimum=0,
+                size=1,
+            ),
             attribute(
                 "black", "number", "units", "level of no light: one number, or 2x2 by position"
             ),
             attribute("white", "number", "units", "saturation level", finite=False),
-            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            attribute("exposure_s", "number", "s", "exposure time"),
-            attribute("band_m", "number", "m", "centre of the narrow band that lit the scene"),
-            attribute("snr_db", "number", "dB", "signal-to-noise ratio asked for", finite=False),
-            attribute("noise_sigma", "number", "units", "standard deviation of the added noise"),
-            attribute("lenslet_count", "number", "1", "lenslets (rows, columns)"),
-            attribute("superpixel_shape", "number", "px", "pixels of a superpixel (rows, columns)"),
+            attribute(
+                "gain_e_per_dn", "number", "e/DN", "electrons for one DN", minimum=1e-30, size=1
+            ),
+            attribute("exposure_s", "number", "s", "exposure time", minimum=0, size=1),
+            attribute(
+                "band_m",
+                "number",
+                "m",
+                "centre of the narrow band that lit the scene",
+                minimum=0,
+                size=1,
+            ),
+            attribute(
+                "snr_db", "number", "dB", "signal-to-noise ratio asked for", finite=False, size=1
+            ),
+            attribute(
+                "noise_sigma",
+                "number",
+                "units",
+                "standard deviation of the added noise",
+                minimum=0,
+                size=1,
+            ),
+            attribute(
+                "lenslet_count", "number", "1", "lenslets (rows, columns)", minimum=1, size=2
+            ),
+            attribute(
+                "superpixel_shape",
+                "number",
+                "px",
+                "pixels of a superpixel (rows, columns)",
+                minimum=1,
+                size=2,
+            ),
             attribute(
                 "superpixel_pitch", "number", "px", "spacing of superpixel centres (rows, columns)"
             ),
             attribute("pixel_phase", "number", "px", "position of the first superpixel centre"),
-            attribute("scene_shape", "number", "1", "object points (rows, columns)"),
+            attribute(
+                "scene_shape", "number", "1", "object points (rows, columns)", minimum=1, size=2
+            ),
             attribute("target", "text", "", "what was in front of the camera"),
             attribute("illuminant", "text", "", "name of the light"),
             attribute("camera", "text", "", "camera make and model"),
@@ -311,6 +356,28 @@ CAPTURE = Schema(
     plots={"capture": ("mosaic", ())},
     default=("capture",),
 )
+
+
+def _lit_lenslets(data: Mapping[str, np.ndarray]) -> str | None:
+    valid = data["grid/valid"].astype(bool)
+    if not valid.any():
+        return "no lenslet of 'grid/valid' is lit"
+    if not np.isfinite(data["grid/centre"][valid]).all():
+        return "lenslets of 'grid/valid' have no 'grid/centre'"
+    return None
+
+
+def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
+    for name, needed in (
+        ("response/F", "response/wavelength"),
+        ("response/F", "response/window"),
+        ("response/window", "response/origin"),
+        ("response/origin", "response/window"),
+    ):
+        if name in data and needed not in data:
+            return f"'{name}' lacks '{needed}'"
+    return None
+
 
 CALIBRATION = Schema(
     kind="calibration",
@@ -438,7 +505,7 @@ CALIBRATION = Schema(
     ),
     attrs={
         "grid": (
-            attribute("lattice", "text", "", "square or hexagonal"),
+            attribute("lattice", "text", "", "square or hexagonal", pattern="square|hexagonal"),
             attribute(
                 "pitch",
                 "number",
@@ -453,17 +520,23 @@ CALIBRATION = Schema(
             _NOTES,
         ),
         "white": (
-            attribute("exposure", "number", "s", "exposure time of the white image"),
-            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            attribute("read_noise", "number", "DN", "noise of a dark pixel"),
-            attribute("cfa", "text", "", "mono or four letters"),
+            attribute(
+                "exposure", "number", "s", "exposure time of the white image", minimum=0, size=1
+            ),
+            attribute(
+                "gain_e_per_dn", "number", "e/DN", "electrons for one DN", minimum=1e-30, size=1
+            ),
+            attribute("read_noise", "number", "DN", "noise of a dark pixel", minimum=0, size=1),
+            attribute("cfa", "text", "", "mono or four letters", pattern="mono|[RGB]{4}"),
             attribute("black", "number", "DN", "level of no light: one number, or 2x2 by position"),
             attribute("white", "number", "DN", "saturation level", finite=False),
             _NOTES,
         ),
         "dark": (
-            attribute("exposure", "number", "s", "exposure time of the dark image"),
-            attribute("sigma", "number", "DN", "noise of a dark pixel"),
+            attribute(
+                "exposure", "number", "s", "exposure time of the dark image", minimum=0, size=1
+            ),
+            attribute("sigma", "number", "DN", "noise of a dark pixel", minimum=0, size=1),
             _NOTES,
         ),
         "response": (
@@ -484,11 +557,13 @@ CALIBRATION = Schema(
                     "(errors in variables)"
                 ),
             ),
-            attribute("read_noise", "number", "DN", "noise of a dark pixel"),
-            attribute("gain_e_per_dn", "number", "e/DN", "electrons for one DN"),
-            attribute("cfa", "text", "", "mono or four letters"),
+            attribute("read_noise", "number", "DN", "noise of a dark pixel", minimum=0, size=1),
+            attribute(
+                "gain_e_per_dn", "number", "e/DN", "electrons for one DN", minimum=1e-30, size=1
+            ),
+            attribute("cfa", "text", "", "mono or four letters", pattern="mono|[RGB]{4}"),
             attribute("units", "text", "", "DN or electron"),
-            attribute("exposure_s", "number", "s", "exposure to which F refers"),
+            attribute("exposure_s", "number", "s", "exposure to which F refers", minimum=0, size=1),
             _NOTES,
         ),
     },
@@ -498,6 +573,7 @@ CALIBRATION = Schema(
         "response": ("F", ()),
         "dark": ("mean", ()),
     },
+    rules=(_lit_lenslets, _whole_response),
     default=("response", "white", "grid"),
 )
 
@@ -583,9 +659,14 @@ DICTIONARY = Schema(
     attrs={
         "dictionary": (
             attribute(
-                "delta", "number", "1", "weight of the term that keeps A times the atoms small"
+                "delta",
+                "number",
+                "1",
+                "weight of the term that keeps A times the atoms small",
+                minimum=0,
+                size=1,
             ),
-            attribute("lambda", "number", "1", "weight of the l1 term"),
+            attribute("lambda", "number", "1", "weight of the l1 term", minimum=0, size=1),
             attribute(
                 "coherence_mutual", "number", "1", "largest |cosine| between a row of A and an atom"
             ),
@@ -609,9 +690,23 @@ DICTIONARY = Schema(
             ),
             attribute("coherence_welch", "number", "1", "lower bound of the effective coherence"),
             attribute("coherence", "json", "", "all coherence measures"),
-            attribute("object_shape", "number", "1", "points of an atom (rows, columns)"),
-            attribute("iterations", "number", "1", "iterations done"),
-            attribute("scale", "number", "1", "factor by which A was divided before learning"),
+            attribute(
+                "object_shape",
+                "number",
+                "1",
+                "points of an atom (rows, columns)",
+                minimum=1,
+                size=2,
+            ),
+            attribute("iterations", "number", "1", "iterations done", minimum=0, size=1),
+            attribute(
+                "scale",
+                "number",
+                "1",
+                "factor by which A was divided before learning",
+                minimum=1e-30,
+                size=1,
+            ),
             attribute("parameters", "json", "", "settings of the method"),
             attribute("random_state", "json", "", "state of the random numbers for a resumed run"),
             _NOTES,

@@ -8,11 +8,15 @@ themselves stand in `kinds`.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+FURTHEST = 1e100
+"""Of any number in a file from 0: no number holds the squares of what lies further."""
 
 Declared = Mapping[str, tuple[tuple[int, ...], Any]]
 """Dataset path -> (shape, dtype), before there are values."""
@@ -69,6 +73,9 @@ class Attr:
     type: number (one, or a short list), text, json or flag.
     unit, doc: for people.
     finite: whether a number may not be infinite.
+    minimum: least number, or None.
+    size: how many numbers (1: no list), or None for any.
+    pattern: regular expression of a whole text, or None for any.
     """
 
     name: str
@@ -76,6 +83,9 @@ class Attr:
     unit: str
     doc: str
     finite: bool = True
+    minimum: float | None = None
+    size: int | None = None
+    pattern: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +97,7 @@ class Schema:
     attrs: group or dataset path -> its attributes; all may be left out.
     plots: group -> (signal dataset, names of its companions).
     default: the groups to draw first.
+    rules: what must hold between datasets; each says what is wrong of (path -> array), or None.
     """
 
     kind: str
@@ -96,6 +107,7 @@ class Schema:
     attrs: dict[str, tuple[Attr, ...]] = field(default_factory=dict)
     plots: dict[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
     default: tuple[str, ...] = ()
+    rules: tuple[Callable[[Mapping[str, np.ndarray]], str | None], ...] = ()
 
     def field_for(self, path: str) -> Field | None:
         """The Field that describes dataset `path`, or None."""
@@ -116,9 +128,9 @@ def dataset(path: str, dims: str | None, dtype: str, unit: str, doc: str, **opti
     return Field(path=path, dims=dims, dtype=dtype, unit=unit, doc=doc, **options)
 
 
-def attribute(name: str, type: str, unit: str, doc: str, *, finite: bool = True) -> Attr:
-    """An Attr, as the tables write it."""
-    return Attr(name=name, type=type, unit=unit, doc=doc, finite=finite)
+def attribute(name: str, type: str, unit: str, doc: str, **options: Any) -> Attr:
+    """An Attr, as the tables write it: its columns in this order, what is rare by name."""
+    return Attr(name=name, type=type, unit=unit, doc=doc, **options)
 
 
 def _dtype_fits(dtype: Any, spec: str) -> bool:
@@ -195,7 +207,7 @@ def _known(schema: Schema) -> str:
 
 def value_problems(schema: Schema, data: Mapping[str, np.ndarray]) -> list[str]:
     """Every way in which the values of `data` (path -> array) break the table: NaN, infinities,
-    below minimum, order.
+    below minimum, beyond FURTHEST, order, and what must hold between datasets.
     """
     problems = []
     for path, values in data.items():
@@ -211,11 +223,13 @@ def value_problems(schema: Schema, data: Mapping[str, np.ndarray]) -> list[str]:
                 if np.isnan(low) and not entry.maskable:
                     problems.append(f"dataset '{path}' holds {int(np.isnan(values).sum())} NaN")
                 low = np.nanmin(values) if not np.isnan(values).all() else 0.0
+        if max(abs(float(low)), abs(float(high if np.isfinite(high) else 0))) > FURTHEST:
+            problems.append(f"dataset '{path}' holds values beyond {FURTHEST:g}")
         if entry.minimum is not None and low < entry.minimum:
             problems.append(f"dataset '{path}' goes down to {low:.6g}, below {entry.minimum:g}")
         if entry.ascending and values.size > 1 and not (np.diff(values) > 0).all():
             problems.append(f"dataset '{path}' does not ascend")
-    return problems
+    return problems + [said for rule in schema.rules if (said := rule(data))]
 
 
 def attribute_problems(schema: Schema, attrs: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -232,14 +246,27 @@ def attribute_problems(schema: Schema, attrs: Mapping[str, Mapping[str, Any]]) -
                 )
             elif not _attribute_fits(attr, value):
                 problems.append(
-                    f"attribute '{name}' of '{where}' is {value!r:.80} where a {attr.type} is due"
+                    f"attribute '{name}' of '{where}' is {value!r:.80} where {_due(attr)} is due"
                 )
     return problems
 
 
+def _due(attr: Attr) -> str:
+    """What an attribute may hold, in words."""
+    if attr.pattern is not None:
+        return attr.pattern.replace("|", " or ")
+    some = f"{attr.size} times a " if attr.size not in (None, 1) else "a "
+    least = "" if attr.minimum is None else f" of at least {attr.minimum:g}"
+    return f"{some}{attr.type}{least}"
+
+
 def _attribute_fits(attr: Attr, value: Any) -> bool:
     if attr.type == "text":
-        return isinstance(value, str) and "\0" not in value
+        return (
+            isinstance(value, str)
+            and "\0" not in value
+            and (attr.pattern is None or re.fullmatch(attr.pattern, value) is not None)
+        )
     if attr.type == "flag":
         return isinstance(value, (bool, np.bool_))
     if attr.type == "json":
@@ -251,7 +278,12 @@ def _attribute_fits(attr: Attr, value: Any) -> bool:
     values = np.asarray(value)
     if values.dtype.kind not in "iuf" or values.size == 0 or values.ndim > 2 or values.size > 4096:
         return False
-    return bool(np.isfinite(values).all()) if attr.finite else not np.isnan(values).any()
+    if attr.size is not None and (values.size != attr.size or (attr.size == 1 and values.ndim)):
+        return False
+    if attr.minimum is not None and not (values >= attr.minimum).all():
+        return False
+    known = values if attr.finite else values[~np.isinf(values)]
+    return bool((np.abs(known.astype(float)) <= FURTHEST).all())
 
 
 def plot_attributes(schema: Schema, declared: Declared) -> dict[str, dict[str, Any]]:

@@ -76,6 +76,11 @@ def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefa
         for name in PARTS[part]:
             if name not in artefact.data:
                 raise _lacks(name, path)
+    window, matrix = (artefact.data.get(f"response/{name}") for name in ("window", "F"))
+    if window is not None and matrix is not None and np.prod(window) != matrix.shape[-2]:
+        raise InputError(
+            "has another number of pixels in response/F than in its windows", path, "make it again"
+        )
     return artefact
 
 

@@ -36,17 +36,20 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
         )
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
         note(f"the dictionary was learnt for another system matrix than {system.path.name}")
-    attrs = artefact.attrs["dictionary"]
-    parameters = attrs["parameters"]
-    directions = parameters.get("directions")
-    return Dictionary(
-        atoms=atoms,
-        synthesis=np.asarray(artefact.data.get("dictionary/synthesis", atoms), float),
-        lam=float(attrs["lambda"]),
-        sigma=float(parameters["sigma"]),
-        directions=None if directions is None else int(directions),
-        training=tuple(parameters.get("training", ())),
-    )
+    try:
+        attrs = artefact.attrs["dictionary"]
+        parameters = dict(attrs["parameters"])
+        directions = parameters.get("directions")
+        return Dictionary(
+            atoms=atoms,
+            synthesis=np.asarray(artefact.data.get("dictionary/synthesis", atoms), float),
+            lam=float(attrs["lambda"]),
+            sigma=float(parameters["sigma"]),
+            directions=None if directions is None else int(directions),
+            training=tuple(map(str, parameters.get("training", ()))),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise _nonsense(path, error) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,3 +98,11 @@ def read_unfinished(path: Path, system: LensletMatrix, *, kept: bool) -> Unfinis
         raise InputError(
             f"lacks {error}, which a resumed run needs", path, "start a new dictionary"
         ) from None
+    except (TypeError, ValueError) as error:
+        raise _nonsense(path, error) from None
+
+
+def _nonsense(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"describes itself in a way that makes no sense ({error})", path, "make it again"
+    )

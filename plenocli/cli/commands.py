@@ -16,6 +16,7 @@ COMMANDS = {
     "plan": "inverse",
     "reconstruct": "inverse",
     "refocus": "inverse",
+    "volume": "inverse",
     "score": "evaluation",
     "report": "evaluation",
     "sweep": "sweep",

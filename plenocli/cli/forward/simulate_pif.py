@@ -87,6 +87,14 @@ class _Step(click.ParamType):
     ),
 )
 @click.option(
+    "--calibration",
+    type=options.FILE,
+    help=(
+        "White image and lenslet grid (from calibrate) of a microscope: its objective's pupil is "
+        "measured there, in place of an ideal one."
+    ),
+)
+@click.option(
     "--dtype",
     type=click.Choice(["auto", "float32", "float64"]),
     default="auto",
@@ -115,6 +123,7 @@ def command(
     model: str,
     accuracy: float | None,
     scene: Path | None,
+    calibration: Path | None,
     dtype: str,
     explain: bool,
     workers: int,
@@ -134,6 +143,7 @@ def command(
       plenocli simulate-pif camera.toml --field-nodes auto --accuracy 1e-2 -o field.h5
       plenocli simulate-pif camera.toml --model fresnel --superpixels 1x1 \\
           --coherent-ring 0 -o isolated.h5
+      plenocli simulate-pif microscope.toml --calibration white.h5 -o kernels.h5
     """
     from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 
@@ -150,6 +160,7 @@ def command(
             model=model,
             accuracy=accuracy,
             scene=scene,
+            calibration=calibration,
             dtype=dtype,
         ),
         explain=explain,

@@ -73,7 +73,7 @@ def along_the_grid(
     moved = motion(cut, white, usable, window_shape)
     middle = windows.origin + (np.asarray(window_shape) - 1) / 2
     aside = np.where(lit[..., None], calibration.grid.centres - middle, 0.0)
-    noise = _noise(capture, calibration, cut, white, usable)
+    noise = pixel_noise(capture, calibration, cut, white, usable)
     if np.abs(aside).max(initial=0) > CENTRED or np.abs(moved).max() > CENTRED:
         image = _pasted(white, windows.origin, window_shape, signal.shape)
         places = np.where(lit[..., None], middle + aside, 0.0)
@@ -147,12 +147,18 @@ def motion(
     return np.where(sure, shift, 0.0)
 
 
-def sampled(image: np.ndarray, centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def sampled(
+    image: np.ndarray,
+    centres: np.ndarray,
+    shape: tuple[int, int],
+    step: tuple[float, float] = (1.0, 1.0),
+) -> np.ndarray:
     """Windows of an image about places between its pixels, by quintic splines.
 
     image: (row, column), NaN where a pixel counts for nothing.
     centres: (.., 2) px.
-    shape: (rows, columns) of a window, px.
+    shape: (rows, columns) of a window.
+    step: between its rows and columns, px.
 
     Returns (.., pixel), NaN near pixels that count for nothing and off the image.
     """
@@ -162,7 +168,7 @@ def sampled(image: np.ndarray, centres: np.ndarray, shape: tuple[int, int]) -> n
     if lost.any():
         nearest = distance_transform_edt(lost, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
-    rows, columns = (np.arange(n) - (n - 1) / 2 for n in shape)
+    rows, columns = ((np.arange(n) - (n - 1) / 2) * s for n, s in zip(shape, step))
     place = np.empty((2, *centres.shape[:-1], *shape))
     place[0] = centres[..., 0, None, None] + rows[:, None]
     place[1] = centres[..., 1, None, None] + columns
@@ -238,14 +244,18 @@ def _binned(values: np.ndarray, shape: tuple[int, int], bins: tuple[int, int]) -
     return parts.mean(axis=(-3, -1)).reshape(*values.shape[:-1], -1)
 
 
-def _noise(
+def pixel_noise(
     capture: Capture,
     calibration: Calibration,
     cut: np.ndarray,
     white: np.ndarray,
     usable: np.ndarray,
 ) -> Noise:
-    """Of a pixel: as the capture tells, as the calibration does, else from the capture itself."""
+    """Of a pixel: as the capture tells, as the calibration does, else from the capture itself.
+
+    cut, white: (lenslet_row, lenslet_column, pixel) of the capture and of the white image.
+    usable: like cut.
+    """
     if capture.noise is not None and capture.noise.without_signal > 0:
         return capture.noise
     sensor = calibration.sensor

@@ -43,6 +43,7 @@ class Settings:
     accuracy: relative L2 error of the worst column, None for what the noise lets be seen;
     model: "auto", "ray", "fresnel" or "exact";
     scene: file of the scene that the matrix is for;
+    calibration: file with the white image of a microscope, which shows its pupil;
     lenslet: (row, column) of the array, None for the one on the axis;
     field_nodes: places of the field along an axis whose matrices stand for all lenslets, an odd
         number, "auto" or None for the axis alone;
@@ -56,6 +57,7 @@ class Settings:
     accuracy: float | None = None
     model: str = "auto"
     scene: Path | str | None = None
+    calibration: Path | str | None = None
     lenslet: tuple[int, int] | None = None
     field_nodes: int | Literal["auto"] | None = None
     dtype: str = "auto"
@@ -285,10 +287,17 @@ def run_simulate_pif(
             output,
             accuracy=settings.accuracy,
             model=_model_of_volume(settings),
+            calibration=settings.calibration,
             explain=explain,
             overwrite=overwrite,
             workers=workers,
             command=command,
+        )
+    if settings.calibration is not None:
+        raise UsageError(
+            "measures the pupil of an [objective], which this camera has not",
+            "--calibration",
+            "leave it out",
         )
     camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
@@ -315,7 +324,9 @@ def run_simulate_pif(
 
 def _model_of_volume(settings: Settings) -> str:
     """The model; UsageError where settings ask for what the kernels of a volume do not have."""
-    plain = Settings(accuracy=settings.accuracy, model=settings.model)
+    plain = Settings(
+        accuracy=settings.accuracy, model=settings.model, calibration=settings.calibration
+    )
     for name, value in asdict(settings).items():
         if value != getattr(plain, name):
             option = "--" + ("wavelength" if name == "wavelengths" else name.replace("_", "-"))

@@ -86,6 +86,7 @@ def run_simulate_stack(
     *,
     accuracy: float | None,
     model: str,
+    calibration: Path | str | None = None,
     explain: bool,
     overwrite: bool,
     workers: int,
@@ -97,6 +98,7 @@ def run_simulate_stack(
     output: file to write (.h5), not needed with `explain`.
     accuracy: share of a voxel's light that may be elsewhere.
     model: "auto", "ray" or "fresnel".
+    calibration: with a white image, from which the pupil is measured; None: as described.
     workers: threads.
 
     Raises InputError and ConfigError for the description, UsageError for options, NumericsError
@@ -110,6 +112,8 @@ def run_simulate_stack(
     from plenocli.forward.volume.stack import build_stack
 
     microscope = load_microscope(path)
+    if calibration is not None:
+        microscope = _with_measured_pupil(microscope, calibration)
     optics, plan = planned(microscope, accuracy, model)
     if explain or output is None:
         return _summary(None, plan)
@@ -122,12 +126,32 @@ def run_simulate_stack(
         stack = build_stack(optics, plan, shown.update)
     provenance = Provenance(
         command=command,
-        inputs=describe_inputs({"camera": path}),
+        inputs=describe_inputs({"camera": path, "calibration": calibration}),
         config=microscope_toml(microscope),
         accuracy=stack.accuracy.as_json(),
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
     return _summary(str(output), plan)
+
+
+def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Microscope:
+    """The microscope with the pupil that a white image shows."""
+    from plenocli.files.read.calibrations import read_calibration
+    from plenocli.forward.volume.cameras import optics_of
+    from plenocli.inverse.calibration.pupil_rings import pupil_rings
+    from plenocli.inverse.volume.superpixels import white_superpixel
+
+    optics = optics_of(microscope)
+    white = white_superpixel(read_calibration(calibration, response=False), optics.pixels)
+    found = pupil_rings(white, optics)
+    note(
+        f"the white image shows a pupil that reaches NA {found.aperture:.3g} (correlation "
+        f"{found.alike:.3f} with its picture, {found.described:.3f} with that of the description)"
+    )
+    lens = microscope.objective.model_copy(
+        update={"rings": found.intensity, "numerical_aperture": found.aperture}
+    )
+    return microscope.model_copy(update={"objective": lens})
 
 
 def planned(

@@ -1,0 +1,90 @@
+"""`plenocli volume`: a specimen in three dimensions from one capture."""
+
+from pathlib import Path
+
+import click
+
+from plenocli.cli import options
+
+
+@click.command("volume", short_help="Reconstruct a volume, with error bars, from one capture.")
+@options.input_path("capture")
+@click.option(
+    "--pif",
+    type=options.FILE,
+    required=True,
+    help="Kernels of the volume: simulate-pif of a description with an [objective].",
+)
+@click.option(
+    "--calibration",
+    type=options.FILE,
+    help="Lenslet grid and white image (from calibrate); captures of capture-sim need none.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "rl", "lmmse", "tv", "tikhonov"]),
+    default="auto",
+    show_default=True,
+    help=(
+        "Richardson-Lucy, Gaussian prior with error bars (lmmse), total variation, independent "
+        "voxels (tikhonov); auto takes what predicts held-out pixels best."
+    ),
+)
+@click.option(
+    "--hold-out",
+    type=options.SHARE,
+    default=0.05,
+    show_default=True,
+    help="Share of the pixels that no method sees and by which they are judged, such as 0.05.",
+)
+@click.option(
+    "--background",
+    type=options.NON_NEGATIVE,
+    default=0.0,
+    help="Light without any specimen, in units of the white image (or of the simulation).",
+)
+@options.output
+@options.seed
+@options.mem_limit
+@options.overwrite
+@options.as_json
+@click.pass_context
+def command(
+    ctx: click.Context,
+    capture: Path,
+    *,
+    pif: Path,
+    calibration: Path | None,
+    method: str,
+    hold_out: float,
+    background: float,
+    output: Path,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Make a volume of CAPTURE, seen through a microscope's lenslets. OUT is .h5, or .ome.tif
+    (voxels in micrometres, errors as a second channel), which Fiji opens.
+
+    \b
+    Examples:
+      plenocli simulate-pif microscope.toml -o kernels.h5
+      plenocli volume capture.h5 --pif kernels.h5 -o volume.h5
+      plenocli volume light_field.tif --pif kernels.h5 --calibration grid.h5 \\
+          --method lmmse -o volume.ome.tif
+    """
+    from plenocli.stages.inverse.volume import run_volume
+
+    report = run_volume(
+        capture,
+        output,
+        pif,
+        calibration=calibration,
+        method=method,
+        hold_out=hold_out,
+        background=background,
+        overwrite=overwrite,
+        seed=seed,
+        command=options.command_line(ctx),
+    )
+    options.summary(report.as_json(), as_json, report.line())

@@ -1,0 +1,150 @@
+"""The superpixels of a capture as a volume's kernels have them: whole pixels about lenslets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.base.errors import InputError
+from plenocli.base.text import by
+from plenocli.base.tiling import to_blocks
+from plenocli.forward.sensor.frames import saturated
+from plenocli.forward.sensor.superpixel import extract
+from plenocli.inverse.calibration.calibration import there
+from plenocli.inverse.picture.real_light import above_dark, pixel_noise, sampled
+from plenocli.inverse.volume.measurement import Measurement
+
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
+    from plenocli.inverse.calibration.calibration import Calibration
+
+DIM = 0.05
+"""Of the usual white level, below which a lenslet counts for nothing."""
+
+
+def measured(
+    capture: Capture,
+    shape: tuple[int, int],
+    calibration: Calibration | None = None,
+    *,
+    where: str | Path | None = None,
+    background: float = 0.0,
+) -> Measurement:
+    """Superpixels of a capture, one unit of light the mean level of the white image, or what the
+    capture calls one.
+
+    shape: (rows, columns) of a superpixel in the kernels.
+    calibration: with grid, white and dark, along which real captures are resampled; None: the
+        capture is tiled as it says itself.
+    where: the calibration's file, for messages.
+    background: light without any specimen, in the same unit.
+
+    Raises InputError where sizes disagree or lenslets are missing.
+    """
+    if capture.cfa != "mono":
+        raise InputError(
+            f"has the colour filter array {capture.cfa}; volumes are made of grey captures",
+            capture.metadata.path,
+            "use a monochrome camera",
+        )
+    if calibration is None:
+        found = _tiled(capture, shape)
+    else:
+        found = _resampled(capture, shape, calibration, where)
+    return replace(found, background=background)
+
+
+def white_superpixel(calibration: Calibration, shape: tuple[int, int]) -> np.ndarray:
+    """Mean superpixel (row, column) of the white image, resampled to `shape`.
+
+    Raises InputError where the calibration has no white image.
+    """
+    white = calibration.white
+    if white is None or white.flat is None:
+        raise InputError(
+            "holds no white image", "calibration", "calibrate with one (--white), as measured"
+        )
+    grid = calibration.grid
+    known = sampled(
+        np.where(np.isfinite(white.flat), white.flat, np.nan),
+        grid.centres[grid.valid],
+        shape,
+        _step(calibration, shape),
+    )
+    return np.nan_to_num(np.nanmean(known, axis=0)).reshape(shape)
+
+
+def _step(calibration: Calibration, shape: tuple[int, int]) -> tuple[float, float]:
+    """Pixels of the sensor between those of the kernels (rows, columns)."""
+    rows, columns = (float(p) / n for p, n in zip(calibration.grid.pitch, shape))
+    return rows, columns
+
+
+def _tiled(capture: Capture, shape: tuple[int, int]) -> Measurement:
+    path = capture.metadata.path
+    own = capture.grid.shape if capture.grid else None
+    if own is None:
+        raise InputError(
+            "does not say where its lenslets are",
+            path,
+            "give --calibration (from calibrate) with the white image of this camera",
+        )
+    if tuple(own) != tuple(shape):
+        raise InputError(
+            f"has superpixels of {by(own)} pixels, the kernels {by(shape)}",
+            path,
+            "simulate-pif with the description that the capture was made with",
+        )
+    signal = capture.signal()
+    unit = capture.metadata.electrons_per_unit or 1.0
+    unit *= (capture.levels.gain or 1.0) if capture.units == "DN" else 1.0
+    noise, usable = capture.noise, np.isfinite(signal)
+    if np.isfinite(capture.levels.white):
+        usable &= ~saturated(capture.mosaic, capture.levels.black, capture.levels.white)
+    return Measurement(
+        signal=to_blocks(np.where(usable, signal, 0.0), shape) / unit,
+        read_variance=0.0 if noise is None else noise.without_signal / unit**2,
+        gain=0.0 if noise is None else noise.gain / unit,
+        usable=to_blocks(usable, shape),
+    )
+
+
+def _resampled(
+    capture: Capture, shape: tuple[int, int], calibration: Calibration, where: str | Path | None
+) -> Measurement:
+    grid, white = calibration.grid, calibration.white
+    step = _step(calibration, shape)
+    if max(abs(s - 1) for s in step) > 0.1:
+        raise InputError(
+            f"has lenslets {by(np.round(grid.pitch, 3).tolist())} pixels apart, the kernels "
+            f"{by(shape)} pixels a lenslet",
+            where,
+            "describe the camera with sensor.pixels_per_lenslet as measured, to the nearest pixel",
+        )
+    if white is None or white.level is None or white.superpixels is None:
+        raise InputError("holds no white image", where, "calibrate with one (--white)")
+    signal = above_dark(capture, calibration)
+    if np.isfinite(capture.levels.white):
+        over = saturated(capture.mosaic, capture.levels.black, capture.levels.white)
+        signal = np.where(over, np.nan, signal)
+    cut = sampled(signal, grid.centres, shape, step)
+    level = np.where(grid.valid, white.level, np.nan)
+    usual = float(np.nanmedian(level))
+    lit = np.isfinite(level) & (level > DIM * usual)
+    # lenslets see less towards the corners, which is no property of the specimen
+    even = np.where(lit, level / usual, 1.0)[..., None]
+    windows = there(calibration.windows)
+    raw = extract(signal, windows.origin, windows.shape)
+    seen = np.broadcast_to(white.superpixels, raw.shape)
+    usable = np.isfinite(raw) & np.isfinite(seen) & lit[..., None]
+    noise = pixel_noise(capture, calibration, raw, seen, usable)
+    good = np.isfinite(cut) & lit[..., None]
+    return Measurement(
+        signal=np.where(good, cut, 0.0) / even / usual,
+        read_variance=noise.without_signal / usual**2,
+        gain=noise.gain / usual,
+        usable=good,
+    )

@@ -1,0 +1,150 @@
+"""volume: a specimen in three dimensions from one capture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plenocli.base.errors import UsageError
+from plenocli.base.progress import note
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.forward.volume.stack import Stack
+    from plenocli.inverse.volume.volume import Volume
+
+SUFFIXES = (".h5", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeSummary:
+    """What volume made.
+
+    shape: planes, rows, columns.
+    method: that was taken; tried: (what, misfit of held-out pixels) of all that were tried.
+    explained_db: of the variance of held-out pixels; None where none were held out.
+    held_by_bars: share of them within 95 % bars, by quartile of brightness, darkest first.
+    margin: lenslets from the border on which light is missing.
+    """
+
+    output: str
+    shape: list[int]
+    method: str
+    tried: list[tuple[str, float]]
+    explained_db: float | None
+    held_by_bars: list[float] | None
+    margin: int
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary of --json."""
+        return asdict(self)
+
+    def line(self) -> str:
+        """One sentence for people."""
+        planes, rows, columns = self.shape
+        text = f"{self.output}: {planes} planes of {rows} x {columns} voxels by {self.method}"
+        if self.explained_db is not None and self.held_by_bars is not None:
+            text += (
+                f"; held-out pixels are predicted to {self.explained_db:.1f} dB of their variance, "
+                f"95 % bars hold {min(self.held_by_bars):.0%} to {max(self.held_by_bars):.0%} of "
+                "them by brightness"
+            )
+        return f"{text}; {self.margin} lenslets along the border miss light"
+
+
+def run_volume(
+    capture: Path | str,
+    output: Path | str,
+    pif: Path | str,
+    *,
+    calibration: Path | str | None = None,
+    method: str = "auto",
+    hold_out: float = 0.05,
+    background: float = 0.0,
+    overwrite: bool = False,
+    seed: int = 0,
+    command: str = "",
+) -> VolumeSummary:
+    """Make a volume of one capture and write it.
+
+    capture: mosaic, raw file or capture artefact.
+    output: .h5, or .ome.tif for Fiji and its kin.
+    pif: kernels of kind pif-stack, from simulate-pif.
+    calibration: lenslet grid and white image; a simulated capture needs none.
+    method: "auto", "rl", "lmmse", "tv" or "tikhonov".
+    hold_out: share of the pixels that are put aside to judge by.
+    background: signal without any specimen, in units of white.
+
+    Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
+    """
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.atomic import check_output
+    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.read.calibrations import read_calibration
+    from plenocli.files.results.stacks import read_stack
+    from plenocli.inverse.volume.methods import METHODS, make_volume
+    from plenocli.inverse.volume.superpixels import measured
+
+    output = Path(output)
+    check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
+    if method not in METHODS:
+        raise UsageError(
+            f"there is no method {method!r}", "--method", f"take one of {', '.join(METHODS)}"
+        )
+    stack = read_stack(pif)
+    known = None if calibration is None else read_calibration(calibration, response=False)
+    shot = read_capture(capture)
+    measurement = measured(shot, stack.pixel_shape, known, where=calibration, background=background)
+    rows, columns = measurement.signal.shape[:2]
+    note(
+        f"{rows} x {columns} lenslets, {len(stack.depth)} planes of {stack.point_shape[0]} x "
+        f"{stack.point_shape[1]} voxels a lenslet"
+    )
+    volume = make_volume(
+        measurement,
+        stack.parts(),
+        method=method,
+        hold_out=hold_out,
+        seed=seed,
+        point_shape=stack.point_shape,
+        spacing=float(np.mean(stack.spacing)),
+        depths=tuple(stack.depth.tolist()),
+        model_error=stack.accuracy.estimated or 0.0,
+    )
+    inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
+    provenance = Provenance(
+        command=command, inputs=inputs, seed=seed, accuracy=stack.accuracy.as_json()
+    )
+    _write(output, volume, stack, provenance, overwrite)
+    held = volume.held_out
+    return VolumeSummary(
+        output=str(output),
+        shape=list(volume.value.shape),
+        method=volume.method,
+        tried=[(trial.what, trial.misfit) for trial in volume.trace],
+        explained_db=None if held is None else held.explained_db,
+        held_by_bars=None if held is None else list(held.held_by_bars),
+        margin=volume.margin,
+    )
+
+
+def _write(
+    path: Path, volume: Volume, stack: Stack, provenance: Provenance, overwrite: bool
+) -> None:
+    """The volume as artefact or OME-TIFF."""
+    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.images.tiff_stack import write_ome_tiff
+    from plenocli.files.results.volumes import volume_artefact
+
+    spacing = stack.spacing.mean(axis=0)
+    if path.suffix == ".h5":
+        made = volume_artefact(volume, stack.depth, spacing, stack.point_shape, provenance)
+        write_artefact(path, made, overwrite=overwrite)
+        return
+    rows, columns = spacing.tolist()
+    write_ome_tiff(
+        path, volume.value, volume.sigma, stack.depth, (rows, columns), overwrite=overwrite
+    )

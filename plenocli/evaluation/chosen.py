@@ -14,6 +14,7 @@ from plenocli.evaluation.metrics import (
     response,
     snr,
     spectral,
+    volume,
 )
 from plenocli.evaluation.metrics.figures import Figure
 from plenocli.evaluation.scores import ResultScore
@@ -165,12 +166,13 @@ _HOMES: Mapping[str, tuple[ModuleType, ...]] = {
     "spectra": (spectral,),
     "lightfield": (depth,),
     "calibration": (response,),
+    "volume": (volume,),
 }
 
 
 def every_definition() -> dict[str, str]:
     """What each figure of pictures, spectra and planes means, by its name."""
-    homes = (quality, spectral, snr, classify, classes, expected, depth)
+    homes = (quality, spectral, snr, classify, classes, expected, depth, volume)
     return {name: text for home in homes for name, text in home.DEFINITIONS.items()}
 
 

@@ -42,7 +42,7 @@ class ResultScore:
     """Figures of one result.
 
     name: its file without folder; label: shorter, and no other's in the document.
-    kind: "image", "spectra", "dictionary", "calibration" or "lightfield".
+    kind: "image", "spectra", "dictionary", "calibration", "lightfield" or "volume".
     method: how it was computed, "" where nobody says.
     wavelengths_nm: of its bands; empty for what has none.
     figures: by the names of the DEFINITIONS.

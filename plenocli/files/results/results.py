@@ -13,18 +13,19 @@ from plenocli.base.text import by
 from plenocli.evaluation.response_score import ComparedResponse
 from plenocli.evaluation.results import Result, ToldFigures, WhiteTarget
 from plenocli.files.results.lightfields import lightfield_of
+from plenocli.files.results.volumes import StoredVolume, volume_of
 from plenocli.inverse.lightfield.planes import LightField
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
 
 PICTURES = ("image", "spectra", "dictionary")
-SCORED = (*PICTURES, "calibration", "lightfield")
+SCORED = (*PICTURES, "calibration", "lightfield", "volume")
 """Kinds of artefacts that score compares."""
 _HISTORY = "dictionary/history/"
 
 
-def read_scored(path: Path | str) -> Result | ComparedResponse | LightField:
+def read_scored(path: Path | str) -> Result | ComparedResponse | LightField | StoredVolume:
     """What score compares, from an artefact .h5 or an EXR picture.
 
     Raises InputError for anything else.
@@ -37,6 +38,8 @@ def read_scored(path: Path | str) -> Result | ComparedResponse | LightField:
     artefact = read_artefact(path, SCORED)
     if artefact.kind == "calibration":
         return _response_of(artefact, path)
+    if artefact.kind == "volume":
+        return volume_of(artefact)
     return lightfield_of(artefact) if artefact.kind == "lightfield" else result_of(artefact, path)
 
 

@@ -36,10 +36,18 @@ def read_stack(path: Path | str) -> Stack:
 
     Raises InputError for another file, or one whose parts do not fit together.
     """
-    from plenocli.base.errors import InputError
     from plenocli.files.artefacts.container import read_artefact
 
-    artefact = read_artefact(path, "pif-stack")
+    return stack_of(read_artefact(path, "pif-stack"), path)
+
+
+def stack_of(artefact: "Artefact", path: Path | str) -> Stack:
+    """The kernels that an artefact holds; `path`: its file, for messages.
+
+    Raises InputError where its parts do not fit together.
+    """
+    from plenocli.base.errors import InputError
+
     data = artefact.data
     pixels, points = (tuple(data[f"stack/{n}_shape"].tolist()) for n in ("pixel", "point"))
     plane = data["stack/plane"]

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.evaluation.metrics.volume import VolumeScore, score_volume
+
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance
@@ -28,6 +30,23 @@ class StoredVolume:
     depth: np.ndarray
     spacing: tuple[float, float]
     facts: dict[str, Any]
+
+    @property
+    def step(self) -> float:
+        """m between planes; of a single one, between its rows."""
+        return float(np.mean(np.diff(self.depth))) if len(self.depth) > 1 else self.spacing[0]
+
+    @property
+    def method(self) -> str | None:
+        """That made it; None where it is known, not made."""
+        return self.facts.get("method")
+
+    @property
+    def border(self) -> tuple[int, int]:
+        """Voxels (rows, columns) along the border whose light is not all seen."""
+        margin = int(self.facts.get("margin", 0))
+        rows, columns = (int(n) for n in self.facts.get("point_shape", (1, 1)))
+        return margin * rows, margin * columns
 
 
 def truth_artefact(
@@ -112,4 +131,28 @@ def volume_of(artefact: Artefact) -> StoredVolume:
         spacing=(rows, columns),
         facts=artefact.attrs.get("volume", {})
         | {f"held_out.{name}": value for name, value in held.items()},
+    )
+
+
+def score_stored(volume: StoredVolume, truth: np.ndarray) -> VolumeScore:
+    """Figures of a volume against a known one, (plane, row, column), without its border.
+
+    Raises InputError where they differ in size or are the same everywhere.
+    """
+    if volume.value.shape != truth.shape:
+        return score_volume(volume.value, truth, (1.0, 1.0, 1.0))
+    rows, columns = volume.border
+    size = truth.shape
+    inner = (
+        slice(None),
+        slice(rows, size[1] - rows) if 2 * rows < size[1] else slice(None),
+        slice(columns, size[2] - columns) if 2 * columns < size[2] else slice(None),
+    )
+    return score_volume(
+        volume.value[inner],
+        truth[inner],
+        (volume.step, *volume.spacing),
+        sigma=None if volume.sigma is None else volume.sigma[inner],
+        held_out_db=volume.facts.get("held_out.explained_db"),
+        held_out_coverage=volume.facts.get("held_out.held_by_bars"),
     )

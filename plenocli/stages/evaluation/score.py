@@ -40,6 +40,7 @@ from plenocli.files.results.results import (
     read_whites,
 )
 from plenocli.files.results.truths import CHART, read_labels, read_truth
+from plenocli.files.results.volumes import StoredVolume, read_volume, score_stored
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.stages.evaluation.expected import run_expected
 
@@ -304,6 +305,8 @@ def _score_one(path: Path | str, comparison: _Comparison) -> _Scored:
     found = read_scored(path)
     if isinstance(found, ComparedResponse):
         return _score_calibration(found, comparison)
+    if isinstance(found, StoredVolume):
+        return _score_volume(path, found, comparison)
     if isinstance(found, LightField):
         return _score_planes(path, found, comparison)
     if found.kind == "dictionary":
@@ -354,6 +357,31 @@ def _score_planes(path: Path | str, field: LightField, comparison: _Comparison) 
         raise error if error.where else error.at(path) from None
     return _Scored(
         score=ResultScore(name=Path(path).name, kind="lightfield", figures=figures(score))
+    )
+
+
+def _score_volume(path: Path | str, volume: StoredVolume, comparison: _Comparison) -> _Scored:
+    """A volume against the one that is known, without the lenslets along its border that miss
+    light.
+    """
+    if comparison.truth is None:
+        raise UsageError(
+            "the truth is missing",
+            path,
+            "name the volume to compare with, as capture-sim --scene-out writes it",
+        )
+    truth = read_volume(comparison.truth)
+    try:
+        score = score_stored(volume, truth.value)
+    except InputError as error:
+        raise error if error.where else error.at(path) from None
+    return _Scored(
+        score=ResultScore(
+            name=Path(path).name,
+            kind="volume",
+            method=volume.method or "",
+            figures=figures(score),
+        )
     )
 
 

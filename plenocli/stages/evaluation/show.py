@@ -237,6 +237,20 @@ def _fit(file: _File, choice: _Choice) -> Figures:
     return fit_figures(names, *(stored.data[f"fit/{part}"] for part in parts))
 
 
+def _kernels(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.stacks import stack_of
+    from plenocli.report.volumes import kernel_figures
+
+    return kernel_figures(stack_of(file.stored(), file.path), file.path.name)
+
+
+def _volume(file: _File, choice: _Choice) -> Figures:
+    from plenocli.files.results.volumes import volume_of
+    from plenocli.report.volumes import volume_figures
+
+    return volume_figures(volume_of(file.stored()), file.path.name)
+
+
 _FIGURES = {
     "pif": _pif,
     "capture": _capture,
@@ -248,6 +262,8 @@ _FIGURES = {
     "sweep": _sweep,
     "lightfield": _lightfield,
     "fit": _fit,
+    "pif-stack": _kernels,
+    "volume": _volume,
 }
 
 

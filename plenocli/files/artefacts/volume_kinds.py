@@ -8,15 +8,16 @@ _GRID = (
         "plane",
         "f",
         "m",
-        "of each plane from the focused one, away from the objective",
+        "of each plane from the focused one, away from the objective; of a photographic camera "
+        "from its main lens",
         ascending=True,
     ),
     dataset(
         "volume/spacing",
-        "2",
+        "plane 2",
         "f",
         "m",
-        "between voxels of the focused plane (rows, columns)",
+        "between voxels (rows, columns)",
         minimum=0,
     ),
 )
@@ -58,7 +59,8 @@ PIF_STACK = Schema(
             "plane",
             "f",
             "m",
-            "of each plane from the focused one, away from the objective",
+            "of each plane from the focused one, away from the objective; of a photographic camera "
+            "from its main lens",
             ascending=True,
         ),
         dataset("stack/spacing", "plane 2", "f", "m", "between voxels (rows, columns)", minimum=0),

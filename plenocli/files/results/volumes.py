@@ -21,7 +21,7 @@ class StoredVolume:
     """What a file says of a volume.
 
     value: (plane, row, column); sigma: likewise, or None.
-    depth: (plane,) m; spacing: (rows, columns) m.
+    depth: (plane,) m; spacing: (rows, columns) m, mean over planes.
     facts: name of an attribute -> its value, those of held-out pixels with "held_out." before them.
     """
 
@@ -54,7 +54,7 @@ def truth_artefact(
 ) -> Artefact:
     """The artefact of a volume that is known.
 
-    value: (plane, row, column); depth: (plane,) m; spacing: (rows, columns) m.
+    value: (plane, row, column); depth: (plane,) m; spacing: (plane, 2) m, rows and columns.
     """
     from plenocli.files.artefacts.container import Artefact
 
@@ -75,7 +75,7 @@ def volume_artefact(
 ) -> Artefact:
     """The artefact of a volume that was made from a capture.
 
-    depth: (plane,) m; spacing: (rows, columns) m; point_shape: voxels of a lenslet.
+    depth: (plane,) m; spacing: (plane, 2) m; point_shape: voxels of a lenslet.
     """
     made = truth_artefact(volume.value, depth, spacing, provenance)
     if volume.sigma is not None:
@@ -122,7 +122,7 @@ def read_volume(path: Path | str) -> StoredVolume:
 
 def volume_of(artefact: Artefact) -> StoredVolume:
     """What an artefact of kind volume holds."""
-    rows, columns = artefact.data["volume/spacing"].tolist()
+    rows, columns = artefact.data["volume/spacing"].mean(axis=0).tolist()
     held = artefact.attrs.get("held_out", {})
     return StoredVolume(
         value=artefact.data["volume/value"],

@@ -6,48 +6,22 @@ away from the objective.
 """
 
 import math
-import re
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 
 from plenocli.base.quantities import Length, Pair, Section, SignedLength, Unit
-from plenocli.base.units import format_length, parse_length
+from plenocli.base.units import format_length
 from plenocli.forward.camera.model import Aberration, Light, Sensor
-
-MOST_PLANES = 1000
-"""Planes of a volume."""
-Samples = Annotated[int, Field(ge=1, le=64)]
-Index = Annotated[float, Field(ge=1.0, le=5.0)]
-_RANGE = re.compile(r"\s*(\S+ ?\S+)\s+to\s+(\S+ ?\S+)\s+step\s+(\S+ ?\S+)\s*")
-
-
-def _planes(value: Any) -> Any:
-    """The planes of "-12 um to 12 um step 1 um" as a list; what is no text stays."""
-    if not isinstance(value, str):
-        return value
-    found = _RANGE.fullmatch(value)
-    if found is None:
-        raise ValueError(
-            f'{value!r} is no range of planes; write for example "-12 um to 12 um step 1 um", or a '
-            'list such as ["-5 um", "0 um", "5 um"]'
-        )
-    start, end, step = (parse_length(part) for part in found.groups())
-    if not step > 0 or end < start:
-        raise ValueError(f"{value!r} must rise in steps above 0")
-    count = math.floor((end - start) / step * (1 + 1e-12) + 1e-9) + 1
-    if count > MOST_PLANES:
-        raise ValueError(f"{value!r} has {count} planes; at most {MOST_PLANES} are possible")
-    # a plane in focus is at 0, not a rounding error away
-    depths = (round(start / step + i, 9) * step for i in range(count))
-    return [format_length(depth) for depth in depths]
-
+from plenocli.forward.camera.planes import MOST_PLANES, planes_of
 
 Planes = Annotated[
     tuple[SignedLength, ...],
     Field(min_length=1, max_length=MOST_PLANES),
-    BeforeValidator(_planes),
+    BeforeValidator(planes_of),
 ]
+Samples = Annotated[int, Field(ge=1, le=64)]
+Index = Annotated[float, Field(ge=1.0, le=5.0)]
 
 
 class Objective(Section):

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from plenocli.base.errors import ConfigError
 from plenocli.base.quantities import (
@@ -39,6 +46,7 @@ from plenocli.base.quantities import (
 from plenocli.base.text import by
 from plenocli.base.toml import violations
 from plenocli.base.units import UnitError, format_length, parse_length, parse_wavelength
+from plenocli.forward.camera.planes import MOST_PLANES, planes_of
 from plenocli.forward.camera.plausible import Lengths, implausible
 from plenocli.forward.camera.quadrature import Disc
 
@@ -225,8 +233,29 @@ class MainLens(Section):
 
 
 class Object(Section):
+    """What is before the camera.
+
+    planes: distances, rising, of the planes of a volume that is looked for, a list or
+        "380 mm to 420 mm step 5 mm"; without them all stands at `distance`, which is in focus.
+    """
+
     distance: Length
     samples_per_lenslet: Pair = (40, 40)
+    planes: (
+        Annotated[
+            tuple[Length, ...],
+            Field(min_length=1, max_length=MOST_PLANES),
+            BeforeValidator(planes_of),
+        ]
+        | None
+    ) = None
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        planes = self.planes or ()
+        if any(b <= a for a, b in zip(planes, planes[1:])):
+            raise ValueError("planes must rise without repetition")
+        return self
 
 
 class LensletArray(Section):

@@ -1,10 +1,14 @@
-"""The optics of a volume, of a microscope or of a photographic camera with planes."""
+"""The optics of a volume, before a microscope or a photographic camera."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.microscope import Microscope
+from plenocli.forward.camera.model import Camera
 from plenocli.forward.volume.optics import Term, VolumeOptics
 
 
@@ -30,8 +34,66 @@ def optics_of(camera: Microscope) -> VolumeOptics:
         pixels=sensor.pixels_per_lenslet,
         pixel_width=math.sqrt(sensor.pixel_fill_factor),
         depths=camera.object.planes,
+        places=camera.object.planes,
+        scales=(1.0,) * len(camera.object.planes),
         apodised=True,
         rings=lens.rings,
         mismatch=mismatch,
+        terms=tuple(Term(noll=t.noll, coefficient=t.coefficient) for t in lens.aberrations),
+    )
+
+
+def optics_of_camera(camera: Camera) -> VolumeOptics:
+    """A photographic camera with [object] planes, as a thin lens at its design wavelength.
+
+    A point at distance z1 is behind the lens in focus 1/z1 = 1/f - 1/z2 - eps: its wave at the
+    lenslets is that of a point z2^2 eps away from focus, paraxially, seen through a pupil z2 away.
+
+    Raises ConfigError for lenslets and pupils whose light is not separable or not round.
+    """
+    lens, array, sensor, z2 = (
+        camera.main_lens,
+        camera.lenslet_array,
+        camera.sensor,
+        camera.lenslet_array.distance,
+    )
+    if (array.lattice, array.aperture_shape) != ("square", "square"):
+        raise ConfigError(
+            "volumes are computed behind square lenslets on a square lattice",
+            "lenslet_array",
+            "leave [object] planes out",
+        )
+    if lens.aperture_shape != "circle" or camera.filter_array is not None:
+        raise ConfigError(
+            "volumes are computed through a clear round pupil",
+            "main_lens.aperture_shape",
+            "leave [object] planes out",
+        )
+    if lens.prescription is not None or lens.wavefront is not None or lens.field:
+        raise ConfigError(
+            "volumes are computed for a thin lens with Zernike terms",
+            "main_lens",
+            "leave prescription, wavefront and field out",
+        )
+    planes = camera.object.planes
+    if planes is None:
+        raise ConfigError("has no planes", "object", 'add planes = "380 mm to 420 mm step 10 mm"')
+    out_of_focus = (1 / lens.focal_length - 1 / np.array(planes) - 1 / z2) * z2**2
+    return VolumeOptics(
+        wavelength=camera.light.design_wavelength,
+        aperture=lens.aperture_diameter / 2 / z2,
+        index=math.inf,
+        magnification=1.0,
+        pitch=array.pitch,
+        open_width=array.pitch * math.sqrt(array.fill_factor),
+        focal_length=array.focal_length,
+        sensor_distance=sensor.distance,
+        pupil_distance=z2,
+        pixels=sensor.pixels_per_lenslet,
+        pixel_width=math.sqrt(sensor.pixel_fill_factor),
+        depths=tuple(out_of_focus.tolist()),
+        places=planes,
+        scales=tuple(plane / z2 for plane in planes),
+        apodised=False,
         terms=tuple(Term(noll=t.noll, coefficient=t.coefficient) for t in lens.aberrations),
     )

@@ -44,6 +44,8 @@ class VolumeOptics:
     pixels: (rows, columns) of a superpixel.
     pixel_width: share of the pixel pitch that senses light, along an axis.
     depths: (plane,) m, effective: phases are k depth (sqrt(index^2 - s^2) - index).
+    places: (plane,) m as they are named: the depths, or distances from a main lens.
+    scales: (plane,) size of a lenslet's image there over that in the focused plane.
     apodised: whether the amplitude rises as a lens with Abbe's sine condition makes it.
     rings: intensity over the pupil at equal steps of s from its middle to its edge, relative; empty
         where it follows `apodised`.
@@ -63,6 +65,8 @@ class VolumeOptics:
     pixels: tuple[int, int]
     pixel_width: float
     depths: tuple[float, ...]
+    places: tuple[float, ...]
+    scales: tuple[float, ...]
     apodised: bool
     rings: tuple[float, ...] = ()
     mismatch: tuple[float, float] | None = None

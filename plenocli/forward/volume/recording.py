@@ -36,7 +36,8 @@ def finer(
     optics: with the planes that are inverted.
     samples: voxels (rows, columns) of a lenslet that are inverted.
     """
-    fine = replace(optics, depths=fine_depths(optics.depths, refine))
+    depths = fine_depths(optics.depths, refine)
+    fine = replace(optics, depths=depths, places=depths, scales=(1.0,) * len(depths))
     many = (samples[0] * refine, samples[1] * refine)
     # a voxel is a box: points of the finer ones stand for it
     box = max(1, round(2 / refine))

@@ -30,7 +30,8 @@ class Stack:
     A: (entry, pixel, point) float32, share of a voxel's light that lands on a pixel.
     plane: (entry,) number of the plane; ascending.
     lenslet_offset: (entry, 2) superpixel (row, column) relative to the voxel's own lenslet.
-    depth: (plane,) m from the focused plane, away from the objective.
+    depth: (plane,) m from the focused plane, away from the objective; of a photographic camera
+        from its main lens.
     spacing: (plane, 2) m between voxels (rows, columns).
     pixel_shape, point_shape: pixels of a superpixel, voxels of a lenslet (rows, columns).
     wavelength: m.
@@ -94,8 +95,8 @@ def build_stack(
         A=np.concatenate([kernels for kernels, _ in planes]),
         plane=np.repeat(np.arange(len(planes)), [len(kernels) for kernels, _ in planes]),
         lenslet_offset=np.concatenate([offsets for _, offsets in planes]),
-        depth=np.array(optics.depths),
-        spacing=np.tile([pitch / rows, pitch / columns], (len(planes), 1)),
+        depth=np.array(optics.places),
+        spacing=np.outer(optics.scales, [pitch / rows, pitch / columns]),
         pixel_shape=optics.pixels,
         point_shape=plan.samples,
         wavelength=optics.wavelength,

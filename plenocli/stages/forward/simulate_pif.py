@@ -281,10 +281,13 @@ def run_simulate_pif(
 
     if not explain:
         _require_output(camera_path, output, overwrite)
-    if describes_microscope(camera_path):
+    microscope = describes_microscope(camera_path)
+    camera = None if microscope else read_camera(camera_path)
+    if camera is None or camera.object.planes is not None:
         return run_simulate_stack(
             camera_path,
             output,
+            camera=camera,
             accuracy=settings.accuracy,
             model=_model_of_volume(settings),
             calibration=settings.calibration,
@@ -299,7 +302,6 @@ def run_simulate_pif(
             "--calibration",
             "leave it out",
         )
-    camera = read_camera(camera_path)
     needs = read_needs(settings.scene, camera) if settings.scene else None
     planes = _planes(camera, settings, needs)
     field = _field(camera, settings, needs)
@@ -331,7 +333,7 @@ def _model_of_volume(settings: Settings) -> str:
         if value != getattr(plain, name):
             option = "--" + ("wavelength" if name == "wavelengths" else name.replace("_", "-"))
             raise UsageError(
-                "does not go with an [objective], whose planes, voxels and wavelength are in its "
+                "does not go with the planes of a volume, whose voxels and wavelength are in the "
                 "description",
                 option,
                 "leave it out",

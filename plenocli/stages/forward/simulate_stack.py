@@ -1,4 +1,4 @@
-"""simulate-pif of a microscope: the kernels of a volume."""
+"""simulate-pif of a microscope, or of a camera with planes: the kernels of a volume."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from plenocli.base.text import by
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.microscope import Microscope
+    from plenocli.forward.camera.model import Camera
     from plenocli.forward.volume.optics import VolumeOptics
     from plenocli.forward.volume.plan import VolumePlan
 
@@ -84,6 +85,7 @@ def run_simulate_stack(
     path: Path | str,
     output: Path | str | None,
     *,
+    camera: Camera | None = None,
     accuracy: float | None,
     model: str,
     calibration: Path | str | None = None,
@@ -92,9 +94,10 @@ def run_simulate_stack(
     workers: int,
     command: str,
 ) -> StackSummary:
-    """Compute the kernels of a microscope's volume and write them.
+    """Compute the kernels of a volume and write them.
 
-    path: description with an [objective].
+    path: description with an [objective], or of a photographic camera with [object] planes.
+    camera: the latter, read; None: the former.
     output: file to write (.h5), not needed with `explain`.
     accuracy: share of a voxel's light that may be elsewhere.
     model: "auto", "ray" or "fresnel".
@@ -107,14 +110,28 @@ def run_simulate_stack(
     from plenocli.base.budget import Budget, budget, within
     from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.config.camera_file import to_toml
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.files.results.stacks import stack_artefact
+    from plenocli.forward.volume.cameras import optics_of, optics_of_camera
     from plenocli.forward.volume.stack import build_stack
 
-    microscope = load_microscope(path)
-    if calibration is not None:
-        microscope = _with_measured_pupil(microscope, calibration)
-    optics, plan = planned(microscope, accuracy, model)
+    if camera is None:
+        microscope = load_microscope(path)
+        if calibration is not None:
+            microscope = _with_measured_pupil(microscope, calibration)
+        config, samples = microscope_toml(microscope), microscope.object.samples_per_lenslet
+        optics = optics_of(microscope)
+    elif calibration is None:
+        config, samples = to_toml(camera), camera.object.samples_per_lenslet
+        optics = optics_of_camera(camera)
+    else:
+        raise UsageError(
+            "measures the pupil of an [objective], which this camera has not",
+            "--calibration",
+            "leave it out",
+        )
+    plan = planned(optics, samples, accuracy, model)
     if explain or output is None:
         return _summary(None, plan)
     if plan.seconds > LONG:
@@ -127,7 +144,7 @@ def run_simulate_stack(
     provenance = Provenance(
         command=command,
         inputs=describe_inputs({"camera": path, "calibration": calibration}),
-        config=microscope_toml(microscope),
+        config=config,
         accuracy=stack.accuracy.as_json(),
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
@@ -155,13 +172,12 @@ def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Mic
 
 
 def planned(
-    microscope: Microscope, accuracy: float | None, model: str
-) -> tuple[VolumeOptics, VolumePlan]:
-    """Optics and plan of a microscope's volume.
+    optics: VolumeOptics, samples: tuple[int, int], accuracy: float | None, model: str
+) -> VolumePlan:
+    """The plan of a volume with `samples` voxels (rows, columns) a lenslet.
 
     Raises UsageError for a model that volumes do not have, NumericsError as plan_volume.
     """
-    from plenocli.forward.volume.cameras import optics_of
     from plenocli.forward.volume.plan import plan_volume
 
     if model == "exact":
@@ -170,14 +186,12 @@ def planned(
             "--model",
             "take ray, fresnel or auto",
         )
-    optics = optics_of(microscope)
-    plan = plan_volume(
+    return plan_volume(
         optics,
-        microscope.object.samples_per_lenslet,
+        samples,
         accuracy=DEFAULT_ACCURACY if accuracy is None else accuracy,
         model=model,
     )
-    return optics, plan
 
 
 def _summary(output: str | None, plan: VolumePlan) -> StackSummary:

@@ -46,8 +46,9 @@ def run_volume_capture(
     from plenocli.files.atomic import check_output, together
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.files.images.mosaic import write_capture
+    from plenocli.forward.volume.cameras import optics_of
     from plenocli.forward.volume.recording import finer, record
-    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY, planned
+    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
 
     _require_taken(settings)
     file = None if volume.startswith("phantom:") else volume
@@ -55,7 +56,7 @@ def run_volume_capture(
     if scene_out:
         check_output(scene_out, overwrite=overwrite, inputs=[path, file, output])
     microscope = load_microscope(path)
-    coarse, _ = planned(microscope, settings.accuracy, settings.model)
+    coarse = optics_of(microscope)
     specimen = _specimen(volume, microscope, coarse, settings.seed)
     samples = microscope.object.samples_per_lenslet
     optics, plan = finer(
@@ -115,7 +116,7 @@ def write_volume(
         rows, columns = spacing
         write_ome_tiff(path, value, None, depth, (rows, columns), overwrite=overwrite)
         return
-    artefact = truth_artefact(value, depth, np.array(spacing), provenance)
+    artefact = truth_artefact(value, depth, np.tile(spacing, (len(depth), 1)), provenance)
     write_artefact(path, artefact, overwrite=overwrite)
 
 

@@ -139,12 +139,11 @@ def _write(
     from plenocli.files.images.tiff_stack import write_ome_tiff
     from plenocli.files.results.volumes import volume_artefact
 
-    spacing = stack.spacing.mean(axis=0)
     if path.suffix == ".h5":
-        made = volume_artefact(volume, stack.depth, spacing, stack.point_shape, provenance)
+        made = volume_artefact(volume, stack.depth, stack.spacing, stack.point_shape, provenance)
         write_artefact(path, made, overwrite=overwrite)
         return
-    rows, columns = spacing.tolist()
+    rows, columns = stack.spacing.mean(axis=0).tolist()
     write_ome_tiff(
         path, volume.value, volume.sigma, stack.depth, (rows, columns), overwrite=overwrite
     )

@@ -1,20 +1,25 @@
 """Volumes through their files: kernels, captures, OME-TIFF."""
 
 import xml.etree.ElementTree as tree
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import tifffile
+from PIL import Image
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_ome_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
+from plenocli.stages.evaluation.score import run_score
 from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
+from plenocli.stages.inverse.volume import run_volume
 
 MICROSCOPE = """
 [objective]
@@ -137,6 +142,69 @@ def test_a_photographic_camera_has_no_volume(tmp_path):
         run_capture_sim(
             "sample_configs/tiny.toml", tmp_path / "a.h5", Capture(), volume="phantom:beads"
         )
+
+
+@pytest.fixture(scope="module")
+def seen(camera, tmp_path_factory):
+    """Folder with kernels, a capture simulated twice finer, and its truth."""
+    folder = tmp_path_factory.mktemp("seen")
+    run_simulate_pif(camera, folder / "stack.h5", Settings(accuracy=2e-2))
+    run_capture_sim(
+        camera,
+        folder / "capture.h5",
+        Capture(snr_db=40, refine=2, accuracy=2e-2, seed=4),
+        volume="phantom:beads",
+        scene_out=folder / "truth.h5",
+    )
+    return folder
+
+
+@pytest.mark.parametrize("method", ["auto", "rl", "lmmse", "tv", "tikhonov"])
+def test_a_specimen_comes_back_and_says_how_well(seen, tmp_path, method):
+    report = run_volume(seen / "capture.h5", tmp_path / "v.h5", seen / "stack.h5", method=method)
+    score = run_score([tmp_path / "v.h5"], tmp_path / "s.json", truth=seen / "truth.h5").results[0]
+    assert report.shape == [3, 14, 12] and score.kind == "volume"
+    assert score.figures["volume_correlation"] > 0.75 and score.figures["volume_snr_db"] > 3
+    assert score.figures["held_out_db"] == pytest.approx(report.explained_db)
+    assert report.explained_db > 8
+    again = run_volume(seen / "capture.h5", tmp_path / "w.h5", seen / "stack.h5", method=method)
+    assert again.explained_db == report.explained_db
+    found, same = (read_volume(tmp_path / f"{n}.h5") for n in "vw")
+    assert np.array_equal(found.value, same.value)
+    if method == "auto":
+        assert {what for what, _ in report.tried} >= {"rl", "lmmse", "tv"}
+
+
+def test_a_volume_for_fiji_has_its_errors_beside_it(seen, tmp_path):
+    run_volume(seen / "capture.h5", tmp_path / "v.ome.tif", seen / "stack.h5", method="lmmse")
+    run_volume(seen / "capture.h5", tmp_path / "v.h5", seen / "stack.h5", method="lmmse")
+    stored, stack = read_volume(tmp_path / "v.h5"), read_tiff_volume(tmp_path / "v.ome.tif")
+    assert np.array_equal(stack.value, stored.value) and stack.step == pytest.approx(4e-6)
+    with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
+        assert np.array_equal(file.asarray()[1], stored.sigma)
+
+
+def test_a_capture_of_another_camera_is_refused(seen, tmp_path):
+    with pytest.raises(InputError, match="lenslets"):
+        Image.fromarray(np.full((40, 40), 9, np.uint8)).save(tmp_path / "a.png")
+        run_volume(tmp_path / "a.png", tmp_path / "v.h5", seen / "stack.h5")
+    assert not (tmp_path / "v.h5").exists()
+
+
+def test_a_photographic_camera_with_planes_has_kernels(tmp_path):
+    """The plane in focus lights its own superpixel; planes away from it light several."""
+    text = Path("sample_configs/tiny.toml").read_text()
+    text = text.replace('distance = "550 mm"', 'distance = "550 mm"\nplanes = ["450 mm", "550 mm"]')
+    text = text.replace("samples_per_lenslet = [8, 8]", "samples_per_lenslet = [2, 2]")
+    (tmp_path / "camera.toml").write_text(text)
+    run_simulate_pif(tmp_path / "camera.toml", tmp_path / "stack.h5", Settings(accuracy=2e-2))
+    stack = read_stack(tmp_path / "stack.h5")
+    own = [
+        kernels[(offsets == 0).all(1)].sum() / kernels.sum() for kernels, offsets in stack.parts()
+    ]
+    assert own[1] > 0.6 > 0.2 > own[0]
+    assert np.allclose(stack.depth, [0.45, 0.55])
+    assert stack.spacing[1, 0] / stack.spacing[0, 0] == pytest.approx(0.55 / 0.45)
 
 
 def test_ome_tiff_is_what_another_reader_reads(tmp_path):

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.volume.stack import Stack
+    from plenocli.inverse.volume.measurement import Measurement, Problem
     from plenocli.inverse.volume.volume import Volume
 
 SUFFIXES = (".h5", ".tif", ".tiff")
@@ -85,15 +85,11 @@ def run_volume(
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
-    from plenocli.inverse.volume.methods import METHODS, make_volume
+    from plenocli.inverse.volume.choose import volume_of
     from plenocli.inverse.volume.superpixels import measured
 
     output = Path(output)
     check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
-    if method not in METHODS:
-        raise UsageError(
-            f"there is no method {method!r}", "--method", f"take one of {', '.join(METHODS)}"
-        )
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
     shot = read_capture(capture)
@@ -103,17 +99,8 @@ def run_volume(
         f"{rows} x {columns} lenslets, {len(stack.depth)} planes of {stack.point_shape[0]} x "
         f"{stack.point_shape[1]} voxels a lenslet"
     )
-    volume = make_volume(
-        measurement,
-        stack.parts(),
-        method=method,
-        hold_out=hold_out,
-        seed=seed,
-        point_shape=stack.point_shape,
-        spacing=float(np.mean(stack.spacing)),
-        depths=tuple(stack.depth.tolist()),
-        model_error=stack.accuracy.estimated or 0.0,
-    )
+    problem = _problem(stack, measurement, hold_out, seed, pif)
+    volume = volume_of(problem, method)
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
     provenance = Provenance(
         command=command, inputs=inputs, seed=seed, accuracy=stack.accuracy.as_json()
@@ -129,6 +116,34 @@ def run_volume(
         held_by_bars=None if held is None else list(held.held_by_bars),
         margin=volume.margin,
     )
+
+
+def _problem(
+    stack: Stack, measurement: Measurement, hold_out: float, seed: int, pif: Path | str
+) -> Problem:
+    """The measurement before the map that the kernels make of it.
+
+    Raises NumericsError where memory does not suffice.
+    """
+    from plenocli.base.budget import budget
+    from plenocli.base.linear_maps import BlockCirculant, torus_for
+    from plenocli.inverse.volume.measurement import Problem, Voxels
+
+    rows, columns, pixels = measurement.signal.shape
+    torus = torus_for((rows, columns), stack.reach)
+    unknowns = len(stack.depth) * stack.A.shape[2]
+    budget().require(
+        BlockCirculant.needed(pixels, unknowns, torus),
+        f"the map of {rows} x {columns} lenslets",
+        pif,
+        "take fewer planes or voxels",
+    )
+    op = BlockCirculant(stack.parts(), (rows, columns), torus)
+    pitch = float(np.mean(stack.spacing))
+    # layers of a photographic camera are told apart by parallax, not by their distance
+    depths = tuple((stack.depth - stack.depth[0]).tolist())
+    voxels = Voxels(point_shape=stack.point_shape, pitch=pitch, depths=depths)
+    return Problem(op, measurement, voxels, hold_out, seed)
 
 
 def _write(

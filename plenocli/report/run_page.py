@@ -75,7 +75,7 @@ def _best_spectra(files: Sequence[RunFile]) -> list[tuple[str, str]]:
 
 def _add_refocused(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str | None:
     """The section about refocused captures; returns its name, or None where there are none."""
-    from plenocli.report.planes import lightfield_figures
+    from plenocli.report.depth.planes import lightfield_figures
 
     found = run.of_kind("lightfield")
     if not found:

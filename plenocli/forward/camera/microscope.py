@@ -10,10 +10,17 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 
-from plenocli.base.quantities import Length, Pair, Section, SignedLength, Unit
+from plenocli.base.quantities import (
+    MOST_PLANES,
+    Length,
+    Pair,
+    Section,
+    SignedLength,
+    Unit,
+    planes_of,
+)
 from plenocli.base.units import format_length
 from plenocli.forward.camera.model import Aberration, Light, Sensor
-from plenocli.forward.camera.planes import MOST_PLANES, planes_of
 
 Planes = Annotated[
     tuple[SignedLength, ...],

@@ -22,6 +22,7 @@ from pydantic import (
 
 from plenocli.base.errors import ConfigError
 from plenocli.base.quantities import (
+    MOST_PLANES,
     Digits,
     Duration,
     ElectronRate,
@@ -41,12 +42,12 @@ from plenocli.base.quantities import (
     Temperature,
     Unit,
     Wavelength,
+    planes_of,
     quantity,
 )
 from plenocli.base.text import by
 from plenocli.base.toml import violations
 from plenocli.base.units import UnitError, format_length, parse_length, parse_wavelength
-from plenocli.forward.camera.planes import MOST_PLANES, planes_of
 from plenocli.forward.camera.plausible import Lengths, implausible
 from plenocli.forward.camera.quadrature import Disc
 

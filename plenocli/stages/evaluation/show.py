@@ -223,7 +223,7 @@ def _sweep(file: _File, choice: _Choice) -> Figures:
 
 def _lightfield(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.lightfields import lightfield_of
-    from plenocli.report.planes import lightfield_figures
+    from plenocli.report.depth.planes import lightfield_figures
 
     return lightfield_figures(lightfield_of(file.stored()))
 
@@ -239,14 +239,14 @@ def _fit(file: _File, choice: _Choice) -> Figures:
 
 def _kernels(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.stacks import stack_of
-    from plenocli.report.volumes import kernel_figures
+    from plenocli.report.depth.volumes import kernel_figures
 
     return kernel_figures(stack_of(file.stored(), file.path), file.path.name)
 
 
 def _volume(file: _File, choice: _Choice) -> Figures:
     from plenocli.files.results.volumes import volume_of
-    from plenocli.report.volumes import volume_figures
+    from plenocli.report.depth.volumes import volume_figures
 
     return volume_figures(volume_of(file.stored()), file.path.name)
 

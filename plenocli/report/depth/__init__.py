@@ -1,0 +1,3 @@
+"""Pictures of what has depth: planes of focus, depth maps,
+volumes and their kernels.
+"""

@@ -50,6 +50,31 @@ def rewritten(text, changes):
     return text
 
 
+def _microscope_files(folder):
+    """microscope.toml and TIFFs of a light field, a fluorescent slide and a dark frame."""
+    from PIL import Image
+
+    from plenocli.files.images.mosaic import read_capture
+
+    small = {
+        '"-12 um to 12 um step 1 um"': '"-2 um to 2 um step 1 um"',
+        "count = [29, 29]": "count = [12, 13]",
+        "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
+    }
+    text = rewritten((ROOT / "sample_configs" / "microscope.toml").read_text(), small)
+    (folder / "microscope.toml").write_text(text)
+    (folder / "sample_configs" / "microscope.toml").write_text(text)
+    for name, phantom in (("radiometry", "slide"), ("light_field", "filaments")):
+        made = folder / f"{name}.dng"
+        line = ["capture-sim", str(folder / "microscope.toml"), "--volume", f"phantom:{phantom}"]
+        assert run([*line, "--accuracy", "0.05", "-o", str(made)]) == 0
+        mosaic = read_capture(made).mosaic.astype(np.uint16)
+        Image.fromarray(mosaic + 100).save(folder / f"{name}.tif")
+        made.unlink()
+    noise = np.random.default_rng(7).integers(98, 103, mosaic.shape)
+    Image.fromarray(noise.astype(np.uint16)).save(folder / "dark.tif")
+
+
 @pytest.fixture(scope="session")
 def kit(tmp_path_factory):
     """A folder with what the pages suppose: descriptions, photographs, RAW files of a small
@@ -121,6 +146,7 @@ def kit(tmp_path_factory):
         folder / "lightfield.png"
     )
 
+    _microscope_files(folder)
     chart = folder / "chart"
     chart.mkdir()
     paint_folder(chart)

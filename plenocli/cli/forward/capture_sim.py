@@ -31,7 +31,7 @@ from plenocli.cli import options
     metavar="VOLUME",
     help=(
         "Instead, before a camera with an [objective]: a volume .h5, a TIFF stack with voxel "
-        "sizes, or phantom:beads, phantom:shells, phantom:filaments, phantom:target."
+        "sizes, or phantom:beads, phantom:shells, phantom:filaments, phantom:target, phantom:slide."
     ),
 )
 @options.output

@@ -106,11 +106,22 @@ def _target(region: Region, rng: np.random.Generator) -> Sampler:
     return at
 
 
+def _slide(region: Region, rng: np.random.Generator) -> Sampler:
+    """An even layer in the middle of the depth, as fluorescent slides have it for white images."""
+
+    def at(depth: float, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        inside = abs(depth - region.middle) < max(region.unit / 2, region.half[0] / 20)
+        return np.full((len(rows), len(columns)), float(inside))
+
+    return at
+
+
 PHANTOMS: dict[str, Callable[[Region, np.random.Generator], Sampler]] = {
     "beads": _beads,
     "shells": _shells,
     "filaments": _filaments,
     "target": _target,
+    "slide": _slide,
 }
 
 

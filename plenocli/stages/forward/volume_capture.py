@@ -209,7 +209,7 @@ def _detected(
         )
     # rounding of transforms leaves dark pixels below zero
     mosaic = to_plane(np.maximum(light, 0), sensor.pixels_per_lenslet) * sensor.quantum_efficiency
-    rng = stream(settings.seed, "capture-sim")
+    rng = stream(settings.seed, "capture-sim of a volume")
     saturated = None
     if settings.snr_db is not None or settings.noise == "none":
         capture = relative_capture(sensor, mosaic, settings.options, rng)

@@ -68,23 +68,27 @@ def _axis(size: int, points: int, kept: int) -> tuple[np.ndarray, np.ndarray]:
     return phase / np.sqrt(points), np.fft.fftfreq(size * points)[fine]
 
 
-def exponential_factor(lattice: Lattice, depths: np.ndarray, length: float) -> np.ndarray:
+def exponential_factor(
+    lattice: Lattice, depths: np.ndarray, length: float, chosen: np.ndarray | None = None
+) -> np.ndarray:
     """Lower triangular roots (frequency, fine frequency, plane, plane) of the covariance exp(-r/l)
     of voxels, of variance 1.
 
     depths: (plane,) m.
     length: l, m; 0 for voxels that are independent.
+    chosen: numbers of the frequencies that are asked for; all by default.
 
     At lateral frequency q the planes' covariance is 2 pi/l Q^-3 (1 + Q|dz|) exp(-Q|dz|),
     Q^2 = q^2 + l^-2.
     """
+    asked = slice(None) if chosen is None else chosen
+    shape = (*lattice.lateral[asked].shape, len(depths), len(depths))
     if length == 0:
-        return np.broadcast_to(
-            np.eye(len(depths)), (*lattice.lateral.shape, len(depths), len(depths))
-        )
+        return np.broadcast_to(np.eye(len(depths)), shape)
     q = np.hypot(2 * np.pi * lattice.lateral, 1 / length)
     power = q**-3
     power /= lattice.mean(power).mean()
+    q, power = q[asked], power[asked]
     apart = np.abs(np.subtract.outer(depths, depths)) * q[..., None, None]
     covariance = (1 + apart) * np.exp(-apart)
     covariance[..., np.arange(len(depths)), np.arange(len(depths))] += 1e-10

@@ -52,18 +52,12 @@ def fit_prior(
     chosen, seen = _observed(problem, lattice, variance, mean)
     depths = np.array(problem.voxels.depths)
     whitening = 1 / np.sqrt(variance)
-    part = Lattice(
-        mixing=lattice.mixing[chosen],
-        lateral=lattice.lateral,
-        turns=lattice.turns,
-        times=lattice.times,
-    )
 
     def at(length: float) -> tuple[float, Fitted]:
-        factor = exponential_factor(lattice, depths, length)[chosen]
+        factor = exponential_factor(lattice, depths, length, chosen)
         modes = [
             _modes(through_prior(whitening[:, None] * problem.op.spectrum[k], mixing, root), y)
-            for k, mixing, root, y in zip(chosen, part.mixing, factor, seen)
+            for k, mixing, root, y in zip(chosen, lattice.mixing[chosen], factor, seen)
         ]
         free = np.count_nonzero(whitening) - np.array([len(m[0]) for m in modes])
         eigenvalues, powers = (np.concatenate(column) for column in zip(*(m[:2] for m in modes)))

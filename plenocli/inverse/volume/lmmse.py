@@ -39,7 +39,7 @@ def lmmse(problem: Problem, white: bool = False, rounds: int = ROUNDS) -> Volume
     Returns a volume whose sigma is that of a Gaussian specimen of the same statistics; where the
     volume is none, it follows the specimen: sigma^2 (0.1 + 0.9 e/mean e), e its local mean square.
     Raises NumericsError where memory is lacking.
-    docs/model.md, "Volumes".
+    docs/model.md, "Volumes inverted".
     """
     op = problem.op
     budget().require(op.spectrum.nbytes, "the estimate's gain", fewer="take fewer planes")

@@ -575,11 +575,6 @@ def _artefacts(folder):
         lambda a: [a.attrs["response"].pop(k, None) for k in ("exposure_s", "gain_e_per_dn")],
     )
     changed("relative.h5", "calibration.h5", lambda a: a.attrs["response"].update(units="relative"))
-    changed(
-        "unlit.h5",
-        "calibration.h5",
-        lambda a: a.data.update({"grid/valid": a.data["grid/valid"] & False}),
-    )
     changed("colour-grid.h5", "calibration.h5", lambda a: a.attrs["white"].update(cfa="RGGB"))
     per_lenslet = ("response/F", "response/covariance", "response/white")
     changed(

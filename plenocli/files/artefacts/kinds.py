@@ -376,6 +376,11 @@ def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
     ):
         if name in data and needed not in data:
             return f"'{name}' lacks '{needed}'"
+    if "response/F" in data:
+        known = np.abs(data["response/F"][np.isfinite(data["response/F"])])
+        largest = float(known.max()) if known.size else np.inf
+        if largest and not 1e-30 <= largest <= 1e30:  # radiances are single precision
+            return f"'response/F' has no value that counts, or values up to {largest:.3g}"
     return None
 
 

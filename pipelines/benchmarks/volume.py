@@ -53,6 +53,8 @@ def optics(pixels, planes):
         pixels=(pixels, pixels),
         pixel_width=1.0,
         depths=depths,
+        places=depths,
+        scales=(1.0,) * planes,
         apodised=True,
     )
 

@@ -47,6 +47,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "rmse_expected",
         "rmse_expected_per_band",
         "noise_expected_per_band",
+        "reference_snr_expected_db",
         "class_accuracy_expected",
         "class_accuracy_ideal",
         "class_distance_ideal",

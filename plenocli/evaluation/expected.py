@@ -31,6 +31,11 @@ DEFINITIONS = {
         "--classes lead to through optics, detector and demultiplexing, each an even field"
     ),
     "noise_expected_per_band": "the part of it that is noise",
+    "reference_snr_expected_db": (
+        "least signal-to-noise ratio over the bands of the white reference that is divided by, dB; "
+        "below some 14 dB expected figures are too good, as errors of a ratio are reckoned to "
+        "first order"
+    ),
     "class_accuracy_expected": (
         "what class_accuracy is at least expected to be (union bound) from the classes' means and "
         "covariance so carried through"
@@ -91,11 +96,13 @@ class Estimates:
     gain: (band, node).
     offset: (band,).
     noise: (band, band) covariance, that of the white reference included.
+    reference: (band,) standard deviations of its noise that the white reference has of signal.
     """
 
     gain: np.ndarray
     offset: np.ndarray
     noise: np.ndarray
+    reference: np.ndarray
 
     @classmethod
     def of(cls, optics: Optics, processing: Processing, spectra: np.ndarray) -> Estimates:
@@ -119,8 +126,13 @@ class Estimates:
         # the reference's, in the ratio
         seen = gain @ mean + offset
         square = np.outer(seen, seen) + gain @ covariance @ gain.T
-        relative = ((psi_white * variances[1]) @ psi_white.T) / np.outer(level, level)
-        return cls(gain=gain, offset=offset, noise=noise + square * relative)
+        spread = (psi_white * variances[1]) @ psi_white.T
+        return cls(
+            gain=gain,
+            offset=offset,
+            noise=noise + square * spread / np.outer(level, level),
+            reference=level / np.sqrt(np.diag(spread)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +142,7 @@ class ExpectedScore:
     rmse_expected: float
     rmse_expected_per_band: list[float]
     noise_expected_per_band: list[float]
+    reference_snr_expected_db: float
     class_accuracy_expected: float
     class_accuracy_ideal: float
     class_distance_ideal: float
@@ -167,6 +180,7 @@ def expected_score(
         rmse_expected=float(rmse.mean()),
         rmse_expected_per_band=rmse.tolist(),
         noise_expected_per_band=np.sqrt(np.diag(found.noise)).tolist(),
+        reference_snr_expected_db=float(20 * np.log10(max(found.reference.min(), 1e-6))),
         class_accuracy_expected=float(share @ _told(judged, found, classes)),
         class_accuracy_ideal=float(share @ predicted_accuracy(pixels)),
         class_distance_ideal=float(pixels.min()),

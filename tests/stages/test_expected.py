@@ -102,6 +102,19 @@ def drawn(folder, method, prior=None):
     return found, truth
 
 
+def drawn_white(folder, method):
+    """The white reference demultiplexed."""
+    demux.run_demux(
+        [folder / "white.h5"],
+        folder / f"white-{method}.h5",
+        calibration=folder / "response.h5",
+        settings=demux.Settings(method=method, register="off"),
+        suffix=".h5",
+        overwrite=True,
+    )
+    return folder / f"white-{method}.h5"
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_errors_and_separability_are_those_of_captures(dim, method):
     """Root mean square error in every band, and shares told rightly, by draws."""
@@ -114,6 +127,10 @@ def test_errors_and_separability_are_those_of_captures(dim, method):
     assert said["rmse_expected"] == pytest.approx(rmse.mean(), rel=0.08)
     noise = np.sqrt(np.mean(found.var(axis=1, ddof=1), axis=0))
     np.testing.assert_allclose(said["noise_expected_per_band"], noise, rtol=0.15)
+    own = {"lmmse": "wls"}.get(method, method)  # a reference is demultiplexed without a prior
+    white = read_artefact(drawn_white(dim, own), "spectra").data["spectra/value"][:, 2:-2, 2:-2]
+    ratio = white.mean(axis=(1, 2)) / white.std(axis=(1, 2), ddof=1)
+    assert said["reference_snr_expected_db"] == pytest.approx(20 * np.log10(ratio.min()), abs=1)
     known = classes.Classes.of_spectra(("rust", "rust", "moss", "moss"), truth)
     spread = known.covariance + np.diag(np.square(said["noise_expected_per_band"]))
     told = classes.assigned(found.reshape(-1, 4), known.means, spread).reshape(4, -1)

@@ -1,10 +1,21 @@
 """`plenocli volume`: a specimen in three dimensions from one capture."""
 
 from pathlib import Path
+from typing import Any, Literal
 
 import click
 
 from plenocli.cli import options
+
+
+class _Background(click.ParamType):
+    name = "auto|NUMBER"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        """The word auto, or a number."""
+        return value if value == "auto" else options.NON_NEGATIVE.convert(value, param, ctx)
 
 
 @click.command("volume", short_help="Reconstruct a volume, with error bars, from one capture.")
@@ -39,9 +50,13 @@ from plenocli.cli import options
 )
 @click.option(
     "--background",
-    type=options.NON_NEGATIVE,
-    default=0.0,
-    help="Light without any specimen, in units of the white image (or of the simulation).",
+    type=_Background(),
+    default="auto",
+    show_default=True,
+    help=(
+        "Light without any specimen, in units of the white image (or of the simulation); auto "
+        "takes the haze that the darkest lenslets show, where held-out pixels agree."
+    ),
 )
 @options.output
 @options.seed
@@ -57,7 +72,7 @@ def command(
     calibration: Path | None,
     method: str,
     hold_out: float,
-    background: float,
+    background: float | Literal["auto"],
     output: Path,
     seed: int,
     overwrite: bool,

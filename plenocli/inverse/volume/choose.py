@@ -55,5 +55,5 @@ def _misfit(problem: Problem, volume: Volume) -> float:
     held = volume.held_out
     assert held is not None
     light = np.zeros(problem.signal.shape)
-    light[problem.held] = held.predicted - problem.measurement.background
+    light[problem.held] = held.predicted - problem.measurement.offset[problem.held]
     return problem.misfit(light)

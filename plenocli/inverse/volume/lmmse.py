@@ -61,7 +61,7 @@ def lmmse(problem: Problem, white: bool = False, rounds: int = ROUNDS) -> Volume
         sigma=_sigma(problem, gain, value),
         method=method,
         trace=(Trial(method, problem.misfit(light)),),
-        background=problem.measurement.background,
+        background=float(problem.measurement.offset.mean()),
         prior=Prior(
             correlation_length=fitted.length,
             variance=fitted.variance,

@@ -27,18 +27,24 @@ class Measurement:
     gain: variance of the photons' noise over the signal, units of the signal; 0 where the noise
         does not grow with it.
     usable: like signal, false where a pixel is dead or saturated; None where all count.
-    background: signal without any specimen.
+    background: signal without any specimen: a number, or (pixel,) for all superpixels.
     """
 
     signal: np.ndarray
     read_variance: float
     gain: float = 0.0
     usable: np.ndarray | None = None
-    background: float = 0.0
+    background: np.ndarray | float = 0.0
+
+    @property
+    def offset(self) -> np.ndarray:
+        """The background of every pixel, like signal; a view."""
+        return np.broadcast_to(np.asarray(self.background, float), self.signal.shape)
 
     def variance(self, signal: np.ndarray) -> np.ndarray:
-        """Variance of pixels that get `signal` of the specimen, any shape."""
-        return self.read_variance + self.gain * np.maximum(signal + self.background, 0)
+        """Variance of pixels that get `signal` of the specimen, (.., pixel) or a number."""
+        whole = signal + np.asarray(self.background)
+        return self.read_variance + self.gain * np.maximum(whole, 0)
 
 
 @dataclass(frozen=True)
@@ -101,9 +107,8 @@ class Problem:
                 f"{measurement.signal.shape} and {voxels.unknowns} unknowns a lenslet"
             )
         self.op, self.measurement, self.voxels = op, measurement, voxels
-        self.signal = np.asarray(measurement.signal, op.dtype) - op.dtype.type(
-            measurement.background
-        )
+        self._hold_out, self._seed = hold_out, seed
+        self.signal = (measurement.signal - measurement.offset).astype(op.dtype)
         usable = np.isfinite(self.signal) & (
             self.light_on_pixels > DARK * self.light_on_pixels.max()
         )
@@ -117,6 +122,10 @@ class Problem:
             raise NumericsError(
                 "no pixel of the capture is left to make a volume of", None, "hold out fewer pixels"
             )
+
+    def with_measurement(self, measurement: Measurement) -> Problem:
+        """The same with another measurement of the same pixels, the same ones put aside."""
+        return Problem(self.op, measurement, self.voxels, self._hold_out, self._seed)
 
     @cached_property
     def light_on_pixels(self) -> np.ndarray:
@@ -161,7 +170,7 @@ class Problem:
         """The pixels that were put aside, beside what is predicted of them (like signal)."""
         if not self.held.any():
             return None
-        offset = self.measurement.background
+        offset = self.measurement.offset[self.held]
         measured, predicted = self.signal[self.held] + offset, prediction[self.held] + offset
         return HeldOut(
             index=np.argwhere(self.held),

@@ -56,7 +56,7 @@ def richardson_lucy(problem: Problem, iterations: int = 200, accelerated: bool =
         sigma=None,
         method="rl",
         trace=trace,
-        background=problem.measurement.background,
+        background=float(problem.measurement.offset.mean()),
         prior=None,
         held_out=problem.judged(steps.prediction),
         margin=problem.margin,
@@ -72,10 +72,10 @@ def iterate(problem: Problem, iterations: int, accelerated: bool = True) -> Step
     """
     op, measurement = problem.op, problem.measurement
     seen = op.adjoint(problem.counts.astype(op.dtype))
-    b = max(measurement.background, 0.0)
+    b = np.maximum(measurement.offset, 0).astype(op.dtype)
     if measurement.gain > 0:
-        b += measurement.read_variance / measurement.gain
-    y = np.where(problem.counts, np.maximum(problem.signal + op.dtype.type(b), 0), 0)
+        b += op.dtype.type(measurement.read_variance / measurement.gain)
+    y = np.where(problem.counts, np.maximum(problem.signal + b, 0), 0)
     light = op.spectrum[0].real.sum(axis=0)
     asked = seen > UNSEEN * light
     seen = np.where(asked, seen, 1)
@@ -131,7 +131,7 @@ class _Walk:
         self.point, self._step = self.result, None
 
 
-def _likelihood(problem: Problem, y: np.ndarray, predicted: np.ndarray, b: float) -> float:
+def _likelihood(problem: Problem, y: np.ndarray, predicted: np.ndarray, b: np.ndarray) -> float:
     at = problem.counts
-    light = np.maximum(predicted[at] + b, np.finfo(np.float32).tiny).astype(float)
+    light = np.maximum(predicted[at] + b[at], np.finfo(np.float32).tiny).astype(float)
     return float(np.sum(y[at] * np.log(light) - light))

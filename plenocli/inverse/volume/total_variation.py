@@ -62,7 +62,7 @@ def total_variation(
         sigma=None,
         method="tv",
         trace=tuple(trace),
-        background=problem.measurement.background,
+        background=float(problem.measurement.offset.mean()),
         prior=None,
         held_out=problem.judged(state.light),
         margin=problem.margin,

@@ -116,7 +116,7 @@ class Volume:
     sigma: like value, its standard deviation; None where the method has none.
     method: that made it.
     trace: what was tried, in order.
-    background: signal that was taken for none of the specimen's.
+    background: signal that was taken for none of the specimen's, mean over pixels.
     prior: that was assumed; None where none was.
     held_out: pixels that were put aside, predicted; None where none were.
     margin: lenslets from the border on which light of some voxels was not seen.

@@ -95,8 +95,8 @@ def _projections(values: np.ndarray, volume: StoredVolume, what: Callable = np.m
             bare(axes, title)
         bar = made.figure.add_subplot(grid[1, 1])
         bare(bar)
-        span = f"{sizes[2] * 1e6:.4g} x {sizes[1] * 1e6:.4g} x {sizes[0] * 1e6:.4g} um"
-        bar.text(0.5, 0.5, span, ha="center", va="center", fontsize=7, wrap=True)
+        span = "\n".join(f"{size * 1e6:.4g} um" for size in reversed(sizes))
+        bar.text(0.5, 0.5, span, ha="center", va="center", fontsize=7)
     return made.png
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -63,7 +63,7 @@ def run_volume(
     calibration: Path | str | None = None,
     method: str = "auto",
     hold_out: float = 0.05,
-    background: float = 0.0,
+    background: float | Literal["auto"] = "auto",
     overwrite: bool = False,
     seed: int = 0,
     command: str = "",
@@ -76,7 +76,8 @@ def run_volume(
     calibration: lenslet grid and white image; a simulated capture needs none.
     method: "auto", "rl", "lmmse", "tv" or "tikhonov".
     hold_out: share of the pixels that are put aside to judge by.
-    background: signal without any specimen, in units of white.
+    background: signal without any specimen, in units of white; "auto": the haze of the darkest
+        lenslets, where that predicts the held-out pixels better.
 
     Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
     """
@@ -86,6 +87,7 @@ def run_volume(
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
     from plenocli.inverse.volume.choose import volume_of
+    from plenocli.inverse.volume.haze import without_haze
     from plenocli.inverse.volume.superpixels import measured
 
     output = Path(output)
@@ -93,13 +95,28 @@ def run_volume(
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
     shot = read_capture(capture)
-    measurement = measured(shot, stack.pixel_shape, known, where=calibration, background=background)
+    measurement = measured(
+        shot,
+        stack.pixel_shape,
+        known,
+        where=calibration,
+        background=0.0 if background == "auto" else background,
+    )
     rows, columns = measurement.signal.shape[:2]
     note(
         f"{rows} x {columns} lenslets, {len(stack.depth)} planes of {stack.point_shape[0]} x "
         f"{stack.point_shape[1]} voxels a lenslet"
     )
     problem = _problem(stack, measurement, hold_out, seed, pif)
+    if background == "auto":
+        problem = without_haze(problem)
+        taken = float(problem.measurement.offset.mean())
+        if taken > 0:
+            share = taken / float(measurement.signal.mean())
+            note(
+                f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
+                "off (--background 0 keeps it)"
+            )
     volume = volume_of(problem, method)
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
     provenance = Provenance(

@@ -1,0 +1,59 @@
+"""Light that is the same behind all lenslets, beside a specimen that is not."""
+
+import numpy as np
+import pytest
+
+from plenocli.base.linear_maps import BlockCirculant
+from plenocli.inverse.volume.haze import haze, without_haze
+from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
+from plenocli.inverse.volume.richardson_lucy import richardson_lucy
+from tests.reference import volumes
+
+
+def seen(pattern, filled, seed=1):
+    """A specimen before the middle lenslets, or all, and light of `pattern` on all."""
+    rng = np.random.default_rng(seed)
+    op = BlockCirculant(volumes.kernels(2, 4, 9), (10, 11), (12, 12))
+    x = np.zeros(op.domain.shape)
+    part = slice(0, 12) if filled else slice(4, 7)
+    x[part, part] = rng.random(x[part, part].shape) ** 4
+    light = op.forward(x)
+    signal = light + pattern + 0.005 * rng.standard_normal(light.shape)
+    measurement = Measurement(signal=signal, read_variance=2.5e-5)
+    voxels = Voxels((2, 2), 1e-6, (-1e-6, 1e-6))
+    return Problem(op, measurement, voxels, hold_out=0.1, seed=seed), x
+
+
+def error(problem, x):
+    """Of the volume, over the truth."""
+    found = richardson_lucy(problem, 150).value
+    return np.linalg.norm(found - problem.inside(x)) / np.linalg.norm(x)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_specimen_in_haze_is_seen_without_it(seed):
+    pattern = 0.4 + 0.3 * np.random.default_rng(seed).random(9)
+    problem, x = seen(pattern, filled=False, seed=seed)
+    clear = without_haze(problem)
+    assert clear.measurement.offset[0, 0] == pytest.approx(0.95 * pattern, abs=0.02)
+    assert error(clear, x) < 0.6 * error(problem, x)
+    assert np.array_equal(clear.held, problem.held)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_specimen_that_fills_the_field_is_not_taken_for_haze_at_a_loss(seed):
+    problem, x = seen(0.0, filled=True, seed=seed)
+    assert error(without_haze(problem), x) < 1.05 * error(problem, x)
+
+
+def test_haze_is_the_light_of_lenslets_without_a_specimen():
+    rng = np.random.default_rng(3)
+    pattern = 1 + 0.3 * np.cos(np.arange(9))
+    signal = np.tile(pattern, (8, 8, 1)) + rng.normal(0, 0.01, (8, 8, 9))
+    signal[2:5, 2:5] += 3
+    found = haze(Measurement(signal=signal, read_variance=1e-4))
+    assert found == pytest.approx(0.95 * pattern, abs=0.03)
+
+
+def test_too_few_lenslets_have_no_haze():
+    assert not haze(Measurement(signal=np.ones((3, 3, 4)), read_variance=0.0)).any()

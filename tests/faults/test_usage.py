@@ -86,6 +86,8 @@ def senseless(kind):
         return ("", "abc", "-1", "0", "nan", "inf", "5nm")
     if type(kind).__name__ == "_Slope":
         return ("", "abc", "nan", "inf", "1e9", "5nm")
+    if type(kind).__name__ == "_Background":
+        return ("", "abc", "-1", "nan", "inf", "5nm")
     if kind.name == "angle":
         return ("", "abc", "5", "5nm", "nan", "nandeg", "1e999deg")
     if isinstance(kind, options._File):

@@ -58,6 +58,15 @@ class _Background(click.ParamType):
         "takes the haze that the darkest lenslets show, where held-out pixels agree."
     ),
 )
+@click.option(
+    "--most-planes",
+    type=options.Whole(1, 1000),
+    default=None,
+    help=(
+        "Keep the planes of the kernels that predict held-out pixels best, no more than this: "
+        "photographic cameras support two or three. Default: all."
+    ),
+)
 @options.output
 @options.seed
 @options.mem_limit
@@ -73,6 +82,7 @@ def command(
     method: str,
     hold_out: float,
     background: float | Literal["auto"],
+    most_planes: int | None,
     output: Path,
     seed: int,
     overwrite: bool,
@@ -98,6 +108,7 @@ def command(
         method=method,
         hold_out=hold_out,
         background=background,
+        most_planes=most_planes,
         overwrite=overwrite,
         seed=seed,
         command=options.command_line(ctx),

@@ -4,8 +4,8 @@ lenslets.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,6 +55,19 @@ class Stack:
         """Farthest offsets (rows, columns)."""
         rows, columns = np.abs(self.lenslet_offset).max(axis=0).tolist()
         return rows, columns
+
+    def only(self, planes: Sequence[int]) -> Stack:
+        """Some of the planes, by their numbers, rising."""
+        kept = np.isin(self.plane, planes)
+        return replace(
+            self,
+            A=self.A[kept],
+            plane=np.searchsorted(planes, self.plane[kept]),
+            lenslet_offset=self.lenslet_offset[kept],
+            depth=self.depth[list(planes)],
+            spacing=self.spacing[list(planes)],
+            column_energy=self.column_energy[list(planes)],
+        )
 
     def parts(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(kernels (offset, pixel, point), offsets (offset, 2)) plane by plane."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from plenocli.base.progress import note
+from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.volume.stack import Stack
     from plenocli.inverse.volume.measurement import Measurement, Problem
-    from plenocli.inverse.volume.volume import Volume
+    from plenocli.inverse.volume.volume import Trial, Volume
 
 SUFFIXES = (".h5", ".tif", ".tiff")
 
@@ -24,6 +25,7 @@ class VolumeSummary:
     """What volume made.
 
     shape: planes, rows, columns.
+    depths: of the planes, m.
     method: that was taken; tried: (what, misfit of held-out pixels) of all that were tried.
     explained_db: of the variance of held-out pixels; None where none were held out.
     held_by_bars: share of them within 95 % bars, by quartile of brightness, darkest first.
@@ -32,6 +34,7 @@ class VolumeSummary:
 
     output: str
     shape: list[int]
+    depths: list[float]
     method: str
     tried: list[tuple[str, float]]
     explained_db: float | None
@@ -64,6 +67,7 @@ def run_volume(
     method: str = "auto",
     hold_out: float = 0.05,
     background: float | Literal["auto"] = "auto",
+    most_planes: int | None = None,
     overwrite: bool = False,
     seed: int = 0,
     command: str = "",
@@ -78,6 +82,7 @@ def run_volume(
     hold_out: share of the pixels that are put aside to judge by.
     background: signal without any specimen, in units of white; "auto": the haze of the darkest
         lenslets, where that predicts the held-out pixels better.
+    most_planes: keep the planes that predict held-out pixels best, no more than this; None: all.
 
     Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
     """
@@ -88,6 +93,7 @@ def run_volume(
     from plenocli.files.results.stacks import read_stack
     from plenocli.inverse.volume.choose import volume_of
     from plenocli.inverse.volume.haze import without_haze
+    from plenocli.inverse.volume.planes import supported_planes
     from plenocli.inverse.volume.superpixels import measured
 
     output = Path(output)
@@ -107,6 +113,16 @@ def run_volume(
         f"{rows} x {columns} lenslets, {len(stack.depth)} planes of {stack.point_shape[0]} x "
         f"{stack.point_shape[1]} voxels a lenslet"
     )
+    trials: tuple[Trial, ...] = ()
+    if most_planes is not None:
+        chosen, trials = supported_planes(
+            lambda planes: _problem(stack.only(planes), measurement, hold_out, seed, pif),
+            len(stack.depth),
+            most_planes,
+        )
+        stack = stack.only(chosen)
+        places = ", ".join(format_length(depth) for depth in stack.depth)
+        note(f"the capture supports {len(chosen)} of the planes: {places}")
     problem = _problem(stack, measurement, hold_out, seed, pif)
     if background == "auto":
         problem = without_haze(problem)
@@ -118,6 +134,7 @@ def run_volume(
                 "off (--background 0 keeps it)"
             )
     volume = volume_of(problem, method)
+    volume = replace(volume, trace=(*trials, *volume.trace))
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
     provenance = Provenance(
         command=command, inputs=inputs, seed=seed, accuracy=stack.accuracy.as_json()
@@ -127,6 +144,7 @@ def run_volume(
     return VolumeSummary(
         output=str(output),
         shape=list(volume.value.shape),
+        depths=stack.depth.tolist(),
         method=volume.method,
         tried=[(trial.what, trial.misfit) for trial in volume.trace],
         explained_db=None if held is None else held.explained_db,

@@ -41,8 +41,8 @@ ARTEFACTS = {
         "capture/cfa": "GRBG",
     },
     "calibration": {
-        "grid/centre": np.full((2, 2, 2), np.nan),
-        "grid/valid": np.zeros((2, 2), bool),
+        "grid/centre": np.ones((2, 2, 2)),
+        "grid/valid": np.ones((2, 2), bool),
     },
     "spectra": {"spectra/value": np.ones((2, 2, 2)), "spectra/wavelength": [4e-7, 5e-7]},
     "dictionary": {"dictionary/atoms": np.eye(3), "dictionary/history/objective": np.arange(3.0)},

@@ -56,6 +56,13 @@ class Stack:
         rows, columns = np.abs(self.lenslet_offset).max(axis=0).tolist()
         return rows, columns
 
+    def even(self) -> np.ndarray:
+        """(pixel,) light of an even object in the plane nearest to the focus, the one that lights
+        the fewest superpixels.
+        """
+        most = np.bincount(self.plane)
+        return self.A[self.plane == np.argmin(most)].sum((0, 2), dtype=float)
+
     def only(self, planes: Sequence[int]) -> Stack:
         """Some of the planes, by their numbers, rising."""
         kept = np.isin(self.plane, planes)

@@ -26,8 +26,11 @@ def haze(measurement: Measurement) -> np.ndarray:
     """
     pixels = measurement.signal.shape[2]
     signal = measurement.signal.reshape(-1, pixels)
-    usable = measurement.usable
-    whole = signal if usable is None else signal[usable.reshape(-1, pixels).all(axis=1)]
+    whole = signal
+    if measurement.usable is not None:
+        usable = measurement.usable.reshape(-1, pixels)
+        # pixels at the pupil's edge count behind no lenslet
+        whole = signal[usable[:, usable.any(axis=0)].all(axis=1)]
     count = max(FEWEST, int(DARKEST * len(whole)))
     if len(whole) < 4 * FEWEST:
         return np.zeros(pixels)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
+EDGE = 0.1
+"""Of the brightest pixel of white, below which one at the pupil's edge counts for nothing."""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 
@@ -32,6 +34,7 @@ def measured(
     *,
     where: str | Path | None = None,
     background: float = 0.0,
+    even: np.ndarray | None = None,
 ) -> Measurement:
     """Superpixels of a capture, one unit of light the mean level of the white image, or what the
     capture calls one.
@@ -41,6 +44,8 @@ def measured(
         capture is tiled as it says itself.
     where: the calibration's file, for messages.
     background: light without any specimen, in the same unit.
+    even: (pixel,) light of an even object by the kernels: where the white image of a real capture
+        shows another, pixels are made what they would be behind the camera that is described.
 
     Raises InputError where sizes disagree or lenslets are missing.
     """
@@ -54,7 +59,18 @@ def measured(
         found = _tiled(capture, shape)
     else:
         found = _resampled(capture, shape, calibration, where)
+        if even is not None:
+            found = _evened(found, white_superpixel(calibration, shape).ravel(), even)
     return replace(found, background=background)
+
+
+def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurement:
+    """A measurement in which the white image (pixel,) would be `even`."""
+    known = (even > EDGE * even.max()) & (white > EDGE * white.max())
+    factor = np.where(known, even / np.where(known, white, 1.0), 0.0)
+    factor /= np.average(factor[known], weights=white[known])
+    usable = np.ones(found.signal.shape, bool) if found.usable is None else found.usable
+    return replace(found, signal=found.signal * factor, usable=usable & known)
 
 
 def white_superpixel(calibration: Calibration, shape: tuple[int, int]) -> np.ndarray:

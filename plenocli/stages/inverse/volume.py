@@ -107,6 +107,7 @@ def run_volume(
         known,
         where=calibration,
         background=0.0 if background == "auto" else background,
+        even=stack.even(),
     )
     rows, columns = measurement.signal.shape[:2]
     note(

@@ -14,7 +14,10 @@ SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
 TINY = (SAMPLES / "tiny.toml").read_text()
 
 
-@pytest.mark.parametrize("path", sorted(SAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+CAMERAS = sorted(path for path in SAMPLES.glob("*.toml") if path.stem != "microscope")
+
+
+@pytest.mark.parametrize("path", CAMERAS, ids=lambda p: p.stem)
 def test_every_sample_reads_and_survives_its_own_text(path):
     camera = load_camera(path)
     assert parse_camera(to_toml(camera)) == camera

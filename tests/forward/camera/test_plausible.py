@@ -22,6 +22,8 @@ FAR_OBJECT = "object.distance"
 def slips():
     """(sample, section.key, text of the length, factor) of every length of every sample."""
     for path in sorted(SAMPLES.glob("*.toml")):
+        if path.stem == "microscope":
+            continue
         text = path.read_text()
         for match in LENGTH.finditer(text):
             section = re.findall(r"^\[(\w+)\]", text[: match.start()], re.M)[-1]

@@ -55,5 +55,13 @@ def test_haze_is_the_light_of_lenslets_without_a_specimen():
     assert found == pytest.approx(0.95 * pattern, abs=0.03)
 
 
+def test_pixels_that_count_behind_no_lenslet_hide_no_haze():
+    signal = np.tile(np.arange(1.0, 5.0), (6, 6, 1))
+    usable = np.ones(signal.shape, bool)
+    usable[..., 0] = usable[2, 3] = False
+    found = haze(Measurement(signal=signal, read_variance=0.0, usable=usable))
+    assert found == pytest.approx(0.95 * np.arange(1.0, 5.0))
+
+
 def test_too_few_lenslets_have_no_haze():
     assert not haze(Measurement(signal=np.ones((3, 3, 4)), read_variance=0.0)).any()

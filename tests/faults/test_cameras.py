@@ -145,7 +145,7 @@ def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(
         "clipped": np.minimum(values, 0.3 * values.max()),
         "tiny": values * 1e-30,
         "huge": values * 1e30,
-        "largest": values.astype(float) / values.max() * 1e99,
+        "largest": values.astype(float) / values.max() * 1e60,
         "hot": np.where(np.arange(values.size).reshape(values.shape) == 77, 1e6, 1) * values,
         "drowned": values
         + 100 * values.std() * np.random.default_rng(6).normal(size=values.shape),  # -40 dB

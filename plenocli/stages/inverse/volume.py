@@ -122,18 +122,12 @@ def run_volume(
             most_planes,
         )
         stack = stack.only(chosen)
-        places = ", ".join(format_length(depth) for depth in stack.depth)
+        places = ", ".join(format_length(depth) for depth in stack.depth.tolist())
         note(f"the capture supports {len(chosen)} of the planes: {places}")
     problem = _problem(stack, measurement, hold_out, seed, pif)
     if background == "auto":
         problem = without_haze(problem)
-        taken = float(problem.measurement.offset.mean())
-        if taken > 0:
-            share = taken / float(measurement.signal.mean())
-            note(
-                f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
-                "off (--background 0 keeps it)"
-            )
+        _tell_of_haze(problem)
     volume = volume_of(problem, method)
     volume = replace(volume, trace=(*trials, *volume.trace))
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
@@ -152,6 +146,17 @@ def run_volume(
         held_by_bars=None if held is None else list(held.held_by_bars),
         margin=volume.margin,
     )
+
+
+def _tell_of_haze(problem: Problem) -> None:
+    """Say how much of the light was taken for haze, where some was."""
+    taken = float(problem.measurement.offset.mean())
+    if taken > 0:
+        share = taken / float(problem.measurement.signal.mean())
+        note(
+            f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
+            "off (--background 0 keeps it)"
+        )
 
 
 def _problem(

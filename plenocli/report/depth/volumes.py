@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.units import format_length
 from plenocli.report.drawing import Figures, bare, drawing, show_picture
 
 if TYPE_CHECKING:
@@ -14,28 +15,33 @@ if TYPE_CHECKING:
     from plenocli.files.results.volumes import StoredVolume
     from plenocli.forward.volume.stack import Stack
 
+DEEP = 3.0
+"""Depth over width from which on a volume is shown plane by plane alone."""
 SLICES = 6
 """Planes drawn, evenly from all."""
 
 
 def volume_figures(volume: StoredVolume, name: str) -> Figures:
     """[(PNG, caption)] of a volume."""
+    slices = (_slices(volume), f"{name}: planes by their depth.")
+    width = max(n * d for n, d in zip(volume.value.shape[1:], volume.spacing))
+    if len(volume.depth) * volume.step > DEEP * width:
+        # a photographic camera's planes are layers far apart
+        return [slices]
     figures = [
         (
             _projections(volume.value, volume),
             f"{name}: brightest voxel along the axis, along rows and along columns.",
-        ),
-        (_slices(volume), f"{name}: planes by their depth."),
+        )
     ]
     if volume.sigma is not None:
-        figures.insert(
-            1,
+        figures.append(
             (
                 _projections(volume.sigma, volume, what=np.mean),
                 f"{name}: mean standard deviation along the same directions.",
-            ),
+            )
         )
-    return figures
+    return [*figures, slices]
 
 
 def kernel_figures(stack: Stack, name: str) -> Figures:
@@ -55,7 +61,7 @@ def kernel_figures(stack: Stack, name: str) -> Figures:
             light[tuple((offsets - least).T)] = kernels[:, :, point]
             picture = light.reshape(*size, rows, columns).transpose(0, 2, 1, 3)
             picture = np.sqrt(picture.reshape(size[0] * rows, -1))
-            show_picture(axes, picture / picture.max(), f"{stack.depth[plane] * 1e6:.4g} um")
+            show_picture(axes, picture / picture.max(), format_length(float(stack.depth[plane])))
     return [(made.png, f"{name}: root of the light of one voxel in planes of some depths.")]
 
 
@@ -112,5 +118,5 @@ def _slices(volume: StoredVolume) -> bytes:
         for axes in panels[len(chosen) :]:
             axes.set_visible(False)
         for axes, plane in zip(panels, chosen):
-            show_picture(axes, values[plane] / top, f"{volume.depth[plane] * 1e6:.4g} um")
+            show_picture(axes, values[plane] / top, format_length(float(volume.depth[plane])))
     return made.png

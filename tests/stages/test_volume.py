@@ -175,6 +175,29 @@ def test_a_specimen_comes_back_and_says_how_well(seen, tmp_path, method):
         assert {what for what, _ in report.tried} >= {"rl", "lmmse", "tv"}
 
 
+def test_kernels_that_do_not_explain_a_capture_are_told(camera, seen, tmp_path, capsys):
+    """Planes 4 um apart for a specimen between them, at a noise that shows it; and their own."""
+    run_capture_sim(
+        camera,
+        tmp_path / "finer.h5",
+        Capture(snr_db=60, refine=2, accuracy=2e-2),
+        volume="phantom:shells",
+    )
+    run_capture_sim(
+        camera, tmp_path / "own.h5", Capture(snr_db=30, accuracy=2e-2), volume="phantom:shells"
+    )
+    for name, told in (("finer", True), ("own", False)):
+        capsys.readouterr()
+        run_volume(
+            tmp_path / f"{name}.h5",
+            tmp_path / f"{name}-v.h5",
+            seen / "stack.h5",
+            method="lmmse",
+            background=0.0,
+        )
+        assert ("times the noise: planes are too far apart" in capsys.readouterr().err) == told
+
+
 def test_a_volume_for_fiji_has_its_errors_beside_it(seen, tmp_path):
     run_volume(seen / "capture.h5", tmp_path / "v.ome.tif", seen / "stack.h5", method="lmmse")
     run_volume(seen / "capture.h5", tmp_path / "v.h5", seen / "stack.h5", method="lmmse")

@@ -6,7 +6,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.linear_maps import times
-from plenocli.base.progress import bar
+from plenocli.base.progress import bar, note
 from plenocli.inverse.volume.gain import Gain, gain_of
 from plenocli.inverse.volume.lattice import exponential_factor, lattice_of
 from plenocli.inverse.volume.likelihood import fit_prior
@@ -24,6 +24,10 @@ FIRST = 8
 EVEN, WIDTH = 0.1, 2.0
 """Share of the variance that every voxel has, and the voxels over which the rest follows the
 specimen's mean square.
+"""
+UNEXPLAINED = 30.0
+"""Variance over the noise's from which on a capture is not what the kernels make of any volume;
+such errors have a pattern, which the bars of voxels do not know.
 """
 GAUSSIAN = 5.0
 """Kurtosis up to which a volume passes for Gaussian, which has 3."""
@@ -47,6 +51,11 @@ def lmmse(problem: Problem, white: bool = False, rounds: int = ROUNDS) -> Volume
     mean = mean_of(problem)
     of_pixels = class_variance(problem)
     fitted = fit_prior(problem, lattice, of_pixels, mean, 0.0 if white else None)
+    if fitted.noise > UNEXPLAINED and problem.measurement.noise_is_known:
+        note(
+            f"what these kernels cannot produce is {fitted.noise:.0f} times the noise: planes are "
+            "too far apart, or it is another microscope; error bars of voxels may be too small"
+        )
     of_pixels = fitted.noise * of_pixels
     factor = exponential_factor(lattice, np.array(problem.voxels.depths), fitted.length)
     # pixels that are left out here and there are as good as more noise everywhere

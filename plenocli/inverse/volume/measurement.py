@@ -37,6 +37,11 @@ class Measurement:
     background: np.ndarray | float = 0.0
 
     @property
+    def noise_is_known(self) -> bool:
+        """Whether the measurement says how much noise it has."""
+        return self.read_variance > 0 or self.gain > 0
+
+    @property
     def offset(self) -> np.ndarray:
         """The background of every pixel, like signal; a view."""
         return np.broadcast_to(np.asarray(self.background, float), self.signal.shape)

@@ -23,6 +23,7 @@ COMMANDS = {
     "optimise": "sweep",
     "colorchecker": "evaluation",
     "show": "evaluation",
+    "view": "evaluation",
     "inspect": "evaluation",
     "lens": "forward",
     "schema": "forward",

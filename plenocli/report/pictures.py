@@ -223,7 +223,7 @@ def pif_columns(
         for axes in panels.flat[len(points) :]:
             axes.set_axis_off()
         pictures = [
-            _on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets)
+            on_superpixels(matrix[:, :, i * object_shape[1] + j], pixel_shape, offsets)
             for i, j in points
         ]
         top = max(picture.max() for picture in pictures) or 1.0
@@ -248,7 +248,7 @@ def _root_norm(top: float) -> "Normalize":
     return PowerNorm(0.5, vmin=0, vmax=top)
 
 
-def _on_superpixels(column: np.ndarray, pixel_shape: Shape, offsets: np.ndarray) -> np.ndarray:
+def on_superpixels(column: np.ndarray, pixel_shape: Shape, offsets: np.ndarray) -> np.ndarray:
     """One column (lenslet, pixel) as a picture of all superpixels, each at its offset."""
     offsets = np.asarray(offsets) - np.min(offsets, axis=0)
     height, width = pixel_shape

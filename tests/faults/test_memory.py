@@ -240,6 +240,7 @@ def test_nobody_gets_more_than_the_limit_and_the_base():
     [
         ["inspect", "image.h5"],
         ["show", "image.h5", "-o", "a.png"],
+        ["view", "image.h5", "-o", "a.html"],
         ["score", "image.h5", "--truth", "capture.h5", "-o", "a.json"],
         ["refocus", "capture.h5", "-o", "a.h5"],
         ["reconstruct", "capture.h5", "--pif", "pif.h5", "-o", "a.h5"],

@@ -1,132 +1,173 @@
-"""A page as headless Chromium shows it, through the DevTools protocol: what it asked for, what
-it complained about, a picture of it.
-"""
+"""A real browser without a window, driven by the DevTools protocol over two pipes."""
 
-import asyncio
 import base64
-import contextlib
 import json
 import os
+import select
 import shutil
-import signal
 import subprocess
-from pathlib import Path
+import time
+from contextlib import closing
 
-CHROMIUM = next(
-    (
-        found
-        for name in ("chromium", "chromium-browser", "google-chrome")
-        if (found := shutil.which(name))
-    ),
-    None,
-)
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next((found for name in NAMES if (found := shutil.which(name))), None)
 WAIT = 60
 """Seconds for any answer."""
 
 
 def look_at(path, width, height, expression, profile):
-    """{"requests": addresses asked for, "messages": what the console said, "value": of a JavaScript
+    """{"requests": addresses asked for, "messages": errors and warnings, "value": of a JavaScript
     expression, "png": the whole page}.
 
-    path: an HTML file;
-    width, height: of the window, px;
+    path: an HTML file.
+    width, height: of the window, px.
     profile: an empty folder for the browser.
     """
-    command = [
-        CHROMIUM,
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-dev-shm-usage",
-        "--no-first-run",
-        "--hide-scrollbars",
-        "--host-resolver-rules=MAP * ~NOTFOUND",
-        f"--user-data-dir={profile}",
-        "--remote-debugging-port=0",
-        "about:blank",
-    ]
-    with open(Path(profile) / "log", "wb") as log:
-        child = subprocess.Popen(
-            command,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+    with closing(Browser(profile, width, height)) as page:
+        page.open(path)
+        value, png = page.run(expression), page.picture()
+        return {"requests": page.requests, "messages": page.errors, "value": value, "png": png}
+
+
+class Browser:
+    """One page of a browser; `errors` collects what its console complains of."""
+
+    def __init__(self, profile, width=1280, height=900):
+        there, ours = os.pipe(), os.pipe()
+        flags = "--headless=new --no-sandbox --disable-gpu --hide-scrollbars --no-first-run "
+        flags += "--disable-dev-shm-usage"
+        command = f'exec "$0" "$@" 3<&{there[0]} 4>&{ours[1]}'
+        self.process = subprocess.Popen(
+            ["bash", "-c", command, CHROMIUM, *flags.split(), f"--user-data-dir={profile}"]
+            + ["--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe", "about:blank"],
             env=os.environ | {"HOME": str(profile)},
+            pass_fds=(there[0], ours[1]),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(there[0])
+        os.close(ours[1])
+        self.send_to, self.read_from = there[1], ours[0]
+        self.buffer, self.number, self.session, self.errors = b"", 0, None, []
+        self.requests = []
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+        self.resize(width, height)
+
+    def call(self, method, **params):
+        self.number += 1
+        message = {"id": self.number, "method": method, "params": params}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.send_to, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self.receive()
+            if answer.get("id") == self.number:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def receive(self):
+        until = time.monotonic() + WAIT
+        while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.read_from], [], [], max(0, until - time.monotonic()))
+            assert ready, "the browser does not answer"
+            self.buffer += os.read(self.read_from, 1 << 20)
+        one, self.buffer = self.buffer.split(b"\0", 1)
+        message = json.loads(one)
+        self.listen(message.get("method"), message.get("params", {}))
+        return message
+
+    def listen(self, method, params):
+        if method == "Runtime.exceptionThrown":
+            self.errors.append(str(params["exceptionDetails"]))
+        if method == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
+            self.errors.append(params["entry"]["text"])
+        if method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning"):
+            self.errors.append(str(params["args"]))
+        if method == "Network.requestWillBeSent":
+            self.requests.append(params["request"]["url"])
+
+    def resize(self, width, height):
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+
+    def open(self, path):
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.wait("document.readyState === 'complete' && location.protocol === 'file:'")
+
+    def run(self, script):
+        answer = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def wait(self, condition):
+        until = time.monotonic() + WAIT
+        while not self.run(condition):
+            assert time.monotonic() < until, f"never: {condition}"
+            time.sleep(0.02)
+
+    def mouse(self, kind, x, y):
+        button = "none" if kind == "mouseMoved" and not self.held else "left"
+        self.call(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=x,
+            y=y,
+            button=button,
+            buttons=int(self.held),
+            clickCount=1,
+        )
+
+    held = False
+
+    def drag(self, *places):
+        """Press at the first place (x, y), move through the others, and let go at the last."""
+        self.mouse("mouseMoved", *places[0])
+        self.held = True
+        self.mouse("mousePressed", *places[0])
+        for place in places[1:]:
+            self.mouse("mouseMoved", *place)
+        self.held = False
+        self.mouse("mouseReleased", *places[-1])
+
+    def key(self, key):
+        for kind in ("keyDown", "keyUp"):
+            text = {"text": key} if len(key) == 1 and kind == "keyDown" else {}
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, **text)
+
+    def box(self, selector):
+        """Left, top, width and height of an element on the screen, scrolled into view."""
+        return self.run(
+            f"(() => {{ const e = document.querySelector({selector!r}); "
+            "e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect(); "
+            "return [b.left, b.top, b.width, b.height]; })()"
+        )
+
+    def picture(self):
+        """PNG of the whole page."""
+        shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
+        return base64.b64decode(shot["data"])
+
+    def close(self):
+        self.session = None
+        os.write(
+            self.send_to, json.dumps({"id": 10**9, "method": "Browser.close"}).encode() + b"\0"
         )
         try:
-            return asyncio.run(
-                asyncio.wait_for(
-                    _look(Path(path), width, height, expression, Path(profile)), 3 * WAIT
-                )
-            )
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(child.pid, signal.SIGKILL)
-            child.wait()
-
-
-async def _look(path, width, height, expression, profile):
-    from tornado.httpclient import AsyncHTTPClient
-    from tornado.websocket import websocket_connect
-
-    known = profile / "DevToolsActivePort"
-    for _ in range(WAIT * 10):
-        if known.exists() and known.read_text().count("\n"):
-            break
-        await asyncio.sleep(0.1)
-    port = known.read_text().splitlines()[0]
-    tabs = json.loads((await AsyncHTTPClient().fetch(f"http://127.0.0.1:{port}/json")).body)
-    socket = await websocket_connect(
-        next(t["webSocketDebuggerUrl"] for t in tabs if t["type"] == "page"),
-        max_message_size=1 << 28,
-    )
-    events, number = [], 0
-
-    async def hear():
-        told = json.loads(await asyncio.wait_for(socket.read_message(), WAIT))
-        events.append(told)
-        return told
-
-    async def ask(method, **parameters):
-        nonlocal number
-        number += 1
-        await socket.write_message(
-            json.dumps({"id": number, "method": method, "params": parameters})
-        )
-        while (told := await hear()).get("id") != number:
-            pass
-        assert "error" not in told, told
-        return told["result"]
-
-    for domain in ("Page", "Network", "Runtime", "Log"):
-        await ask(f"{domain}.enable")
-    await ask(
-        "Emulation.setDeviceMetricsOverride",
-        width=width,
-        height=height,
-        deviceScaleFactor=1,
-        mobile=width < 600,
-    )
-    await ask("Page.navigate", url=path.resolve().as_uri())
-    while not any(e.get("method") == "Page.loadEventFired" for e in events):
-        await hear()
-    value = await ask(
-        "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
-    )
-    shot = await ask("Page.captureScreenshot", format="png", captureBeyondViewport=True)
-    socket.close()
-    return {
-        "requests": [
-            e["params"]["request"]["url"]
-            for e in events
-            if e.get("method") == "Network.requestWillBeSent"
-        ],
-        "messages": [
-            e
-            for e in events
-            if e.get("method")
-            in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
-        ],
-        "value": value["result"]["value"],
-        "png": base64.b64decode(shot["data"]),
-    }
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait(10)
+        os.close(self.send_to)
+        os.close(self.read_from)

@@ -214,7 +214,7 @@ def test_the_grid_lies_between_superpixels():
 def test_pif_columns_stand_where_their_superpixels_are():
     offsets = np.array([[-1, 0], [0, 0], [0, 1]])
     column = np.arange(12.0).reshape(3, 4)
-    shown = pictures._on_superpixels(column, (2, 2), offsets)
+    shown = pictures.on_superpixels(column, (2, 2), offsets)
     np.testing.assert_array_equal(shown, [[0, 1, 0, 0], [2, 3, 0, 0], [4, 5, 8, 9], [6, 7, 10, 11]])
 
 

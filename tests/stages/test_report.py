@@ -381,7 +381,6 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
 
     from PIL import Image
 
-    pytest.importorskip("tornado")
     (tmp_path / "profile").mkdir()
     pictures = (
         "Promise.all([...document.images].map(i => i.decode())).then(() => "

@@ -37,6 +37,13 @@ def lightfield_artefact(
     return Artefact("lightfield", data, attrs, provenance)
 
 
+def pupil_and_pitch(artefact: "Artefact") -> tuple[float, float]:
+    """Width of the pupil's image and spacing of the lenslets, px, of a light field's artefact."""
+    attrs = artefact.attrs.get("refocus", {})
+    pitch = float(attrs.get("pitch") or 1.0)
+    return float(attrs.get("pupil") or pitch), pitch
+
+
 def lightfield_of(artefact: "Artefact") -> LightField:
     """The light field that an artefact holds."""
     data = artefact.data

@@ -13,7 +13,7 @@ from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
 
 if TYPE_CHECKING:
-    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.opened_file import OpenedFile
     from plenocli.files.results.matrices import StoredMatrix
     from plenocli.report.drawing import Figures
 
@@ -32,21 +32,6 @@ class ShowSummary:
     def as_json(self) -> dict[str, Any]:
         """The summary of --json."""
         return asdict(self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _File:
-    """A file to draw: its kind, and its artefact, verified, where it is one."""
-
-    path: Path
-    kind: str
-    artefact: Artefact | None
-
-    def stored(self) -> Artefact:
-        """The artefact of a file that is one."""
-        if self.artefact is None:
-            raise ValueError(f"{self.path} is no artefact")
-        return self.artefact
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +71,7 @@ def run_show(
     Raises InputError for a file that no stage would read, UsageError where points lie outside.
     """
     from plenocli.files.atomic import check_output, publish
+    from plenocli.files.opened_file import open_file
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.drawing import stacked
 
@@ -93,7 +79,7 @@ def run_show(
     inputs = [*files, truth, calibration]
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".png",))
     centres = None if calibration is None else _centres(calibration)
-    found = [_open(Path(file)) for file in files]
+    found = [open_file(file) for file in files]
     kinds = [file.kind for file in found]
     if truth is not None:
         if set(kinds) != {"image"}:
@@ -121,37 +107,13 @@ def run_show(
     )
 
 
-def _open(path: Path) -> _File:
-    """A file of any kind that can be drawn; InputError where it is none."""
-    from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.provenance import require_file
-    from plenocli.files.artefacts.shards import PIF_KINDS, read_pif
-    from plenocli.files.images.exr import read_exr
-    from plenocli.files.images.mosaic import CAPTURE, is_hdf5
-    from plenocli.files.images.pictures import file_type
-    from plenocli.files.images.spectral_exr import is_spectral
-
-    require_file(path)
-    if is_hdf5(path):
-        artefact = read_artefact(path)
-        if artefact.kind != "pif" and artefact.kind in PIF_KINDS:
-            return _File(path=path, kind="pif", artefact=read_pif(path))
-        return _File(path=path, kind=artefact.kind, artefact=artefact)
-    kind = "capture"
-    if file_type(path) == "exr" and is_spectral(path):
-        kind = "spectra"
-    elif file_type(path) == "exr" and CAPTURE not in read_exr(path)[1]:
-        kind = "image"
-    return _File(path=path, kind=kind, artefact=None)
-
-
 def _centres(path: Path | str) -> np.ndarray:
     from plenocli.files.read.calibrations import read_calibration
 
     return read_calibration(path, response=False).grid.centres
 
 
-def _pif(file: _File, choice: _Choice) -> Figures:
+def _pif(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.figures import matrix_figures
 
@@ -170,7 +132,7 @@ def _require_inside(
             )
 
 
-def _capture(file: _File, choice: _Choice) -> Figures:
+def _capture(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.images.mosaic import read_capture
     from plenocli.report.figures import capture_figures
 
@@ -180,14 +142,14 @@ def _capture(file: _File, choice: _Choice) -> Figures:
     return capture_figures(read_capture(file.path), file.path.name, centres)
 
 
-def _calibration(file: _File, choice: _Choice) -> Figures:
+def _calibration(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.read.calibrations import calibration_of
     from plenocli.report.figures import calibration_figures
 
     return calibration_figures(calibration_of(file.stored()))
 
 
-def _dictionary(file: _File, choice: _Choice) -> Figures:
+def _dictionary(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.results import result_of
     from plenocli.report.figures import dictionary_figures
 
@@ -195,7 +157,7 @@ def _dictionary(file: _File, choice: _Choice) -> Figures:
     return dictionary_figures(result_of(learnt, file.path), file.path.name, choice.matrix)
 
 
-def _spectra(file: _File, choice: _Choice) -> Figures:
+def _spectra(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.results import read_result
     from plenocli.report.figures import spectra_figures
 
@@ -204,7 +166,7 @@ def _spectra(file: _File, choice: _Choice) -> Figures:
     return spectra_figures(result, file.path.name, choice.lenslets)
 
 
-def _image(file: _File, choice: _Choice) -> Figures:
+def _image(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.results import read_result
     from plenocli.report.figures import image_figures, spectra_figures
 
@@ -214,21 +176,21 @@ def _image(file: _File, choice: _Choice) -> Figures:
     return image_figures(result, file.path.name, result.seen)
 
 
-def _sweep(file: _File, choice: _Choice) -> Figures:
+def _sweep(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.design_tables import designs_of
     from plenocli.report.front import front_figures
 
     return front_figures(designs_of(file.stored()))
 
 
-def _lightfield(file: _File, choice: _Choice) -> Figures:
+def _lightfield(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.lightfields import lightfield_of
     from plenocli.report.depth.planes import lightfield_figures
 
     return lightfield_figures(lightfield_of(file.stored()))
 
 
-def _fit(file: _File, choice: _Choice) -> Figures:
+def _fit(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.report.figures import fit_figures
 
     stored = file.stored()
@@ -237,14 +199,14 @@ def _fit(file: _File, choice: _Choice) -> Figures:
     return fit_figures(names, *(stored.data[f"fit/{part}"] for part in parts))
 
 
-def _kernels(file: _File, choice: _Choice) -> Figures:
+def _kernels(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.stacks import stack_of
     from plenocli.report.depth.volumes import kernel_figures
 
     return kernel_figures(stack_of(file.stored(), file.path), file.path.name)
 
 
-def _volume(file: _File, choice: _Choice) -> Figures:
+def _volume(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.volumes import volume_of
     from plenocli.report.depth.volumes import volume_figures
 

@@ -82,7 +82,7 @@ def test_every_stage_of_the_spatial_experiment_runs(spatial):
     assert inner["lmmse"] > inner["lmmse-no-neighbours"] + 2, (
         "the neighbours' light matters and is modelled"
     )
-    assert "data:image/png" in (run / "report.html").read_text()
+    assert "data:image/webp" in (run / "report.html").read_text()
 
 
 def test_a_second_run_does_nothing_and_a_change_reruns_what_depends_on_it(spatial):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
+    from PIL import Image, ImageFont
 
 Figures = list[tuple[bytes, str]]
 """Pictures (PNG) with their captions."""
@@ -111,6 +112,22 @@ def drawing(
         made.png = buffer.getvalue()
 
 
+QUALITY = 80
+"""Of pictures on pages; letters and lines stay sharp on a screen."""
+
+
+def compact(png: bytes) -> bytes:
+    """A PNG as WebP for a page: without loss where that is smaller, as it is for plain drawings."""
+    from PIL import Image
+
+    image, made = Image.open(io.BytesIO(png)).convert("RGB"), []
+    for options in ({"quality": QUALITY}, {"lossless": True, "method": 2}):
+        buffer = io.BytesIO()
+        image.save(buffer, "webp", **options)
+        made.append(buffer.getvalue())
+    return min(made, key=len)
+
+
 def show_picture(axes: "Axes", values: ArrayLike, title: str = "", **options: Any) -> None:
     """A picture without ticks, encoded for the screen as sRGB is.
 
@@ -191,31 +208,58 @@ _LETTER, _LINE = 16, 24
 """Height of a letter and of a line of a caption on a sheet of pictures, pixels."""
 
 
-def stacked(figures: Figures) -> bytes:
-    """One PNG of several, below each other on white, each under its caption."""
-    import textwrap
+TALLEST = 8000
+"""Of a sheet, px: from there on its pictures stand side by side at half their size."""
 
+
+def stacked(figures: Figures) -> bytes:
+    """One PNG of several, below each other on white, each under its caption; many of them in
+    columns at half their size, so that the sheet stays about as wide as it is high.
+    """
     from matplotlib.font_manager import findfont
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageFont
 
     font = ImageFont.truetype(findfont("DejaVu Sans"), _LETTER)
     images = [Image.open(io.BytesIO(png)).convert("RGB") for png, _ in figures]
+    count = 1
+    if sum(image.height for image in images) > TALLEST:
+        images = [image.reduce(2) for image in images]
+        area = sum(image.height for image in images) * max(image.width for image in images)
+        count = max(2, round(area**0.5 / max(image.width for image in images)))
     width = max(image.width for image in images)
-    captions = [
-        textwrap.wrap(caption, max(20, int(width / (0.56 * _LETTER)))) for _, caption in figures
+    cells = [
+        _captioned(image, caption, width, font)
+        for image, (_, caption) in zip(images, figures, strict=True)
     ]
-    heights = [len(lines) * _LINE + _LINE // 2 for lines in captions]
+    lines = [cells[start : start + count] for start in range(0, len(cells), count)]
+    heights = [max(cell.height for cell in line) for line in lines]
     sheet = Image.new(
         "RGB",
-        (width, sum(i.height for i in images) + sum(heights) + _LINE * (len(images) - 1)),
+        (count * width + (count - 1) * _LINE, sum(heights) + _LINE * (len(lines) - 1)),
         "white",
     )
-    pen, top = ImageDraw.Draw(sheet), 0
-    for image, lines, height in zip(images, captions, heights):
-        for number, line in enumerate(lines):
-            pen.text((10, top + 6 + number * _LINE), line, fill="#5b6670", font=font)
-        sheet.paste(image, ((width - image.width) // 2, top + height))
-        top += height + image.height + _LINE
+    for number, line in enumerate(lines):
+        top = sum(heights[:number]) + _LINE * number
+        for place, cell in enumerate(line):
+            sheet.paste(cell, (place * (width + _LINE), top))
     buffer = io.BytesIO()
     sheet.save(buffer, "png")
     return buffer.getvalue()
+
+
+def _captioned(
+    image: "Image.Image", caption: str, width: int, font: "ImageFont.FreeTypeFont"
+) -> "Image.Image":
+    """A picture on white, `width` px wide, under its caption."""
+    import textwrap
+
+    from PIL import Image, ImageDraw
+
+    lines = textwrap.wrap(caption, max(20, int(width / (0.56 * _LETTER))))
+    top = len(lines) * _LINE + _LINE // 2
+    cell = Image.new("RGB", (width, top + image.height), "white")
+    pen = ImageDraw.Draw(cell)
+    for number, line in enumerate(lines):
+        pen.text((10, 6 + number * _LINE), line, fill="#5b6670", font=font)
+    cell.paste(image, ((width - image.width) // 2, top))
+    return cell

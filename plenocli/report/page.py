@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 from plenocli.base.text import printable_lines
+from plenocli.report.drawing import compact
 
 
 def _escaped(text: str) -> str:
@@ -20,6 +21,7 @@ class Page:
         self._title, self._lead = title, lead
         self._blocks: list[str] = []
         self._sections: list[str] = []
+        self._headings: list[tuple[int, str]] = []
 
     def section(self, title: str, text: str = "") -> None:
         """A numbered-by-order main section with an entry in the list at the top."""
@@ -28,8 +30,9 @@ class Page:
         self.text(text)
 
     def heading(self, title: str, text: str = "") -> None:
-        """A heading below a section."""
-        self._blocks.append(f"<h3>{_escaped(title)}</h3>")
+        """A heading below a section, in the list at the top too."""
+        self._headings.append((len(self._sections), title))
+        self._blocks.append(f'<h3 id="h{len(self._headings)}">{_escaped(title)}</h3>')
         self.text(text)
 
     def text(self, text: str) -> None:
@@ -53,10 +56,10 @@ class Page:
     def figure(self, png: bytes, caption: str = "") -> None:
         """A picture with its caption, which is also its description for those who cannot see it."""
         if png:
-            data = base64.b64encode(png).decode("ascii")
+            data = base64.b64encode(compact(png)).decode("ascii")
             width, height = (int.from_bytes(png[at : at + 4], "big") for at in (16, 20))
             self._blocks.append(
-                f'<figure><img src="data:image/png;base64,{data}" width="{width * 100 // 130}" '
+                f'<figure><img src="data:image/webp;base64,{data}" width="{width * 100 // 130}" '
                 f'height="{height * 100 // 130}" alt="{_escaped(caption or "picture")}">'
                 f"<figcaption>{_escaped(caption)}</figcaption></figure>"
             )
@@ -97,7 +100,7 @@ class Page:
             for number, row in enumerate(rows)
         )
         legend = f"<caption>{_escaped(caption)}</caption>" if caption else ""
-        kind = ' class="text"' if text else ""
+        kind = ' class="text"' if text else ' class="wide"' if len(header) > 8 else ""
         self._blocks.append(
             f'<div class="scroll"><table{kind}>{legend}<thead><tr>{head}</tr></thead><tbody>{body}'
             "</tbody></table></div>"
@@ -122,14 +125,32 @@ class Page:
             f"<details><summary>{_escaped(summary)}</summary><pre>{_escaped(text)}</pre></details>"
         )
 
+    def _contents(self) -> str:
+        """Links to the sections, each with its headings below it."""
+        parts = []
+        for number, title in enumerate(self._sections, start=1):
+            below = "".join(
+                f'<li><a href="#h{i}">{_escaped(text)}</a></li>'
+                for i, (section, text) in enumerate(self._headings, start=1)
+                if section == number
+            )
+            parts.append(
+                f'<li><a href="#s{number}">{_escaped(title)}</a>'
+                + (f"<ul>{below}</ul>" if below else "")
+                + "</li>"
+            )
+        return f"<ol>{''.join(parts)}</ol>"
+
+    def others(self, names: Sequence[str]) -> None:
+        """Files that a section does not draw, folded away; nothing for none."""
+        if names:
+            how = "plenocli view FILE -o view.html shows one"
+            self.code("\n".join(names), f"{len(names)} more: {how}")
+
     def render(self) -> str:
         """The page as text. The same blocks give the same bytes."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-        links = "".join(
-            f'<a href="#s{i}">{_escaped(title)}</a>'
-            for i, title in enumerate(self._sections, start=1)
-        )
-        nav = f"<nav>{links}</nav>" if len(self._sections) > 1 else ""
+        nav = f"<nav>{self._contents()}</nav>" if len(self._sections) > 1 else ""
         lead = f'<p class="lead">{_escaped(self._lead)}</p>' if self._lead else ""
         return (
             (

@@ -7,7 +7,7 @@ from plenocli.files.results.lightfields import lightfield_of
 from plenocli.files.results.run_folder import RunFile, RunFolder
 from plenocli.report.page import Page
 from plenocli.report.run_spatial import add_spatial, of_pictures
-from plenocli.report.run_spectral import add_spectral, of_bands
+from plenocli.report.run_spectral import add_grids, add_spectral, of_bands
 from plenocli.report.score_page import add_table
 
 
@@ -29,6 +29,7 @@ def run_page(run: RunFolder, title: str) -> tuple[Page, list[str]]:
     sections = [
         add_spatial(page, run, spatial),
         add_spectral(page, run, spectral),
+        add_grids(page, run),
         _add_refocused(page, run, scores),
         _add_designs(page, run),
     ]
@@ -90,10 +91,10 @@ def _add_refocused(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str
     )
     for file in scores:
         if file.scores and any(one.kind == "lightfield" for one in file.scores.results):
-            page.heading(file.name.removesuffix(".json"), file.command)
+            page.heading(file.name.removesuffix(".json"), file.made_by)
             add_table(page, file.scores)
     for file in found:
-        page.heading(file.name.removesuffix(".h5"), file.command)
+        page.heading(file.name.removesuffix(".h5"), file.made_by)
         page.figures(lightfield_figures(lightfield_of(file.artefact())))
     return "Depth"
 
@@ -114,7 +115,7 @@ def _add_designs(page: Page, run: RunFolder) -> str | None:
         ),
     )
     for file in found:
-        page.heading(file.name.removesuffix(".h5"), file.command)
+        page.heading(file.name.removesuffix(".h5"), file.made_by)
         table = designs_of(file.artefact())
         if table.ahead.any():
             page.figures(front_figures(table))
@@ -140,8 +141,11 @@ def _add_files(page: Page, run: RunFolder) -> None:
             "when this page was made."
         ),
     )
-    rows = [[file.name, file.kind, file.digest[:12], file.command] for file in run.files]
+    rows = [[file.name, file.kind, file.digest[:12], file.made_by] for file in run.files]
     page.table(["file", "kind", "SHA-256", "made by"], rows, text=True)
+    long = dict.fromkeys(file.command for file in run.files if file.made_by != file.command)
+    if long:
+        page.code("\n\n".join(long), "Long commands in full")
     configs: dict[str, list[str]] = {}
     for file in run.files:
         if file.config:

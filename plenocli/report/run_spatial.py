@@ -21,9 +21,20 @@ MOST_CAPTURES = 3
 """Drawn in a section; the rest are listed."""
 
 
+MOST_MATRICES = 2
+"""System matrices that are drawn."""
+MOST_ALONE = 6
+"""Results without a score that are drawn."""
+
+
 def of_pictures(document: ScoreDocument) -> bool:
     """Whether a score document compares pictures."""
     return any("psnr_db" in one.figures and not one.wavelengths_nm for one in document.results)
+
+
+def is_grid(file: RunFile) -> bool:
+    """Whether a calibration holds the lenslets alone, of a camera that has no filters to tell."""
+    return "response/F" not in file.artefact().data
 
 
 def add_spatial(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str | None:
@@ -63,17 +74,15 @@ def add_spatial(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str | 
             "Quality of every method; the dashed line is the PSNR of one value a lenslet.",
         )
     for file, document in documents:
-        page.heading(file.name.removesuffix(".json"), file.command)
+        page.heading(file.name.removesuffix(".json"), file.made_by)
         add_table(page, document)
         _add_drawn_results(page, run, file, document)
     scored = {digest for file in scores for digest in file.sources.values()}
     _add_alone(page, [file for file in images if file.digest not in scored])
-    if captures:
-        page.heading("Captures")
-    for file in captures[:MOST_CAPTURES]:
-        add_capture(page, run, file)
-    for file in matrices[:2]:
+    add_captures(page, run, captures)
+    for file in matrices[:MOST_MATRICES]:
         _add_matrix(page, file)
+    page.others([file.name for file in matrices[MOST_MATRICES:]])
     for file in dictionaries:
         _add_dictionary(page, run, file)
     return "Spatial"
@@ -91,7 +100,7 @@ def _of_pictures(run: RunFolder, images: Sequence[RunFile]) -> tuple[list[RunFil
         for file in (*run.of_kind("calibration"), *run.of_kind("spectra"))
         for digest in file.sources.values()
     }
-    homes = {file.folder for file in run.of_kind("calibration")}
+    homes = {file.folder for file in run.of_kind("calibration") if not is_grid(file)}
 
     def belongs(file: RunFile) -> bool:
         # a DNG does not say what it was for: what lies with a calibration belongs to it
@@ -130,10 +139,24 @@ def _add_alone(page: Page, files: Sequence[RunFile]) -> None:
     """Reconstructions that nobody scored, real captures' for instance."""
     from plenocli.report.figures import image_figures
 
-    for file in files[:6]:
+    alone = [file for file in files if file.kind == "image"]
+    if len(alone) > MOST_ALONE:
+        page.heading(f"Pictures without a score: {MOST_ALONE} of {len(alone)}")
+        page.others([file.name for file in alone[MOST_ALONE:]])
+    for file in alone[:MOST_ALONE]:
         result = read_result(file.path)
         if result.wavelengths is None:
             page.figures(image_figures(result, file.name))
+
+
+def add_captures(page: Page, run: RunFolder, files: Sequence[RunFile]) -> None:
+    """Some captures as pictures, how many there are, and the names of the others."""
+    shown, others = files[:MOST_CAPTURES], files[MOST_CAPTURES:]
+    if shown:
+        page.heading(f"Captures: {len(shown)} of {len(files)}" if others else "Captures")
+    for file in shown:
+        add_capture(page, run, file)
+    page.others([file.name for file in others])
 
 
 def add_capture(page: Page, run: RunFolder, file: RunFile) -> None:
@@ -174,7 +197,7 @@ def _add_matrix(page: Page, file: RunFile) -> None:
     from plenocli.report.figures import matrix_figures
 
     matrix = matrix_of(file.artefact())
-    page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.command)
+    page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.made_by)
     facts = [
         (
             "bands x superpixels x pixels x object points",
@@ -221,7 +244,7 @@ def _add_dictionary(page: Page, run: RunFolder, file: RunFile) -> None:
     from plenocli.report.figures import dictionary_figures
 
     artefact = file.artefact()
-    page.heading(f"Dictionary {file.name.removesuffix('.h5')}", file.command)
+    page.heading(f"Dictionary {file.name.removesuffix('.h5')}", file.made_by)
     attrs = artefact.attrs.get("dictionary", {})
     rows = [
         [name.replace("_", " "), cell_text(value)]

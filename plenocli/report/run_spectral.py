@@ -14,7 +14,7 @@ from plenocli.files.results.results import read_response, read_result
 from plenocli.files.results.run_folder import RunFile, RunFolder
 from plenocli.report.drawing import Figures
 from plenocli.report.page import Page
-from plenocli.report.run_spatial import MOST_CAPTURES, add_capture
+from plenocli.report.run_spatial import add_captures, is_grid
 from plenocli.report.score_page import add_spectra, add_table
 from plenocli.report.tables import cell_text
 
@@ -30,6 +30,20 @@ def of_bands(document: ScoreDocument) -> bool:
     return any(one.wavelengths_nm for one in document.results)
 
 
+def add_grids(page: Page, run: RunFolder) -> str | None:
+    """The section about lenslet grids; returns its name, or None where there are none."""
+    grids = [file for file in run.of_kind("calibration") if is_grid(file)]
+    if not grids:
+        return None
+    page.section("Lenslets", "Where the lenslets stand on the sensor, as a white image shows them.")
+    described: set[str] = set()
+    for file in grids:
+        _add_calibration(page, file, described)
+    sources = {digest for file in grids for digest in file.sources.values()}
+    add_captures(page, run, [f for f in run.of_kind("capture") if f.digest in sources])
+    return "Lenslets"
+
+
 def _of_responses(document: ScoreDocument) -> bool:
     return all(one.kind == "calibration" for one in document.results if not one.error)
 
@@ -41,7 +55,8 @@ def add_spectral(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str |
 
     Returns its name, None where there is nothing to show.
     """
-    calibrations, spectra = run.of_kind("calibration"), run.of_kind("spectra")
+    every, spectra = run.of_kind("calibration"), run.of_kind("spectra")
+    calibrations = [file for file in every if not is_grid(file)]
     if not (scores or calibrations or spectra):
         return None
     page.section(
@@ -84,12 +99,8 @@ def _add_captures(page: Page, run: RunFolder, users: Sequence[RunFile]) -> None:
         next((f for f in captures if word in f.path.name), None)
         for word in ("chart", "white", "band")
     ]
-    digests = list(dict.fromkeys(f.digest for f in [*sorts, *captures] if f))
-    if digests:
-        page.heading("Captures")
-    for file in map(run.by_digest, digests[:MOST_CAPTURES]):
-        if file is not None:
-            add_capture(page, run, file)
+    by_digest = {f.digest: f for f in [*sorts, *captures] if f}
+    add_captures(page, run, list(by_digest.values()))
 
 
 def _add_merged_scores(page: Page, run: RunFolder, files: Sequence[RunFile]) -> None:
@@ -122,7 +133,7 @@ def _add_agreement(page: Page, run: RunFolder, file: RunFile) -> None:
     """
     from plenocli.report.spectral_pictures import response_errors
 
-    page.heading("Responses compared", file.command)
+    page.heading("Responses compared", file.made_by)
     if file.scores is not None:
         add_table(page, file.scores)
     first, truth = (run.by_digest(file.sources.get(role)) for role in ("result 1", "truth"))
@@ -147,6 +158,9 @@ def _is_white(run: RunFolder, file: RunFile) -> bool:
 def _add_bands_alone(page: Page, files: Sequence[RunFile]) -> None:
     from plenocli.report.spectral_pictures import band_pictures
 
+    if len(files) > MOST_SPECTRA:
+        page.heading(f"Spectra without a score: {MOST_SPECTRA} of {len(files)}")
+        page.others([file.name for file in files[MOST_SPECTRA:]])
     for file in files[:MOST_SPECTRA]:
         result = read_result(file.path)
         page.figure(
@@ -162,7 +176,7 @@ def _add_calibration(page: Page, file: RunFile, described: set[str]) -> None:
 
     artefact = file.artefact()
     attrs = artefact.attrs
-    page.heading(f"Calibration {file.name.removesuffix('.h5')}", file.command)
+    page.heading(f"Calibration {file.name.removesuffix('.h5')}", file.made_by)
     grid, response = attrs.get("grid", {}), attrs.get("response", {})
     rows = [
         [label, _listed(of.get(name))]

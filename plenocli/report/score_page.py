@@ -56,11 +56,14 @@ def score_page(document: ScoreDocument, drawn: Sequence[Compared | None]) -> str
 
 
 def add_table(page: Page, document: ScoreDocument, caption: str = "") -> None:
-    """The table of all results with the best of each row in bold, failed results, and the
-    definitions.
+    """The table of all results with the best of each row in bold, the result with most of them
+    first, failed results, and the definitions.
     """
     header, rows = metric_rows(document)
-    page.table(header, rows, caption, _best(document, rows))
+    best = [column for found in _best(document, rows).values() for column in found]
+    order = [0, *sorted(range(1, len(header)), key=lambda column: -best.count(column))]
+    rows = [[row[column] for column in order] for row in rows]
+    page.table([header[column] for column in order], rows, caption, _best(document, rows))
     for one in document.results:
         if one.error:
             page.warning(f"{one.name} could not be scored: {one.error}")

@@ -33,10 +33,10 @@ PLAN = {
 }
 
 
-def put(path, kind, data, attrs=None, inputs=None):
+def put(path, kind, data, attrs=None, inputs=None, command=None):
     path.parent.mkdir(parents=True, exist_ok=True)
     provenance = Provenance(
-        command=f"plenocli made {path.name}",
+        command=command or f"plenocli made {path.name}",
         inputs=describe_inputs(inputs or {}),
         seed=1,
         config="# camera\n",
@@ -410,3 +410,26 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
     assert (
         np.ptp(shot) > 200 and dark.mean() > 0.3 and np.flatnonzero(dark)[-1] > 0.9 * len(shot)
     ), "pictures and text from top to bottom"
+
+
+def test_many_captures_are_counted_and_the_others_named(tmp_path):
+    """Forty captures of one long command and a grid alone: no row repeats the command, the rest of
+    the captures is named, and the grid does not stand under filters.
+    """
+    rng = np.random.default_rng(11)
+    names = [f"night-{i:02}.h5" for i in range(40)]
+    command = f"plenocli capture-sim {' '.join(names)} --seed 1 -o night"
+    for name in names:
+        data = {"capture/mosaic": rng.random((20, 20)).astype("f4"), "capture/cfa": "mono"}
+        put(tmp_path / name, "capture", data, {"capture": {"units": "DN"}}, command=command)
+    centres = np.stack(np.meshgrid(*2 * [np.arange(4.0) * 5 + 2], indexing="ij"), -1)
+    grid = {"grid/centre": centres, "grid/valid": np.ones((4, 4), bool)}
+    attrs = {"grid": {"lattice": "square", "pitch": [5.0, 5.0], "angle": 0.0}}
+    put(tmp_path / "grid.h5", "calibration", grid, attrs, {"white": tmp_path / names[0]})
+    made = run_report(tmp_path, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert "Lenslets" in made.sections and "Filters in the pupil" not in page
+    assert "Captures: 3 of 39" in page and "36 more: plenocli view FILE" in page
+    assert page.count(" ".join(names[15:25])) == 1, "the long command in full, once"
+    assert f"plenocli capture-sim {names[0]}" in page and "--seed 1 -o night" in page
+    assert len(page) < 1e6

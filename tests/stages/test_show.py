@@ -136,3 +136,15 @@ def test_refusals(folder, tmp_path, monkeypatch, capfd, arguments, code, message
     monkeypatch.chdir(folder)
     assert run(["show", *arguments, "-o", str(tmp_path / "p.png")]) == code
     assert message in capfd.readouterr().err and not (tmp_path / "p.png").exists()
+
+
+def test_a_sheet_of_many_pictures_is_about_as_wide_as_high():
+    buffer = io.BytesIO()
+    Image.new("RGB", (1326, 740), "#204060").save(buffer, "png")
+    figures = [(buffer.getvalue(), f"capture number {i}") for i in range(48)]
+    with Image.open(io.BytesIO(stacked(figures))) as sheet:
+        assert max(sheet.size) < 5000 and 0.5 < sheet.width / sheet.height < 2
+        blue = (np.asarray(sheet) == (0x20, 0x40, 0x60)).all(axis=-1)
+    assert label(blue)[1] == 48
+    with Image.open(io.BytesIO(stacked(figures[:3]))) as sheet:
+        assert sheet.width == 1326 and sheet.height > 3 * 740

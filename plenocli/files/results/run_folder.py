@@ -19,6 +19,10 @@ _KEPT_BYTES = 32 << 20
 """Larger artefacts are read again when they are drawn."""
 
 
+LONG_COMMAND = 160
+"""Letters from which on the middle of a command is left out on pages."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunFile:
     """One readable file.
@@ -46,6 +50,15 @@ class RunFile:
     def folder(self) -> Path:
         """The folder it lies in."""
         return self.path.parent
+
+    @property
+    def made_by(self) -> str:
+        """The command, its middle left out where it names many files."""
+        if len(self.command) <= LONG_COMMAND:
+            return self.command
+        half = LONG_COMMAND // 2
+        begin, end = self.command[:half].rpartition(" "), self.command[-half:].partition(" ")
+        return f"{begin[0] or begin[2]} … {end[2] or end[0]}"
 
     def artefact(self) -> "Artefact":
         """The artefact itself, verified."""

@@ -15,4 +15,4 @@ spectral:
 
 $(RUN)/report.html: spatial spectral
 	@if [ ! -e $@ ] || [ $(RUN)/spatial/report.html -nt $@ ] || [ $(RUN)/spectral/report.html -nt $@ ]; then \
-	  echo "$(P) report $(RUN) -o $@ --overwrite"; $(P) report $(RUN) -o $@ --overwrite; fi
+	  echo "$(P) report $(RUN) -o $@ --view $(RUN)/view.html --overwrite"; $(P) report $(RUN) -o $@ --view $(RUN)/view.html --overwrite; fi

@@ -141,6 +141,15 @@ class Page:
             )
         return f"<ol>{''.join(parts)}</ol>"
 
+    def links(self, links: Sequence[tuple[str, str]]) -> None:
+        """A list of (text, address) of other pages."""
+        items = "".join(
+            f'<li><a href="{html.escape(address)}">{_escaped(text)}</a></li>'
+            for text, address in links
+        )
+        if items:
+            self._blocks.append(f'<ul class="links">{items}</ul>')
+
     def others(self, names: Sequence[str]) -> None:
         """Files that a section does not draw, folded away; nothing for none."""
         if names:

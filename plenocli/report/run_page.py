@@ -11,8 +11,13 @@ from plenocli.report.run_spectral import add_grids, add_spectral, of_bands
 from plenocli.report.score_page import add_table
 
 
-def run_page(run: RunFolder, title: str) -> tuple[Page, list[str]]:
-    """The page about a run folder, and the names of its sections that show something."""
+def run_page(
+    run: RunFolder, title: str, closer: Sequence[tuple[str, str]] = ()
+) -> tuple[Page, list[str]]:
+    """The page about a run folder, and the names of its sections that show something.
+
+    closer: (text, address) of views of its files.
+    """
     page = Page(
         title,
         (
@@ -24,6 +29,9 @@ def run_page(run: RunFolder, title: str) -> tuple[Page, list[str]]:
     spatial = [file for file in scores if file.scores and of_pictures(file.scores)]
     spectral = [file for file in scores if file.scores and of_bands(file.scores)]
     page.cards([*_best_pictures(spatial), *_best_spectra(spectral)])
+    if closer:
+        page.section("Look closer", "Pages in which these files are refocused, compared and read.")
+        page.links(closer)
     for name, problem in run.unreadable:
         page.warning(f"{name} could not be read: it {problem}.")
     sections = [

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, UsageError
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance, describe_inputs
@@ -433,3 +433,20 @@ def test_many_captures_are_counted_and_the_others_named(tmp_path):
     assert page.count(" ".join(names[15:25])) == 1, "the long command in full, once"
     assert f"plenocli capture-sim {names[0]}" in page and "--seed 1 -o night" in page
     assert len(page) < 1e6
+
+
+def test_the_report_links_to_the_views_of_its_files(folder, tmp_path):
+    there = tmp_path / "a page"
+    there.mkdir()
+    made = run_report(folder, tmp_path / "r.html", view=there / "view.html")
+    page, views = (tmp_path / "r.html").read_text(), (there / "view.html").read_text()
+    content = json.loads(views.split('id="content">')[1].split("</script>")[0])
+    titles = [panel["title"] for panel in content]
+    assert made.view == str(there / "view.html")
+    assert any("lmmse.h5" in t and "tikhonov.h5" in t for t in titles), "one truth, one panel"
+    for word in ("capture.h5", "pif.h5", "dictionary.h5", "chart-pinv.h5", "calibration.h5"):
+        assert any(word in title for title in titles), word
+    for number, title in enumerate(titles):
+        assert f'<a href="a%20page/view.html#p{number}">{title}</a>' in page
+    with pytest.raises(UsageError):
+        run_report(folder, tmp_path / "r.html", view=tmp_path / "r.html", overwrite=True)

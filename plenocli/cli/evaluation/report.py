@@ -13,6 +13,12 @@ from plenocli.cli import options
 @options.input_path("run_folder")
 @options.output
 @click.option("--title", help="Title of the page; default the name of the folder.")
+@click.option(
+    "--view",
+    type=options.FILE,
+    metavar="VIEW",
+    help="Also write this page of views of the files (.html), as view does, and link to it.",
+)
 @options.mem_limit
 @options.overwrite
 @options.as_json
@@ -21,6 +27,7 @@ def command(
     *,
     output: Path,
     title: str | None,
+    view: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -33,11 +40,11 @@ def command(
 
     \b
     Example:
-      plenocli report runs/demo -o runs/demo/report.html --overwrite
+      plenocli report runs/demo -o runs/demo/report.html --view runs/demo/view.html --overwrite
     """
     from plenocli.stages.evaluation.report import run_report
 
-    made = run_report(run_folder, output, title=title, overwrite=overwrite)
+    made = run_report(run_folder, output, title=title, view=view, overwrite=overwrite)
     missing = f", {len(made.unreadable)} unreadable" if made.unreadable else ""
     options.summary(
         made.as_json(),

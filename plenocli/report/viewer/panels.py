@@ -186,7 +186,8 @@ def picture_panels(results: Sequence[Result], truth: np.ndarray | None, most: in
             )
         if result.sigma is not None:
             layers.append(levels(f"σ of {layer.name}", thinned(result.sigma, share)[0]))
-    names = ", ".join(result.path.name for result in results)
+    names = ", ".join(result.path.name for result in results[:3])
+    names += f" and {len(results) - 3} more" if len(results) > 3 else ""
     return [Stack(title=names, caption="Relative radiance.", layers=layers, labels=[], block=block)]
 
 

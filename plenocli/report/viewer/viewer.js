@@ -536,7 +536,10 @@
       else if (!panel || !panel.key(k)) return;
       e.preventDefault();
     });
-    await open(0);
+    // #p3 is the fourth panel
+    const asked = () => { const n = Number(/^#p(\d+)$/.exec(location.hash)?.[1] ?? 0); return n < content.length ? n : 0; };
+    addEventListener("hashchange", () => open(asked()));
+    await open(asked());
   }
   begin();
 })();

@@ -87,6 +87,21 @@ def run_view(
     )
 
 
+def looked_at(files: Sequence[Path], *, truth: Path | None, most: int, below: Path) -> list[Panel]:
+    """Panels of files, named by their places below a folder.
+
+    truth: of all of them, or None.
+    most: values that they may show.
+    """
+    from plenocli.files.opened_file import open_file
+
+    found = [open_file(file) for file in files]
+    choice = _Choice(truth=truth, calibration=None, most=most // len(files))
+    home = files[0].parent.relative_to(below).as_posix()
+    panels = _panels(found, choice)
+    return [replace(panel, title=f"{home}/{panel.title}".removeprefix("./")) for panel in panels]
+
+
 def _require_view(file: OpenedFile) -> None:
     if file.kind not in _VIEWS:
         raise InputError(

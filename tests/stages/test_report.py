@@ -391,7 +391,11 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
         width,
         height,
         (
-            f"{pictures}.then(p => ({{pictures: p, needs: "
+            f"{pictures}.then(p => ({{pictures: p, best: [...document.querySelectorAll('table')]"
+            ".filter(t => t.querySelector('.best')).map(t => Math.min(...[...t.querySelectorAll("
+            "'.best')].map(b => b.getBoundingClientRect().right))), words: "
+            "[...document.querySelectorAll('.scroll:has(.text)')].map(s => "
+            "s.scrollWidth - s.clientWidth), needs: "
             "document.documentElement.scrollWidth, has: innerWidth}))"
         ),
         tmp_path / "profile",
@@ -404,6 +408,8 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
         natural > 300 and shown > 250 for natural, shown in seen["value"]["pictures"]
     )
     assert seen["value"]["needs"] <= seen["value"]["has"] == width, "the page scrolls sideways"
+    best, words = seen["value"]["best"], seen["value"]["words"]
+    assert best and max(best) <= width and words and max(words) == 0
     shot = np.asarray(Image.open(io.BytesIO(seen["png"])).convert("L"))
     assert shot.shape[1] == width and shot.shape[0] > 4 * height
     dark = (shot < 128).reshape(len(shot), -1).any(axis=1)

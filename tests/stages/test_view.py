@@ -345,7 +345,9 @@ def test_slices_of_a_volume_meet_in_the_voxel_that_was_clicked(browser, tmp_path
     look(browser, view_page("v", panels), tmp_path / "v.html")
     assert browser.run("document.querySelectorAll('.three').length") == 2
     browser.key(".")
+    browser.resize(1280, 900)
     left, top, wide, high = browser.box(".three .picture")
+    assert wide > 400 and high == pytest.approx(wide * 12 / 16, abs=1)
     browser.drag((left + wide * 10.5 / 16, top + high * 3.5 / 12))
     top_value = panels[0].layers[0].high
     for number, due in enumerate((value[3], value[:, 3], value[:, :, 10]), 1):

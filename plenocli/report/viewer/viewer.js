@@ -446,12 +446,16 @@
       this.place = this.shape.map((n) => n >> 1);
       // deep volumes would be needles: a plane is drawn at most 8 pixels high
       const thick = clamp(dz / dx, 0.25, 8);
+      const wide = cols * dx, high = rows * dy, widest = Math.max(wide, high);
       const kinds = [
-        { name: "xy", rows: 1, cols: 2, aspect: dy / dx }, { name: "xz", rows: 0, cols: 2, aspect: thick }, { name: "yz", rows: 0, cols: 1, aspect: thick * dx / dy },
+        { name: "xy", rows: 1, cols: 2, aspect: dy / dx, width: wide },
+        { name: "xz", rows: 0, cols: 2, aspect: thick, width: wide },
+        { name: "yz", rows: 0, cols: 1, aspect: thick * dx / dy, width: high },
       ];
       this.sets = data.layers.map((layer) => {
         const slices = kinds.map((kind) => {
-          const picture = new Picture(this.shape[kind.rows], this.shape[kind.cols], { aspect: kind.aspect, most: 420 });
+          const picture = new Picture(this.shape[kind.rows], this.shape[kind.cols], { aspect: kind.aspect });
+          picture.box.style.maxWidth = `${100 * kind.width / widest}%`;
           const lines = [el("i", { className: "cross" }), el("i", { className: "cross" })];
           picture.box.append(...lines, el("span", { className: "tag left", textContent: kind.name }));
           const go = (r, c) => { this.place[kind.rows] = r; this.place[kind.cols] = c; this.draw(); };

@@ -86,8 +86,8 @@ colorchecker: $(READY) ## a real ColorChecker under narrow-band light against it
 raw: $(READY) ## calibrate and demultiplex your own captures: make raw WHITE=.. DARK=.. CAPTURES="a.nef b.nef"
 	$(PIPELINE) pipelines/raw.mk RUN=$(RUNS)/raw
 
-paper: spatial spectral ## the paper's figures made anew, each beside what the paper says: runs/paper.html
-	$(BIN)/python pipelines/paper.py $(RUNS)/spatial $(RUNS)/spectral/achromat $(RUNS)/paper.html
+paper: $(READY) ## the paper's figures made anew, each with its statement, our number and a verdict: runs/paper/paper.html (DOLL=file)
+	$(PIPELINE) pipelines/paper.mk $(ALL_CORES) RUN=$(RUNS)/paper $(DOLL:%=DOLL=%)
 
 tradeoff: $(READY) ## what the accuracy dial promises and delivers, against brute force: a table and a plot (an hour; PLAN=1 says how long)
 	$(PIPELINE) pipelines/tradeoff.mk RUN=$(RUNS)/tradeoff

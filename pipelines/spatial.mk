@@ -19,12 +19,13 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 # a result is called by its method; what a method needs beyond its name stands here
 METHODS := block-mean tikhonov tsvd nnls-300 nnls lmmse dictionary tv pnp
-OPTIONS_nnls-300 := --method nnls --nnls-iterations 300
 OPTIONS_lmmse-3x3 := --method lmmse --overlap 3
 OPTIONS_dictionary := --method dictionary --dictionary $(RUN)/dictionary.h5
+OPTIONS_unlearned := --method dictionary --dictionary $(RUN)/unlearned.h5
+STEPS = $(patsubst nnls-%,%,$(filter nnls-%,$*))
 OPTIONS_lmmse-no-neighbours := --method lmmse --pif $(RUN)/pif.h5
 OPTIONS_lmmse-right := --method lmmse --pif $(RUN)/pif-exact.h5
-OPTIONS = $(or $(OPTIONS_$*),--method $*) $(if $(filter lmmse% tv pnp auto,$*),$(TRAINING:%=--training %))
+OPTIONS = $(or $(OPTIONS_$*),$(STEPS:%=--method nnls --nnls-iterations %),--method $*) $(if $(filter lmmse% tv pnp auto,$*),$(TRAINING:%=--training %))
 
 PAPER := $(patsubst %,$(RUN)/paper/%.h5,$(METHODS) lmmse-3x3)
 # converged nnls takes minutes a sweep and only shows again what it does on the paper's capture
@@ -61,6 +62,12 @@ $(RUN)/model/capture.h5: $(CONFIG) $(RUN)/pif-exact.h5 | $(RUN)/model/
 
 $(RUN)/dictionary.h5: $(RUN)/pif.h5
 	$(P) learn-dict $(TRAINING) --pif $< $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed 3 --synthesis -o $@ --overwrite
+
+# the start of Algorithm 1, to tell what learning adds
+$(RUN)/unlearned.h5: $(RUN)/pif.h5
+	$(P) learn-dict $(TRAINING) --pif $< --iterations 0 --snr $(SNR) --seed 3 --synthesis -o $@ --overwrite
+
+$(RUN)/paper/unlearned.h5: $(RUN)/unlearned.h5
 
 $(RUN)/paper/dictionary.h5 $(RUN)/stray/dictionary.h5 $(RUN)/model/dictionary.h5: $(RUN)/dictionary.h5
 

@@ -372,7 +372,7 @@ def _reconstructed(run):
             f"Non-linear least squares {PAPER_NNLS} dB",
             ", ".join(f"{v:.1f} dB at {n}" for n, v in nnls.items()) + " steps",
             "cannot be told",
-            "the step where it stopped is not given; the curve passes through the paper's figure",
+            "the step where it stopped is not given, and the figure depends on it",
         ),
         (
             f"The learnt dictionary {PAPER_DICTIONARY} dB, "
@@ -386,7 +386,7 @@ def _reconstructed(run):
             "The gain is that of learning",
             f"{learning:.2f} dB over the patches that learning starts from",
             _word(learning > 0.3),
-            "most of the gain comes from a dictionary of patches, learnt or not",
+            "same capture, same method; at least 0.3 dB are asked for here",
         ),
         (
             "Blocking goes when 3x3 lenslets are reconstructed and averaged",

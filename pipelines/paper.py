@@ -330,6 +330,7 @@ def _curve(nnls, others):
     with drawing(6.4, 3.2) as made:
         axes = made.figure.subplots()
         axes.semilogx(list(nnls), list(nnls.values()), "o-", label="NNLS")
+        axes.set_xticks(list(nnls), [str(n) for n in nnls], minor=False)
         for (name, value), style in zip(others.items(), ("-", "--", ":"), strict=False):
             axes.axhline(value, linestyle=style, color="#777777", label=f"{name}, {value:.1f} dB")
         axes.axhline(PAPER_NNLS, color="#c03030", label=f"the paper's NNLS, {PAPER_NNLS} dB")

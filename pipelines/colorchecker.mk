@@ -16,7 +16,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))spectral_captures.mk
 
 SCORES := $(EXPOSURES:%=$(RUN)/score-%.json)
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 .PHONY: all
 
 # the real chart: numbers against the spectrometer, and an upright scene

@@ -6,6 +6,7 @@ SHELL := bash
 
 P := plenocli
 RUN ?= runs/experiment
+SIGN ?=
 include $(dir $(lastword $(MAKEFILE_LIST)))names.mk
 
 $(RUN):
@@ -14,3 +15,8 @@ $(RUN)/%/:
 	@mkdir -p $@
 # else Make takes them for files of its own and tries to remove them at the end
 .PRECIOUS: $(RUN)/%/
+
+# what all files of the folder are, for plenocli verify; SIGN=key signs it
+SEAL = $(P) seal $(RUN) $(SIGN:%=--sign %)
+$(RUN)/SHA256SUMS:
+	@$(SEAL)

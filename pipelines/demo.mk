@@ -4,7 +4,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 HERE := $(dir $(lastword $(MAKEFILE_LIST)))
 SUB = +$(MAKE) --no-print-directory -f
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 .PHONY: all spatial spectral
 
 spatial:

@@ -13,7 +13,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 COMMON = $(TRAINING) --pif $(RUN)/pif.h5 $(BATCH:%=--batch %) --iterations $(ITERATIONS) --snr $(SNR) --seed $(SEED) --synthesis --checkpoint $(@D)/unfinished.h5 $(LEARN)
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 ablation: $(RUN)/without-delta/report.html
 .PHONY: all ablation
 

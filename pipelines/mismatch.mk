@@ -37,7 +37,8 @@ OPTIONS_nnls-300 := --method nnls --nnls-iterations 300
 OPTIONS = $(or $(OPTIONS_$(1)),--method $(1)) $(if $(filter lmmse tv pnp auto,$(1)),$(TRAINING:%=--training %))
 DICTIONARY = $(if $(filter dictionary,$(1)),--dictionary $(RUN)/dictionaries/$(2).h5)
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 .PHONY: all
 .SECONDARY:
 

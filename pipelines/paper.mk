@@ -13,6 +13,7 @@ SPATIAL := $(RUN)/$(if $(DOLL),doll,astronaut)
 
 all: spatial spectral
 	python $(HERE)paper.py $(SPATIAL) $(RUN)/spectral $(RUN)/paper.html
+	@$(SEAL)
 .PHONY: all spatial spectral
 
 # non-negative least squares at several steps: the paper does not say where it stopped

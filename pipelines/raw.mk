@@ -10,7 +10,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 RESULT := $(if $(BANDS),spectra,pictures)
 
-all: $(RUN)/calibration.h5 $(if $(CAPTURES),$(RUN)/$(RESULT)/.done)
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/calibration.h5 $(if $(CAPTURES),$(RUN)/$(RESULT)/.done)
 .PHONY: all
 
 BAND_FILES := $(foreach b,$(BANDS),$(word 2,$(subst =, ,$b)))

@@ -32,7 +32,8 @@ PAPER := $(patsubst %,$(RUN)/paper/%.h5,$(METHODS) lmmse-3x3)
 STRAY := $(patsubst %,$(RUN)/stray/%.h5,$(filter-out nnls,$(METHODS)) lmmse-no-neighbours)
 MODEL := $(patsubst %,$(RUN)/model/%.h5,$(filter-out nnls,$(METHODS)) auto lmmse-right)
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 .PHONY: all
 
 # the paper's matrix: one isolated lenslet

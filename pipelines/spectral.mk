@@ -17,7 +17,8 @@ RESPONSES := measured predicted
 spectra = $(foreach m,$(METHODS),$(RUN)/spectra/$(1)/$(2)-$m.h5)
 SPECTRA := $(foreach r,$(RESPONSES),$(foreach e,$(EXPOSURES),$(call spectra,$r,chart-$e) $(call spectra,$r,white-$e))) $(foreach m,$(filter pinv single-pixel,$(METHODS)),$(RUN)/spectra/measured/photo-$m.h5)
 
-all: $(RUN)/report.html
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(RUN)/report.html
 .PHONY: all
 
 # large, and gone when the captures are made

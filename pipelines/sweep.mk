@@ -9,7 +9,8 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 TABLES := $(patsubst %.toml,$(RUN)/%.h5,$(notdir $(SWEEPS)))
 
-all: $(TABLES)
+all: $(RUN)/SHA256SUMS
+$(RUN)/SHA256SUMS: $(TABLES)
 .PHONY: all
 
 define RULE

@@ -6,6 +6,7 @@ SWEEPS = $(TRADES)
 
 page: all
 	$(P) report $(RUN) --title "What accuracy buys, and what it costs" -o $(RUN)/trade.html --overwrite
+	@$(SEAL)
 .PHONY: page
 
 include $(dir $(lastword $(MAKEFILE_LIST)))sweep.mk

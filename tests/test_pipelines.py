@@ -237,6 +237,7 @@ def test_a_sweep_is_made_once_and_again_where_its_file_changed(tmp_path):
     )
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
         "small.h5",
+        "SHA256SUMS",
         "small.csv",
         "small.png",
         "small.parts",

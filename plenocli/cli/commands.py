@@ -25,6 +25,8 @@ COMMANDS = {
     "show": "evaluation",
     "view": "evaluation",
     "inspect": "evaluation",
+    "verify": "evaluation",
+    "seal": "evaluation",
     "lens": "forward",
     "schema": "forward",
 }

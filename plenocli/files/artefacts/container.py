@@ -15,7 +15,7 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,9 +108,38 @@ def read_artefact(
     breaks its table; NumericsError for one that the memory of this process does not hold.
     """
     path = Path(path)
+    return _parsed(path, _verified_bytes, kind, skip)
+
+
+def read_edited(path: str | os.PathLike) -> tuple[Artefact, str]:
+    """An artefact whose digest may not fit, because it was edited since, and the digest.
+
+    Raises as read_artefact, but for the digest.
+    """
+    path = Path(path)
+    budget().require_reading(path, READING * require_file(path))
+    header = _HEADER.fullmatch(first_bytes(path, HEADER_BYTES))
+    if header is None:
+        raise InputError(
+            "is no artefact with a digest block", path, "edit it with a library that keeps it"
+        )
+
+    def image(path: Path) -> memoryview:
+        return memoryview(path.read_bytes())[HEADER_BYTES:]
+
+    return _parsed(path, image, None, ()), header[1].decode()
+
+
+def _parsed(
+    path: Path,
+    image: Callable[[Path], memoryview],
+    kind: str | tuple[str, ...] | None,
+    skip: Collection[str],
+) -> Artefact:
+    """What the HDF5 part of a file, its `image`, holds; errors as read_artefact."""
     try:
         # which keeps a copy: ours goes
-        with h5py.File(_open_image(_verified_bytes(path)), "r") as file:
+        with h5py.File(_open_image(image(path)), "r") as file:
             return _parse(path, file, kind, skip)
     except (PlenoError, MemoryError):
         raise

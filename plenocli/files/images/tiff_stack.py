@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import uuid
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -12,7 +14,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.files.atomic import publish
+from plenocli.files.seal import SEAL, publish_sealed, require_seal
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -54,8 +56,11 @@ def write_ome_tiff(
 
     channels = [value] if sigma is None else [value, sigma]
     names = ["volume", "sigma"][: len(channels)]
+    planes = np.stack(channels).astype(np.float32)
     metadata = {
         "axes": "CZYX",
+        # else it has the clock and the machine in it
+        "UUID": uuid.uuid5(uuid.NAMESPACE_OID, hashlib.sha256(planes.tobytes()).hexdigest()).urn,
         "PhysicalSizeX": spacing[1] * 1e6,
         "PhysicalSizeXUnit": "µm",
         "PhysicalSizeY": spacing[0] * 1e6,
@@ -67,22 +72,21 @@ def write_ome_tiff(
         metadata |= {"PhysicalSizeZ": step * 1e6, "PhysicalSizeZUnit": "µm"}
     memory = BytesIO()
     with tifffile.TiffWriter(memory, ome=True) as file:
-        file.write(
-            np.stack(channels).astype(np.float32), photometric="minisblack", metadata=metadata
-        )
-    publish(path, memory.getvalue(), overwrite=overwrite)
+        file.write(planes, photometric="minisblack", metadata=metadata, software=SEAL)
+    publish_sealed(path, [memory.getbuffer()], overwrite=overwrite)
 
 
 def read_tiff_volume(path: str | os.PathLike) -> TiffVolume:
     """The first channel of a TIFF stack, with what its OME-XML or ImageJ description says of sizes.
 
-    Raises InputError where the file cannot be read or is no stack.
+    Raises InputError where the file cannot be read, is no stack, or one of ours that was altered.
     """
     import tifffile
 
     path = Path(path)
     if not path.is_file():
         raise InputError("is no file", path, "give a TIFF stack")
+    require_seal(path)
     try:
         with tifffile.TiffFile(path) as file:
             series = file.series[0]

@@ -32,6 +32,22 @@ def read_scores(path: Path | str) -> ScoreDocument | None:
 
     Raises InputError where it is no JSON, or no score document although it has results.
     """
+    document = read_sealed_json(path)
+    if document is None:
+        return None
+    if not isinstance(document.get("results"), list):
+        return None
+    try:
+        return _document(document)
+    except _Nonsense as error:
+        raise InputError(f"is not a score document: {error}", path, "run score again") from None
+
+
+def read_sealed_json(path: Path | str) -> dict[str, Any] | None:
+    """A JSON document of ours, None for any other JSON.
+
+    Raises InputError where it is no JSON, or was altered.
+    """
     path = Path(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -40,12 +56,7 @@ def read_scores(path: Path | str) -> ScoreDocument | None:
     if not isinstance(document, dict) or not {"results", "seal"} & document.keys():
         return None
     require_seal(path)
-    if not isinstance(document.get("results"), list):
-        return None
-    try:
-        return _document(document)
-    except _Nonsense as error:
-        raise InputError(f"is not a score document: {error}", path, "run score again") from None
+    return document
 
 
 def _document(document: dict[str, Any]) -> ScoreDocument:

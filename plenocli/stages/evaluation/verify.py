@@ -1,0 +1,106 @@
+"""Whether files are as they were written: each by its own digest, a run folder by its manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from plenocli.base.errors import InputError
+
+_FEW = 5
+"""Names of a list that are told in one line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verified:
+    """A file or folder that is as it was written.
+
+    files: that were compared.
+    signer: who signed the manifest, None where nobody was asked for.
+    unlisted: files of the folder that its manifest does not list.
+    """
+
+    path: Path
+    files: int = 1
+    signer: str | None = None
+    unlisted: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "path": str(self.path),
+            "files": self.files,
+            "signer": self.signer,
+            "unlisted": list(self.unlisted),
+        }
+
+    def line(self) -> str:
+        """In words."""
+        told = f"{self.path}: as it was written"
+        if self.path.is_dir():
+            told = f"{self.path}: {self.files} files as they were sealed"
+        if self.signer is not None:
+            told += f", signed by {self.signer}"
+        if self.unlisted:
+            told += f"; {few(self.unlisted)} came since and are not vouched for"
+        return told
+
+
+def few(names: Sequence[str]) -> str:
+    """Names, or the first ones and how many more."""
+    from plenocli.base.text import printable
+
+    shown = ", ".join(printable(name) for name in names[:_FEW])
+    return shown if len(names) <= _FEW else f"{shown} and {len(names) - _FEW} more"
+
+
+def run_verify(path: Path, *, signers: Path | None = None) -> Verified:
+    """Compare a file with the digest in it, or a folder with its manifest.
+
+    path: artefact, DNG, EXR, OME-TIFF or JSON of ours; or a folder with SHA256SUMS.
+    signers: file of the signers of which one must have signed the manifest.
+
+    Raises InputError naming what was altered or is missing, or where nothing says how it was.
+    """
+    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.images.mosaic import is_hdf5
+    from plenocli.files.seal import require_seal
+
+    if path.is_dir():
+        return _folder(path, signers)
+    if signers is not None:
+        raise InputError("is a file, and folders are signed", path, "name the folder of its run")
+    if is_hdf5(path):
+        read_artefact(path)
+    elif not require_seal(path):
+        raise InputError(
+            "holds no digest: it is none of the files that have one",
+            path,
+            "name the folder of its run, whose manifest lists every file",
+        )
+    return Verified(path=path)
+
+
+def _folder(root: Path, signers: Path | None) -> Verified:
+    from plenocli.files import manifest
+
+    signer = None if signers is None else manifest.signer(root, signers)
+    listed = manifest.read_manifest(root)
+    found = manifest.differences(manifest.digests(root), listed)
+    if found.altered or found.missing:
+        told = [
+            f"{few(names)} {verb}"
+            for names, verb in (
+                (found.altered, "altered"),
+                (found.missing, "missing"),
+            )
+            if names
+        ]
+        raise InputError(
+            f"is not as it was sealed: {'; '.join(told)}",
+            root,
+            "make them again, or accept them: plenocli seal FOLDER",
+        )
+    return Verified(path=root, files=found.same, signer=signer, unlisted=found.unlisted)

@@ -49,7 +49,7 @@ from plenocli.cli import options
 @click.option(
     "--camera",
     type=options.FILE,
-    help="Camera description (.toml) for the sensor's gain and read noise.",
+    help="Camera description (.toml) for gain, read noise and the number of lenslets.",
 )
 @click.option(
     "--response",
@@ -76,8 +76,9 @@ from plenocli.cli import options
     default=None,
     metavar="ROW COLUMN",
     help=(
-        "A pixel near the centre of any superpixel; needed only where filters in the pupil draw "
-        "lines as dark as the superpixels' borders."
+        "A pixel near the centre of any superpixel: a grid without a centre within a quarter of "
+        "the pitch of it is refused. Needed only where filters in the pupil draw lines as dark as "
+        "the superpixels' borders."
     ),
 )
 @click.option(

@@ -110,8 +110,8 @@ def calibrate(
     whites: captures of an evenly lit white, at one or several exposure times.
     darks: captures without light.
     bands: captures under narrow-band light; None: no response.
-    camera: description, for gain and read noise, and whether a filter array parts the superpixels;
-        None: as the captures tell.
+    camera: description, for gain and read noise, how many lenslets there are, and whether a filter
+        array parts the superpixels; None: as the captures tell.
     response: "own", "shared", "low-rank" or "auto" (measured_response).
     lattice: "auto", "square" or "hexagonal".
     near: (row, column) px close to any superpixel's centre (plenocli.inverse.grid.detect).
@@ -137,8 +137,7 @@ def calibrate(
         first.exposure_s,
     )
     _check_saturation(signal, first)
-    cells = camera is not None and camera.filter_array is not None
-    found = _grid(signal, first, lattice, near, parts=cells)
+    found = _grid(signal, first, camera, lattice, near)
     windows, valid = windows_on(found, first.shape)
     step = 1 if first.cfa == "mono" else 2
     bad = bad_pixels(signal, dark, first.levels.white, step) | np.isnan(signal)
@@ -258,14 +257,17 @@ def _told_by(group: Sequence[Capture], dark: Dark, noise: KnownNoise) -> KnownNo
 def _grid(
     signal: np.ndarray,
     white: Capture,
+    camera: Camera | None,
     lattice: str,
     near: tuple[float, float] | None,
-    *,
-    parts: bool,
 ) -> LensletGrid:
+    """The grid, of as many lenslets as the camera's description or else the capture says."""
+    parts = camera is not None and camera.filter_array is not None
+    said = camera.lenslet_array.count if camera is not None else None
+    count = said or (white.grid.count if white.grid else None)
     filled = np.where(np.isnan(signal), np.nanmax(signal), signal)
     try:
-        return find_grid(filled, white.cfa, None, lattice, near, parts=parts)
+        return find_grid(filled, white.cfa, None, lattice, near, parts=parts, count=count)
     except (NumericsError, InputError) as error:
         raise error.at(white.metadata.path) from None
 

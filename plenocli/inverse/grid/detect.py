@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
@@ -30,6 +31,16 @@ SCATTER = 0.07
 """Of the pitch, by which spots may scatter (rms) about the best grid."""
 BORDER_WEIGHT = 0.1
 """Of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it."""
+NEAR = 0.25
+"""Of the pitch: what a centre may lie from where it is said to be."""
+LINE = 0.1
+"""Of the darkest line's depth, by which a line must stand out of what surrounds it."""
+BOTTOM = 0.02
+"""Of the darkest line's depth, within which a line is at its bottom."""
+EDGE = 0.15
+"""Of a cell: what is looked at on either side of a line's flat bottom."""
+ALIKE = 0.7
+"""Of the chosen lines' depth, from which on others might as well be the superpixels' borders."""
 FRAME_TOLERANCE = 0.4
 """px by which a cell's edge may seem to lie outside the frame: sensors end where the array does."""
 FIX = (
@@ -47,6 +58,7 @@ def find_grid(
     crop: int = 1024,
     *,
     parts: bool = False,
+    count: Sequence[int] | None = None,
 ) -> LensletGrid:
     """Find the lenslet grid of a white image.
 
@@ -61,9 +73,12 @@ def find_grid(
     crop: px, side of the part in which the lattice is looked for first.
     parts: whether superpixels are known to hold several bright parts, as those behind a filter
         array do: one that is much brighter than the others passes for all of the superpixel.
+    count: lenslets (rows, columns), where they are known: of several phases that of this count is
+        taken.
 
-    Raises NumericsError, saying what was seen, where there is no lattice, InputError for an image
-    too small or not finite.
+    Raises NumericsError, saying what was seen, where there is no lattice or none with a centre
+    near `near`, InputError for an image too small or not finite. Notes where several phases would
+    do, and an array of another size than `count`.
     docs/model.md, "Spectral response: calibration and demultiplexing".
     """
     mosaic = prepare(white, cfa, dark)
@@ -81,11 +96,31 @@ def find_grid(
     model, _ = distortion.choose_model(index[inside], position[inside], weight)
     lit = None
     if structured and kind == "square":
-        moved = _to_dark_borders(image, model, index[inside], pitch, near)
+        moved = _to_dark_borders(image, model, index[inside], pitch, near=near, count=count)
         position = position + moved.at(index) - model.at(index)
         model, lit = moved, _lit_cells(image, moved)
     miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
-    return _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
+    if near is not None:
+        _check_near(model, near, pitch)
+    found = _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
+    if count is not None and found.valid.shape != tuple(count):
+        note(
+            f"warning: {by(found.valid.shape)} lenslets are found where {by(count)} are known: "
+            "rows or columns are dark or cut by the frame, or the grid lies aside; look at the "
+            "white image, or name a superpixel's middle"
+        )
+    return found
+
+
+def _check_near(model: GridModel, near: Sequence[float], pitch: float) -> None:
+    """Refuse a grid that has no centre within a quarter of the pitch of `near` (row, column) px."""
+    centre = model.at(np.rint(_index_at(model, near)))
+    if np.hypot(*(centre - near)) > NEAR * pitch:
+        raise NumericsError(
+            f"no superpixel has its centre near row {near[0]:g}, column {near[1]:g}: the nearest "
+            f"one that the image shows is at row {centre[0]:.1f}, column {centre[1]:.1f}",
+            fix="give a pixel near the middle of a superpixel, or none to let the image decide",
+        )
 
 
 def _basis(image: np.ndarray, lattice_kind: str) -> tuple[np.ndarray, str, bool]:
@@ -287,31 +322,45 @@ def _to_dark_borders(
     model: GridModel,
     index: np.ndarray,
     pitch: float,
+    *,
     near: Sequence[float] | None,
+    count: Sequence[int] | None,
 ) -> GridModel:
     """The map moved so that cell borders lie on dark lines between superpixels.
 
     The brightness of several parts draws a centroid towards the brightest; dark lines, seen in
     profiles along both lattice directions of all cells folded into one, do not care. Lines between
     the parts may be as dark as those between superpixels: of several candidates the one nearest to
-    `near`, or the best filled frame, decides.
+    `near`, that of the known `count`, or the best filled frame, decides.
     """
     lines = [_dark_lines(image, model, index, pitch, axis) for axis in (0, 1)]
-    best, chosen = None, model
+    found = []
     for down, depth_down in lines[0]:
         for right, depth_right in lines[1]:
             moved = replace(model, shift=model.shift - np.array([down, right]))
-            if near is not None:
-                site = np.rint(_index_at(moved, near))
-                merit = (-np.hypot(*(moved.at(site) - near)), 0.0)
-            else:
-                cells = _cells(moved, image.shape)
-                merit = (
-                    int(_whole(moved.at(cells), image.shape, 0.5 * pitch).sum()),
-                    depth_down + depth_right,
-                )
-            if best is None or merit > best:
-                best, chosen = merit, moved
+            cells = _cells(moved, image.shape)
+            whole = _whole(moved.at(cells), image.shape, 0.5 * pitch)
+            shape = [int(whole.any(axis=axis).sum()) for axis in (1, 0)]
+            hint = (
+                -float(np.hypot(*(moved.at(np.rint(_index_at(moved, near))) - near)))
+                if near is not None
+                else -float(np.abs(np.subtract(shape, count)).sum())
+                if count is not None
+                else 0.0
+            )
+            found.append(((hint, int(whole.sum())), depth_down + depth_right, moved))
+    if not found:
+        return model
+    merit, depth, chosen = max(found, key=lambda one: one[:2])
+    others = [m for m in found if m[2] is not chosen and m[0] == merit and m[1] > ALIKE * depth]
+    if others:
+        centre = chosen.at(np.rint(_index_at(chosen, np.array(image.shape) / 2)))
+        note(
+            "warning: lines within superpixels are nearly as dark as those between them, and "
+            f"{len(others) + 1} grids fill the frame alike; the darkest lines are taken, which "
+            f"puts a centre at row {centre[0]:.1f}, column {centre[1]:.1f}: if no superpixel has "
+            "its middle there, say where one has"
+        )
     return chosen
 
 
@@ -321,6 +370,8 @@ def _dark_lines(
     """Dark lines across one lattice direction: [(distance of the line from the cell's
     border, cells; depth)].
     """
+    from scipy.signal import find_peaks
+
     chosen = index[:: max(1, len(index) // 300)]
     bins = max(24, int(4 * pitch))
     along = (np.arange(bins) + 0.5) / bins
@@ -336,16 +387,21 @@ def _dark_lines(
     kernel = np.ones(max(1, bins // 24)) / max(1, bins // 24)
     smooth = np.convolve(np.tile(profile, 3), kernel, "same")[bins : 2 * bins]
     depth = smooth.max() - smooth
-    peaks = np.flatnonzero(
-        (depth >= np.roll(depth, 1)) & (depth > np.roll(depth, -1)) & (depth > 0.35 * depth.max())
-    )
+    # a dark band is one line, however its bottom is ruffled; folded thrice, no line is cut
+    folded = np.tile(depth, 3)
+    bottom = BOTTOM * depth.max()
+    peaks, _ = find_peaks(folded, height=0.35 * depth.max(), prominence=LINE * depth.max())
+    left = np.array([np.flatnonzero(folded[:p] < folded[p] - bottom)[-1] for p in peaks])
+    right = np.array([p + np.flatnonzero(folded[p:] < folded[p] - bottom)[0] for p in peaks])
+    middle = (left + right + 1) / 2 / bins - 1
+    once = (middle >= 0) & (middle < 1)
     lines = []
-    for peak in peaks:
-        others = np.abs((along[peaks] - along[peak] + 0.5) % 1 - 0.5)
-        reach = min(0.2, others[others > 0].min(initial=0.4) / 2)
-        lines.append(
-            (along[peak] + _line(along, profile, along[peak], reach) - 0.5, float(depth[peak]))
-        )
+    for peak, start, flat in zip(peaks[once], middle[once], (right - left)[once] / bins):
+        others = np.abs((middle[once] - start + 0.5) % 1 - 0.5)
+        reach = min(flat / 2 + EDGE, others[others > 1e-9].min(initial=0.8) / 2)
+        for _ in range(2):  # the second time with the line in the middle of what is looked at
+            start = start + _line(along, profile, start, reach)
+        lines.append((start - 0.5, float(folded[peak])))
     return lines
 
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.progress import collected_notes
 from plenocli.inverse.grid import distortion, lattice
 from plenocli.inverse.grid.detect import find_grid
 from tests.reference.prototype import superpixels
@@ -265,6 +266,46 @@ def test_a_hint_settles_what_the_picture_cannot():
     for near in ((30.5, 32.5), (18.5, 20.5)):
         grid = find_grid(white, near=near)
         assert np.hypot(*(grid.centres.reshape(-1, 2) - near).T).min() < 1
+
+
+def framed_white(count=(7, 10), pitch=52, seed=3):
+    """Superpixels of four unlike filters, each with a broad dark frame whose bottom only noise
+    ruffles and a narrow dark gap; they fill the frame. Centres: pitch (k + 1/2) - 1/2.
+    """
+    side = np.abs(np.arange(pitch) - (pitch - 1) / 2)
+    part = np.clip(19.5 - side, 0, 1) * np.clip(side - 0.5, 0, 1)
+    cell = np.kron([[1.0, 0.7], [0.35, 0.2]], np.ones((pitch // 2,) * 2)) * np.outer(part, part)
+    return np.random.default_rng(seed).poisson(4000 * np.tile(cell, count) + 5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_on_the_bottom_of_a_broad_dark_frame_costs_no_row(seed):
+    grid = find_grid(framed_white(seed=seed))
+    assert grid.valid.all() and grid.valid.shape == (7, 10)
+    index = np.stack(np.meshgrid(np.arange(7), np.arange(10), indexing="ij"), axis=-1)
+    np.testing.assert_allclose(grid.centres, 52 * index + 25.5, atol=0.1)
+
+
+def test_lines_that_nothing_tells_from_borders_are_said_and_a_hint_or_a_count_binds():
+    white = coded_white(0.5, 0.5)
+    with collected_notes() as said:
+        find_grid(white[18:277, 18:325])
+    assert len(said) == 1 and "4 grids fill the frame alike" in said[0]
+    with collected_notes() as said:
+        known = find_grid(white[12:-12], count=(10, 15))
+    assert not said and known.valid.shape == (10, 15)
+    np.testing.assert_allclose(known.centres[0, 0], (23.5, 11.5), atol=0.5)
+    with collected_notes() as said:
+        find_grid(white, count=(13, 15))
+    assert len(said) == 1 and "12 x 15 lenslets are found where 13 x 15 are known" in said[0]
+    with pytest.raises(NumericsError, match="no superpixel has its centre near row 31"):
+        find_grid(spots_white(), near=(31, 31))
+
+
+def spots_white():
+    """Bright bells 24 px apart, centres at 12 + 24 k."""
+    bell = np.exp(-(((np.arange(24) - 12) / 6.0) ** 2))
+    return np.random.default_rng(1).poisson(3000 * np.tile(np.outer(bell, bell), (10, 10)))
 
 
 def test_constant_small_and_broken_images_are_refused():

@@ -519,7 +519,8 @@ def refocus(
     calibration: its lenslets and white image; a simulated capture needs none.
     camera: its description, which turns slopes into distances.
     distances: of planes in front of the main lens, m; needs `camera`.
-    slopes: of planes, px per px; without either, thirteen around the lenslets' plane.
+    slopes: of planes, px per px; without either, thirteen around the lenslets' plane, and
+        more of them while what has texture lies beyond.
     views: along each side, 0 for none.
 
     Raises UsageError for distances without a camera, InputError where lenslets or light are
@@ -532,7 +533,7 @@ def refocus(
     wanted = [*slopes, *(optics.slope(d) for d in distances if optics is not None)]
     planes = np.array(sorted(set(wanted))) if wanted else usual_slopes()
     samples, shape = samples_of(_capture(capture), calibration, planes=len(planes))
-    return refocused(samples, shape, planes, views=views, optics=optics)
+    return refocused(samples, shape, planes, views=views, optics=optics, grow=not wanted)
 
 
 def score(

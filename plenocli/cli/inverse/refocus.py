@@ -63,7 +63,10 @@ class _Slope(click.ParamType):
     type=options.Whole(1, 1000),
     default=13,
     show_default=True,
-    help="Planes from slope -3 to 3 where neither --distance nor --slope is given.",
+    help=(
+        "Planes from slope -3 to 3 where neither --distance nor --slope is given; more of them, as "
+        "far apart, while what has texture lies beyond."
+    ),
 )
 @click.option(
     "--views",
@@ -92,7 +95,8 @@ def command(
     as_json: bool,
 ) -> None:
     """Refocus CAPTURE: every pixel's ray is followed to the planes asked for. With three planes or
-    more OUT (.h5) holds a map of depth with its confidence.
+    more OUT (.h5) holds a map of depth with its confidence; where nothing tells the depth it is
+    unknown (NaN).
 
     \b
     Examples:
@@ -116,6 +120,7 @@ def command(
         views=views,
     )
     away = report.sharpest_distance_m
+    known = report.depth_known_share
     rows, columns = report.lenslets
     options.summary(
         report.as_json(),
@@ -124,5 +129,6 @@ def command(
             f"{report.output}: {report.planes} planes of {rows} x {columns} lenslets; sharpest at "
             f"slope {report.sharpest_slope:.3g}"
             f"{'' if away is None else f', {away:.4g} m away'}"
+            f"{'' if known is None else f'; depth known in {100 * known:.3g} %'}"
         ),
     )

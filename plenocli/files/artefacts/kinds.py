@@ -913,7 +913,7 @@ LIGHTFIELD = Schema(
             "row column",
             "f",
             "1",
-            "0 where all slopes agree alike, towards 1 where one stands out",
+            "0 where nothing is known, towards 1 where one slope stands out",
             optional=True,
             minimum=0,
         ),

@@ -10,6 +10,14 @@ from plenocli.inverse.lightfield.samples import Samples
 
 ROUNDS = 4
 """Corrections of a depth map by least squares."""
+FLAT = 0.1
+"""Confidence up to which a lenslet has no texture that would tell its depth."""
+FEW = 0.05
+"""Share of the lenslets that may lie beyond a range before it grows."""
+MOST = 12.0
+"""Slope to which a range grows at most: a point's light is then spread over a hundred lenslets."""
+GROWTH = 4
+"""Planes by which a range grows at a time."""
 
 
 def depth(
@@ -23,21 +31,87 @@ def depth(
     width: of the Gaussian over which disagreement is averaged, pitches.
 
     Disagreement is the variance of what meets a point beyond that of the picture's own slant within
-    a lenslet's width; its least value is found on a parabola, and corrected by least squares.
+    a lenslet's width; its least value is found on a parabola, and corrected by least squares. A
+    lenslet whose views agree best on the first or the last plane lies beyond the slopes, and one
+    whose disagreement hardly changes has no texture: both are unknown, NaN with confidence 0.
 
     docs/model.md, "Refocusing and depth".
     """
     tried = np.asarray(slopes, float)
-    disagreement = np.array([_disagreement(samples, slope, shape, width) for slope in tried])
-    blind = ~np.isfinite(disagreement).all(axis=0)
-    disagreement[:, blind] = 1.0
-    found, confidence = _least(disagreement, tried)
+    return _map(samples, tried, _disagreements(samples, tried, shape, width), width)
+
+
+def depth_in_reach(
+    samples: Samples, slopes: Sequence[float], shape: tuple[int, int], width: float = 1.5
+) -> tuple[DepthMap, np.ndarray]:
+    """`depth` over a range that grows, at the spacing of `slopes`, on the side on which lenslets
+    with texture lie beyond it; at most to where neighbouring pixels of a superpixel see the scene a
+    pitch apart, a slope of as many as a pitch has pixels, and to MOST.
+
+    samples, shape, width: as in `depth`.
+    slopes: (plane,) at least three, rising, evenly spaced.
+
+    Returns the map and the slopes (plane,) that were tried.
+    """
+    tried = np.asarray(slopes, float)
+    gap = tried[1] - tried[0]
+    disagreement = _disagreements(samples, tried, shape, width)
+    for side in (-1, 1):
+        while _beyond(disagreement, side) > FEW:
+            end = tried[0 if side < 0 else -1]
+            more = end + side * gap * np.arange(1, 1 + GROWTH)
+            more = np.sort(more[np.abs(more) <= min(samples.pitch, MOST)])
+            if more.size == 0:
+                break
+            parts = [_disagreements(samples, more, shape, width), disagreement]
+            disagreement = np.concatenate(parts[::-side])
+            tried = np.concatenate([more, tried][::-side])
+    return _map(samples, tried, disagreement, width), tried
+
+
+def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:
+    """The map of the least disagreement (plane, row, column)."""
+    least, confidence = _least(disagreement, tried)
+    shape = (least.shape[0], least.shape[1])
+    textured = confidence > FLAT
+    beyond = textured & _at_edge(disagreement)
+    found = least
     for _ in range(ROUNDS):
         found = np.clip(found + _correction(samples, found, shape, width), tried[0], tried[-1])
+    inside = (found > tried[0]) & (found < tried[-1])
+    known = textured & ~beyond & inside
     return DepthMap(
-        np.where(blind, np.nan, found),
-        np.where(blind, 0.0, np.clip(np.nan_to_num(confidence), 0, 1)),
+        np.where(known, found, np.nan),
+        np.where(known, np.clip(confidence, 0, 1), 0.0),
+        beyond=float(np.mean(textured & ~known)),
     )
+
+
+def _disagreements(
+    samples: Samples, slopes: np.ndarray, shape: tuple[int, int], width: float
+) -> np.ndarray:
+    """(plane, row, column), NaN where nothing meets a point."""
+    return np.array([_disagreement(samples, slope, shape, width) for slope in slopes])
+
+
+def _at_edge(disagreement: np.ndarray, sides: Sequence[int] = (-1, 1)) -> np.ndarray:
+    """Where (row, column) the first or the last plane has the least disagreement."""
+    best = np.nan_to_num(disagreement, nan=np.inf).argmin(axis=0)
+    ends = [0 if side < 0 else len(disagreement) - 1 for side in sides]
+    return np.isin(best, ends)
+
+
+def _beyond(disagreement: np.ndarray, side: int) -> float:
+    """Share of the lenslets, with texture, that agree best on the first (side -1) or last plane."""
+    textured = _contrast(disagreement) > FLAT
+    return float(np.mean(textured & _at_edge(disagreement, (side,))))
+
+
+def _contrast(disagreement: np.ndarray) -> np.ndarray:
+    """How clearly the least disagreement stands out, (row, column); 0 where a plane has none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = 1 - disagreement.min(axis=0) / np.median(disagreement, axis=0)
+    return np.nan_to_num(found)
 
 
 def _disagreement(
@@ -62,17 +136,17 @@ def _disagreement(
 
 def _least(disagreement: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(slope of the least disagreement (plane, row, column), by a parabola; how clearly)."""
-    best = np.clip(disagreement.argmin(axis=0), 1, len(slopes) - 2)
-    before, least, after = (
-        np.take_along_axis(disagreement, (best + k)[None], 0)[0] for k in (-1, 0, 1)
-    )
+    blind = ~np.isfinite(disagreement).all(axis=0)
+    clear = np.where(blind, 1.0, disagreement)
+    best = np.clip(clear.argmin(axis=0), 1, len(slopes) - 2)
+    before, least, after = (np.take_along_axis(clear, (best + k)[None], 0)[0] for k in (-1, 0, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         move = np.where(
             before + after > 2 * least, (before - after) / (2 * (before - 2 * least + after)), 0.0
         )
-        confidence = 1 - disagreement.min(axis=0) / np.median(disagreement, axis=0)
     place_of_best = best + np.clip(np.nan_to_num(move), -1, 1)
-    return np.interp(place_of_best, np.arange(len(slopes)), slopes), confidence
+    found = np.interp(place_of_best, np.arange(len(slopes)), slopes)
+    return found, _contrast(disagreement)
 
 
 def _correction(

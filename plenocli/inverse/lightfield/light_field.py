@@ -11,7 +11,7 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.inverse.lightfield import refocus as focus
-from plenocli.inverse.lightfield.depth import depth
+from plenocli.inverse.lightfield.depth import depth, depth_in_reach
 from plenocli.inverse.lightfield.planes import LightField, distance_of, slope_of
 from plenocli.inverse.lightfield.samples import Samples, collect
 
@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from plenocli.inverse.calibration.calibration import Calibration
 
 RANGE = 3.0
-"""Slopes from -RANGE to RANGE are searched where no distances are given: a lenslet's width of
+"""Slopes from -RANGE to RANGE are searched first where no distances are given: a lenslet's width of
 parallax across the pupil is one.
 """
+WIDER = 4
+"""Times its first width to which a range that grows is reckoned with, for memory."""
 PIXEL_BYTES, PLANE_BYTES = 126, 1
 """Memory for each pixel of the capture, and for each of its pixels and each plane (measured)."""
 
@@ -69,6 +71,7 @@ def refocused(
     *,
     views: int = 3,
     optics: Optics | None = None,
+    grow: bool = False,
 ) -> LightField:
     """Planes, depth map and views of the samples of a capture.
 
@@ -76,11 +79,16 @@ def refocused(
     slopes: (plane,) px per px, rising; a depth map needs at least three.
     views: along each side, 0 for none.
     optics: turns slopes into distances.
+    grow: widens evenly spaced slopes, three or more, until what has texture is within them.
 
     docs/model.md, "Refocusing and depth".
     """
+    found = None
+    if len(slopes) >= 3 and grow:
+        found, slopes = depth_in_reach(samples, slopes.tolist(), shape)
+    elif len(slopes) >= 3:
+        found = depth(samples, slopes.tolist(), shape)
     pictures = np.stack([focus.refocus(samples, slope, shape)[0] for slope in slopes])
-    found = depth(samples, slopes.tolist(), shape) if len(slopes) >= 3 else None
     if found is not None and optics is not None:
         found = replace(found, distance=optics.distance(found.slope))
     return LightField(

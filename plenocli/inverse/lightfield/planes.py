@@ -22,13 +22,16 @@ class DepthMap:
     """Where the views agree best, (row, column) each, one value a lenslet pitch.
 
     slope: px per px, NaN where nothing is known.
-    confidence: 0 where all slopes agree alike (no texture), towards 1 where one stands out.
+    confidence: 0 where nothing is known, towards 1 where one slope stands out.
     distance: m in front of the main lens, NaN beyond infinity; None without a camera.
+    beyond: share of the map that has texture but lies beyond the slopes tried; None where it was
+        not kept.
     """
 
     slope: np.ndarray
     confidence: np.ndarray
     distance: np.ndarray | None = None
+    beyond: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

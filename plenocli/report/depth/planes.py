@@ -75,9 +75,10 @@ def _depth(depth: DepthMap) -> bytes:
     values, bar = depth.slope, "slope [px/px]"
     if depth.distance is not None and np.isfinite(depth.distance).any():
         values, bar = 1e3 * depth.distance, "distance [mm]"
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, [2, 98]) if known.size else (0.0, 1.0)
     with drawing(8.6, 3.4) as made:
         left, right = made.figure.subplots(1, 2)
-        low, high = np.nanpercentile(values, [2, 98])
         left.set_facecolor("#dddddd")
         show_map(
             left,

@@ -13,6 +13,7 @@ from plenocli.base.errors import UsageError
 
 if TYPE_CHECKING:
     from plenocli.inverse.lightfield.light_field import Optics
+    from plenocli.inverse.lightfield.planes import DepthMap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +24,8 @@ class RefocusSummary:
     sharpest_slope: of the plane whose picture is the sharpest, px per px.
     slopes, sharpness: of every plane.
     sharpest_distance_m: None without a camera or beyond infinity.
+    depth_known_share: of the depth map; None without one.
+    depth_beyond_share: of the depth map, with texture but beyond the slopes tried.
     """
 
     output: str
@@ -32,6 +35,8 @@ class RefocusSummary:
     slopes: list[float]
     sharpness: list[float]
     sharpest_distance_m: float | None
+    depth_known_share: float | None
+    depth_beyond_share: float | None
 
     def as_json(self) -> dict[str, Any]:
         """The summary of --json."""
@@ -58,8 +63,9 @@ def run_refocus(
     calibration: its lenslet grid and white image; a simulated capture needs none.
     camera: description (.toml) that turns slopes into distances.
     distances: of planes in front of the main lens, m (needs `camera`).
-    slopes: of planes; without either, `planes` slopes around the lenslets' own plane. A depth map
-        needs at least three planes.
+    slopes: of planes; without either, `planes` slopes around the lenslets' own plane, and more
+        of them, as far apart, while what has texture lies beyond. A depth map needs at least three
+        planes.
     views: along each side, 0 for none.
 
     Raises UsageError, InputError, OutputError.
@@ -71,7 +77,7 @@ def run_refocus(
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.read.cameras import read_camera
     from plenocli.files.results.lightfields import lightfield_artefact
-    from plenocli.inverse.lightfield.light_field import Optics, refocused, samples_of
+    from plenocli.inverse.lightfield.light_field import WIDER, Optics, refocused, samples_of
 
     output = Path(output)
     check_output(
@@ -80,8 +86,15 @@ def run_refocus(
     optics = None if camera is None else Optics.of(read_camera(camera))
     tried = _slopes(slopes, distances, planes, optics)
     found = None if calibration is None else read_calibration(calibration, response=False)
-    samples, shape = samples_of(read_capture(capture), found, planes=len(tried), where=calibration)
-    field = refocused(samples, shape, tried, views=views, optics=optics)
+    grow = not (slopes or distances)
+    samples, shape = samples_of(
+        read_capture(capture),
+        found,
+        planes=len(tried) * (WIDER if grow else 1),
+        where=calibration,
+    )
+    field = refocused(samples, shape, tried, views=views, optics=optics, grow=grow)
+    known, beyond = _told(field.depth, field.slopes)
     inputs = describe_inputs({"capture": capture, "calibration": calibration, "camera": camera})
     write_artefact(
         output,
@@ -92,13 +105,30 @@ def run_refocus(
     distance = np.nan if field.distances is None else float(field.distances[best])
     return RefocusSummary(
         output=str(output),
-        planes=len(tried),
+        planes=len(field.slopes),
         lenslets=list(shape),
-        sharpest_slope=float(tried[best]),
-        slopes=tried.tolist(),
+        sharpest_slope=float(field.slopes[best]),
+        slopes=field.slopes.tolist(),
         sharpness=field.sharpness.tolist(),
         sharpest_distance_m=None if np.isnan(distance) else distance,
+        depth_known_share=known,
+        depth_beyond_share=beyond,
     )
+
+
+def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:
+    """Shares of a depth map that are known and that lie beyond the slopes, which a note tells."""
+    from plenocli.base.progress import note
+
+    if depth is None:
+        return None, None
+    beyond = depth.beyond or 0.0
+    if beyond > 0:
+        note(
+            f"{100 * beyond:.3g} % of the depth map has texture but lies beyond slopes "
+            f"{slopes[0]:.3g} to {slopes[-1]:.3g}: unknown there"
+        )
+    return float(np.isfinite(depth.slope).mean()), beyond
 
 
 def _slopes(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from plenocli.inverse.lightfield.depth import depth
+from plenocli.inverse.lightfield.light_field import refocused, usual_slopes
 from plenocli.inverse.lightfield.planes import distance_of, slope_of
 from plenocli.inverse.lightfield.refocus import STEP, refocus, views
 from plenocli.inverse.lightfield.samples import collect
@@ -112,7 +113,7 @@ def _parts(found):
 def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(noise, far, near):
     """The limit: a lenslet of parallax across the pupil is a slope of one."""
     made = samples(capture(far, near), noise)
-    found, confidence = _parts(depth(made, np.linspace(-3, 3, 25), (COUNT, COUNT)))
+    found, confidence = _parts(depth(made, np.linspace(-4, 4, 33), (COUNT, COUNT)))
     inner = confidence[4:-4, 4:-4] > 0.5
     left, right = found[4:-4, 4:10], found[4:-4, 15:-4]
     sure_left, sure_right = inner[:, :6], inner[:, 11:]
@@ -132,9 +133,29 @@ def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(n
 def test_a_scene_without_texture_has_no_depth_and_no_confidence():
     made = samples(np.full((COUNT * PITCH_PX,) * 2, 0.4))
     found, confidence = _parts(depth(made, np.linspace(-2, 2, 9), (COUNT, COUNT)))
-    assert confidence.max() < 1e-6 and np.isfinite(found[3:-3, 3:-3]).all()
+    assert confidence.max() == 0 and np.isnan(found).all()
     picture, spread = refocus(made, 1.3, (COUNT, COUNT))
     assert np.nanmax(np.abs(picture - 0.4)) < 1e-9 and np.nanmax(spread) < 1e-12
+
+
+@pytest.mark.parametrize("distance", [0.42, 0.45, 0.7, 0.8])
+def test_a_plane_beyond_the_usual_range_is_found_and_no_lenslet_is_sure_at_an_edge(distance):
+    made = samples(capture(distance), 0.01)
+    field = refocused(made, (COUNT, COUNT), usual_slopes(7), views=0, grow=True)
+    found, confidence = _parts(field.depth)
+    off = np.abs(found - slope(distance))
+    sure = confidence >= 0.4
+    assert abs(np.nanmedian(found) - slope(distance)) < 0.3
+    assert sure.mean() > 0.5 and np.mean(off[sure] < 1) > 0.9
+    assert len(field.slopes) == len(field.pictures) and np.ptp(np.diff(field.slopes)) < 1e-9
+    assert not np.isin(found, field.slopes[[0, -1]]).any()
+
+
+def test_beyond_slopes_that_do_not_grow_nothing_is_known():
+    """The plane stands at a slope of 3.4."""
+    found = depth(samples(capture(0.42)), np.linspace(-2, 2, 9), (COUNT, COUNT))
+    assert found.beyond > 0.9 and np.isnan(found.slope).mean() > 0.9
+    assert (found.confidence[np.isnan(found.slope)] == 0).all()
 
 
 def test_views_see_the_parallax_of_their_part_of_the_pupil():

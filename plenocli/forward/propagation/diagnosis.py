@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.lapack import dtpqrt
 
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.costs import law, priced
@@ -114,9 +113,11 @@ class Spectrum:
             self._squares += times * squares.sum(axis=0)
             self._longest = max(self._longest, float(squares.sum(axis=(1, 2)).max()))
             blocks = [block * np.sqrt(times) for block in self._blocks(rows)]
-            if not self._triangles:
-                self._triangles = [np.zeros((b.shape[1],) * 2, order="F") for b in blocks]
-            self._triangles = [_reduced(r, b) for r, b in zip(self._triangles, blocks)]
+            self._triangles = (
+                [_reduced(r, b) for r, b in zip(self._triangles, blocks)]
+                if self._triangles
+                else [_triangle(b) for b in blocks]
+            )
 
     def values(self) -> np.ndarray:
         """Singular values, descending: as many as the matrix has rows or points, what is less."""
@@ -161,10 +162,20 @@ class Spectrum:
         yield from _turn_parities(odd)
 
 
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    """The triangular factor R (value, value) of rows (row, value)."""
+    triangle = np.zeros((rows.shape[1],) * 2, order="F")
+    factor = np.linalg.qr(rows, mode="r")
+    triangle[: len(factor)] = factor
+    return triangle
+
+
 def _reduced(triangle: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The triangular factor R (value, value) of an upper triangle with rows (row, value) below."""
     if not triangle.size:
         return triangle
+    from scipy.linalg.lapack import dtpqrt
+
     reduced, *_, info = dtpqrt(
         0,
         min(_PANEL, len(triangle)),

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import convolve
 
 from plenocli.base.random_streams import stream
 from plenocli.forward.sensor.noise import Noise
@@ -199,6 +198,8 @@ def spread_to_neighbours(electrons: np.ndarray, share: float) -> np.ndarray:
     electrons: (row, column).
     share: of a pixel's electrons that its neighbours collect together.
     """
+    from scipy.ndimage import convolve
+
     quarter = share / 4
     kernel = [[0.0, quarter, 0.0], [quarter, 1 - share, quarter], [0.0, quarter, 0.0]]
     return convolve(electrons, np.array(kernel), mode="nearest")

@@ -131,13 +131,18 @@ def test_orbits_of_superpixels():
 def test_what_the_diagnosis_costs_is_counted_as_it_is_done(change, monkeypatch):
     camera = small_camera(**change)
     plan = plan_pif(camera, superpixels=(3, 3), model="fresnel", accuracy=1e-2, coherent_ring=1)
-    operations, reduced = [], diagnose._reduced
+    operations = []
 
-    def counting(triangle, rows):
-        operations.append(2 * rows.shape[0] * rows.shape[1] ** 2)
-        return reduced(triangle, rows)
+    def counting(reduced):
+        def counted(*blocks):
+            rows = blocks[-1]
+            operations.append(2 * rows.shape[0] * rows.shape[1] ** 2)
+            return reduced(*blocks)
 
-    monkeypatch.setattr(diagnose, "_reduced", counting)
+        return counted
+
+    for name in ("_triangle", "_reduced"):
+        monkeypatch.setattr(diagnose, name, counting(vars(diagnose)[name]))
     found = describe(build_pif(camera, plan))
     assert sum(operations) == pytest.approx(diagnose.features(camera, plan)["reduced"], rel=0.05)
     assert found.rank is not None and diagnose.seconds(camera, plan) > 0

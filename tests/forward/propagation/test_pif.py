@@ -4,7 +4,7 @@ energy, shifts, rays.
 
 import numpy as np
 import pytest
-from scipy.special import j1, roots_legendre, sici
+from scipy.special import j0, j1, roots_legendre, sici
 
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.explain import explain
@@ -409,3 +409,17 @@ def test_superpixels_with_factors_of_their_own_rank():
         error = builder.columns([5 * i + j])[:, :, 0] - truth
         assert np.linalg.norm(error) < 1e-4 * np.linalg.norm(truth)
         assert (np.linalg.norm(error, axis=1) < 1e-2 * np.linalg.norm(truth, axis=1)).all()
+
+
+@pytest.mark.parametrize("edge", [0.5, 30.0, 600.0])
+def test_a_hankel_series_is_the_sum_of_bessel_functions(edge):
+    from plenocli.forward.propagation.fresnel.radial import hankel_series
+
+    rng = np.random.default_rng(5)
+    rates = np.sort(rng.uniform(0, edge, 150))
+    weight = rng.normal(size=150) + 1j * rng.normal(size=150)
+    t = np.linspace(0, 1, 301)
+    found = np.polynomial.chebyshev.chebval(2 * t * t - 1, hankel_series(rates, weight, edge))
+    error = np.abs(found - j0(np.outer(t, rates)) @ weight).max()
+    assert error < 3e-14 * np.abs(weight).sum()
+    assert not np.iscomplexobj(hankel_series(rates, weight.real, edge))

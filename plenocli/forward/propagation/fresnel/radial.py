@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 SERIES_POINTS = 1 << 13
 """Points that go through the series together: three such arrays stay in the cache."""
+_TOGETHER = 64
+"""Radii whose orders are transformed together: this bounds memory."""
 
 
 def is_radial(camera: Camera) -> bool:
@@ -80,16 +82,21 @@ def hankel_series(rates: np.ndarray, weight: np.ndarray, edge: float) -> np.ndar
     edge: largest rate.
 
     Returns (term,), real where the sum is.
-    """
-    from scipy.special import j0
 
+    J0(2 z sin u) is the sum of J_k(z)^2 cos(2 k u) over all orders k (Neumann), and the J_k(z) are
+    the Fourier coefficients of exp(i z sin u) (Jacobi and Anger): no series is fitted.
+    """
     count = int(edge / 2 + 4 * np.cbrt(edge) + 12)
-    theta = (np.arange(count) + 0.5) * np.pi / count
-    samples = j0(np.outer(np.cos(theta / 2), rates)) @ np.stack([weight.real, weight.imag], -1)
-    series = np.cos(np.outer(np.arange(count), theta)) @ samples * (2 / count)
-    series[0] /= 2
-    real = np.abs(series[:, 1]).max() <= 1e-14 * np.abs(series[:, 0]).max()
-    return series[:, 0] if real else series[:, 0] + 1j * series[:, 1]
+    wave = np.sin(np.arange(2 * count) * np.pi / count)
+    series = np.zeros(count, complex)
+    for first in range(0, len(rates), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        orders = np.fft.fft(np.exp(0.5j * rates[some, None] * wave), norm="forward")
+        series += weight[some] @ orders.real[:, :count] ** 2
+    series[1:] *= 2
+    series[1::2] *= -1
+    real = np.abs(series.imag).max() <= 1e-14 * np.abs(series.real).max()
+    return series.real if real else series
 
 
 def radial_field(

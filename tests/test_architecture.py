@@ -220,7 +220,7 @@ def test_help_imports_nothing_heavy(command):
 def test_a_matrix_is_computed_without_what_it_does_not_use(tmp_path):
     arguments = ["simulate-pif", str(PACKAGE / "samples" / "seed_spatial.toml")]
     arguments += ["--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel"]
-    unused = sorted({*HEAVY, "pandas", "numpy.f2py"} - {"numpy", "h5py", "pydantic"})
+    unused = sorted({*HEAVY, "numpy.f2py"} - {"numpy", "h5py", "pydantic", "tqdm"})
     code = (
         "import sys; from plenocli.cli.main import run\n"
         f"assert run({[*arguments, '-o', str(tmp_path / 'pif.h5')]!r}) == 0\n"

@@ -217,19 +217,6 @@ def test_help_imports_nothing_heavy(command):
     assert "Usage: plenocli" in done.stdout
 
 
-def test_a_matrix_is_computed_without_what_it_does_not_use(tmp_path):
-    arguments = ["simulate-pif", str(PACKAGE / "samples" / "seed_spatial.toml")]
-    arguments += ["--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel"]
-    unused = sorted({*HEAVY, "numpy.f2py"} - {"numpy", "h5py", "pydantic", "tqdm"})
-    code = (
-        "import sys; from plenocli.cli.main import run\n"
-        f"assert run({[*arguments, '-o', str(tmp_path / 'pif.h5')]!r}) == 0\n"
-        f"print('UNUSED', [m for m in {unused!r} if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "UNUSED []"
-
-
 def test_no_unsafe_loader_anywhere():
     for path in PACKAGE.rglob("*.py"):
         names = {name.split(".")[0] for name in imported(path)}

@@ -12,6 +12,7 @@ from plenocli.base.budget import Budget, within
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import read_artefact
 from tests.peak import PEAK
+from tests.test_architecture import HEAVY
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ROOT / "sample_configs" / "tiny.toml"
@@ -488,3 +489,16 @@ def test_planes_that_fail_leave_no_file(tmp_path, capsys, monkeypatch):
     command = ["simulate-pif", str(TINY), "--scene", depth, "--accuracy", "0.1"]
     assert run([*command, "--model", "ray", "-o", str(tmp_path / "stack.h5")]) == 4
     assert not list(tmp_path.glob("*.h5"))
+
+
+def test_a_matrix_is_computed_without_what_it_does_not_use(tmp_path):
+    arguments = ["simulate-pif", str(ROOT / "sample_configs" / "seed_spatial.toml")]
+    arguments += ["--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel"]
+    unused = sorted({*HEAVY, "numpy.f2py"} - {"numpy", "h5py", "pydantic", "tqdm"})
+    code = (
+        "import sys; from plenocli.cli.main import run\n"
+        f"assert run({[*arguments, '-o', str(tmp_path / 'pif.h5')]!r}) == 0\n"
+        f"print('UNUSED', [m for m in {unused!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "UNUSED []"

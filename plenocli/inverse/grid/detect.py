@@ -90,10 +90,9 @@ def find_grid(
     index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
     inside = _whole(position, image.shape, 0.5 * pitch) & clean
     model, weight = _first_model(index, position, inside, kind, pitch)
-    position[inside], _ = template.register(
-        mosaic, model.at(index[inside]), basis, slope[inside], symmetric=not structured
+    position[inside], model = _registered(
+        mosaic, model, index[inside], basis, slope[inside], weight, symmetric=not structured
     )
-    model, _ = distortion.choose_model(index[inside], position[inside], weight)
     lit = None
     if structured and kind == "square":
         moved = _to_dark_borders(image, model, index[inside], pitch, near=near, count=count)
@@ -110,6 +109,34 @@ def find_grid(
             "white image, or name a superpixel's middle"
         )
     return found
+
+
+def _registered(
+    mosaic: np.ndarray,
+    model: GridModel,
+    index: np.ndarray,
+    basis: np.ndarray,
+    slope: np.ndarray,
+    weight: np.ndarray,
+    *,
+    symmetric: bool,
+) -> tuple[np.ndarray, GridModel]:
+    """(places (N, 2) px of the sites `index` by their common look, the map through them).
+
+    Light that falls off within superpixels moves bells, light of lenslets dimmed as a whole does
+    not, and bells look alike in both: there the lattice tells, if it has no bends with the one or
+    with a mixture.
+    """
+    first = model.at(index)
+    position, _, told = template.register(mosaic, first, basis, slope, symmetric)
+    model, _ = distortion.choose_model(index, position, weight)
+    if told or weight.sum() < 1.5 * distortion.FREEDOM["homography"]:
+        return position, model
+    dimmed, _, _ = template.register(mosaic, first, basis, slope, symmetric, share=0.0)
+    share = distortion.share_between(index, position, dimmed, weight)
+    mixed = position + share * (dimmed - position)
+    straight, _ = distortion.choose_model(index, mixed, weight)
+    return (mixed, straight) if straight.kind in distortion.STRAIGHT else (position, model)
 
 
 def _check_near(model: GridModel, near: Sequence[float], pitch: float) -> None:

@@ -14,6 +14,10 @@ FREEDOM = {"affine": 6, "homography": 8, "radial": 11, "poly2": 12, "poly3": 20,
 """Parameters of each kind of map, simplest first."""
 MARGIN = 0.12
 """Of the residual, by which a richer map must be better."""
+STRAIGHT = ("affine", "homography")
+"""Maps that keep lines straight."""
+CERTAIN = 4.0
+"""Standard deviations from which on a lattice is believed that it would bend."""
 ENOUGH = 2000
 """Sites for the first, rough part of a fit."""
 
@@ -126,6 +130,30 @@ def choose_model(
     best = min(error.values())
     kind = next(kind for kind in allowed if error[kind] <= margin * best + 1e-9)
     return fitted[kind], error
+
+
+def share_between(
+    index: np.ndarray, position: np.ndarray, other: np.ndarray, weight: np.ndarray
+) -> float:
+    """How far (0..1) on the way from `position` to `other` a map without bends fits best.
+
+    Least squares of the homography and the share together: what a homography takes up says
+    nothing. 0 unless the share is CERTAIN standard deviations above it.
+    index: (N, 2) of the sites.
+    position, other: (N, 2) px.
+    weight: (N,).
+    """
+    model = fit_model("homography", index, position, weight)
+    heavy = np.repeat(np.sqrt(weight * _tukey(_miss(model, index, position))), 2)
+    design = _jacobian(model, np.asarray(index, float)).reshape(2 * len(index), -1)
+    columns = np.stack([(other - position).ravel(), (model.at(index) - position).ravel()], axis=1)
+    design, columns = design * heavy[:, None], columns * heavy[:, None]
+    design = design / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    way, miss = (columns - design @ np.linalg.lstsq(design, columns, rcond=None)[0]).T
+    share = way @ miss / max(way @ way, 1e-300)
+    noise = np.sum((miss - share * way) ** 2) / max(heavy @ heavy - FREEDOM["homography"] - 1, 1)
+    sure = share * np.sqrt(way @ way) > CERTAIN * np.sqrt(noise)
+    return float(np.clip(share, 0, 1)) if sure else 0.0
 
 
 def _tukey(miss: np.ndarray) -> np.ndarray:

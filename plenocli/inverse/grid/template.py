@@ -68,21 +68,23 @@ def register(
     basis: np.ndarray,
     slope: np.ndarray | None = None,
     symmetric: bool = True,
-) -> tuple[np.ndarray, np.ndarray]:
+    share: float | None = None,
+) -> tuple[np.ndarray, np.ndarray, bool]:
     """Places of superpixels by a fit of their common look.
 
     Each patch is a * template(r - shift) + b under light that changes by `slope`: a share of it
-    continuously, the rest from one superpixel to the next (a lenslet dimmed as a whole); the share
-    is estimated.
+    continuously, the rest from one superpixel to the next (a lenslet dimmed as a whole).
     image: (row, column).
     centres: (N, 2) px, near those of whole cells.
     basis: (2, 2) px, the lattice, which says whose light a pixel shows.
     slope: (N, 2), of the light, relative per px; None: none.
     symmetric: superpixels have a centre, that of the template's point symmetry; otherwise
         (superpixels of several parts) the median shift is zero: the phase stays that of `centres`.
+    share: of the light's slope that is continuous, 0 to 1; None: what the pixels say, 1 where they
+        say nothing.
 
-    Returns positions (N, 2) px, and quality (N,), the share of a patch's pixels that follow the
-    template.
+    Returns positions (N, 2) px, quality (N,), the share of a patch's pixels that follow the
+    template, and whether the share is known: given, or said by the pixels.
     """
     pitch = np.hypot(*np.asarray(basis).T).min()
     shrink = max(1, int(pitch // SIZE))
@@ -90,7 +92,8 @@ def register(
     place = (np.asarray(centres, float) - (shrink - 1) / 2) / shrink
     slope = np.zeros_like(place) if slope is None else slope * shrink
     window = _make_patch(np.asarray(basis) / shrink)
-    share, quality = 1.0, np.ones(len(place))
+    told, said, quality = share is not None, share, np.ones(len(place))
+    share = 1.0 if said is None else said
     first = place.copy()
     for turn in range(2):
         if turn == 1:  # edges sharper than two pixels cannot be interpolated
@@ -98,14 +101,15 @@ def register(
         template = _template(small, place, slope, window.lever(share), quality, window)
         bank = _bank(template, window)
         spread = _usual_miss(small, place, slope, window.lever(share), bank, window)
-        if turn == 0:
-            share = _share_within(small, place, slope, bank, spread, window)
+        if turn == 0 and not told:
+            said = _share_within(small, place, slope, bank, spread, window)
+            share = 1.0 if said is None else said
         place, quality = _fit_all(small, place, slope, window.lever(share), bank, spread, window)
         place = place + (
             _centre(template, window) if symmetric else -np.median(place - first, axis=0)
         )
     place = place + share * VARIANCE * slope
-    return place * shrink + (shrink - 1) / 2, quality
+    return place * shrink + (shrink - 1) / 2, quality, said is not None
 
 
 def _block_means(image: np.ndarray, shrink: int) -> np.ndarray:
@@ -374,14 +378,14 @@ def _share_within(
     bank: np.ndarray,
     spread: np.ndarray,
     window: _Patch,
-) -> float:
+) -> float | None:
     """How much (0..1) of the illumination's gradient across lenslets also holds
     within a superpixel.
 
     Light that falls off continuously over the sensor has it all, a vignetting that dims whole
     superpixels none. Fitted to the pixels of all sites together, beside the shift of each. Where
     these cannot tell (a tilted bell is a moved one: nearly nothing of the tilt is left beside the
-    shift) it tends to 1.
+    shift) it is None.
     """
     chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 2000)
     whole = window.lever(0)
@@ -412,5 +416,5 @@ def _share_within(
         total.append(own)
     values, trusts, totals = (np.concatenate(x) for x in (value, trust, total))
     if trusts.sum() <= DEGENERATE * totals.sum():
-        return 1.0
+        return None
     return float(np.clip((values.sum() + 1.0) / (trusts.sum() + 1.0), 0, 1))  # 1: a prior of 1 +- 1

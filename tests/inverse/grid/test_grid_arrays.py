@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from plenocli.inverse.grid.detect import find_grid
+from plenocli.inverse.grid.distortion import share_between
 from tests.reference.arrays import Array, render, true_centres, whole
 
 PITCHES = (6.0, 8.3, 11.7, 16.4, 24.0, 37.3, 61.9, 200.0)
@@ -95,6 +96,38 @@ def test_every_lenslet_is_found_where_it_is(array):
     )
     if not (array.perspective or array.cubic):
         np.testing.assert_allclose(grid.pitch, array.pitch, rtol=1e-5)
+
+
+@pytest.mark.parametrize("falloff", ["lenslet", "sensor"])
+@pytest.mark.parametrize("pitch, angle", [(16.4, 14.0), (24.0, 9.0)])
+def test_bells_dimmed_as_a_whole_are_not_drawn_inwards(pitch, angle, falloff):
+    """A bell under light that falls off within it is moved by its variance times the relative
+    slope, 0.1 px here, one of a lenslet that is dimmed as a whole is not; both look alike.
+    """
+    array = Array(
+        "hexagonal", pitch, angle, sites=18, spot="bell", vignetting=0.56, falloff=falloff, seed=7
+    )
+    white, _ = render(array)
+    centres = true_centres(array)[1]
+    centres = centres[whole(centres, array)]
+    grid = find_grid(white, dark=400)
+    miss, which = cKDTree(grid.centres[grid.valid]).query(centres)
+    assert len(set(which)) == len(centres)
+    assert np.sqrt(np.mean(miss**2)) <= 0.015
+
+
+def test_the_lattice_tells_a_share_only_by_what_a_homography_does_not_take_up():
+    index = np.stack(np.meshgrid(np.arange(15), np.arange(15), indexing="ij"), -1).reshape(-1, 2)
+    away = (index - 7.0) / 7
+    rng = np.random.default_rng(4)
+    bend = 0.1 * (away**2).sum(axis=1, keepdims=True) * away
+    true = 20.0 * index + 3 + 0.004 * rng.normal(size=index.shape)
+    alike = np.ones(len(index))
+    for share in (0.0, 0.4, 1.0):
+        found = share_between(index, true - share * bend, true + (1 - share) * bend, alike)
+        assert found == pytest.approx(share, abs=0.03)
+    stretched = true + 0.1 * away
+    assert share_between(index, true, stretched, alike) < 0.05
 
 
 def test_the_rendering_itself():

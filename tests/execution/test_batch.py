@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from plenocli.base.errors import InputError, PlenoError
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import open_pool
 from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.read.captures import named_captures
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux
 
@@ -145,6 +147,27 @@ def test_a_bad_file_stops_no_other(folder, tmp_path, workers, capsys):
     ]
     err = capsys.readouterr().err
     assert str(bad) in err and "missing.h5" in err
+
+
+def test_a_folder_is_the_captures_in_it(folder, tmp_path):
+    """The calibration, a JPEG, notes, hidden files and folders among them are none."""
+    for path in [*shots(folder)[:3], folder / "c.h5"]:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for name in ("shot00.JPG", "notes.txt", ".hidden.h5"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "older.h5").mkdir()
+    calibration, names = tmp_path / "c.h5", ["shot00.h5", "shot01.h5", "shot02.h5"]
+    done = run_demux([tmp_path], tmp_path / "out", calibration=calibration)
+    assert [Path(one.capture).name for one in done.captures] == names
+    assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == [n[:-3] for n in names]
+    again = run_demux([tmp_path], tmp_path / "out", calibration=calibration)
+    assert (again.done, again.skipped) == (0, 3)
+    pattern = [tmp_path / "shot0[12].h5", tmp_path / "shot01.h5"]
+    assert [path.name for path in named_captures(pattern)] == names[1:]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="without captures"):
+        run_demux([tmp_path / "empty"], tmp_path / "o", calibration=calibration)
+    assert not (tmp_path / "o").exists()
 
 
 def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):

@@ -88,9 +88,9 @@ def command(
     """Demultiplex CAPTURE...: x = F b + noise is solved for the band radiances b of every lenslet,
     with standard deviations.
 
-    OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each.
-    Finished ones are skipped on a rerun, a bad one is reported and does not stop the others.
-    Lenslets partly off the sensor are NaN.
+    OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each. CAPTURE
+    may be a folder: the captures in it. Finished ones are skipped on a rerun, a bad one is reported
+    and does not stop the others. Lenslets partly off the sensor are NaN.
 
     A lenslet's light reaches its neighbours' superpixels, which is wrong by one part in a hundred
     where neighbours differ. Where the camera's description is known (calibrate --camera keeps it,
@@ -99,7 +99,7 @@ def command(
     \b
     Examples:
       plenocli demux chart.NEF --calibration cal.h5 --reference white.NEF -o chart.exr
-      plenocli demux captures/*.NEF --calibration cal.h5 --method wls --workers 2 -o spectra/
+      plenocli demux captures/ --calibration cal.h5 --method wls --workers 2 -o spectra/
       plenocli demux captures/*.NEF --calibration cal.h5 --scheduler tcp://10.0.0.1:8786 -o spectra/
       plenocli demux chart.dng --calibration cal.h5 --method lmmse --prior paints.csv -o chart.h5
       plenocli demux chart.dng --calibration cal.h5 --method single-pixel -o chart.h5
@@ -125,7 +125,7 @@ def command(
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
-    if len(captures) == 1 and summary.done == 1:
+    if summary.done == 1 and not summary.skipped:
         one = summary.captures[0]
         line = (
             f"{one.output}: {one.quantity} in {len(one.bands_nm)} bands behind "

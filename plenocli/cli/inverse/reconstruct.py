@@ -165,9 +165,10 @@ def command(
 
     OUT is an image .h5 (with the predicted standard deviation for all but block-mean, and what of a
     lenslet's object the sensor can see at all) or .exr; with several captures a folder with one
-    file each. Finished ones are skipped on a rerun, a bad one is reported and does not stop the
-    others. --workers and --scheduler share captures out, or batches of the lenslets of a single one
-    (nnls, dictionary). With --calibration and no --pif the picture has one value a lenslet.
+    file each. CAPTURE may be a folder: the captures in it. Finished ones are skipped on a rerun, a
+    bad one is reported and does not stop the others. --workers and --scheduler share captures out,
+    or batches of the lenslets of a single one (nnls, dictionary). With --calibration and no --pif
+    the picture has one value a lenslet.
 
     \b
     Examples:
@@ -209,7 +210,7 @@ def command(
         overwrite=overwrite,
         command=options.command_line(ctx),
     )
-    if len(captures) == 1 and len(summary.captures) == 1:
+    if len(summary.captures) == 1 and not summary.skipped:
         line = summary.captures[0].line(with_reason=method == "auto")
     else:
         done, skipped = len(summary.captures), summary.skipped

@@ -1,14 +1,67 @@
-"""Captures from files as superpixels in the units of the system matrix."""
+"""Captures that a command line names, and captures from files as superpixels in the units of the
+system matrix.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
+from plenocli.base.errors import InputError
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.calibrations import read_calibration
 from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.superpixels import superpixels
+
+SUFFIXES = tuple(
+    ".h5 .exr .dng .png .tif .tiff .3fr .arw .cr2 .cr3 .crw .erf .fff .iiq .kdc .mef .mos .mrw "
+    ".nef .nrw .orf .pef .raf .raw .rw2 .rwl .srw .x3f".split()
+)
+"""Of the files in a folder that are taken for captures; JPEGs and notes lie beside them."""
+
+
+def named_captures(
+    names: Iterable[str | Path], others: Iterable[str | Path | None] = ()
+) -> list[Path]:
+    """The files that a list of captures means, each once, in its order.
+
+    names: files as they are; of a folder the captures directly in it, by name; of a pattern such as
+        `shots/*.NEF`, which not every shell resolves, the files that match.
+    others: files that are no captures, a calibration beside them for example; None is nobody.
+
+    Raises InputError where a folder holds no captures.
+    """
+    apart = {Path(other).absolute() for other in others if other is not None}
+    found: dict[Path, None] = {}
+    for name in map(Path, names):
+        found.update(dict.fromkeys(_meant(name, apart)))
+    return list(found)
+
+
+def _meant(name: Path, apart: set[Path]) -> list[Path]:
+    """What one name of named_captures stands for."""
+    try:
+        is_folder, is_there = name.is_dir(), name.exists()
+    except OSError:  # a name too long, of which its reader says more
+        return [name]
+    if not is_folder:
+        pattern = not is_there and any(mark in name.name for mark in "*?[")
+        matches = sorted(name.parent.glob(name.name)) if pattern else []
+        return matches or [name]
+    inside = [
+        path
+        for path in sorted(name.iterdir())
+        if path.suffix.lower() in SUFFIXES
+        and not path.name.startswith(".")
+        and path.is_file()
+        and path.absolute() not in apart
+    ]
+    if not inside:
+        raise InputError(
+            "is a folder without captures", name, "name one with .h5, .exr, .dng, RAW or TIFF files"
+        )
+    return inside
 
 
 def read_superpixels(

@@ -17,6 +17,7 @@ from plenocli.base.progress import note
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
+from plenocli.files.read.captures import named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
 
@@ -127,6 +128,7 @@ def run_demux(
     after the capture; finished ones are skipped unless overwrite. A capture that fails does not
     stop the others: its message is printed and an error is raised at the end, with the exit
     code of the worst.
+    captures: files, folders of them, or patterns (plenocli.files.read.captures.named_captures).
     workers: captures that are read and demultiplexed at the same time, in threads; they share one
         calibration, and results are written one at a time.
     scheduler: a Dask cluster that demultiplexes them instead (plenocli.execution.pool).
@@ -135,13 +137,15 @@ def run_demux(
     import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
 
+    others = [calibration, settings.reference, settings.camera, settings.prior]
+    captures = named_captures(captures, others)
     batch = plan_batch(
         captures,
         output,
         suffix,
         "spectra are",
         overwrite=overwrite,
-        inputs=[*captures, calibration, settings.reference, settings.camera, settings.prior],
+        inputs=[*captures, *others],
     )
     # captures are what runs side by side, and the bytes must not depend on how many
     with threadpool_limits(1, "blas"):

@@ -17,7 +17,7 @@ from plenocli.base.progress import bar, collected_notes, note
 from plenocli.base.tiling import to_blocks
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
-from plenocli.files.read.captures import read_superpixels, read_white
+from plenocli.files.read.captures import named_captures, read_superpixels, read_white
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import (
     FieldMatrix,
@@ -239,7 +239,7 @@ def run_reconstruct(
     a single one, by methods that take long over each. Finished ones are skipped unless overwrite.
     One that fails does not stop the others; an error with the worst exit code follows at the end.
 
-    captures: files.
+    captures: files, folders of them, or patterns (plenocli.files.read.captures.named_captures).
     output: the file (.h5 or .exr) of one capture, or a folder with one file each.
     pif, calibration: what explains the captures; one of them at least.
     suffix: of the files in a folder.
@@ -247,14 +247,15 @@ def run_reconstruct(
     command: for the provenance.
     """
     _check_options(settings, pif, calibration)
-    inputs = [
-        *captures,
+    others = [
         pif,
         calibration,
         settings.dictionary,
         settings.truth,
         *(files_of(settings.training) or ()),
     ]
+    captures = named_captures(captures, others)
+    inputs = [*captures, *others]
     batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
     if not batch.todo:
         return _summary(summarise(batch, ()))

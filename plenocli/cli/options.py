@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
+from plenocli.base.errors import PlenoError
 from plenocli.base.progress import tell
 from plenocli.base.text import json_value, printable
 from plenocli.base.units import (
@@ -427,6 +429,19 @@ def _word(value: Any, kind: click.ParamType | None) -> str:
     if isinstance(kind, _Quantity):
         return kind.show(value)
     return format(value, ".12g") if isinstance(value, float) else str(value)
+
+
+@contextmanager
+def partly_told(as_json: bool) -> Iterator[None]:
+    """Where a batch fails in part, print what it did as JSON on request, before its error."""
+    from plenocli.execution.batch import PartialFailure
+
+    try:
+        yield
+    except PlenoError as error:
+        if as_json and isinstance(error.__cause__, PartialFailure):
+            summary(error.__cause__.as_json(), as_json, "")
+        raise
 
 
 def summary(report: dict[str, Any], as_json: bool, line: str) -> None:

@@ -126,6 +126,28 @@ class BatchSummary:
     reports: tuple[Any, ...]
 
 
+class PartialFailure(Exception):
+    """What caused the error of a batch that failed in part: what it did nevertheless.
+
+    done: the captures that did not fail; their reports have as_json().
+    errors: (capture, error) of the others.
+    """
+
+    def __init__(self, done: BatchSummary, errors: Sequence[tuple[Path, PlenoError]]) -> None:
+        super().__init__(f"{len(errors)} captures failed")
+        self.done, self.errors = done, errors
+
+    def as_json(self) -> dict[str, Any]:
+        """What --json prints: the summary of a batch, and `failed`."""
+        return {
+            "output": self.done.output,
+            "done": len(self.done.reports),
+            "skipped": self.done.skipped,
+            "captures": [report.as_json() for report in self.done.reports],
+            "failed": [{"capture": str(path), "error": str(e)} for path, e in self.errors],
+        }
+
+
 def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
     """The summary of a batch whose captures have ended, in any order.
 
@@ -134,7 +156,8 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
     batch: what was to be done.
     ended: (capture, report or PlenoError), as `outcomes` yields them.
 
-    Raises at the end an error with the exit code of the worst; that of a single capture as it is.
+    Raises at the end an error with the exit code of the worst, caused by a PartialFailure; that of
+    a single capture as it is.
     """
     reports: list[tuple[Path, Any]] = []
     errors: list[tuple[Path, PlenoError]] = []
@@ -149,6 +172,11 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
     order = {capture: number for number, (capture, _) in enumerate(batch.jobs)}
     reports.sort(key=lambda pair: order[pair[0]])
     errors.sort(key=lambda pair: order[pair[0]])
+    done = BatchSummary(
+        str(batch.output),
+        len(batch.jobs) - len(batch.todo),
+        tuple(report for _, report in reports),
+    )
     if errors:
         raise failed_together(
             errors,
@@ -156,12 +184,8 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
             "captures",
             batch.output,
             f"{len(batch.jobs) - len(errors)} are done; see the messages above",
-        )
-    return BatchSummary(
-        str(batch.output),
-        len(batch.jobs) - len(batch.todo),
-        tuple(report for _, report in reports),
-    )
+        ) from PartialFailure(done, errors)
+    return done
 
 
 def failed_together(

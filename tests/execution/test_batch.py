@@ -2,6 +2,7 @@
 threads, one writer.
 """
 
+import json
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError, PlenoError
+from plenocli.cli.main import run
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import open_pool
 from plenocli.files.artefacts.container import Artefact, write_artefact
@@ -168,6 +170,18 @@ def test_a_folder_is_the_captures_in_it(folder, tmp_path):
     with pytest.raises(InputError, match="without captures"):
         run_demux([tmp_path / "empty"], tmp_path / "o", calibration=calibration)
     assert not (tmp_path / "o").exists()
+
+
+def test_a_batch_that_fails_in_part_tells_one_document(folder, tmp_path, capsys):
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(shots(folder)[0].read_bytes()[:-40])
+    asked = [*map(str, shots(folder)[:2]), str(bad), "--calibration", str(folder / "c.h5")]
+    assert run(["demux", *asked, "-o", str(tmp_path / "out"), "--json"]) == 3
+    told = json.loads(capsys.readouterr().out)
+    assert (told["done"], told["skipped"]) == (2, 0)
+    assert [one["capture"] for one in told["captures"]] == [p.name for p in shots(folder)[:2]]
+    assert [one["capture"] for one in told["failed"]] == [str(bad)]
+    assert str(bad) in told["failed"][0]["error"]
 
 
 def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):

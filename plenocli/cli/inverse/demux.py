@@ -107,24 +107,25 @@ def command(
     """
     from plenocli.stages.inverse.demux import Settings, run_demux
 
-    summary = run_demux(
-        captures,
-        output,
-        calibration=calibration,
-        settings=Settings(
-            method=method,
-            reference=reference,
-            reference_reflectance=reference_reflectance,
-            register=register,
-            camera=camera,
-            prior=prior,
-        ),
-        suffix=f".{suffix}",
-        workers=workers,
-        scheduler=scheduler,
-        overwrite=overwrite,
-        command=options.command_line(ctx),
-    )
+    with options.partly_told(as_json):
+        summary = run_demux(
+            captures,
+            output,
+            calibration=calibration,
+            settings=Settings(
+                method=method,
+                reference=reference,
+                reference_reflectance=reference_reflectance,
+                register=register,
+                camera=camera,
+                prior=prior,
+            ),
+            suffix=f".{suffix}",
+            workers=workers,
+            scheduler=scheduler,
+            overwrite=overwrite,
+            command=options.command_line(ctx),
+        )
     if summary.done == 1 and not summary.skipped:
         one = summary.captures[0]
         line = (

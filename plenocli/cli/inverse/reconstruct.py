@@ -183,33 +183,34 @@ def command(
     """
     from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
 
-    summary = run_reconstruct(
-        captures,
-        output,
-        Settings(
-            overlap=int(overlap) if overlap else None,
-            method=method,
-            dictionary=dictionary,
-            training=training,
-            truth=truth,
-            noise_sigma=noise_sigma,
-            alpha=alpha,
-            rank=rank,
-            lam=lam,
-            nnls_iterations=nnls_iterations,
-            hold_out=hold_out,
-            fit=fit,
-            clip=clip,
-            seed=seed,
-            workers=workers,
-        ),
-        pif=pif,
-        calibration=calibration,
-        suffix=f".{suffix}",
-        scheduler=scheduler,
-        overwrite=overwrite,
-        command=options.command_line(ctx),
-    )
+    with options.partly_told(as_json):
+        summary = run_reconstruct(
+            captures,
+            output,
+            Settings(
+                overlap=int(overlap) if overlap else None,
+                method=method,
+                dictionary=dictionary,
+                training=training,
+                truth=truth,
+                noise_sigma=noise_sigma,
+                alpha=alpha,
+                rank=rank,
+                lam=lam,
+                nnls_iterations=nnls_iterations,
+                hold_out=hold_out,
+                fit=fit,
+                clip=clip,
+                seed=seed,
+                workers=workers,
+            ),
+            pif=pif,
+            calibration=calibration,
+            suffix=f".{suffix}",
+            scheduler=scheduler,
+            overwrite=overwrite,
+            command=options.command_line(ctx),
+        )
     if len(summary.captures) == 1 and not summary.skipped:
         line = summary.captures[0].line(with_reason=method == "auto")
     else:

@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ def pytest_configure(config):
     how many of them tests have seen.
     """
     listen(_reached.add)
+    os.environ["PLENOCLI_CACHE"] = "off"
 
 
 @pytest.hookimpl(wrapper=True)

@@ -15,7 +15,7 @@ import numpy as np
 from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.progress import bar
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
-from plenocli.inverse.picture.solvers.least_squares import Svd
+from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
 from plenocli.inverse.prior.scene_prior import ReadPictures, ScenePrior
 from plenocli.inverse.sparse.dictionary import Dictionary
 
@@ -78,11 +78,15 @@ class Estimators:
         read_dictionary: Callable[[], Dictionary] | None = None,
         *,
         threads: int | None = None,
+        decomposed: Callable[[np.ndarray], Svd] = decompose,
     ) -> None:
-        """read_pictures: gives the training pictures; read_dictionary: the learnt dictionary, None
+        """decomposed: gives the Svd of a matrix.
+
+        read_pictures: gives the training pictures; read_dictionary: the learnt dictionary, None
         where there is none; threads: of compiled code, None for all cores.
         """
         self.system, self.options, self.threads = system, options, threads
+        self.decomposed = decomposed
         self.read_pictures, self.read_dictionary = read_pictures, read_dictionary
         self.trials: dict[TrialKey, dict[str, float]] = {}
         self.coupled = len(system.offsets) > 1
@@ -91,9 +95,7 @@ class Estimators:
     @cached_property
     def svd(self) -> Svd:
         """Of the own block."""
-        from plenocli.inverse.picture.solvers.least_squares import decompose
-
-        return decompose(self.system.own)
+        return self.decomposed(self.system.own)
 
     @cached_property
     def prior(self) -> ScenePrior:

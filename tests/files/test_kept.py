@@ -1,0 +1,93 @@
+import os
+
+import numpy as np
+import pytest
+
+from plenocli.files import kept as module
+from plenocli.files.kept import folder, kept
+
+RNG = np.random.default_rng(4)
+MATRIX, OTHER = RNG.normal(size=(2, 9, 6))
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.setenv("PLENOCLI_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def decomposed(matrix, made):
+    def make():
+        made.append(1)
+        return np.linalg.svd(matrix, full_matrices=False)
+
+    return kept("svd", [matrix], make)
+
+
+def same(found, wanted):
+    return all(a.tobytes() == b.tobytes() for a, b in zip(found, wanted, strict=True))
+
+
+def test_what_is_kept_is_what_was_made_and_is_made_once(place):
+    made = []
+    first, again = decomposed(MATRIX, made), decomposed(MATRIX, made)
+    assert len(made) == 1 and same(first, again)
+    assert same(again, np.linalg.svd(MATRIX, full_matrices=False))
+    decomposed(OTHER, made)
+    decomposed(MATRIX.T, made)
+    assert len(made) == 3 and len(list(place.iterdir())) == 3
+
+
+@pytest.mark.parametrize("damage", ["cut", "longer", "bit", "foreign", "empty", "folder"])
+def test_damaged_files_are_made_again(place, damage):
+    made = []
+    wanted = decomposed(MATRIX, made)
+    (path,) = place.iterdir()
+    data = path.read_bytes()
+    flipped = data[:-5] + bytes([data[-5] ^ 1]) + data[-4:]
+    foreign = b'{"a": [[1]]}\n' + data
+    if damage == "folder":
+        path.unlink()
+        path.mkdir()
+    else:
+        path.write_bytes(
+            {
+                "cut": data[:-8],
+                "longer": data + b"1",
+                "bit": flipped,
+                "foreign": foreign,
+                "empty": b"",
+            }[damage]
+        )
+    assert same(decomposed(MATRIX, made), wanted) and len(made) == 2
+    decomposed(MATRIX, made)
+    assert len(made) == (3 if damage == "folder" else 2)
+
+
+def test_nothing_is_kept_where_that_is_switched_off_or_impossible(tmp_path, monkeypatch):
+    monkeypatch.setenv("PLENOCLI_CACHE", "off")
+    made = []
+    wanted = decomposed(MATRIX, made)
+    assert folder() is None
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("PLENOCLI_CACHE", str(tmp_path / "file"))
+    assert same(decomposed(MATRIX, made), wanted)
+    decomposed(MATRIX, made)
+    assert len(made) == 3 and (tmp_path / "file").read_text() == "no folder"
+
+
+def test_what_was_not_used_for_longest_makes_room(place, monkeypatch):
+    made = []
+    decomposed(MATRIX, made)
+    (oldest,) = place.iterdir()
+    os.utime(oldest, (1, 1))
+    size = oldest.stat().st_size
+    monkeypatch.setattr(module, "LARGEST", int(2.5 * size))
+    decomposed(OTHER, made)
+    decomposed(MATRIX, made)  # read, which makes it the younger one
+    os.utime(next(f for f in place.iterdir() if f != oldest), (2, 2))
+    decomposed(MATRIX + OTHER, made)
+    assert len(made) == 3 and len(list(place.iterdir())) == 2 and oldest.exists()
+    monkeypatch.setattr(module, "LARGEST", size // 4)
+    decomposed(MATRIX - OTHER, made)
+    assert len(list(place.iterdir())) == 2

@@ -918,6 +918,15 @@ LIGHTFIELD = Schema(
             minimum=0,
         ),
         dataset(
+            "depth/picture",
+            "point_row point_column",
+            "f",
+            "1",
+            "everything in focus: each lenslet at its own slope, or at the nearest known one",
+            optional=True,
+            maskable=True,
+        ),
+        dataset(
             "views/value",
             "view_row view_column row column",
             "f",

@@ -31,6 +31,8 @@ def lightfield_artefact(
             "depth/confidence": field.depth.confidence,
             "depth/distance": field.depth.distance,
         }
+    if field.sharp is not None:
+        data |= {"depth/picture": field.sharp.astype(np.float32)}
     if field.views is not None:
         data |= {"views/value": field.views.astype(np.float32)}
     attrs = {"refocus": {"pitch": samples.pitch, "step": STEP, "pupil": 2 * samples.reach()}}
@@ -58,5 +60,6 @@ def lightfield_of(artefact: "Artefact") -> LightField:
         sharpness=data["refocus/sharpness"],
         distances=data.get("refocus/distance"),
         depth=depth,
+        sharp=data.get("depth/picture"),
         views=data.get("views/value"),
     )

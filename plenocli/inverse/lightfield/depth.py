@@ -69,6 +69,32 @@ def depth_in_reach(
     return _map(samples, tried, disagreement, width), tried
 
 
+def all_in_focus(samples: Samples, slope: np.ndarray, shape: tuple[int, int]) -> np.ndarray | None:
+    """The picture in which every lenslet is refocused by its own slope.
+
+    samples: of one capture.
+    slope: (row, column), one value a pitch; NaN takes the nearest known one.
+    shape: (rows, columns) of the map.
+
+    Returns (row, column), like `refocus`; None where no slope is known.
+    docs/model.md, "Refocusing and depth".
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    unknown = np.isnan(slope)
+    if unknown.all():
+        return None
+    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return refocus(samples, _own(samples, slope[tuple(nearest)]), shape)[0]
+
+
+def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
+    """(sample,) slope of each sample's lenslet, from a map (row, column)."""
+    from scipy.ndimage import map_coordinates
+
+    return map_coordinates(slope, samples.centre.T / samples.pitch - 0.5, order=1, mode="nearest")
+
+
 def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:
     """The map of the least disagreement (plane, row, column)."""
     least, confidence = _least(disagreement, tried)
@@ -158,7 +184,7 @@ def _correction(
     """
     from scipy.ndimage import gaussian_filter, map_coordinates
 
-    own = map_coordinates(slope, samples.centre.T / samples.pitch - 0.5, order=1, mode="nearest")
+    own = _own(samples, slope)
     picture, _ = refocus(samples, own, shape, step=STEP)
     picture = np.where(np.isfinite(picture), picture, np.nanmean(picture))
     where = place(samples, own, STEP).T

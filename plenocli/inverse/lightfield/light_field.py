@@ -11,7 +11,7 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.inverse.lightfield import refocus as focus
-from plenocli.inverse.lightfield.depth import depth, depth_in_reach
+from plenocli.inverse.lightfield.depth import all_in_focus, depth, depth_in_reach
 from plenocli.inverse.lightfield.planes import LightField, distance_of, slope_of
 from plenocli.inverse.lightfield.samples import Samples, collect
 
@@ -97,6 +97,7 @@ def refocused(
         sharpness=np.array([focus.sharpness(p) for p in pictures]),
         distances=None if optics is None else optics.distance(slopes),
         depth=found,
+        sharp=None if found is None else all_in_focus(samples, found.slope, shape),
         views=focus.views(samples, views, shape) if views else None,
     )
 

@@ -43,6 +43,7 @@ class LightField:
     sharpness: (plane,) mean square gradient.
     distances: (plane,) m in front of the main lens, NaN beyond infinity; None without a camera.
     depth: None with fewer than three planes.
+    sharp: (row, column), like a picture, everything in focus; None without known depth.
     views: (view_row, view_column, row, column), or None.
     """
 
@@ -51,6 +52,7 @@ class LightField:
     sharpness: np.ndarray
     distances: np.ndarray | None = None
     depth: DepthMap | None = None
+    sharp: np.ndarray | None = None
     views: np.ndarray | None = None
 
 

@@ -19,6 +19,8 @@ def lightfield_figures(field: LightField) -> Figures:
     ]
     if field.depth is not None:
         figures.append((_depth(field.depth), "Where the views agree best, and how clearly."))
+    if field.sharp is not None:
+        figures.append((_sharp(field.sharp), "Everything in focus, by the depth map."))
     if field.views is not None:
         figures.append((_views(field.views), "The scene through parts of the pupil."))
     return figures
@@ -91,6 +93,12 @@ def _depth(depth: DepthMap) -> bytes:
             alpha=np.clip(2 * depth.confidence, 0.1, 1),
         )
         show_map(right, depth.confidence, "confidence", "", cmap=LEVEL_MAP, vmin=0, vmax=1)
+    return made.png
+
+
+def _sharp(picture: np.ndarray) -> bytes:
+    with drawing(5.6, 5.6 * picture.shape[0] / picture.shape[1] + 0.1) as made:
+        show_picture(made.figure.subplots(), picture / _top(picture))
     return made.png
 
 

@@ -151,6 +151,19 @@ def test_a_plane_beyond_the_usual_range_is_found_and_no_lenslet_is_sure_at_an_ed
     assert not np.isin(found, field.slopes[[0, -1]]).any()
 
 
+def test_both_halves_of_a_scene_are_sharp_in_the_picture_by_its_depths():
+    made = samples(capture(0.65, 0.48))
+    field = refocused(made, (COUNT, COUNT), usual_slopes(13), views=0, grow=True)
+    at = (np.arange(COUNT * STEP) / STEP * PITCH_PX - (COUNT * PITCH_PX - 1) / 2) / PITCH_PX
+    true = scene(*np.meshgrid(at, at, indexing="ij")[::-1])
+    inner = slice(5 * STEP, -5 * STEP)
+
+    def error(picture):
+        return float(np.sqrt(np.nanmean((picture - true)[inner, inner] ** 2)))
+
+    assert error(field.sharp) < 0.7 * min(error(p) for p in field.pictures)
+
+
 def test_beyond_slopes_that_do_not_grow_nothing_is_known():
     """The plane stands at a slope of 3.4."""
     found = depth(samples(capture(0.42)), np.linspace(-2, 2, 9), (COUNT, COUNT))

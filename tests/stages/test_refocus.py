@@ -200,7 +200,7 @@ def test_a_report_shows_planes_and_how_good_they_are(folder):
     assert run(["report", str(folder / "run"), "-o", str(folder / "run.html")]) == 0
     page = (folder / "run.html").read_text()
     assert (
-        page.count("<figure>") == 4
+        page.count("<figure>") == 5
         and ">Depth</h2>" in page
         and "error of the slope over the geometric limit, median" in page
     )

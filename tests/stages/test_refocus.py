@@ -40,53 +40,53 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("refocus")
 
 
-@pytest.mark.parametrize("distance, reach", [("550 mm", 1), ("500 mm", 5), ("620 mm", 5)])
-def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distance, reach):
+def planes_at(folder, distance, superpixels):
+    """The capture at `distance` mm, its camera and its planes: made where no test has made them."""
+    camera, capture, out = (folder / f"{distance}{end}" for end in (".toml", ".h5", "-planes.h5"))
+    if not out.exists():
+        camera.write_text(CAMERA.format(distance=f"{distance} mm"))
+        model = ["--model", "ray", "--superpixels", superpixels, "--coherent-ring", "0"]
+        options = ["--scene", "skimage:camera", *model, "--noise", "none", "-o", str(capture)]
+        assert run(["capture-sim", str(camera), *options]) == 0
+        assert run(["refocus", str(capture), "--camera", str(camera), "-o", str(out)]) == 0
+    return capture, out
+
+
+@pytest.fixture
+def at_550(folder):
+    """The folder with 550.toml, 550.h5 and 550-planes.h5, whichever test runs first."""
+    planes_at(folder, 550, "1x1")
+    return folder
+
+
+@pytest.mark.parametrize("distance, superpixels", [(550, "1x1"), (500, "3x3"), (620, "3x3")])
+def test_a_simulated_scene_out_of_focus_is_found_at_its_distance(folder, distance, superpixels):
     """capture-sim works with system matrices of waves and knows nothing of slopes."""
-    name = distance.split()[0]
-    camera, capture, out = (
-        folder / f"{name}.toml",
-        folder / f"{name}.h5",
-        folder / f"{name}-planes.h5",
-    )
-    camera.write_text(CAMERA.format(distance=distance))
-    grid = f"{reach}x{reach}" if reach == 1 else "3x3"
-    assert (
-        run(
-            [
-                "capture-sim",
-                str(camera),
-                "--scene",
-                "skimage:camera",
-                "--model",
-                "ray",
-                "--superpixels",
-                grid,
-                "--coherent-ring",
-                "0",
-                "--noise",
-                "none",
-                "-o",
-                str(capture),
-            ]
-        )
-        == 0
-    )
-    assert run(["refocus", str(capture), "--camera", str(camera), "-o", str(out)]) == 0
+    capture, out = planes_at(folder, distance, superpixels)
     data = read_artefact(out, "lightfield").data
-    true = slope_of(float(name) * 1e-3, 0.05, 0.055, 352e-6)
+    true = slope_of(distance * 1e-3, 0.05, 0.055, 352e-6)
     sure = data["depth/confidence"][3:-3, 3:-3] > 0.4
     assert sure.sum() > 10
     assert np.median(data["depth/slope"][3:-3, 3:-3][sure]) == pytest.approx(true, abs=0.25)
     assert abs(data["refocus/slope"][np.argmax(data["refocus/sharpness"])] - true) <= 0.5
     # told, or what the capture says of its camera
-    for number, truth in enumerate((distance.replace(" ", ""), str(capture))):
+    for number, truth in enumerate((f"{distance}mm", str(capture))):
         assert (
-            run(["score", str(out), "--truth", truth, "-o", str(folder / f"{name}-{number}.json")])
+            run(
+                [
+                    "score",
+                    str(out),
+                    "--truth",
+                    truth,
+                    "-o",
+                    str(folder / f"{distance}-{number}.json"),
+                ]
+            )
             == 0
         )
     told, known = (
-        json.loads((folder / f"{name}-{number}.json").read_text())["metrics"] for number in (0, 1)
+        json.loads((folder / f"{distance}-{number}.json").read_text())["metrics"]
+        for number in (0, 1)
     )
     assert told == known
     assert (
@@ -163,10 +163,10 @@ def test_the_letters_stand_at_two_depths(folder, shared_data, capsys):
         (["--camera", "none.toml"], 3, "none.toml"),
     ],
 )
-def test_wrong_requests_have_one_message(folder, capfd, monkeypatch, arguments, code, words):
-    monkeypatch.chdir(folder)
+def test_wrong_requests_have_one_message(at_550, capfd, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(at_550)
     assert run(["refocus", "550.h5", *arguments, "-o", "never.h5"]) == code
-    assert words in capfd.readouterr().err and not (folder / "never.h5").exists()
+    assert words in capfd.readouterr().err and not (at_550 / "never.h5").exists()
 
 
 def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
@@ -181,24 +181,24 @@ def test_a_picture_without_a_grid_is_refused_with_what_to_do(folder, capfd):
     assert "--calibration" in capfd.readouterr().err
 
 
-def test_a_report_shows_planes_and_how_good_they_are(folder):
-    (folder / "run").mkdir()
-    shutil.copy(folder / "550-planes.h5", folder / "run")
+def test_a_report_shows_planes_and_how_good_they_are(at_550):
+    (at_550 / "run").mkdir()
+    shutil.copy(at_550 / "550-planes.h5", at_550 / "run")
     assert (
         run(
             [
                 "score",
-                str(folder / "run" / "550-planes.h5"),
+                str(at_550 / "run" / "550-planes.h5"),
                 "--truth",
                 "550mm",
                 "-o",
-                str(folder / "run" / "depth.json"),
+                str(at_550 / "run" / "depth.json"),
             ]
         )
         == 0
     )
-    assert run(["report", str(folder / "run"), "-o", str(folder / "run.html")]) == 0
-    page = (folder / "run.html").read_text()
+    assert run(["report", str(at_550 / "run"), "-o", str(at_550 / "run.html")]) == 0
+    page = (at_550 / "run.html").read_text()
     assert (
         page.count("<figure>") == 5
         and ">Depth</h2>" in page
@@ -206,9 +206,9 @@ def test_a_report_shows_planes_and_how_good_they_are(folder):
     )
 
 
-def test_show_draws_it(folder):
-    assert run(["show", str(folder / "550-planes.h5"), "-o", str(folder / "550.png")]) == 0
-    assert (folder / "550.png").stat().st_size > 20_000
+def test_show_draws_it(at_550):
+    assert run(["show", str(at_550 / "550-planes.h5"), "-o", str(at_550 / "550.png")]) == 0
+    assert (at_550 / "550.png").stat().st_size > 20_000
 
 
 @pytest.mark.parametrize(
@@ -220,9 +220,9 @@ def test_show_draws_it(folder):
         (["--truth", "550mm", "--metric", "psnr"], 3, "--camera"),
     ],
 )
-def test_depth_is_not_scored_without_distances(folder, capfd, monkeypatch, arguments, code, words):
-    monkeypatch.chdir(folder)
-    if not (folder / "plain.h5").exists():
+def test_depth_is_not_scored_without_distances(at_550, capfd, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(at_550)
+    if not (at_550 / "plain.h5").exists():
         assert run(["refocus", "550.h5", "-o", "plain.h5"]) == 0
     assert (
         run(
@@ -236,4 +236,4 @@ def test_depth_is_not_scored_without_distances(folder, capfd, monkeypatch, argum
         )
         == code
     )
-    assert words in capfd.readouterr().err and not (folder / "never.json").exists()
+    assert words in capfd.readouterr().err and not (at_550 / "never.json").exists()

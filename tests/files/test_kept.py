@@ -5,6 +5,7 @@ import pytest
 
 from plenocli.files import kept as module
 from plenocli.files.kept import folder, kept
+from plenocli.inverse.picture.solvers.least_squares import Svd
 
 RNG = np.random.default_rng(4)
 MATRIX, OTHER = RNG.normal(size=(2, 9, 6))
@@ -91,3 +92,38 @@ def test_what_was_not_used_for_longest_makes_room(place, monkeypatch):
     monkeypatch.setattr(module, "LARGEST", size // 4)
     decomposed(MATRIX - OTHER, made)
     assert len(list(place.iterdir())) == 2
+
+
+def test_a_second_run_measures_no_photographs_and_has_the_same_bytes(place, monkeypatch):
+    """Statistics depend on the pictures, the size of an object and the seed, and on no more."""
+    from plenocli.inverse.picture.lenslet_model import LensletMatrix
+    from plenocli.inverse.prior import natural_images
+    from plenocli.inverse.prior.scene_prior import ScenePrior
+
+    measured, of = [], natural_images.mean_covariance
+    monkeypatch.setattr(
+        natural_images, "mean_covariance", lambda patches: measured.append(1) or of(patches)
+    )
+    pictures = [("one", RNG.random((40, 30))), ("two", RNG.random((25, 50)))]
+    system = LensletMatrix(
+        path=place,
+        blocks=RNG.random((1, 16, 9)),
+        offsets=np.zeros((1, 2), int),
+        object_shape=(3, 3),
+        pixel_shape=(4, 4),
+        bands=(5.5e-7,),
+    )
+
+    def statistics(training, seed, **options):
+        svd = Svd(*np.linalg.svd(system.own, full_matrices=False))
+        prior = ScenePrior(system, lambda: svd, lambda scene: training, seed, **options)
+        prior.lmmse(0.1, None)
+        return prior.statistics[None]
+
+    told = statistics(pictures, 1)
+    first, again = (statistics(pictures, 1, keep=kept) for _ in range(2))
+    assert len(measured) == 2 and same(first, told) and same(again, told)
+    other = [pictures[0], ("two", pictures[1][1] * 0.999)]
+    assert not same(statistics(pictures, 2**70, keep=kept), told)
+    assert not same(statistics(other, 1, keep=kept), told)
+    assert len(measured) == 4

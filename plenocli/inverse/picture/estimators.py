@@ -16,7 +16,7 @@ from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.progress import bar
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
-from plenocli.inverse.prior.scene_prior import ReadPictures, ScenePrior
+from plenocli.inverse.prior.scene_prior import Keep, ReadPictures, ScenePrior, work_out
 from plenocli.inverse.sparse.dictionary import Dictionary
 
 INNER = (slice(1, -1), slice(1, -1))
@@ -78,15 +78,15 @@ class Estimators:
         read_dictionary: Callable[[], Dictionary] | None = None,
         *,
         threads: int | None = None,
-        decomposed: Callable[[np.ndarray], Svd] = decompose,
+        keep: Keep = work_out,
     ) -> None:
-        """decomposed: gives the Svd of a matrix.
+        """keep: of decompositions, and of what photographs are like.
 
         read_pictures: gives the training pictures; read_dictionary: the learnt dictionary, None
         where there is none; threads: of compiled code, None for all cores.
         """
         self.system, self.options, self.threads = system, options, threads
-        self.decomposed = decomposed
+        self.keep = keep
         self.read_pictures, self.read_dictionary = read_pictures, read_dictionary
         self.trials: dict[TrialKey, dict[str, float]] = {}
         self.coupled = len(system.offsets) > 1
@@ -95,12 +95,19 @@ class Estimators:
     @cached_property
     def svd(self) -> Svd:
         """Of the own block."""
-        return self.decomposed(self.system.own)
+
+        def decomposed() -> tuple[np.ndarray, ...]:
+            svd = decompose(self.system.own)
+            return svd.u, svd.s, svd.vt
+
+        return Svd(*self.keep("svd", [self.system.own], decomposed))
 
     @cached_property
     def prior(self) -> ScenePrior:
         """What photographs look like to this matrix."""
-        return ScenePrior(self.system, lambda: self.svd, self.read_pictures, self.options.seed)
+        return ScenePrior(
+            self.system, lambda: self.svd, self.read_pictures, self.options.seed, keep=self.keep
+        )
 
     @cached_property
     def learnt(self) -> Dictionary:

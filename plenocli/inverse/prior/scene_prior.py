@@ -23,7 +23,19 @@ KEPT = 4
 ReadPictures = Callable[[str | None], list[TrainingPicture]]
 """Gives the training pictures without the scene of this name."""
 
+Keep = Callable[
+    [str, list[np.ndarray], Callable[[], tuple[np.ndarray, ...]]], tuple[np.ndarray, ...]
+]
+"""(name, all that it depends on, what works it out): the arrays, worked out now or earlier."""
+
 _Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, np.ndarray)
+
+
+def work_out(
+    name: str, inputs: list[np.ndarray], make: Callable[[], tuple[np.ndarray, ...]]
+) -> tuple[np.ndarray, ...]:
+    """A Keep that keeps nothing."""
+    return make()
 
 
 class ScenePrior:
@@ -33,11 +45,18 @@ class ScenePrior:
     """
 
     def __init__(
-        self, system: LensletMatrix, svd: Callable[[], Svd], read_pictures: ReadPictures, seed: int
+        self,
+        system: LensletMatrix,
+        svd: Callable[[], Svd],
+        read_pictures: ReadPictures,
+        seed: int,
+        *,
+        keep: Keep = work_out,
     ) -> None:
         """svd: gives that of the own block of `system`; read_pictures: called once a scene; seed:
-        of the patches drawn.
+        of the patches drawn; keep: of mean and covariance of photographs.
         """
+        self.keep = keep
         self.system, self.svd, self.read_pictures, self.seed = system, svd, read_pictures, seed
         self.pictures_of: dict[str | None, list[TrainingPicture]] = {}
         self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
@@ -72,20 +91,28 @@ class ScenePrior:
     def lmmse(self, sigma: float, scene: str | None) -> lmmse.Lmmse:
         """LMMSE of a lenslet by itself, at noise `sigma` of a pixel."""
         if scene not in self.statistics:
-            shape = self.system.object_shape
-            patches = natural_images.draw_patches(
-                self.pictures(scene),
-                shape,
-                PATCHES_A_POINT * int(np.prod(shape)),
-                stream(self.seed, "reconstruct"),
-            )
-            self.statistics[scene] = natural_images.mean_covariance(patches)
+            self.statistics[scene] = self._measured(self.pictures(scene))
         mean, covariance = self.statistics[scene]
         return _kept(
             self._own,
             (sigma, scene),
             lambda: lmmse.prepare(self.svd(), mean, covariance, sigma, self.bands()),
         )
+
+    def _measured(self, pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance of the pictures' patches of an object's size."""
+        shape = self.system.object_shape
+        count = PATCHES_A_POINT * int(np.prod(shape))
+
+        def measured() -> tuple[np.ndarray, np.ndarray]:
+            rng = stream(self.seed, "reconstruct")
+            return natural_images.mean_covariance(
+                natural_images.draw_patches(pictures, shape, count, rng)
+            )
+
+        drawn = np.frombuffer(f"{shape} {count} {self.seed}".encode(), np.uint8)
+        mean, covariance = self.keep("photographs", [drawn, *pictures], measured)
+        return mean, covariance
 
     def heard(self, sigma: float, scene: str | None) -> np.ndarray:
         """Directions of a superpixel, (pixel, k), in which photographs matter at noise `sigma` of

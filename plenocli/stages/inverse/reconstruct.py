@@ -34,7 +34,6 @@ from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
-from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
 from plenocli.inverse.picture.superpixels import windows_of
 from plenocli.stages.inverse.field_classes import estimate_by_class
 from plenocli.stages.inverse.fitted_matrix import likely_cause, with_fitted_camera
@@ -342,18 +341,8 @@ def _estimators(recipe: Recipe) -> Estimators:
         read_pictures,
         None if learnt is None else partial(read_dictionary, learnt, system),
         threads=recipe.threads,
-        decomposed=_decomposed,
+        keep=kept,
     )
-
-
-def _decomposed(matrix: np.ndarray) -> Svd:
-    """The decomposition of a matrix, kept for runs to come."""
-
-    def made() -> tuple[np.ndarray, ...]:
-        svd = decompose(matrix)
-        return svd.u, svd.s, svd.vt
-
-    return Svd(*kept("svd", [matrix], made))
 
 
 def _system(recipe: Recipe) -> LensletMatrix:

@@ -13,6 +13,7 @@ from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.config.camera_file import load_camera, parse_camera
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.accuracy.dial import system_matrix
+from plenocli.stages.forward import capture_sim
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
 FILTERS = """
@@ -246,6 +247,37 @@ def test_without_a_time_light_of_known_strength_is_exposed_until_white_is_bright
         assert found.data["capture/mosaic"].max() == pytest.approx(0.8 * 60000 * 0.99, rel=0.02)
     assert times[1] == pytest.approx(4 * times[0])
     assert f"exposed for {times[1] * 1e3:.3g} ms" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options, exposure", [([], 0.01), (["--noise", "none"], None), (["--exposure", "3ms"], 0.003)]
+)
+def test_a_dark_frame_needs_no_optics(camera, tmp_path, monkeypatch, options, exposure):
+    """It is what a scene without light gives through the optics."""
+    black = np.zeros((12, 16), np.float32)
+    write_artefact(
+        tmp_path / "black.h5",
+        Artefact("image", {"image/value": black}, {}, Provenance(command="test")),
+    )
+    scene = capture(camera, "--scene", tmp_path / "black.h5", *options, "-o", tmp_path / "s.h5")
+    for name in ("planned_accuracy", "simulate_capture"):
+        monkeypatch.setattr(capture_sim, name, None)
+    dark = capture(camera, "--target", "dark", *options, "-o", tmp_path / "d.h5")
+    assert dark.data.keys() == scene.data.keys()
+    for name, values in scene.data.items():
+        assert dark.data[name].tobytes() == values.tobytes()
+    times = [found.attrs["capture"].get("exposure_s") for found in (dark, scene)]
+    assert times == [exposure, exposure]
+
+
+def test_a_dark_frame_lasts_as_long_as_white_where_the_light_decides(camera, tmp_path):
+    described = lit(camera, 8, 1000, None)
+    found = {
+        target: capture(described, "--target", target, "-o", tmp_path / f"{target}.h5")
+        for target in ("dark", "white")
+    }
+    dark, white = (found[name].attrs["capture"]["exposure_s"] for name in ("dark", "white"))
+    assert dark == white > 0
 
 
 def test_same_seed_same_bytes_other_seed_other_noise(camera, tmp_path):

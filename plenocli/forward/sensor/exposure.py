@@ -107,6 +107,41 @@ def simulate_capture(
     )
 
 
+def dark_capture(
+    camera: Camera, options: ExposureOptions, name: str = "dark"
+) -> SimulatedCapture | None:
+    """The exposure without light, for which no optics are needed.
+
+    options: the noise, the exposure.
+    name: of the scene, for later stages and messages.
+
+    Returns None where light of known strength and no exposure are given: how long a perfect white
+    may shine decides, and the optics say that. The capture does not tell electrons_per_unit.
+    Raises NumericsError where the noise is to be in proportion to the light.
+    """
+    count, pixels = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
+    mosaic = np.zeros((count[0] * pixels[0], count[1] * pixels[1]))
+    rng, saturated = stream(options.seed, "capture-sim"), None
+    if options.snr_db is not None or options.noise == "none":
+        capture = relative_capture(camera.sensor, mosaic, options, rng)
+    else:
+        seconds = options.exposure or camera.sensor.exposure
+        if seconds is None and camera.light.strength is not None:
+            return None
+        exposure = ExposureScale(1.0, seconds or camera.light.white_exposure)
+        capture, saturated = exposed_capture(camera.sensor, mosaic, exposure, name, rng)
+        capture = replace(capture, metadata=replace(capture.metadata, electrons_per_unit=None))
+    samples = camera.object.samples_per_lenslet
+    grid = (count[0] * samples[0] * options.refine, count[1] * samples[1] * options.refine)
+    scene = _truth(camera, Uniform(0.0), grid, options.refine)
+    return SimulatedCapture(
+        capture=_described(capture, camera, scene, name, None),
+        scene=scene,
+        wavelengths=np.array(camera.light.wavelengths[:1]),
+        saturated=saturated,
+    )
+
+
 class MatrixByPoints(Protocol):
     """A system matrix at one wavelength that comes in blocks of object points."""
 

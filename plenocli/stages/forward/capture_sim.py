@@ -18,6 +18,7 @@ from plenocli.forward.sensor.exposure import (
     SimulatedCapture,
     StoredField,
     StoredMatrix,
+    dark_capture,
     planned_accuracy,
     require_memory_for,
     require_tiling,
@@ -84,16 +85,19 @@ def run_capture_sim(
     require_tiling(camera, camera_path)
     require_memory_for(camera, options, camera_path)
     source, what = _source(camera, settings, scene)
-    if pif:
-        matrices, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path)
-    else:
-        matrices = None
-        accuracy = planned_accuracy(camera, options, source.wavelengths).as_json()
-    _tell_of_the_field(AccuracyRecord.from_json(accuracy))
-    name, band = settings.target or str(scene), _band(settings.target)
-    found = simulate_capture(
-        camera, source, what, options, matrices=matrices, name=name, band_m=band
-    )
+    found = dark_capture(camera, options) if settings.target == "dark" and not pif else None
+    accuracy: dict[str, Any] = {}
+    if found is None:
+        if pif:
+            matrices, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path)
+        else:
+            matrices = None
+            accuracy = planned_accuracy(camera, options, source.wavelengths).as_json()
+        _tell_of_the_field(AccuracyRecord.from_json(accuracy))
+        name, band = settings.target or str(scene), _band(settings.target)
+        found = simulate_capture(
+            camera, source, what, options, matrices=matrices, name=name, band_m=band
+        )
     roles = camera_files(camera_path, camera) | {
         "pif": pif,
         "scene": scene if scene and Path(scene).exists() else None,

@@ -5,7 +5,8 @@ nearest known key.
 import difflib
 import re
 import tomllib
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -16,6 +17,11 @@ _NAME = r"""(?:"[^"\n]*"|'[^'\n]*'|[\w-]+)"""
 
 
 _DEEP_KEY = re.compile(rf"^\s*\[{{0,2}}\s*{_NAME}(?:\s*\.\s*{_NAME}){{20}}", re.MULTILINE)
+
+
+_DOTTED = rf"({_NAME}(?:\s*\.\s*{_NAME})*)"
+_TABLE = re.compile(rf"\s*(\[{{1,2}})\s*{_DOTTED}\s*\]{{1,2}}\s*(?:#.*)?$")
+_KEY = re.compile(rf"\s*{_DOTTED}\s*=")
 
 
 _MOST_LINES = 40
@@ -50,12 +56,18 @@ def parse_toml(
     try:
         return model.model_validate(prepare(data))
     except ValidationError as error:
-        raise violations(error, where, model) from None
+        raise violations(error, where, model, text) from None
 
 
-def violations(error: ValidationError, where: object, model: type[BaseModel]) -> ConfigError:
-    """The ConfigError that lists everything a pydantic ValidationError found."""
-    lines = [_short(_sentence(e, model)) for e in error.errors()]
+def violations(
+    error: ValidationError, where: object, model: type[BaseModel], text: str = ""
+) -> ConfigError:
+    """The ConfigError that lists everything a pydantic ValidationError found, with its line.
+
+    text: the TOML, empty where the tables came from elsewhere.
+    """
+    line_of = _lines(text)
+    lines = [_short(_sentence(e, model)) + _on_line(e["loc"], line_of) for e in error.errors()]
     count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
     if len(lines) > _MOST_LINES:
         lines[_MOST_LINES:] = ["..."]
@@ -81,6 +93,41 @@ def _sentence(error: Any, model: type[BaseModel]) -> str:
     if error["type"] == "missing":
         message = "is missing"
     return f"{'.'.join(path) or model.__name__.lower()}: {message}"
+
+
+def _lines(text: str) -> dict[tuple[str, ...], int]:
+    """Numbers of the lines on which tables and keys of TOML text first stand, by their names and,
+    for one of an array of tables, its place in it.
+    """
+    found: dict[tuple[str, ...], int] = {}
+    table: tuple[str, ...] = ()
+    arrays: Counter[tuple[str, ...]] = Counter()
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := _TABLE.match(line):
+            table = name = _names(header[2])
+            if header[1] == "[[":
+                table = name = (*name, str(arrays[name]))
+                arrays[name[:-1]] += 1
+        elif key := _KEY.match(line):
+            name = table + _names(key[1])
+        else:
+            continue
+        found.setdefault(name, number)
+    return found
+
+
+def _names(dotted: str) -> tuple[str, ...]:
+    return tuple(name.strip("\"'") for name in re.findall(_NAME, dotted))
+
+
+def _on_line(path: Sequence[str | int], line_of: Mapping[tuple[str, ...], int]) -> str:
+    """The line of the key that a violation is about, or of what holds it: nothing where it is not
+    told by name.
+    """
+    names = tuple(map(str, path))
+    found = (line_of.get(names[:n]) for n in range(len(names), 0, -1))
+    number = next((n for n in found if n), None)
+    return "" if number is None else f" (line {number})"
 
 
 def known_keys(path: list[str], model: type[BaseModel]) -> list[str]:

@@ -121,7 +121,7 @@ def dark_capture(
     """
     count, pixels = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
     mosaic = np.zeros((count[0] * pixels[0], count[1] * pixels[1]))
-    rng, saturated = stream(options.seed, "capture-sim"), None
+    rng, saturated = _noise_source(options), None
     if options.snr_db is not None or options.noise == "none":
         capture = relative_capture(camera.sensor, mosaic, options, rng)
     else:
@@ -441,12 +441,16 @@ def detect(
             "camera",
             "check filters, wavelengths and illuminant",
         )
-    rng = stream(options.seed, "capture-sim")
+    rng = _noise_source(options)
     if options.snr_db is not None or options.noise == "none":
         return relative_capture(camera.sensor, mosaic, options, rng), None
     brightest = float(light.white.max())
     electrons = exposure_scale(camera, source, brightest, options.exposure, lamp=lamp)
     return exposed_capture(camera.sensor, mosaic, electrons, scene, rng)
+
+
+def _noise_source(options: ExposureOptions) -> np.random.Generator:
+    return stream(options.seed, "capture-sim")
 
 
 def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:

@@ -35,9 +35,7 @@ class Space:
 
 
 class LinearMap(Protocol):
-    """What every map offers. <forward(x), y> = <x, adjoint(y)> for all x in domain, y in range
-    (see adjoint_gap).
-    """
+    """What every map offers. <forward(x), y> = <x, adjoint(y)> for all x in domain, y in range."""
 
     domain: Space
     range: Space
@@ -50,28 +48,6 @@ class LinearMap(Protocol):
     def adjoint(self, y: np.ndarray) -> np.ndarray:
         """A* y, of `domain.shape`."""
         ...
-
-
-class Dense:
-    """y = A x for one matrix A (pixel, point)."""
-
-    def __init__(self, matrix: np.ndarray) -> None:
-        self.matrix = np.asarray(matrix)
-        if self.matrix.ndim != 2:
-            raise ValueError(
-                f"a dense map needs a matrix, not an array of shape {self.matrix.shape}"
-            )
-        self.dtype = self.matrix.dtype
-        self.range = Space(("pixel",), self.matrix.shape[:1])
-        self.domain = Space(("point",), self.matrix.shape[1:])
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        """(point,) -> (pixel,): A x."""
-        return self.matrix @ _checked(x, self.domain)
-
-    def adjoint(self, y: np.ndarray) -> np.ndarray:
-        """(pixel,) -> (point,): A^T y."""
-        return self.matrix.T @ _checked(y, self.range)
 
 
 class BlockToeplitz:
@@ -309,27 +285,6 @@ def torus_for(
 
     least = [n + (2 if beyond else 1) * r for n, r in zip(count, reach)]
     return next_fast_len(least[0]), next_fast_len(least[1], real=True)
-
-
-def adjoint_gap(op: LinearMap, seed: int = 0) -> float:
-    """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y.
-
-    op: the map.
-    seed: of x and y.
-
-    Returns about 1-10 for a correct pair of forward and adjoint, at any shape and scale.
-
-    Divided by |Ax| |y| / sqrt(size of y), not by the inner product itself, which may be near zero
-    by chance. An adjoint that is wrong by 0.1 % gives hundreds (float32) or more, so 100
-    separates right from wrong.
-    """
-    rng = np.random.default_rng(seed)
-    x, y = (rng.standard_normal(s.shape).astype(op.dtype) for s in (op.domain, op.range))
-    ax, aty = op.forward(x), op.adjoint(y)
-    scale = np.linalg.norm(ax) * np.linalg.norm(y) / np.sqrt(y.size)
-    if scale == 0:
-        return 0.0 if not np.any(aty) else float("inf")
-    return float(abs(np.vdot(ax, y) - np.vdot(x, aty)) / (np.finfo(op.dtype).eps * scale))
 
 
 def _checked(array: np.ndarray, space: Space) -> np.ndarray:

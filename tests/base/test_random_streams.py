@@ -35,7 +35,6 @@ def test_every_stage_draws_under_a_name_of_its_own_and_not_otherwise():
         "random_streams.py",
         "dictionary.py",
         "sweep_file.py",
-        "linear_maps.py",
         "low_rank_product.py",
     }
 

@@ -19,7 +19,6 @@ from plenocli.files.artefacts.container import (
     HEADER_BYTES,
     MAGIC,
     Artefact,
-    build_image,
     cfa_text,
     read_artefact,
     write_artefact,
@@ -83,7 +82,8 @@ def hostile(path, make):
     it a correct digest.
     """
     plain = path.with_suffix(".plain")
-    plain.write_bytes(build_image(spectra()))
+    write_artefact(path, spectra())
+    plain.write_bytes(path.read_bytes()[HEADER_BYTES:])
     with h5py.File(plain, "a") as file:
         make(file)
     path.write_bytes(signed(plain.read_bytes()))

@@ -203,18 +203,6 @@ class Frame:
             yield first, last
 
 
-def build_image(artefact: Artefact) -> bytes:
-    """The HDF5 file as bytes. Raises ValueError listing every broken rule of the table."""
-    frame = Frame(artefact)
-    image = bytearray(frame.size)
-    for offset, content in frame._file.extents():
-        image[offset : offset + len(content)] = content
-    for name, values in frame.raw.items():
-        start = frame.offset(name) - HEADER_BYTES
-        image[start : start + values.nbytes] = values.tobytes()
-    return bytes(image)
-
-
 def is_raw(schema: tables.Schema, path: str, shape: tuple[int, ...]) -> bool:
     """Whether a dataset is stored as one run of numbers: what the table does not
     compress, and is not empty.

@@ -386,25 +386,6 @@ def _on_sphere(
     return rays.path - n * back, cosines
 
 
-def wavefront_grid(
-    lens: Prescription, wavelength: float, samples: int = 64, **field: Any
-) -> np.ndarray:
-    """Wavefront error on a square grid of pixel centres over the stop's diameter.
-
-    wavelength: m;
-    samples: of a side;
-    field: as `wavefront`.
-
-    Returns (samples, samples) W in m, rows along y; NaN outside.
-    """
-    axis = (np.arange(samples) + 0.5) * (2 / samples) - 1
-    x, y = np.meshgrid(axis, axis)
-    inside = x * x + y * y <= 1
-    out = np.full((samples, samples), np.nan)
-    out[inside] = wavefront(lens, wavelength, np.stack([x[inside], y[inside]]), **field).error
-    return out
-
-
 def noll_coefficients(
     lens: Prescription,
     wavelength: float,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from plenocli.forward.volume.arriving import ArrivingField
-from plenocli.forward.volume.lenslets import sampling, terms_for, to_pixels
+from plenocli.forward.volume.lenslets import sampling, to_pixels
 from plenocli.forward.volume.optics import VolumeOptics
 
 
@@ -97,16 +97,4 @@ def _windows(terms: np.ndarray, window: int, step: int, count: int) -> np.ndarra
     row, column = terms.strides
     return as_strided(
         terms, (count, window, terms.shape[1]), (step * row, row, column), writeable=False
-    )
-
-
-def settings_for(
-    optics: VolumeOptics, error: float, neighbours: int, reach: int, pixel_nodes: int = 3
-) -> WaveSettings:
-    """Settings whose terms hold arriving fields to `error`."""
-    return WaveSettings(
-        neighbours=neighbours,
-        pixel_nodes=pixel_nodes,
-        terms=terms_for(optics, error),
-        reach=reach,
     )

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from plenocli.inverse.registration.smooth_response import SmoothResponses
     from plenocli.inverse.spectra.responses import LensletResponses
 
-MODES = ("auto", "on", "off")
 POOR_FIT = 1.5
 """Residual over noise, mean squares, above which the calibration does not describe the capture."""
 FITS = 1.02

@@ -23,7 +23,6 @@ from plenocli.forward.camera.lens import (
     paraxial_image,
     transmitted,
     wavefront,
-    wavefront_grid,
 )
 from plenocli.forward.camera.prescription import Prescription, Surface
 from plenocli.forward.camera.pupil import zernike
@@ -161,18 +160,6 @@ def test_zernike_coefficients_give_the_wavefront_back():
         # the meridional plane is a plane of symmetry: no term that is odd in x
         odd = [j for j in range(1, 46) if abs(zernike(j, 0.3, 0.4) - zernike(j, 0.3, -0.4)) > 1e-9]
         assert np.abs(terms[np.array(odd) - 1]).max() < 1e-6 * wave.rms(WEIGHTS)
-
-
-def test_the_grid_is_the_wavefront_and_upright():
-    lens, angle = triplet(), math.radians(10)
-    grid = wavefront_grid(lens, D_LINE, 16, angle=angle)
-    row, column = 3, 9
-    point = np.array([[(column + 0.5) / 8 - 1], [(row + 0.5) / 8 - 1]])
-    assert grid[row, column] == pytest.approx(
-        wavefront(lens, D_LINE, point, angle).error[0], rel=1e-9
-    )
-    assert np.isnan(grid[0, 0]) and np.allclose(grid, grid[:, ::-1], equal_nan=True, atol=1e-14)
-    assert not np.allclose(grid, grid[::-1], equal_nan=True, atol=1e-8)
 
 
 def test_focal_shift_of_a_thin_singlet():

@@ -1,6 +1,9 @@
 """Nothing that a file says is run, followed or drawn as markup."""
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,26 +93,45 @@ def test_no_module_runs_what_a_file_says(count):
     count("modules that run, unpickle or evaluate what a file says", modules=len(files), found=0)
 
 
-def test_libraw_runs_in_the_limited_child_only():
-    importing = {
-        path.name: {
-            a.name.split(".")[0]
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import)
-            for a in node.names
-        }
-        for path in PACKAGE.rglob("*.py")
-    }
-    assert [name for name, modules in importing.items() if "rawpy" in modules] == ["raw_child.py"]
-    child = (PACKAGE / "files" / "images" / "raw_child.py").read_text()
-    assert all(
-        limit in child for limit in ("RLIMIT_AS", "RLIMIT_CPU", "RLIMIT_FSIZE")
-    ) and child.index("setrlimit") < child.index("rawpy.imread")
-    assert not [
-        path.name
-        for path in PACKAGE.rglob("*.py")
-        if "import raw_child" in path.read_text() or "raw_child import" in path.read_text()
-    ]
+DECODERS = """
+import sys
+from pathlib import Path
+import numpy as np
+from plenocli.files.images import mosaic, pictures, spectral_exr, tiff_stack
+folder = Path(sys.argv[1])
+mosaic.read_capture(folder / "x.dng")
+mosaic.read_capture(folder / "x.exr")
+pictures.read_picture(folder / "x.png")
+tiff_stack.read_tiff_volume(folder / "x.tif")
+print(*(name for name in ("rawpy", "OpenImageIO", "tifffile", "exifread") if name in sys.modules))
+"""
+
+
+def test_nothing_decodes_a_picture_or_a_raw_file_in_this_process(tmp_path):
+    """The libraries are not even loaded where files are read."""
+    import OpenImageIO as oiio
+
+    from plenocli.files.images.dng import write_dng
+    from plenocli.files.images.exr import write_exr
+    from plenocli.files.images.tiff_stack import write_ome_tiff
+
+    values = np.arange(900, dtype=np.uint16).reshape(30, 30)
+    write_dng(tmp_path / "x.dng", values, cfa="RGGB", black=0, white=16383)
+    write_exr(tmp_path / "x.exr", {"Y": values.astype(np.float32)})
+    write_ome_tiff(
+        tmp_path / "x.tif", np.ones((2, 4, 4)), None, np.array([0.0, 1e-6]), (1e-6, 1e-6)
+    )
+    output = oiio.ImageOutput.create("png")
+    assert output.open(str(tmp_path / "x.png"), oiio.ImageSpec(30, 30, 1, "uint16"))
+    assert output.write_image(values) and output.close()
+    command = [sys.executable, "-c", DECODERS, str(tmp_path)]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(PACKAGE.parent)},
+    )
+    assert done.returncode == 0 and done.stdout.split() == [], done.stderr + done.stdout
 
 
 @pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "a/b.h5", "", "x\0.h5", 3])

@@ -90,6 +90,8 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
 def _cost(start: float) -> None:
     import resource
 
+    if "plenocli.files.outside" in sys.modules:
+        sys.modules["plenocli.files.outside"].close()
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     seconds, peak = (
         sum(u.ru_utime + u.ru_stime for u in used),

@@ -41,7 +41,7 @@ def _import_everything():
     import plenocli
 
     for module in pkgutil.walk_packages(plenocli.__path__, "plenocli."):
-        if not module.name.endswith(("__main__", "raw_child")):
+        if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     import h5py  # noqa: F401
 

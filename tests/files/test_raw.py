@@ -9,10 +9,8 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, NumericsError, OutputError
-from plenocli.files.images import raw as raw_module
 from plenocli.files.images.dng import read_notes, write_dng
 from plenocli.files.images.mosaic import read_capture
-from plenocli.files.images.raw import read_raw
 
 
 def mosaic(shape, seed=0, top=16384):
@@ -209,64 +207,6 @@ def test_a_mosaic_that_does_not_fit_is_told_what_it_needs_before_it_is_unpacked(
             read_capture(tmp_path / "x.dng")
     with within(Budget(5 * values.nbytes)):
         np.testing.assert_array_equal(read_capture(tmp_path / "x.dng").mosaic, values)
-
-
-def test_too_little_time_or_memory_becomes_an_input_error(tmp_path, monkeypatch):
-    write_dng(tmp_path / "x.dng", mosaic((30, 30)), cfa="RGGB", black=0, white=16383)
-    with pytest.raises(InputError, match="did not finish"):
-        read_raw(tmp_path / "x.dng", timeout_s=0.01)
-    monkeypatch.setattr(raw_module, "_BASE_BYTES", 0)
-    with within(Budget(50_000_000)), pytest.raises(InputError):
-        read_raw(tmp_path / "x.dng")
-
-
-HOSTILE = {  # what a file might make LibRaw do, after the child has bound itself
-    "crash": ("os.kill(os.getpid(), signal.SIGSEGV)", "crash or hit its limits"),
-    "abort": ("os.abort()", "crash or hit its limits"),
-    "spin": ("while True: pass", "crash or hit its limits"),
-    "sleep": ("time.sleep(600)", "did not finish within"),
-    "memory": ("bytearray(3 << 30)", "needs more memory than the limit"),
-    "disk": ("open(sys.argv[1] + '.new', 'wb', buffering=0).write(b'x')", "File too large"),
-    "exit": ("os._exit(7)", "no answer"),
-    "garbage": ("os.write(channel.fileno(), b'[1, 2\\n\\0\\0'); os._exit(0)", "garbled"),
-    "short": (
-        (
-            "found, pixels = {'shape': [30, 30], 'refused_': 0}, b'12'; "
-            "channel.write(json.dumps(found).encode() + b'\\n' + pixels); "
-            "channel.flush(); os._exit(0)"
-        ),
-        "incomplete",
-    ),
-}
-
-
-@pytest.mark.parametrize("deed", HOSTILE)
-def test_whatever_a_file_does_to_the_child_ends_as_exit_3_with_its_name(
-    tmp_path, monkeypatch, deed, capsys
-):
-    """The deed stands in the place of LibRaw's call, within the child's own limits."""
-    from plenocli.cli.main import run
-
-    write_dng(tmp_path / "x.dng", mosaic((30, 30)), cfa="RGGB", black=0, white=16383)
-    source = raw_module.CHILD.read_text()
-    call = "        found, pixels = read(path, memory)\n"
-    assert call in source
-    child = tmp_path / "child.py"
-    child.write_text(
-        "import signal, time\n" + source.replace(call, f"        {HOSTILE[deed][0]}\n")
-    )
-    monkeypatch.setattr(raw_module, "CHILD", child)
-    monkeypatch.setattr(raw_module, "_CPU_S", 1)
-    if deed == "sleep":
-        with pytest.raises(InputError, match=HOSTILE[deed][1]):
-            read_raw(tmp_path / "x.dng", timeout_s=1.0)
-        return
-    with within(Budget(1 << 30)), pytest.raises(InputError, match=HOSTILE[deed][1]):
-        read_raw(tmp_path / "x.dng")
-    assert run(["inspect", str(tmp_path / "x.dng")]) == 3
-    said = capsys.readouterr().err
-    assert "x.dng" in said and "Traceback" not in said
-    assert sorted(p.name for p in tmp_path.iterdir() if p.stat().st_size) == ["child.py", "x.dng"]
 
 
 def test_notes_of_other_files_are_empty(tmp_path):

@@ -32,8 +32,15 @@ from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, require_file
 from plenocli.files.artefacts.sparse import SparseFile
-from plenocli.files.artefacts.structure import EMPTY_AXIS, attribute_names, read_attribute, survey
+from plenocli.files.artefacts.structure import (
+    EMPTY_AXIS,
+    attribute_names,
+    look,
+    read_attribute,
+    survey,
+)
 from plenocli.files.atomic import replacement, reserve, write_at
+from plenocli.files.outside import outside
 
 MAGIC = b"plenocli artefact 1\n"
 HEADER_BYTES = 512
@@ -42,6 +49,8 @@ _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18
 _CHUNK_BYTES = 1 << 20
 _READ_BYTES = 1 << 22
 _NUMBER = itertools.count()
+_LOOK_S = 10
+"""Processor time in which HDF5 finds all objects of any file that is sound."""
 _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 
@@ -138,8 +147,12 @@ def _parsed(
 ) -> Artefact:
     """What the HDF5 part of a file, its `image`, holds; errors as read_artefact."""
     try:
+        content = image(path)
+        outside(look, path, seconds=_LOOK_S)
         # which keeps a copy: ours goes
-        with h5py.File(_open_image(image(path)), "r") as file:
+        opened = _open_image(content)
+        del content
+        with h5py.File(opened, "r") as file:
             return _parse(path, file, kind, skip)
     except (PlenoError, MemoryError):
         raise

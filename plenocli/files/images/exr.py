@@ -22,6 +22,7 @@ from plenocli.base.memory import size_text
 from plenocli.base.text import printable, utf8
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
+from plenocli.files.outside import outside
 from plenocli.files.seal import SEAL, put_seal, require_seal
 
 Name = str | os.PathLike[str]
@@ -90,6 +91,12 @@ def read_exr(
     holds integer channels.
     """
     require_seal(path)
+    channels, attrs = outside(_channels, path, most)
+    return channels, attrs
+
+
+def _channels(path: str, most: int | None) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """As read_exr; runs outside."""
     with _opened(path) as source:
         spec = source.spec()
         _check_header(path, source, spec, most)
@@ -113,6 +120,12 @@ def channel_names(path: Name) -> list[str]:
 
     Raises InputError.
     """
+    names: list[str] = outside(_names, path)
+    return names
+
+
+def _names(path: str) -> list[str]:
+    """As channel_names; runs outside."""
     with _opened(path) as source:
         return list(source.spec().channelnames)
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.text import by
-from plenocli.files.artefacts.provenance import require_file
+from plenocli.files.artefacts.provenance import first_bytes, require_file
 from plenocli.files.artefacts.structure import read_attribute, survey
 from plenocli.files.images.exr import read_exr, require_at_most
 from plenocli.files.images.pictures import file_type, read_stored
+from plenocli.files.outside import outside
 
 MAX_BYTES = 64 << 20
 """No map of at most 1024 x 1024 values is longer."""
@@ -56,9 +57,8 @@ def read_wavefront(path: str | os.PathLike[str]) -> np.ndarray:
     Raises InputError.
     """
     _require_small(path)
-    content = Path(path).read_bytes()
-    if content.startswith(_HDF5):
-        return _from_hdf5(path, content)
+    if first_bytes(path, len(_HDF5)) == _HDF5:
+        return np.asarray(outside(_from_hdf5, path))
     if file_type(path) == "exr":
         return _one_channel(path)
     raise InputError(
@@ -89,7 +89,9 @@ def _one_channel(path: str | os.PathLike[str]) -> np.ndarray:
     return np.asarray(channels.get("Y", next(iter(channels.values()))), float)
 
 
-def _from_hdf5(path: str | os.PathLike[str], content: bytes) -> np.ndarray:
+def _from_hdf5(path: str) -> np.ndarray:
+    """The values of /wavefront; runs outside."""
+    content = Path(path).read_bytes()
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fapl_core(max(len(content), 1), False)
     access.set_file_image(content)

@@ -13,6 +13,7 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.images.exr import oiio_error, oiio_name, require_at_most
+from plenocli.files.outside import outside
 
 _MAGIC = (
     (b"\x89PNG\r\n\x1a\n", "png"),
@@ -105,6 +106,12 @@ def read_stored(
     14) come back unscaled in uint16.
     Raises InputError.
     """
+    values, names, bits = outside(_stored, path, kind, most)
+    return values, names, bits
+
+
+def _stored(path: str, kind: str, most: int | None) -> tuple[np.ndarray, list[str], int]:
+    """As read_stored; runs outside."""
     import OpenImageIO as oiio
 
     settings = oiio.ImageSpec()

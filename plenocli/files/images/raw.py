@@ -1,15 +1,13 @@
 """Camera RAW and DNG: the mosaic as stored, with the levels of each position, never demosaiced.
 
-LibRaw runs in a child process with limits (`raw_child`); what it returns must be plausible before
-anyone computes with it.
+LibRaw runs outside (`files.outside`); what it returns must be plausible before anyone computes with
+it.
 """
 
 from __future__ import annotations
 
-import json
+import logging
 import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +18,11 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
+from plenocli.files.outside import outside
 from plenocli.files.seal import require_seal
 
-CHILD = Path(__file__).with_name("raw_child.py")
-TIMEOUT_S = 120
-_CPU_S = 90
-_BASE_BYTES = 3 << 29  # what Python, numpy and LibRaw map before they read anything
+_COPIES = 4
+"""Of a mosaic that exist at the same time while it is read, in this process and outside."""
 _FIX = "give an intact camera RAW or DNG with a colour filter mosaic"
 _REASONS = {
     "LibRawFileUnsupportedError": (
@@ -60,8 +57,8 @@ class RawFile:
     details: dict[str, Any]
 
 
-def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
-    """Read a RAW file or DNG; LibRaw may take `timeout_s`.
+def read_raw(path: str | Path) -> RawFile:
+    """Read a RAW file or DNG.
 
     Raises InputError, saying why, for a file that LibRaw cannot read, that holds no mosaic, or
     whose mosaic is implausible.
@@ -70,17 +67,10 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
     size = require_file(path)
     budget().require_reading(path, size)
     ours = require_seal(path)
-    found, pixels = _from_child(path, timeout_s)
-    if "declared" in found:
-        budget().require_declared(path, found["declared"], found["needed"])
-    if "refused" in found:
-        raise InputError(_reason(found, size), path, _FIX)
-    values = np.frombuffer(pixels, dtype="<u2")
-    shape = tuple(found["shape"])
-    if len(shape) != 2 or values.size != shape[0] * shape[1] or values.size == 0:
+    found = outside(_decoded, path)
+    values, cfa = found["values"], _letters(path, found)
+    if values.ndim != 2 or values.size == 0:
         raise InputError("came back incomplete from LibRaw", path, _FIX)
-    values = values.reshape(shape).copy()
-    cfa = _letters(path, found)
     black = (
         np.array(found["black"])[np.clip(np.array(found.get("indices", [[0, 0], [0, 0]])), 0, 3)]
         if cfa != "mono"
@@ -114,61 +104,87 @@ def read_raw(path: str | Path, *, timeout_s: float = TIMEOUT_S) -> RawFile:
     )
 
 
-def _from_child(path: Path, timeout_s: float) -> tuple[dict[str, Any], bytes]:
-    """(description, mosaic bytes) from the child process; a crash there becomes
-    an InputError here.
-    """
-    command = [
-        sys.executable,
-        "-P",
-        str(CHILD),
-        str(path.resolve()),
-        str(budget().memory),
-        str(_BASE_BYTES),
-        str(_CPU_S),
-    ]
-    # threads map memory
-    single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+def _decoded(path: str) -> dict[str, Any]:
+    """What LibRaw and the EXIF tags say of a file; runs outside."""
+    import rawpy
+
+    name = path
     try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            timeout=timeout_s,
-            stdin=subprocess.DEVNULL,
-            env={**os.environ, **single},
-        )
-    except subprocess.TimeoutExpired as error:
-        raise InputError(f"LibRaw did not finish within {timeout_s:g} s", path, _FIX) from error
-    except OSError as error:
+        path.encode()
+    except UnicodeEncodeError:  # LibRaw is given UTF-8 only
+        name = f"/proc/self/fd/{os.open(path, os.O_RDONLY)}"
+    try:
+        with rawpy.imread(name) as raw:
+            return {**_mosaic(path, raw), "exif": _exif(path)}
+    except rawpy.LibRawError as error:
+        raise InputError(_reason(error, path), path, _FIX) from None
+
+
+def _mosaic(path: str, raw: Any) -> dict[str, Any]:
+    """Values, levels and colours of a file that LibRaw has open."""
+    import rawpy
+
+    declared = 2 * raw.sizes.raw_width * raw.sizes.raw_height
+    budget().require_declared(path, declared, _COPIES * declared)
+    if raw.raw_type != rawpy.RawType.Flat:
         raise InputError(
-            f"cannot be read: no process could be started for LibRaw ({error.strerror})",
-            path,
-            "close other programs, and try again",
-        ) from error
-    line, newline, pixels = done.stdout.partition(b"\n")
-    if done.returncode != 0 or not newline:
-        if done.returncode < 0:
-            raise InputError(
-                f"made LibRaw crash or hit its limits (signal {-done.returncode})", path, _FIX
-            )
-        detail = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        raise InputError(
-            f"could not be read by the RAW process ({detail[-1] if detail else 'no answer'})",
+            f"holds {raw.raw_image.shape[-1]} values a pixel, not a colour filter mosaic: "
+            "it is demosaiced, a scan or a stack",
             path,
             _FIX,
         )
+    colours, camera_white = raw.raw_colors_visible, raw.camera_white_level_per_channel
+    found = {
+        # a copy: LibRaw frees the mosaic when it is closed
+        "values": raw.raw_image_visible.astype("<u2"),
+        "full_shape": list(raw.raw_image.shape),
+        "description": raw.color_desc.decode("latin-1"),
+        "colour_count": int(raw.num_colors),
+        "black": [float(v) for v in raw.black_level_per_channel],
+        "white": float(raw.white_level),
+        "camera_white": None if camera_white is None else [float(v) for v in camera_white],
+        "exposure_s": float(raw.other.shutter_speed),
+        "iso": float(raw.other.iso_speed),
+        "f_number": float(raw.other.aperture),
+        "focal_length_m": float(raw.other.focal_length) / 1000,
+    }
+    if colours.shape[0] >= 2 and colours.shape[1] >= 2:
+        indices = colours[:2, :2].astype(int)
+        repeats = all((colours[i::2, j::2] == indices[i, j]).all() for i in (0, 1) for j in (0, 1))
+        found |= {"indices": indices.tolist(), "repeats": repeats}
+    return found
+
+
+def _exif(path: str) -> dict[str, Any]:
+    """Make, model and exposure from the EXIF tags, as far as they can be read."""
+    import exifread
+
+    logging.disable(logging.CRITICAL)
     try:
-        return dict(json.loads(line)), pixels
-    except (TypeError, ValueError) as error:
-        raise InputError("came back garbled from LibRaw", path, _FIX) from error
+        with open(path, "rb") as stream:
+            tags = exifread.process_file(stream, details=False)
+    except Exception:  # a courtesy: whatever breaks in the tags, the mosaic stands on its own
+        return {}
+    found: dict[str, Any] = {}
+    for key, name in (("Image Make", "make"), ("Image Model", "model")):
+        if key in tags:
+            found[name] = str(tags[key]).strip("\0 ")
+    for key in ("EXIF ExposureTime", "Image ExposureTime"):
+        try:
+            found.setdefault("exposure_s", float(tags[key].values[0]))
+        except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError, AttributeError):
+            continue
+    return found
 
 
-def _reason(found: dict[str, Any], size: int) -> str:
+def _reason(error: Exception, path: str) -> str:
     """A sentence for the user from what LibRaw said."""
-    known = _REASONS.get(found.get("error", ""))
+    text = error.args[0] if error.args else ""
+    text = text.decode("latin-1") if isinstance(text, bytes) else str(text)
+    known = _REASONS.get(type(error).__name__)
     if known is None:
-        return found["refused"] + (f" ({found['error']})" if "error" in found else "")
-    return f"{known} ({size} bytes; LibRaw: {found['refused']})"
+        return f"{text} ({type(error).__name__})"
+    return f"{known} ({os.path.getsize(path)} bytes; LibRaw: {text})"
 
 
 def _letters(path: Path, found: dict[str, Any]) -> str:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, PlenoError
+from plenocli.files.outside import outside
 from plenocli.files.seal import SEAL, publish_sealed, require_seal
 
 if TYPE_CHECKING:
@@ -81,27 +82,11 @@ def read_tiff_volume(path: str | os.PathLike) -> TiffVolume:
 
     Raises InputError where the file cannot be read, is no stack, or one of ours that was altered.
     """
-    import tifffile
-
     path = Path(path)
     if not path.is_file():
         raise InputError("is no file", path, "give a TIFF stack")
     require_seal(path)
-    try:
-        with tifffile.TiffFile(path) as file:
-            series = file.series[0]
-            axes, shape = series.axes, series.shape
-            size = int(np.prod(shape, dtype=object)) * 8
-            budget().require_declared(path, size, size)
-            value, step, spacing = series.asarray(), *_sizes(file)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # tifffile raises many types for a damaged file
-        if type(error).__module__.startswith("plenocli"):
-            raise
-        raise InputError(
-            f"cannot be read as TIFF ({type(error).__name__}: {error})", path, "give a TIFF stack"
-        ) from None
+    value, axes, step, spacing = outside(_decoded, path)
     for axis in (a for a in axes if a not in "ZIQYX"):
         value, axes = np.take(value, 0, axes.index(axis)), axes.replace(axis, "", 1)
     if value.ndim == 2:
@@ -115,7 +100,25 @@ def read_tiff_volume(path: str | os.PathLike) -> TiffVolume:
     value = value.astype(np.float32)
     if not np.isfinite(value).all():
         raise InputError("holds values that are NaN or infinite", path, "mend them")
-    return TiffVolume(value=value, step=step, spacing=spacing)
+    return TiffVolume(value=value, step=step, spacing=spacing and tuple(spacing))
+
+
+def _decoded(path: str) -> tuple[np.ndarray, str, float | None, tuple[float, float] | None]:
+    """(values, axes, m between planes, m between rows and columns) of a TIFF; runs outside."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            series = file.series[0]
+            size = int(np.prod(series.shape, dtype=object)) * 8
+            budget().require_declared(path, size, size)
+            return series.asarray(), series.axes, *_sizes(file)
+    except (PlenoError, MemoryError):
+        raise
+    except Exception as error:  # tifffile raises many types for a damaged file
+        raise InputError(
+            f"cannot be read as TIFF ({type(error).__name__}: {error})", path, "give a TIFF stack"
+        ) from None
 
 
 def _sizes(file: TiffFile) -> tuple[float | None, tuple[float, float] | None]:

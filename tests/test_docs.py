@@ -107,6 +107,9 @@ def kit(tmp_path_factory):
 
     (folder / "photos").mkdir()
     Image.fromarray(data.astronaut()).save(folder / "photo.png")
+    near = np.full((60, 60, 4), 200, np.uint8)
+    near[:, 30:, 3] = 0
+    Image.fromarray(near).save(folder / "near.png")
     for name in ("camera", "coffee", "chelsea", "coins"):
         Image.fromarray(getattr(data, name)()).save(folder / "photos" / f"{name}.jpg", quality=95)
 

@@ -80,6 +80,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "depth_slope_worst",
         "depth_sure_share",
         "sharpest_slope_error",
+        "depth_layer_errors",
         "depth_distance_m",
         "depth_distance_error_m",
         "depth_limit_m",

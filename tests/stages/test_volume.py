@@ -20,6 +20,7 @@ from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
+from plenocli.stages.inverse.refocus import run_refocus
 from plenocli.stages.inverse.volume import run_volume
 
 MICROSCOPE = """
@@ -263,3 +264,92 @@ def test_what_is_no_tiff_is_told(tmp_path, content):
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(InputError):
         read_tiff_volume(tmp_path / "a.tif")
+
+
+CAMERA = """
+[main_lens]
+focal_length = "50 mm"
+f_number = 8
+aperture_shape = "circle"
+[object]
+distance = "550 mm"
+planes = ["480 mm", "640 mm"]
+samples_per_lenslet = [2, 2]
+[lenslet_array]
+distance = "55 mm"
+superpixel_pitch = "100 um"
+focal_length = "0.8 mm"
+count = [24, 22]
+[sensor]
+distance = "0.8 mm"
+pixel_pitch = "11.11111 um"
+pixels_per_lenslet = [9, 9]
+[light]
+wavelengths = ["550 nm"]
+"""
+
+
+@pytest.fixture(scope="module")
+def sheets(tmp_path_factory):
+    """Folder with a camera, a sheet with a rim of nothing, and one behind it."""
+    folder = tmp_path_factory.mktemp("sheets")
+    (folder / "camera.toml").write_text(CAMERA)
+    texture = np.random.default_rng(2).random((2, 12, 11)).repeat(20, 1).repeat(20, 2)
+    near, far = (255 * texture).astype(np.uint8)
+    alpha = np.zeros_like(near)
+    alpha[:, :110] = 255
+    Image.fromarray(np.dstack([near, near, near, alpha])).save(folder / "near.png")
+    Image.fromarray(far).save(folder / "far.png")
+    return folder
+
+
+def test_the_depth_of_two_opaque_layers_is_found_and_their_volume_shows_both(sheets, tmp_path):
+    run_capture_sim(
+        sheets / "camera.toml",
+        tmp_path / "capture.h5",
+        Capture(snr_db=40, refine=2, model="ray"),
+        layers=[f"{sheets}/far.png@640mm", f"{sheets}/near.png@480mm"],
+        scene_out=tmp_path / "truth.h5",
+    )
+    truth = read_volume(tmp_path / "truth.h5")
+    assert np.allclose(truth.depth, [0.48, 0.64]) and truth.opacity.shape == (2, 48, 44)
+    assert truth.opacity[0, :, :20].min() == 1 and truth.opacity[0, :, 24:].max() == 0
+    assert not truth.value[1, :, :18].any() and truth.value[1, :, 26:].any()
+    run_refocus(tmp_path / "capture.h5", tmp_path / "planes.h5", camera=sheets / "camera.toml")
+    figures = (
+        run_score([tmp_path / "planes.h5"], tmp_path / "d.json", truth=tmp_path / "truth.h5")
+        .results[0]
+        .figures
+    )
+    assert max(figures["depth_layer_errors"]) < 0.2 and figures["depth_sure_share"] > 0.8
+    run_simulate_pif(sheets / "camera.toml", tmp_path / "k.h5", Settings(model="ray"))
+    run_volume(tmp_path / "capture.h5", tmp_path / "v.h5", tmp_path / "k.h5", method="rl")
+    found = read_volume(tmp_path / "v.h5").value
+    sides = (slice(None), slice(2, 18)), (slice(None), slice(26, 42))
+    for plane, (own, other) in enumerate([sides, sides[::-1]]):
+        shown = np.corrcoef(found[plane][own].ravel(), truth.value[plane][own].ravel())[0, 1]
+        assert shown > 0.7 and found[plane][own].mean() > 2 * found[plane][other].mean()
+
+
+@pytest.mark.parametrize(
+    ("layers", "others", "match"),
+    [
+        (["near.png"], {}, "does not say where"),
+        (["near.png@-3mm"], {}, "no picture before"),
+        (["near.png@48cm", "far.png@480mm"], {}, "one distance"),
+        (["near.png@480mm"], {"scene": "skimage:coins"}, "--layer"),
+        (["near.png@480mm"], {"volume": "phantom:beads"}, "no \\[objective\\]"),
+    ],
+)
+def test_layers_that_cannot_be_are_refused(sheets, tmp_path, layers, others, match):
+    layers = [f"{sheets}/{layer}" for layer in layers]
+    with pytest.raises(UsageError, match=match):
+        run_capture_sim(
+            sheets / "camera.toml", tmp_path / "a.h5", Capture(), layers=layers, **others
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_microscope_takes_no_layers(camera, sheets, tmp_path):
+    with pytest.raises(UsageError, match="objective"):
+        run_capture_sim(camera, tmp_path / "a.h5", Capture(), layers=[f"{sheets}/near.png@480mm"])

@@ -34,6 +34,17 @@ from plenocli.cli import options
         "sizes, or phantom:beads, phantom:shells, phantom:filaments, phantom:target, phantom:slide."
     ),
 )
+@click.option(
+    "--layer",
+    "layers",
+    metavar="PICTURE@DISTANCE",
+    multiple=True,
+    help=(
+        "Instead, before a photographic camera: an opaque picture at a distance, such as "
+        "near.png@380mm, again for each; alpha says where a layer is clear, and nearer layers hide "
+        "what is behind them."
+    ),
+)
 @options.output
 @click.option("--pif", type=options.FILE, help="Use this system matrix instead of computing one.")
 @click.option(
@@ -129,6 +140,7 @@ def command(
     scene: str | None,
     target: str | None,
     volume: str | None,
+    layers: tuple[str, ...],
     output: Path,
     pif: Path | None,
     snr_db: float | None,
@@ -163,6 +175,8 @@ def command(
           --snr 60dB -o fine.h5
       plenocli capture-sim microscope.toml --volume phantom:shells --refine 2 --snr 40dB \\
           --scene-out truth.h5 -o capture.h5
+      plenocli capture-sim camera.toml --layer near.png@380mm --layer far.png@420mm \\
+          --refine 2 --snr 40dB --scene-out truth.h5 -o capture.h5
     """
     from plenocli.stages.forward.capture_settings import Settings
     from plenocli.stages.forward.capture_sim import run_capture_sim
@@ -188,6 +202,7 @@ def command(
         ),
         scene=scene,
         volume=volume,
+        layers=layers,
         pif=pif,
         scene_out=scene_out,
         overwrite=overwrite,

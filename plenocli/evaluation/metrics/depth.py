@@ -24,10 +24,29 @@ DEFINITIONS = {
     "sharpest_slope_error": (
         "slope of the sharpest plane, by a parabola through it and its neighbours, less the truth"
     ),
+    "depth_layer_errors": (
+        "of opaque layers, the nearest first: depth_slope_error over the lenslets that show it, no "
+        "edge within three lenslets and its blur"
+    ),
     "depth_distance_m": "distance of the plane, m",
     "depth_distance_error_m": "median of |distance - truth| over the lenslets that count, m",
     "depth_limit_m": "how far the plane would have to move to be seen one geometric limit away, m",
 }
+
+SMOOTHED = 3
+"""Lenslets over which depth maps are smoothed, about: so near an edge they mix what is there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayersScore:
+    """Figures of a depth map of opaque layers, slopes in units of the geometric limit; NaN where no
+    lenslet counts. See DEFINITIONS.
+    """
+
+    depth_slope_error: float
+    depth_slope_worst: float
+    depth_sure_share: float
+    depth_layer_errors: list[float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +99,38 @@ def score_depth(
         depth_slope_worst=float(far),
         depth_sure_share=found.size / np.size(slope),
         sharpest_slope_error=float(sharpest(planes, sharpness) - true_slope),
+    )
+
+
+def score_layers(
+    slope: np.ndarray, confidence: np.ndarray, opacity: np.ndarray, true_slopes: np.ndarray
+) -> LayersScore:
+    """Figures of a depth map of opaque layers, away from their edges.
+
+    slope, confidence: (row, column).
+    opacity: (layer, row, column) of each over a lenslet, the nearest first.
+    true_slopes: (layer,) px per px.
+
+    docs/model.md, "Refocusing and depth".
+    """
+    from scipy.ndimage import minimum_filter
+
+    # light of a point is spread over as many lenslets as its slope says
+    away = 2 * (SMOOTHED + int(np.ceil(np.abs(true_slopes).max() / 2))) + 1
+    sure, open_to = counted(slope, confidence), np.ones(opacity.shape[1:])
+    errors, judged = [], 0
+    for one, true in zip(opacity, true_slopes):
+        shown = minimum_filter(one * open_to, away, mode="nearest") > 1 - 1e-6
+        errors.append(np.abs(slope[shown & sure] - true))
+        judged += int(shown.sum())
+        open_to = open_to * (1 - one)
+    every = np.concatenate(errors)
+    middle, far = np.percentile(every, [50, 95]) if every.size else (np.nan, np.nan)
+    return LayersScore(
+        depth_slope_error=float(middle),
+        depth_slope_worst=float(far),
+        depth_sure_share=every.size / judged if judged else np.nan,
+        depth_layer_errors=[float(np.median(e)) if e.size else np.nan for e in errors],
     )
 
 

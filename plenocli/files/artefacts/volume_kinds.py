@@ -104,6 +104,15 @@ VOLUME = Schema(
             optional=True,
             minimum=0,
         ),
+        dataset(
+            "volume/opacity",
+            "plane point_row point_column",
+            "f",
+            "1",
+            "of opaque layers, the nearest first: what of the light behind them each voxel hides",
+            optional=True,
+            minimum=0,
+        ),
         *_GRID,
         dataset(
             "held_out/index",

@@ -79,6 +79,22 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     return Picture(values=table[stored])
 
 
+def read_opacity(path: str | os.PathLike[str]) -> np.ndarray | None:
+    """Alpha of a photograph (PNG or TIFF), (row, column) 0..1; None where it has none.
+
+    Raises InputError.
+    """
+    kind = file_type(path)
+    if kind in (None, "exr"):
+        return None
+    stored, names, _ = read_stored(path, kind)
+    alpha = [i for i, name in enumerate(names) if name.upper() in ("A", "ALPHA")]
+    if not alpha:
+        return None
+    full = 1.0 if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max
+    return np.clip(stored[..., alpha[0]].astype(np.float32) / np.float32(full), 0, 1)
+
+
 def srgb_to_linear(encoded: ArrayLike) -> np.ndarray:
     """Linear light of sRGB-encoded values, both 0..1 (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, dtype=np.float64)

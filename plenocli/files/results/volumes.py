@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 class StoredVolume:
     """What a file says of a volume.
 
-    value: (plane, row, column); sigma: likewise, or None.
+    value: (plane, row, column); sigma, opacity: likewise, or None.
     depth: (plane,) m; spacing: (rows, columns) m, mean over planes.
     facts: name of an attribute -> its value, those of held-out pixels with "held_out." before them.
     """
 
     value: np.ndarray
     sigma: np.ndarray | None
+    opacity: np.ndarray | None
     depth: np.ndarray
     spacing: tuple[float, float]
     facts: dict[str, Any]
@@ -50,11 +51,16 @@ class StoredVolume:
 
 
 def truth_artefact(
-    value: np.ndarray, depth: np.ndarray, spacing: np.ndarray, provenance: Provenance
+    value: np.ndarray,
+    depth: np.ndarray,
+    spacing: np.ndarray,
+    provenance: Provenance,
+    opacity: np.ndarray | None = None,
 ) -> Artefact:
     """The artefact of a volume that is known.
 
     value: (plane, row, column); depth: (plane,) m; spacing: (plane, 2) m, rows and columns.
+    opacity: like value, of opaque layers.
     """
     from plenocli.files.artefacts.container import Artefact
 
@@ -63,6 +69,8 @@ def truth_artefact(
         "volume/depth": np.asarray(depth, float),
         "volume/spacing": np.asarray(spacing, float),
     }
+    if opacity is not None:
+        data["volume/opacity"] = opacity.astype(np.float32)
     return Artefact("volume", data, {}, provenance)
 
 
@@ -127,6 +135,7 @@ def volume_of(artefact: Artefact) -> StoredVolume:
     return StoredVolume(
         value=artefact.data["volume/value"],
         sigma=artefact.data.get("volume/sigma"),
+        opacity=artefact.data.get("volume/opacity"),
         depth=artefact.data["volume/depth"],
         spacing=(rows, columns),
         facts=artefact.attrs.get("volume", {})

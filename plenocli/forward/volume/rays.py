@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from plenocli.forward.volume.optics import VolumeOptics
@@ -10,8 +12,25 @@ SLOPE_STEP = 1e-4
 """Of the pupil's radius, by which the slope of a path is told."""
 
 
+class Landing(NamedTuple):
+    """Of rays, along one axis: the lenslet that each meets, counted from the one that places are
+    told from; the pixel, counted from that one's first; whether the lenslet's open width takes it,
+    and whether the pixel senses it.
+    """
+
+    lenslet: np.ndarray
+    pixel: np.ndarray
+    entered: np.ndarray
+    kept: np.ndarray
+
+
 class RayPlane:
-    """Columns of points at one depth, by a grid of rays over the pupil."""
+    """Columns of points at one depth, by a grid of rays over the pupil.
+
+    weight: (ray,) share of a point's light.
+    away: of both axes, (ray,) m from a point's image to where its rays meet the lenslets, on the
+        object's side.
+    """
 
     def __init__(self, optics: VolumeOptics, depth: float, reach: int, rays: int) -> None:
         """reach: superpixels on each side of a point's own; rays: across a pixel."""
@@ -23,35 +42,44 @@ class RayPlane:
         y, x = y[inside], x[inside]
         self._sines = (y * optics.aperture, x * optics.aperture)
         weight = optics.amplitude(np.hypot(y, x) * optics.aperture) ** 2
-        self._weight = weight / weight.sum()
-        self._away = tuple(-_slope(optics, depth, y, x, axis) for axis in (0, 1))
+        self.weight = weight / weight.sum()
+        self.away = tuple(-_slope(optics, depth, y, x, axis) for axis in (0, 1))
+
+    def landed(self, place: np.ndarray | float, axis: int) -> Landing:
+        """Where rays from places along an axis (row or column) come down.
+
+        place: m from the middle of a lenslet's own on the object's side, (..., 1) or a number.
+        """
+        o = self.optics
+        on_array = (place + self.away[axis]) * o.magnification
+        lenslet = np.rint(on_array / o.pitch)
+        inside = on_array - lenslet * o.pitch
+        bend = 1 / o.sensor_distance + 1 / o.pupil_distance - 1 / o.focal_length
+        on_sensor = o.sensor_distance * (self._sines[axis] / o.magnification + inside * bend)
+        size = o.pitch * o.widening / o.pixels[axis]
+        pixel = lenslet * o.pixels[axis] + on_sensor / size + (o.pixels[axis] - 1) / 2
+        nearest = np.rint(pixel)
+        entered = np.abs(inside) <= o.open_width / 2
+        kept = entered & (np.abs(pixel - nearest) <= o.pixel_width / 2)
+        return Landing(lenslet, nearest.astype(int), entered, kept)
 
     def column(self, y: float, x: float) -> tuple[np.ndarray, float]:
         """As WavePlane.column."""
         o, half = self.optics, 2 * self.reach + 1
-        kept, index = np.ones(len(self._weight), bool), []
+        kept, index = np.ones(len(self.weight), bool), []
         entered = kept.copy()
-        for axis, (place, away, sine) in enumerate(zip((y, x), self._away, self._sines)):
-            on_array = (place + away) * o.magnification
-            lenslet = np.rint(on_array / o.pitch)
-            inside = on_array - lenslet * o.pitch
-            entered &= (np.abs(inside) <= o.open_width / 2) & (np.abs(lenslet) <= self.reach)
-            bend = 1 / o.sensor_distance + 1 / o.pupil_distance - 1 / o.focal_length
-            on_sensor = o.sensor_distance * (sine / o.magnification + inside * bend)
-            size = o.pitch * o.widening / o.pixels[axis]
-            pixel = lenslet * o.pixels[axis] + on_sensor / size + (o.pixels[axis] - 1) / 2
-            nearest = np.rint(pixel)
-            kept &= np.abs(pixel - nearest) <= o.pixel_width / 2
-            count = half * o.pixels[axis]
-            place_of = (nearest + self.reach * o.pixels[axis]).astype(int)
-            kept &= (place_of >= 0) & (place_of < count)
+        for axis, place in enumerate((y, x)):
+            landing = self.landed(place, axis)
+            entered &= landing.entered & (np.abs(landing.lenslet) <= self.reach)
+            place_of = landing.pixel + self.reach * o.pixels[axis]
+            kept &= landing.kept & (place_of >= 0) & (place_of < half * o.pixels[axis])
             index.append(place_of)
         kept &= entered
         shape = (half * o.pixels[0], half * o.pixels[1])
         flat = index[0][kept] * shape[1] + index[1][kept]
-        light = np.bincount(flat, self._weight[kept], shape[0] * shape[1]).astype(np.float32)
+        light = np.bincount(flat, self.weight[kept], shape[0] * shape[1]).astype(np.float32)
         whole = light.reshape(half, o.pixels[0], half, o.pixels[1])
-        return whole, float(self._weight[entered].sum())
+        return whole, float(self.weight[entered].sum())
 
 
 def _slope(

@@ -69,8 +69,26 @@ def record(
 
     Raises NumericsError where memory does not suffice.
     """
+    require_room(optics, plan, count)
+    places = tuple(places_along(n, s, optics.object_pitch) for n, s in zip(count, plan.samples))
+    light = np.zeros((*count, optics.pixels[0] * optics.pixels[1]))
+    planes, layers = len(plan.reach), 1 if len(plan.reach) == 1 else refine
+    shape = tuple(n * s // refine for n, s in zip(count, plan.samples))
+    volume = np.zeros((planes // layers, *shape))
+    for number, depth in enumerate(optics.depths):
+        seen = specimen(depth, *places)
+        coarse = seen.reshape(shape[0], refine, shape[1], refine).mean((1, 3))
+        volume[number // layers] += coarse / layers
+        if seen.any():
+            light += plane_light(optics, plan, number, count, seen) / (refine**2 * layers)
+        if progress:
+            progress(1)
+    return Recording(light=light, volume=volume)
+
+
+def require_room(optics: VolumeOptics, plan: VolumePlan, count: tuple[int, int]) -> None:
+    """NumericsError where memory does not suffice to record before `count` lenslets."""
     pixels = optics.pixels[0] * optics.pixels[1]
-    places = tuple(_axis(n, s, optics.object_pitch) for n, s in zip(count, plan.samples))
     many = plan.samples[0] * plan.samples[1]
     widest = torus_for(count, (max(plan.reach),) * 2)
     per_plane = 4 * pixels * many * (2 * max(plan.reach) + 1) ** 2
@@ -80,30 +98,23 @@ def record(
         "lenslet_array.count",
         "take fewer lenslets or voxels",
     )
-    light = np.zeros((*count, pixels))
-    planes, layers = len(plan.reach), 1 if len(plan.reach) == 1 else refine
-    shape = tuple(n * s // refine for n, s in zip(count, plan.samples))
-    volume = np.zeros((planes // layers, *shape))
-    for number, depth in enumerate(optics.depths):
-        seen = specimen(depth, *places)
-        coarse = seen.reshape(shape[0], refine, shape[1], refine).mean((1, 3))
-        volume[number // layers] += coarse / layers
-        if seen.any():
-            light += _through(optics, plan, number, count, seen) / (refine**2 * layers)
-        if progress:
-            progress(1)
-    return Recording(light=light, volume=volume)
 
 
-def _axis(count: int, samples: int, pitch: float) -> np.ndarray:
-    """Places (m) of all voxels along an axis."""
+def places_along(count: int, samples: int, pitch: float) -> np.ndarray:
+    """Places (m) of all voxels along an axis.
+
+    count: of lenslets; samples: voxels of each; pitch: of the lenslets' images, m.
+    """
     return ((np.arange(count * samples) + 0.5) / samples - count / 2) * pitch
 
 
-def _through(
+def plane_light(
     optics: VolumeOptics, plan: VolumePlan, number: int, count: tuple[int, int], seen: np.ndarray
 ) -> np.ndarray:
-    """Light of one plane on every superpixel."""
+    """Light of one plane on every superpixel, (lenslet_row, lenslet_column, pixel).
+
+    number: of the plane; seen: (row, column) light of its voxels.
+    """
     kernels, offsets = plane_kernels(optics, plan, number)
     torus = torus_for(count, (plan.reach[number],) * 2)
     x = np.zeros((*torus, kernels.shape[2]), np.float32)

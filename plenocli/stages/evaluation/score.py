@@ -15,8 +15,9 @@ from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.text import json_value
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
-from plenocli.evaluation.depth_score import known_depth, score_lightfield
+from plenocli.evaluation.depth_score import known_depth, score_layered, score_lightfield
 from plenocli.evaluation.metrics.coherence import CoherenceScore, dictionary_coherence
+from plenocli.evaluation.metrics.depth import DepthScore, LayersScore
 from plenocli.evaluation.metrics.figures import figures
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
 from plenocli.evaluation.metrics.response import score_response
@@ -40,7 +41,7 @@ from plenocli.files.results.results import (
     read_whites,
 )
 from plenocli.files.results.truths import CHART, read_labels, read_truth
-from plenocli.files.results.volumes import StoredVolume, read_volume, score_stored
+from plenocli.files.results.volumes import StoredVolume, read_volume, score_stored, volume_of
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.stages.evaluation.expected import run_expected
 
@@ -351,13 +352,37 @@ def _score_calibration(response: ComparedResponse, comparison: _Comparison) -> _
 def _score_planes(path: Path | str, field: LightField, comparison: _Comparison) -> _Scored:
     try:
         known_depth(field)  # before the truth is looked at
-        distance = _distance(comparison.truth, path)
-        score = score_lightfield(field, distance)
+        layers = _layers(comparison.truth)
+        score: DepthScore | LayersScore
+        if layers is not None:
+            assert layers.opacity is not None
+            score = score_layered(field, layers.opacity, layers.depth)
+        else:
+            score = score_lightfield(field, _distance(comparison.truth, path))
     except InputError as error:
         raise error if error.where else error.at(path) from None
     return _Scored(
         score=ResultScore(name=Path(path).name, kind="lightfield", figures=figures(score))
     )
+
+
+def _layers(truth: Path | str | None) -> StoredVolume | None:
+    """Opaque layers, where the truth is a file of them."""
+    from plenocli.files.artefacts.container import read_artefact
+
+    if truth is None or Path(truth).suffix != ".h5":
+        return None
+    found = read_artefact(truth, ("capture", "volume"))
+    if found.kind == "capture":
+        return None
+    layers = volume_of(found)
+    if layers.opacity is None:
+        raise InputError(
+            "is a volume without opaque layers, of which no depth map is made",
+            truth,
+            "name what capture-sim --layer wrote with --scene-out",
+        )
+    return layers
 
 
 def _score_volume(path: Path | str, volume: StoredVolume, comparison: _Comparison) -> _Scored:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +41,7 @@ def run_capture_sim(
     *,
     scene: str | Path | None = None,
     volume: str | None = None,
+    layers: Sequence[str] = (),
     pif: str | Path | None = None,
     scene_out: str | Path | None = None,
     overwrite: bool = False,
@@ -51,6 +53,7 @@ def run_capture_sim(
     output: .h5, .exr or .dng.
     scene: what read_scene takes; None where the settings have a target.
     volume: what run_volume_capture takes, before a camera with an [objective].
+    layers: opaque pictures before a photographic camera, PICTURE@DISTANCE each.
     pif: artefact whose system matrix is used instead of a computed one.
     scene_out: also write the object as sampled, .h5 or .exr.
     overwrite: replace files that are there.
@@ -67,12 +70,13 @@ def run_capture_sim(
     from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import camera_files, read_camera
 
-    if volume is not None or describes_microscope(camera_path):
+    if volume is not None or layers or describes_microscope(camera_path):
         return _of_volume(
             camera_path,
             output,
             settings,
             volume,
+            layers,
             {"--scene": scene, "--pif": pif},
             scene_out=scene_out,
             overwrite=overwrite,
@@ -124,36 +128,40 @@ def _of_volume(
     output: str | Path,
     settings: Settings,
     volume: str | None,
+    layers: Sequence[str],
     others: dict[str, str | Path | None],
     *,
     scene_out: str | Path | None,
     overwrite: bool,
     command: str,
 ) -> CaptureSummary:
-    """The capture of a volume; UsageError where one is not what the other needs."""
+    """The capture of a volume or of layers; UsageError where one is not what the other needs."""
     from plenocli.files.config.microscope_file import describes_microscope
     from plenocli.stages.forward.volume_capture import run_volume_capture
 
-    if volume is None:
+    microscope = describes_microscope(camera_path)
+    if microscope and (volume is None or layers):
         raise UsageError(
             "has an [objective], before which a volume lies",
             camera_path,
             "give --volume, for example --volume phantom:beads",
         )
-    if not describes_microscope(camera_path):
+    if not microscope and volume is not None:
         raise UsageError(
             "has no [objective], before which a volume would lie",
             camera_path,
-            "give --scene or --target instead of --volume",
+            "give --scene, --target or --layer instead of --volume",
         )
     for option, value in others.items():
         if value is not None:
-            raise UsageError("does not go with --volume", option, "leave one of them out")
+            given = "--layer" if layers else "--volume"
+            raise UsageError(f"does not go with {given}", option, "leave one of them out")
     return run_volume_capture(
         camera_path,
         output,
         settings,
         volume,
+        layers,
         scene_out=scene_out,
         overwrite=overwrite,
         command=command,

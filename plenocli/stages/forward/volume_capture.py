@@ -1,8 +1,10 @@
-"""capture-sim of a volume before a microscope's lenslets."""
+"""capture-sim of a volume before a microscope, and of opaque layers before a camera."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,30 +15,56 @@ from plenocli.base.progress import bar, note
 from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
 
 if TYPE_CHECKING:
+    from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.camera.microscope import Microscope
+    from plenocli.forward.camera.model import Camera
     from plenocli.forward.sensor.capture import Capture
+    from plenocli.forward.volume.layers import Layer
     from plenocli.forward.volume.optics import VolumeOptics
     from plenocli.forward.volume.phantoms import Sampler
+    from plenocli.forward.volume.plan import VolumePlan
 
 TAKEN = ("snr_db", "noise", "exposure", "refine", "accuracy", "model", "seed")
 """Settings that a volume's capture has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Recorded:
+    """What was recorded before a camera.
+
+    camera: its description, resolved; config: the same as TOML.
+    depth: (plane,) m; spacing: (plane, 2) m between voxels; opacity: like the volume, of layers.
+    files: that were read, by their roles.
+    """
+
+    camera: Microscope | Camera
+    config: str
+    light: np.ndarray
+    volume: np.ndarray
+    depth: np.ndarray
+    spacing: np.ndarray
+    plan: VolumePlan
+    files: dict[str, str | None]
+    opacity: np.ndarray | None = None
 
 
 def run_volume_capture(
     path: str | Path,
     output: str | Path,
     settings: Settings,
-    volume: str,
+    volume: str | None,
+    layers: Sequence[str] = (),
     *,
     scene_out: str | Path | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> CaptureSummary:
-    """Simulate the capture of a volume and write it.
+    """Simulate the capture of a volume, or of opaque layers, and write it.
 
-    path: description of a microscope, .toml.
+    path: description, .toml: of a microscope for a volume, of a photographic camera for layers.
     output: .h5, .exr or .dng.
     volume: "phantom:NAME", a file of kind volume, or a TIFF stack.
+    layers: instead, "PICTURE@DISTANCE" each.
     scene_out: also write the volume on the voxels of the description, .h5 or .ome.tif.
 
     Raises ConfigError for the description, UsageError for options, InputError for files,
@@ -44,44 +72,35 @@ def run_volume_capture(
     """
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output, together
-    from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.files.images.mosaic import write_capture
-    from plenocli.forward.volume.cameras import optics_of
-    from plenocli.forward.volume.recording import finer, record
-    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
 
-    _require_taken(settings)
-    file = None if volume.startswith("phantom:") else volume
-    check_output(output, overwrite=overwrite, inputs=[path, file], suffixes=(".h5", ".exr", ".dng"))
-    if scene_out:
-        check_output(scene_out, overwrite=overwrite, inputs=[path, file, output])
-    microscope = load_microscope(path)
-    coarse = optics_of(microscope)
-    specimen = _specimen(volume, microscope, coarse, settings.seed)
-    samples = microscope.object.samples_per_lenslet
-    optics, plan = finer(
-        coarse, samples, settings.refine, settings.accuracy or DEFAULT_ACCURACY, settings.model
+    _require_taken(settings, "--layer" if layers else "--volume")
+    pictures = [_named(layer) for layer in layers]
+    files = [name for name, _ in pictures if not name.startswith("skimage:")]
+    if volume is not None and not volume.startswith("phantom:"):
+        files = [volume]
+    check_output(
+        output, overwrite=overwrite, inputs=[path, *files], suffixes=(".h5", ".exr", ".dng")
     )
-    note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
-    with bar(None, len(plan.reach), "planes") as shown:
-        found = record(
-            optics, plan, microscope.lenslet_array.count, specimen, settings.refine, shown.update
-        )
-    capture, saturated = _detected(microscope, found.light, settings, volume)
+    if scene_out:
+        check_output(scene_out, overwrite=overwrite, inputs=[path, *files, output])
+    if volume is not None:
+        found, name = _of_specimen(path, settings, volume), volume
+    else:
+        found, name = _of_layers(path, settings, pictures), " before ".join(layers)
+    capture, saturated = _detected(found.camera, found.light, settings, name)
+    plan = found.plan
     provenance = Provenance(
         command=command,
-        inputs=describe_inputs({"camera": path, "volume": file}),
+        inputs=describe_inputs({"camera": path} | found.files),
         seed=settings.seed,
-        config=microscope_toml(microscope),
+        config=found.config,
         accuracy={"asked": plan.asked, "estimated": plan.error, "rung": plan.rung},
     )
     with together():
         write_capture(output, capture, provenance, overwrite=overwrite)
         if scene_out:
-            spacing = [coarse.object_pitch / n for n in samples]
-            write_volume(
-                scene_out, found.volume, np.array(coarse.depths), spacing, provenance, overwrite
-            )
+            _write_truth(scene_out, found, provenance, overwrite)
     relative = saturated is None
     peak = capture.mosaic.max()
     return CaptureSummary(
@@ -97,36 +116,163 @@ def run_volume_capture(
     )
 
 
-def write_volume(
-    path: str | Path,
-    value: np.ndarray,
-    depth: np.ndarray,
-    spacing: list[float],
-    provenance: object,
-    overwrite: bool,
+def _of_specimen(path: str | Path, settings: Settings, volume: str) -> _Recorded:
+    """A specimen before an objective."""
+    from plenocli.files.config.microscope_file import load_microscope, microscope_toml
+    from plenocli.forward.volume.cameras import optics_of
+    from plenocli.forward.volume.recording import finer, record
+    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
+
+    microscope = load_microscope(path)
+    coarse = optics_of(microscope)
+    specimen = _specimen(volume, microscope, coarse, settings.seed)
+    samples = microscope.object.samples_per_lenslet
+    optics, plan = finer(
+        coarse, samples, settings.refine, settings.accuracy or DEFAULT_ACCURACY, settings.model
+    )
+    with _shown(plan) as progress:
+        found = record(
+            optics, plan, microscope.lenslet_array.count, specimen, settings.refine, progress
+        )
+    spacing = [coarse.object_pitch / n for n in samples]
+    return _Recorded(
+        camera=microscope,
+        config=microscope_toml(microscope),
+        light=found.light,
+        volume=found.volume,
+        depth=np.array(coarse.depths),
+        spacing=np.tile(spacing, (len(coarse.depths), 1)),
+        plan=plan,
+        files={"volume": None if volume.startswith("phantom:") else volume},
+    )
+
+
+def _of_layers(
+    path: str | Path, settings: Settings, pictures: Sequence[tuple[str, float]]
+) -> _Recorded:
+    """Opaque layers before a photographic camera, the nearest hiding those behind."""
+    from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.read.cameras import read_camera
+    from plenocli.forward.sensor.exposure import require_tiling
+    from plenocli.forward.volume.cameras import optics_of_camera
+    from plenocli.forward.volume.layers import record_layers
+    from plenocli.forward.volume.plan import plan_volume
+    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
+
+    camera = read_camera(path)
+    require_tiling(camera, path)
+    pictures = sorted(pictures, key=lambda one: one[1])
+    distances = tuple(distance for _, distance in pictures)
+    if len(set(distances)) < len(distances):
+        raise UsageError("two layers stand at one distance", "--layer", "draw them as one picture")
+    planes = camera.object.model_copy(update={"planes": distances})
+    optics = optics_of_camera(camera.model_copy(update={"object": planes}))
+    refine, samples, count = (
+        settings.refine,
+        camera.object.samples_per_lenslet,
+        camera.lenslet_array.count,
+    )
+    fine = samples[0] * refine, samples[1] * refine
+    plan = plan_volume(
+        optics,
+        fine,
+        accuracy=settings.accuracy or DEFAULT_ACCURACY,
+        model=settings.model,
+        box=max(1, round(2 / refine)),
+    )
+    shape = count[0] * fine[0], count[1] * fine[1]
+    layers = [_layer(name, shape, settings.sampling) for name, _ in pictures]
+    with _shown(plan) as progress:
+        found = record_layers(optics, plan, count, layers, refine, progress)
+    blocks = [
+        one.opacity.reshape(shape[0] // refine, refine, shape[1] // refine, refine).mean((1, 3))
+        for one in layers
+    ]
+    pitches = [optics.object_pitch / n for n in samples]
+    return _Recorded(
+        camera=camera,
+        config=to_toml(camera),
+        light=found.light,
+        volume=found.volume,
+        depth=np.array(distances),
+        spacing=np.outer(optics.scales, pitches),
+        plan=plan,
+        files={
+            f"layer {number}": None if name.startswith("skimage:") else name
+            for number, (name, _) in enumerate(pictures, 1)
+        },
+        opacity=np.array(blocks),
+    )
+
+
+def _named(layer: str) -> tuple[str, float]:
+    """Picture and distance (m) of PICTURE@DISTANCE."""
+    from plenocli.base.units import UnitError, parse_length
+
+    name, _, distance = layer.rpartition("@")
+    try:
+        found = parse_length(distance)
+    except UnitError as error:
+        raise UsageError(
+            f"{layer!r} does not say where the layer stands ({error})",
+            "--layer",
+            "write PICTURE@DISTANCE, such as near.png@380mm",
+        ) from None
+    if not name or found <= 0:
+        raise UsageError(
+            f"{layer!r} names no picture before the camera",
+            "--layer",
+            "write PICTURE@DISTANCE, such as near.png@380mm",
+        )
+    return name, found
+
+
+def _layer(name: str, shape: tuple[int, int], sampling: str) -> Layer:
+    """A picture on (rows, columns) points; what it has of alpha is its opacity."""
+    from plenocli.files.images.pictures import read_opacity
+    from plenocli.files.read.scenes import read_scene
+    from plenocli.forward.scene.sample import sample_picture
+    from plenocli.forward.volume.layers import Layer
+
+    light = read_scene(name, sampling=sampling).at(550e-9, *shape).astype(float)
+    alpha = None if name.startswith("skimage:") else read_opacity(name)
+    if alpha is None:
+        return Layer(light, np.ones(shape))
+    return Layer(light, np.clip(sample_picture(alpha, *shape, sampling), 0, 1))
+
+
+@contextmanager
+def _shown(plan: VolumePlan) -> Iterator[Callable[[int], None]]:
+    """Says how long it takes, and shows the planes that are done."""
+    note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
+    with bar(None, len(plan.reach), "planes") as shown:
+        yield shown.update
+
+
+def _write_truth(
+    path: str | Path, found: _Recorded, provenance: Provenance, overwrite: bool
 ) -> None:
-    """A volume that is known, as its artefact (.h5) or OME-TIFF."""
+    """What was recorded, as its artefact (.h5) or OME-TIFF."""
     from plenocli.files.artefacts.container import write_artefact
-    from plenocli.files.artefacts.provenance import Provenance
     from plenocli.files.images.tiff_stack import write_ome_tiff
     from plenocli.files.results.volumes import truth_artefact
 
-    assert isinstance(provenance, Provenance)
     if Path(path).suffix.lower() in (".tif", ".tiff"):
-        rows, columns = spacing
-        write_ome_tiff(path, value, None, depth, (rows, columns), overwrite=overwrite)
+        rows, columns = found.spacing.mean(axis=0).tolist()
+        write_ome_tiff(path, found.volume, None, found.depth, (rows, columns), overwrite=overwrite)
         return
-    artefact = truth_artefact(value, depth, np.tile(spacing, (len(depth), 1)), provenance)
+    artefact = truth_artefact(found.volume, found.depth, found.spacing, provenance, found.opacity)
     write_artefact(path, artefact, overwrite=overwrite)
 
 
-def _require_taken(settings: Settings) -> None:
-    """UsageError where settings ask for what a volume's capture does not have."""
-    plain = Settings(**{name: getattr(settings, name) for name in TAKEN})
+def _require_taken(settings: Settings, option: str) -> None:
+    """UsageError where settings ask for what the capture of a volume, or of layers, has not."""
+    taken = (*TAKEN, "sampling") if option == "--layer" else TAKEN
+    plain = Settings(**{name: getattr(settings, name) for name in taken})
     for name in (field.name for field in fields(settings)):
         if getattr(settings, name) != getattr(plain, name):
             raise UsageError(
-                "does not go with --volume", f"--{name.replace('_', '-')}", "leave one of them out"
+                f"does not go with {option}", f"--{name.replace('_', '-')}", "leave one of them out"
             )
 
 
@@ -189,7 +335,7 @@ def _stored(path: str, optics: VolumeOptics) -> Sampler:
 
 
 def _detected(
-    microscope: Microscope, light: np.ndarray, settings: Settings, name: str
+    camera: Microscope | Camera, light: np.ndarray, settings: Settings, name: str
 ) -> tuple[Capture, float | None]:
     """What the sensor reports, and the share of its pixels over full well."""
     from plenocli.base.random_streams import stream
@@ -202,7 +348,7 @@ def _detected(
         relative_capture,
     )
 
-    sensor = microscope.sensor
+    sensor = camera.sensor
     if not light.any():
         raise InputError(
             "puts no light on the sensor", name, "give a volume within the planes and the field"
@@ -214,11 +360,11 @@ def _detected(
     if settings.snr_db is not None or settings.noise == "none":
         capture = relative_capture(sensor, mosaic, settings.options, rng)
     else:
-        usual = microscope.light.white_exposure
+        usual = camera.light.white_exposure
         seconds = settings.exposure or sensor.exposure or usual
         full = WHITE_LEVEL * sensor.full_well / float(mosaic.max())
         scale = ExposureScale(full * seconds / usual, seconds)
         capture, saturated = exposed_capture(sensor, mosaic, scale, name, rng)
-    grid = SuperpixelGrid.tiled(microscope.lenslet_array.count, sensor.pixels_per_lenslet)
+    grid = SuperpixelGrid.tiled(camera.lenslet_array.count, sensor.pixels_per_lenslet)
     about = replace(capture.metadata, target=Path(name).name)
     return replace(capture, grid=grid, metadata=about), saturated

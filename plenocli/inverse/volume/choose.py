@@ -1,17 +1,20 @@
-"""The solvers by name, and the one that predicts held-out pixels best."""
+"""What predicts held-out pixels best: which of the solvers, and which planes, few where a camera's
+lenslets tell little of depth.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.base.progress import bar
 from plenocli.inverse.volume.lmmse import lmmse
 from plenocli.inverse.volume.measurement import Problem
-from plenocli.inverse.volume.richardson_lucy import richardson_lucy
+from plenocli.inverse.volume.richardson_lucy import iterate, richardson_lucy
 from plenocli.inverse.volume.total_variation import total_variation
 from plenocli.inverse.volume.volume import Trial, Volume
 
@@ -24,6 +27,10 @@ SOLVERS: dict[str, Callable[[Problem], Volume]] = {
 """By name: of a Problem, its Volume."""
 COMPARED = ("rl", "lmmse", "tv")
 """What `auto` tries; the likelihood already lets lmmse take voxels for independent."""
+TRIED = 25
+"""Iterations of Richardson-Lucy by which planes are judged."""
+WORTH = 0.02
+"""Share of the misfit that a further plane must take away."""
 
 
 def volume_of(problem: Problem, method: str = "auto") -> Volume:
@@ -57,3 +64,55 @@ def _misfit(problem: Problem, volume: Volume) -> float:
     light = np.zeros(problem.signal.shape)
     light[problem.held] = held.predicted - problem.measurement.offset[problem.held]
     return problem.misfit(light)
+
+
+def supported_planes(
+    problem_of: Callable[[Sequence[int]], Problem], count: int, most: int
+) -> tuple[list[int], tuple[Trial, ...]]:
+    """The planes that predict held-out pixels best: one after the other, as long as one more helps,
+    each then exchanged for its neighbours where these are better.
+
+    problem_of: the problem with some of the planes alone, by their numbers, rising; the same pixels
+        put aside in all.
+    count: planes there are; most: how many are taken at the most.
+
+    Returns their numbers, rising, and what was tried: planes and misfit of held-out pixels.
+    """
+    misfits: dict[tuple[int, ...], float] = {}
+
+    def misfit(planes: set[int]) -> float:
+        key = tuple(sorted(planes))
+        if key not in misfits:
+            misfits[key] = min(iterate(problem_of(key), TRIED).misfits)
+        return misfits[key]
+
+    chosen: set[int] = set()
+    for _ in range(min(most, count)):
+        others = [plane for plane in range(count) if plane not in chosen]
+        found = min(bar(others, len(others), "planes"), key=lambda plane: misfit(chosen | {plane}))
+        if chosen and misfit(chosen | {found}) > (1 - WORTH) * misfit(chosen):
+            break
+        chosen = _exchanged(chosen | {found}, count, misfit)
+    trials = (Trial(f"planes {_named(key)}", value) for key, value in misfits.items())
+    return sorted(chosen), tuple(trials)
+
+
+def _exchanged(chosen: set[int], count: int, misfit: Callable[[set[int]], float]) -> set[int]:
+    """The planes after each has moved to a neighbour as long as that is better."""
+    better = True
+    while better:
+        better = False
+        for plane in sorted(chosen):
+            for near in (plane - 1, plane + 1):
+                moved = chosen - {plane} | {near}
+                if 0 <= near < count and len(moved) == len(chosen):
+                    if misfit(moved) < misfit(chosen):
+                        chosen, better = moved, True
+                        break
+            if better:
+                break
+    return chosen
+
+
+def _named(planes: tuple[int, ...]) -> str:
+    return ", ".join(str(plane) for plane in planes)

@@ -38,13 +38,11 @@ def haze(measurement: Measurement) -> np.ndarray:
     return KEPT * np.maximum(whole[darkest].mean(axis=0), 0)
 
 
-def without_haze(problem: Problem) -> Problem:
-    """The problem with the haze as its background, where that predicts the held-out pixels better;
-    else as it is.
+def without_haze(problem: Problem, known: np.ndarray) -> Problem:
+    """The problem with the haze (pixel,) as its background, where that predicts the held-out pixels
+    better; else as it is.
     """
-    hazy = problem.with_measurement(
-        replace(problem.measurement, background=haze(problem.measurement))
-    )
+    hazy = problem.with_measurement(replace(problem.measurement, background=known))
     if not problem.held.any() or not hazy.measurement.offset.any():
         return problem
     as_it_is, taken_off = (_explained(one) for one in (problem, hazy))

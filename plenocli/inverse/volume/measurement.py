@@ -91,6 +91,7 @@ class Problem:
     voxels: of the map's unknowns.
     hold_out: share of the usable pixels that no solver sees.
     seed: of which ones.
+    draw: like the measurement's signal, 0..1, what decides instead: those below `hold_out`.
 
     `signal`, `counts` and `held` are (lenslet_row, lenslet_column, pixel): the specimen's light,
     whether a pixel is fitted, and whether it was put aside.
@@ -105,6 +106,7 @@ class Problem:
         voxels: Voxels,
         hold_out: float = 0.05,
         seed: int = 0,
+        draw: np.ndarray | None = None,
     ) -> None:
         if measurement.signal.shape != op.range.shape or voxels.unknowns != op.domain.shape[2]:
             raise ValueError(
@@ -112,7 +114,9 @@ class Problem:
                 f"{measurement.signal.shape} and {voxels.unknowns} unknowns a lenslet"
             )
         self.op, self.measurement, self.voxels = op, measurement, voxels
-        self._hold_out, self._seed = hold_out, seed
+        if draw is None:
+            draw = stream(seed, "volume-hold-out").random(measurement.signal.shape)
+        self._hold_out, self._draw = hold_out, draw
         self.signal = (measurement.signal - measurement.offset).astype(op.dtype)
         usable = np.isfinite(self.signal) & (
             self.light_on_pixels > DARK * self.light_on_pixels.max()
@@ -120,7 +124,6 @@ class Problem:
         if measurement.usable is not None:
             usable &= measurement.usable
         self.signal[~usable] = 0
-        draw = stream(seed, "volume-hold-out").random(usable.shape)
         self.held = usable & (draw < hold_out)
         self.counts = usable & ~self.held
         if not self.counts.any():
@@ -130,7 +133,7 @@ class Problem:
 
     def with_measurement(self, measurement: Measurement) -> Problem:
         """The same with another measurement of the same pixels, the same ones put aside."""
-        return Problem(self.op, measurement, self.voxels, self._hold_out, self._seed)
+        return Problem(self.op, measurement, self.voxels, self._hold_out, draw=self._draw)
 
     @cached_property
     def light_on_pixels(self) -> np.ndarray:

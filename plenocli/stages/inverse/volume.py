@@ -6,15 +6,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from plenocli.base.progress import note
+from plenocli.base.text import by
 from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.volume.stack import Stack
-    from plenocli.inverse.volume.measurement import Measurement, Problem
     from plenocli.inverse.volume.volume import Trial, Volume
 
 SUFFIXES = (".h5", ".tif", ".tiff")
@@ -91,10 +89,9 @@ def run_volume(
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
-    from plenocli.inverse.volume.choose import volume_of
-    from plenocli.inverse.volume.haze import without_haze
-    from plenocli.inverse.volume.planes import supported_planes
+    from plenocli.inverse.volume.choose import supported_planes
     from plenocli.inverse.volume.superpixels import measured
+    from plenocli.inverse.volume.tiles import Tiles
 
     output = Path(output)
     check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
@@ -115,20 +112,25 @@ def run_volume(
         f"{stack.point_shape[1]} voxels a lenslet"
     )
     trials: tuple[Trial, ...] = ()
+    tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
     if most_planes is not None:
+        whole = stack
         chosen, trials = supported_planes(
-            lambda planes: _problem(stack.only(planes), measurement, hold_out, seed, pif),
-            len(stack.depth),
-            most_planes,
+            lambda planes: tiles.of(whole.only(planes)), len(stack.depth), most_planes
         )
         stack = stack.only(chosen)
         places = ", ".join(format_length(depth) for depth in stack.depth.tolist())
         note(f"the capture supports {len(chosen)} of the planes: {places}")
-    problem = _problem(stack, measurement, hold_out, seed, pif)
-    if background == "auto":
-        problem = without_haze(problem)
-        _tell_of_haze(problem)
-    volume = volume_of(problem, method)
+        tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
+    if len(tiles.windows) > 1:
+        size = by(tiles.windows[0].weight.shape)
+        note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
+    if background == "auto" and (share := tiles.without_haze()):
+        note(
+            f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
+            "off (--background 0 keeps it)"
+        )
+    volume = tiles.volume()
     volume = replace(volume, trace=(*trials, *volume.trace))
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
     provenance = Provenance(
@@ -146,45 +148,6 @@ def run_volume(
         held_by_bars=None if held is None else list(held.held_by_bars),
         margin=volume.margin,
     )
-
-
-def _tell_of_haze(problem: Problem) -> None:
-    """Say how much of the light was taken for haze, where some was."""
-    taken = float(problem.measurement.offset.mean())
-    if taken > 0:
-        share = taken / float(problem.measurement.signal.mean())
-        note(
-            f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
-            "off (--background 0 keeps it)"
-        )
-
-
-def _problem(
-    stack: Stack, measurement: Measurement, hold_out: float, seed: int, pif: Path | str
-) -> Problem:
-    """The measurement before the map that the kernels make of it.
-
-    Raises NumericsError where memory does not suffice.
-    """
-    from plenocli.base.budget import budget
-    from plenocli.base.linear_maps import BlockCirculant, torus_for
-    from plenocli.inverse.volume.measurement import Problem, Voxels
-
-    rows, columns, pixels = measurement.signal.shape
-    torus = torus_for((rows, columns), stack.reach)
-    unknowns = len(stack.depth) * stack.A.shape[2]
-    budget().require(
-        BlockCirculant.needed(pixels, unknowns, torus),
-        f"the map of {rows} x {columns} lenslets",
-        pif,
-        "take fewer planes or voxels",
-    )
-    op = BlockCirculant(stack.parts(), (rows, columns), torus)
-    pitch = float(np.mean(stack.spacing))
-    # layers of a photographic camera are told apart by parallax, not by their distance
-    depths = tuple((stack.depth - stack.depth[0]).tolist())
-    voxels = Voxels(point_shape=stack.point_shape, pitch=pitch, depths=depths)
-    return Problem(op, measurement, voxels, hold_out, seed)
 
 
 def _write(

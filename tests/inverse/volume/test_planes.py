@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from plenocli.base.linear_maps import BlockCirculant
+from plenocli.inverse.volume.choose import supported_planes
 from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
-from plenocli.inverse.volume.planes import supported_planes
 
 
 def kernels(planes, seed=1):

@@ -1,0 +1,288 @@
+"""Arrays of lenslets that are too many at once: windows of them, one beside the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from plenocli.base.budget import budget
+from plenocli.base.linear_maps import BlockCirculant, torus_for
+from plenocli.base.progress import bar
+from plenocli.base.random_streams import stream
+from plenocli.forward.volume.stack import Stack
+from plenocli.inverse.volume.choose import volume_of
+from plenocli.inverse.volume.haze import haze, without_haze
+from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, Voxels
+from plenocli.inverse.volume.volume import HeldOut, Prior, Trial, Volume, predictive_sigma
+
+MOST = 10_000
+"""Windows, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Lenslets that are worked on at once, and what their voxels count beside those of other
+    windows: rows and columns (start, stop), weights (row,) and (column,).
+    """
+
+    rows: slice
+    columns: slice
+    row_weight: np.ndarray
+    column_weight: np.ndarray
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(row, column)."""
+        return np.multiply.outer(self.row_weight, self.column_weight)
+
+
+class Tiles:
+    """A measurement before kernels, in as few windows as the memory has room for.
+
+    stack: the kernels.
+    measurement: of all lenslets.
+    method: as volume_of takes it.
+    hold_out: share of the pixels that are put aside, the same ones in all windows.
+    seed: of which ones.
+    where: the kernels' file, for messages.
+
+    Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
+    All have the same size, and so the same map.
+
+    Raises NumericsError where not even the smallest window has room.
+    """
+
+    def __init__(
+        self,
+        stack: Stack,
+        measurement: Measurement,
+        method: str,
+        *,
+        hold_out: float,
+        seed: int,
+        where: str | Path | None = None,
+    ) -> None:
+        self.stack, self.measurement, self.method = stack, measurement, method
+        self._hold_out, self._seed, self._where = hold_out, seed, where
+        count = measurement.signal.shape[:2]
+        self.windows = _windows(count, self._several(count), _halo(stack))
+
+    def _several(self, count: Sequence[int]) -> tuple[int, int]:
+        """Windows along rows and columns: the fewest that fit."""
+        halo, reach = _halo(self.stack), self.stack.reach
+        pixels, unknowns = self.stack.A.shape[1], len(self.stack.depth) * self.stack.A.shape[2]
+        least, best = math.inf, (1, 1)
+        for rows in range(1, count[0] + 1):
+            for columns in range(1, count[1] + 1):
+                if rows * columns >= min(least, MOST):
+                    break
+                size = _size(count[0], rows, halo), _size(count[1], columns, halo)
+                needed = _needed(self.method, pixels, unknowns, torus_for(size, reach))
+                if needed <= budget().memory:
+                    least, best = rows * columns, (rows, columns)
+        if not math.isfinite(least):
+            smallest = tuple(_size(n, n, halo) for n in count)
+            budget().require(
+                _needed(
+                    self.method, pixels, unknowns, torus_for((smallest[0], smallest[1]), reach)
+                ),
+                f"the map of {smallest[0]} x {smallest[1]} lenslets",
+                self._where,
+                "take fewer planes or voxels",
+            )
+        return best
+
+    @cached_property
+    def _op(self) -> BlockCirculant:
+        window = self.windows[0]
+        size = len(window.row_weight), len(window.column_weight)
+        return BlockCirculant(self.stack.parts(), size, torus_for(size, self.stack.reach))
+
+    @cached_property
+    def _draw(self) -> np.ndarray:
+        return stream(self._seed, "volume-hold-out").random(self.measurement.signal.shape)
+
+    def problem(self, window: Window) -> Problem:
+        """What is seen in one window."""
+        at = window.rows, window.columns
+        whole = self.measurement
+        part = replace(
+            whole,
+            signal=whole.signal[at],
+            usable=None if whole.usable is None else whole.usable[at],
+        )
+        # layers of a photographic camera are told apart by parallax, not by their distance
+        depths = tuple((self.stack.depth - self.stack.depth[0]).tolist())
+        pitch = float(np.mean(self.stack.spacing))
+        voxels = Voxels(point_shape=self.stack.point_shape, pitch=pitch, depths=depths)
+        return Problem(self._op, part, voxels, self._hold_out, draw=self._draw[at])
+
+    @cached_property
+    def brightest(self) -> Window:
+        """The window in which there is most to see, by the variance of its lenslets."""
+        usable = self.measurement.usable
+        signal = self.measurement.signal
+        light = (signal if usable is None else np.where(usable, signal, 0)).sum(axis=2)
+        return max(self.windows, key=lambda w: float(light[w.rows, w.columns].var()))
+
+    def of(self, stack: Stack) -> Problem:
+        """The brightest window before other kernels, the same pixels put aside."""
+        other = Tiles(
+            stack,
+            self.measurement,
+            self.method,
+            hold_out=self._hold_out,
+            seed=self._seed,
+            where=self._where,
+        )
+        other.windows, other._draw = self.windows, self._draw
+        return other.problem(self.brightest)
+
+    def without_haze(self) -> float:
+        """Take the haze that the darkest lenslets show off the measurement, where that predicts
+        the held-out pixels of the brightest window better.
+
+        Returns its share of the light, 0 where it was left.
+        """
+        known = haze(self.measurement)
+        problem = without_haze(self.problem(self.brightest), known)
+        self.measurement = replace(self.measurement, background=problem.measurement.background)
+        taken = float(problem.measurement.offset.mean())
+        return taken / float(self.measurement.signal.mean()) if taken else 0.0
+
+    def volume(self) -> Volume:
+        """The volume of all windows; "auto" chooses by the brightest one.
+
+        Raises as volume_of.
+        """
+        if len(self.windows) == 1:
+            return volume_of(self.problem(self.windows[0]), self.method)
+        first = volume_of(self.problem(self.brightest), self.method)
+        found = [
+            first if w is self.brightest else volume_of(self.problem(w), first.method)
+            for w in bar(self.windows, len(self.windows), "windows")
+        ]
+        return self._joined(found)
+
+    def _joined(self, parts: Sequence[Volume]) -> Volume:
+        rows, columns = self.measurement.signal.shape[:2]
+        s, t = self.stack.point_shape
+        weights = np.zeros((rows * s, columns * t))
+        shape = (len(self.stack.depth), *weights.shape)
+        value = np.zeros(shape, parts[0].value.dtype)
+        sigma = None if parts[0].sigma is None else np.zeros_like(value)
+        owner, most = np.zeros((rows, columns), int), np.zeros((rows, columns))
+        for number, (window, part) in enumerate(zip(self.windows, parts)):
+            voxels = (
+                slice(window.rows.start * s, window.rows.stop * s),
+                slice(window.columns.start * t, window.columns.stop * t),
+            )
+            weight = np.kron(window.weight, np.ones((s, t))).astype(value.dtype)
+            weights[voxels] += weight
+            value[(slice(None), *voxels)] += weight * part.value
+            if sigma is not None and part.sigma is not None:
+                sigma[(slice(None), *voxels)] += weight * part.sigma
+            at = window.rows, window.columns
+            better = window.weight > most[at]
+            owner[at] = np.where(better, number, owner[at])
+            most[at] = np.maximum(most[at], window.weight)
+        value /= weights
+        if sigma is not None:
+            sigma /= weights
+        priors = [part.prior for part in parts if part.prior is not None]
+        return replace(
+            parts[0],
+            value=value,
+            sigma=sigma,
+            trace=tuple(
+                Trial(f"window {number}, {part.trace[-1].what}", part.trace[-1].misfit)
+                for number, part in enumerate(parts, 1)
+            ),
+            background=float(np.mean([part.background for part in parts])),
+            prior=_mean_prior(priors) if priors else None,
+            held_out=self._held(parts, owner),
+        )
+
+    def _held(self, parts: Sequence[Volume], owner: np.ndarray) -> HeldOut | None:
+        """Every pixel that was put aside, as the window predicts it in which it is innermost."""
+        index, measured, predicted = [], [], []
+        for number, (window, part) in enumerate(zip(self.windows, parts)):
+            if part.held_out is None:
+                return None
+            places = part.held_out.index + [window.rows.start, window.columns.start, 0]
+            own = owner[places[:, 0], places[:, 1]] == number
+            index.append(places[own])
+            measured.append(part.held_out.measured[own])
+            predicted.append(part.held_out.predicted[own])
+        seen, told = np.concatenate(measured), np.concatenate(predicted)
+        return HeldOut(
+            index=np.concatenate(index),
+            measured=seen,
+            predicted=told,
+            sigma=predictive_sigma(seen, told),
+        )
+
+
+def _mean_prior(priors: Sequence[Prior]) -> Prior:
+    return Prior(
+        **{name: float(np.mean([vars(p)[name] for p in priors])) for name in vars(priors[0])}
+    )
+
+
+def _halo(stack: Stack) -> int:
+    """Lenslets on each side that get SEEN of every voxel's light."""
+    away = np.abs(stack.lenslet_offset).max(axis=1)
+    light = stack.A.sum(axis=1, dtype=float)
+    for halo in range(int(away.max()) + 1):
+        near = away <= halo
+        seen = [light[near & (stack.plane == z)].sum(axis=0).min() for z in range(len(stack.depth))]
+        if np.all(np.array(seen) >= SEEN * stack.column_energy.min(axis=1)):
+            return halo
+    return int(away.max())
+
+
+def _size(count: int, several: int, halo: int) -> int:
+    """Lenslets along an axis of each of several windows."""
+    return min(count, math.ceil((count - 2 * halo) / several) + 2 * halo) if several > 1 else count
+
+
+def _windows(count: Sequence[int], several: tuple[int, int], halo: int) -> list[Window]:
+    """Windows of one size, row by row."""
+    axes = []
+    for n, many in zip(count, several):
+        size = _size(n, many, halo)
+        starts = sorted({round(i * (n - size) / max(many - 1, 1)) for i in range(many)})
+        axes.append([(slice(a, a + size), _weights(a, size, n, halo)) for a in starts])
+    return [
+        Window(rows=rows, columns=columns, row_weight=down, column_weight=right)
+        for rows, down in axes[0]
+        for columns, right in axes[1]
+    ]
+
+
+def _weights(start: int, size: int, count: int, halo: int) -> np.ndarray:
+    """(lenslet,) 1 inside a window, falling to nothing half a halo from where it ends, unless the
+    array ends there.
+    """
+    place = np.arange(size)
+    before = place if start > 0 else np.full(size, count)
+    after = size - 1 - place if start + size < count else np.full(size, count)
+    fade = max(1, halo // 2)
+    inside = np.minimum(before, after) + 0.5 - (halo - fade)
+    return np.clip(inside / (2 * fade), 1e-6, 1.0)
+
+
+def _needed(method: str, pixels: int, unknowns: int, torus: tuple[int, int]) -> int:
+    """Bytes that a method takes on a torus, in single precision."""
+    frequencies = torus[0] * (torus[1] // 2 + 1)
+    whole = BlockCirculant.needed(pixels, unknowns, torus)
+    arrays = 48 * torus[0] * torus[1] * (pixels + unknowns)
+    gain = 8 * frequencies * pixels * unknowns + 128 * unknowns * (unknowns + pixels)
+    steps = 8 * frequencies * unknowns**2
+    beside = {"rl": 0, "lmmse": gain, "tikhonov": gain, "tv": steps, "auto": max(gain, steps)}
+    return whole + arrays + beside[method]

@@ -1,0 +1,123 @@
+"""Windows of lenslets give what all lenslets at once give, and are as few as memory wants."""
+
+import numpy as np
+import pytest
+
+from plenocli.base.budget import Budget, within
+from plenocli.base.errors import NumericsError
+from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.volume.stack import Stack
+from plenocli.inverse.volume import tiles
+from plenocli.inverse.volume.measurement import Measurement
+from plenocli.inverse.volume.tiles import Tiles
+from tests.reference import volumes
+
+COUNT, MANY = (21, 26), (2, 3)
+
+
+@pytest.fixture(scope="module")
+def stack():
+    parts = volumes.kernels(2, 4, 9)
+    return Stack(
+        A=np.concatenate([blocks for blocks, _ in parts]).astype(np.float32),
+        plane=np.repeat([0, 1], [len(blocks) for blocks, _ in parts]),
+        lenslet_offset=np.concatenate([offsets for _, offsets in parts]),
+        depth=np.array([-1e-6, 1e-6]),
+        spacing=np.full((2, 2), 1e-6),
+        pixel_shape=(3, 3),
+        point_shape=(2, 2),
+        wavelength=5e-7,
+        column_energy=np.ones((2, 4)),
+        accuracy=AccuracyRecord(asked=1e-3, estimated=1e-3, model="ray", rung="rays", by_source={}),
+    )
+
+
+@pytest.fixture(scope="module")
+def measurement(stack):
+    rng = np.random.default_rng(4)
+    whole = Tiles(
+        stack,
+        Measurement(signal=np.zeros((*COUNT, 9)), read_variance=1e-4),
+        "rl",
+        hold_out=0.1,
+        seed=1,
+    )
+    op = whole._op
+    light = op.forward(rng.random(op.domain.shape) ** 6)
+    return Measurement(signal=light + 0.01 * rng.standard_normal(light.shape), read_variance=1e-4)
+
+
+def tiled(stack, measurement, method, memory=1 << 40):
+    with within(Budget(memory)):
+        found = Tiles(stack, measurement, method, hold_out=0.1, seed=1)
+        return found, found.volume()
+
+
+def memory_of(method, several, count=COUNT, halo=1):
+    """Bytes with which windows as many as this fit, and no fewer."""
+    size = [tiles._size(n, m, halo) for n, m in zip(count, several)]
+    return tiles._needed(method, 9, 8, tiles.torus_for(tuple(size), (1, 1)))
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr("plenocli.base.linear_maps.CHUNK", 1 << 10)
+
+
+@pytest.mark.parametrize("method", ["rl", "lmmse", "tv"])
+def test_windows_give_what_all_lenslets_at_once_give(stack, measurement, method):
+    whole, expected = tiled(stack, measurement, method)
+    parts, found = tiled(stack, measurement, method, memory_of(method, MANY))
+    assert len(whole.windows) == 1 < len(parts.windows) <= 6
+    rest = np.sqrt(np.mean((found.value - expected.value) ** 2) / np.var(expected.value))
+    assert rest < {"rl": 0.25, "lmmse": 0.1, "tv": 0.15}[method]
+    less = expected.held_out.explained_db - found.held_out.explained_db
+    assert less < {"rl": 1.0, "lmmse": 0.3, "tv": 0.5}[method]
+    assert np.array_equal(
+        np.sort(np.ravel_multi_index(found.held_out.index.T, (*COUNT, 9))),
+        np.sort(np.ravel_multi_index(expected.held_out.index.T, (*COUNT, 9))),
+    )
+    if expected.sigma is not None:
+        assert np.allclose(found.sigma, expected.sigma, rtol=0.15)
+    assert len(found.trace) == len(parts.windows)
+
+
+def test_a_pixel_is_put_aside_in_every_window_that_has_it(stack, measurement):
+    parts, _ = tiled(stack, measurement, "rl", memory_of("rl", MANY))
+    held = np.zeros((*COUNT, 9), int)
+    seen = np.zeros_like(held)
+    for window in parts.windows:
+        problem = parts.problem(window)
+        held[window.rows, window.columns] += problem.held
+        seen[window.rows, window.columns] += problem.held | problem.counts
+    assert seen.max() > 1
+    assert np.all((held == 0) | (held == seen))
+
+
+@pytest.mark.parametrize("count", [(5, 5), (21, 26), (40, 7)])
+@pytest.mark.parametrize("several", [(1, 1), (2, 3), (5, 1), (4, 4)])
+@pytest.mark.parametrize("halo", [0, 1, 3])
+def test_windows_cover_the_array_and_overlap_by_two_halos(count, several, halo):
+    windows = tiles._windows(count, several, halo)
+    weights, sizes = np.zeros(count), set()
+    for window in windows:
+        weights[window.rows, window.columns] += window.weight
+        sizes.add(window.weight.shape)
+        # what counts as more than a trace is a halo from where the window ends, or half of one
+        fade = max(1, halo // 2)
+        for part, weight, n in ((window.rows, window.row_weight, count[0]),):
+            if part.start > 0 and halo > fade:
+                assert weight[: halo - fade].max() < 1e-3
+            assert 0 <= part.start < part.stop <= n
+    assert len(sizes) == 1 and weights.min() > 0.1
+
+
+def test_what_does_not_fit_even_so_is_refused(stack, measurement):
+    with pytest.raises(NumericsError, match="lenslets"):
+        tiled(stack, measurement, "lmmse", 3000)
+
+
+def test_auto_takes_one_method_for_all_windows(stack, measurement):
+    parts, found = tiled(stack, measurement, "auto", memory_of("auto", MANY))
+    assert len(parts.windows) > 1 and found.method in ("rl", "lmmse", "tv")
+    assert found.value.shape == (2, 42, 52) and np.isfinite(found.value).all()

@@ -198,6 +198,6 @@ def planes_of(value: Any) -> Any:
     count = math.floor((end - start) / step * (1 + 1e-12) + 1e-9) + 1
     if count > MOST_PLANES:
         raise ValueError(f"{value!r} has {count} planes; at most {MOST_PLANES} are possible")
-    # a plane in focus is at 0, not a rounding error away
-    depths = (round(start / step + i, 9) * step for i in range(count))
+    # a plane in focus is at 0, and 394 mm not a rounding error away
+    depths = (float(f"{round(start / step + i, 9) * step:.12g}") for i in range(count))
     return [format_length(depth) for depth in depths]

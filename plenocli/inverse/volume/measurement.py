@@ -83,6 +83,11 @@ class Voxels:
         return parts.reshape(parts.shape[0], parts.shape[1], -1)
 
 
+def lots(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Like a signal of `shape`, 0..1: what decides which pixels are put aside."""
+    return stream(seed, "volume-hold-out").random(shape)
+
+
 class Problem:
     """A measurement before its map, with some pixels put aside.
 
@@ -115,7 +120,7 @@ class Problem:
             )
         self.op, self.measurement, self.voxels = op, measurement, voxels
         if draw is None:
-            draw = stream(seed, "volume-hold-out").random(measurement.signal.shape)
+            draw = lots(seed, measurement.signal.shape)
         self._hold_out, self._draw = hold_out, draw
         self.signal = (measurement.signal - measurement.offset).astype(op.dtype)
         usable = np.isfinite(self.signal) & (

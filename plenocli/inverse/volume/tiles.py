@@ -13,11 +13,10 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
-from plenocli.base.random_streams import stream
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume.choose import volume_of
 from plenocli.inverse.volume.haze import haze, without_haze
-from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, Voxels
+from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, Voxels, lots
 from plenocli.inverse.volume.volume import HeldOut, Prior, Trial, Volume, predictive_sigma
 
 MOST = 10_000
@@ -105,7 +104,7 @@ class Tiles:
 
     @cached_property
     def _draw(self) -> np.ndarray:
-        return stream(self._seed, "volume-hold-out").random(self.measurement.signal.shape)
+        return lots(self._seed, self.measurement.signal.shape)
 
     def problem(self, window: Window) -> Problem:
         """What is seen in one window."""

@@ -13,6 +13,7 @@ from plenocli.base.units import format_length
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.volume.stack import Stack
+    from plenocli.inverse.volume.tiles import Tiles
     from plenocli.inverse.volume.volume import Trial, Volume
 
 SUFFIXES = (".h5", ".tif", ".tiff")
@@ -89,7 +90,6 @@ def run_volume(
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
-    from plenocli.inverse.volume.choose import supported_planes
     from plenocli.inverse.volume.superpixels import measured
     from plenocli.inverse.volume.tiles import Tiles
 
@@ -114,22 +114,13 @@ def run_volume(
     trials: tuple[Trial, ...] = ()
     tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
     if most_planes is not None:
-        whole = stack
-        chosen, trials = supported_planes(
-            lambda planes: tiles.of(whole.only(planes)), len(stack.depth), most_planes
-        )
-        stack = stack.only(chosen)
-        places = ", ".join(format_length(depth) for depth in stack.depth.tolist())
-        note(f"the capture supports {len(chosen)} of the planes: {places}")
+        stack, trials = _supported(tiles, most_planes)
         tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
     if len(tiles.windows) > 1:
         size = by(tiles.windows[0].weight.shape)
         note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
-    if background == "auto" and (share := tiles.without_haze()):
-        note(
-            f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
-            "off (--background 0 keeps it)"
-        )
+    if background == "auto":
+        _take_haze(tiles)
     volume = tiles.volume()
     volume = replace(volume, trace=(*trials, *volume.trace))
     inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
@@ -148,6 +139,29 @@ def run_volume(
         held_by_bars=None if held is None else list(held.held_by_bars),
         margin=volume.margin,
     )
+
+
+def _supported(tiles: Tiles, most: int) -> tuple[Stack, tuple[Trial, ...]]:
+    """The kernels of the planes that predict held-out pixels best, and what was tried."""
+    from plenocli.inverse.volume.choose import supported_planes
+
+    whole = tiles.stack
+    chosen, trials = supported_planes(
+        lambda planes: tiles.of(whole.only(planes)), len(whole.depth), most
+    )
+    stack = whole.only(chosen)
+    places = ", ".join(format_length(depth) for depth in stack.depth.tolist())
+    note(f"the capture supports {len(chosen)} of the planes: {places}")
+    return stack, trials
+
+
+def _take_haze(tiles: Tiles) -> None:
+    """Take haze off, where held-out pixels agree, and say how much it was."""
+    if share := tiles.without_haze():
+        note(
+            f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
+            "off (--background 0 keeps it)"
+        )
 
 
 def _write(

@@ -48,6 +48,10 @@ not quite what the prior says, and the noise of few pixels is known so well only
 UNRESOLVED = 4e-4
 """What objects finer than the points of a lenslet may leave over, of a capture's root mean square.
 """
+ALMOST = 100.0
+"""By how much less likely (log) than the camera that was found a start may be that is gone on from
+all the same: so much is gained on the way from a camera that is mirrored along one axis.
+"""
 CLEAR = 4.0
 """Steps over lenslet borders under the mirrored camera, over those under the found one, from which
 on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
@@ -124,6 +128,7 @@ def fit_camera(
         best, ascent, problem = mend(best, ascent, problem)
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
+        best = _mirrored_along_one_axis(ascent, best)
         best, turned = _told_apart(ascent, best, problem.captures)
     # what is left over beyond the noise is believed of fine objects only where pictures go on
     sure = turned is not None and turned >= CLEAR
@@ -200,6 +205,19 @@ def _highest(ascent: Ascent, first: Point, limit: float) -> Point:
     x = max(found, key=_likely).x
     other = ascent.settle(ascent.point(x, finer=ascent.difference(x)), STEPS)
     return max([first, other], key=_likely)
+
+
+def _mirrored_along_one_axis(ascent: Ascent, at: Point) -> Point:
+    """Where the way leads from a camera whose defocus and astigmatism have changed places, if it is
+    more likely than the one that was found: both blur alike, and where noise hides the difference
+    either is a maximum of the evidence.
+    """
+    family = ascent.family
+    for values in family.half_mirrored(ascent.values(at.x)):
+        other = ascent.point((values - family.start) / family.tolerance, finer=at.finer)
+        if _likely(other) > _likely(at) - ALMOST:
+            at = max([at, ascent.climb(other, STEPS)], key=_likely)
+    return at
 
 
 def _likely(at: Point) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 
 from plenocli.base.errors import UsageError
 from plenocli.forward.camera.glass import focal_length
+from plenocli.forward.camera.pupil import unit_radius
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -241,7 +242,7 @@ class CameraFamily:
         if {"focus", "lenslet focal length"} - set(self._place):
             return None
         g, out = self.geometry_at(values), values.copy()
-        out[self._place["focus"]] = 1 / (2 * (1 / g.f1 - 1 / g.z2) - 1 / g.z1)
+        out[self._place["focus"]] = self._in_focus_by(g, -g.eps)
         relay = 1 / g.z2 + 1 / g.z3
         f2 = 1 / (2 * relay - 1 / g.f2)
         place = self._place["lenslet focal length"]
@@ -250,6 +251,28 @@ class CameraFamily:
             if parameter.noll:
                 out[i] = -values[i]
         return out
+
+    def half_mirrored(self, values: np.ndarray) -> list[np.ndarray]:
+        """The values (parameter,) of cameras that are mirrored along rows or columns alone, so that
+        they blur as much both ways: defocus and vertical astigmatism have changed places, with
+        either sign. Empty where the parameters cannot express it.
+        """
+        name = ZERNIKES[6][0]
+        if not (self.has("focus") and self.has(name)):
+            return []
+        g, place, found = self.geometry_at(values), self._place[name], []
+        # the wavefront is eps r^2/2 + c sqrt(6) cos(2 phi) r^2/R^2
+        per = 2 * np.sqrt(6) / unit_radius(self.camera.main_lens) ** 2
+        for side in (1, -1):
+            out = values.copy()
+            out[place] = side * g.eps / per
+            out[self._place["focus"]] = self._in_focus_by(g, side * values[place] * per)
+            found.append(out)
+        return found
+
+    def _in_focus_by(self, g: Geometry, eps: float) -> float:
+        """The distance z1 at which objects have a defocus eps, 1/m."""
+        return 1 / (eps + 1 / g.f1 - 1 / g.z2)
 
 
 def require_fittable(camera: Camera) -> None:

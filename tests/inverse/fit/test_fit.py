@@ -85,6 +85,19 @@ def test_a_camera_is_found_from_a_photograph(kind):
     assert ("pitch", "wavelength") in fit.inseparable or "pitch" in fit.unmeasured
 
 
+def test_astigmatism_is_not_taken_for_a_defocus(monkeypatch):
+    """The way from the described camera ends out of focus, where noise hides what is wrong."""
+    monkeypatch.setattr(f"{__name__}.SNR", 30)
+    x = np.zeros(12)
+    x[FAMILY.place("astigmatism, vertical")] = -1
+    truth = FAMILY.start + x * FAMILY.tolerance
+    fit = fit_camera(CAMERA, [captured(truth, finer=1)], TRAINING, model="fresnel")
+    right = exact(tuple(truth), 1)
+    assert fit.accepted, fit.why
+    assert np.linalg.norm(fit.matrix - right) < 3 * fit.model_error * np.linalg.norm(right)
+    assert np.abs([(p.value - t) / p.sigma for p, t in zip(fit.parameters, truth)]).max() < 4
+
+
 def test_the_fitted_camera_is_a_camera_file_like_any_other():
     truth, fit = fitted("all")
     camera = parse_camera(to_toml(fit.camera))

@@ -85,6 +85,27 @@ def test_the_mirrored_camera_sees_turned_objects():
     assert np.allclose(cameras.mirrored(other), values, rtol=1e-12, atol=1e-18)
 
 
+def test_half_mirrored_cameras_see_objects_turned_over_along_one_axis():
+    """Exactly so where everything is a product of rows and columns, and lenslets image the pupil:
+    one sign of the defocus and astigmatism that change places turns rows, the other columns.
+    """
+    cameras = family(main_lens__aperture_shape="square")
+    values, g = cameras.start.copy(), cameras.geometry
+    values[cameras.place("lenslet focal length")] = 1 / (1 / g.z2 + 1 / g.z3)
+    for name, far in (("focus", 0.6), ("astigmatism, vertical", 0.3), ("shift, rows", 0.2)):
+        values[cameras.place(name)] += far * cameras.tolerance[cameras.place(name)]
+    lenslets = LensletFamily(cameras, double=True, tolerance=1e-9)
+    A = lenslets.at(values).matrix.reshape(-1, *g.object_shape)
+    halves = cameras.half_mirrored(values)
+    B = [lenslets.at(v).matrix.reshape(A.shape) for v in halves]
+    turned = [A[:, ::-1], A[:, :, ::-1]]
+    error = np.array([[np.linalg.norm(b - t) for t in turned] for b in B]) / np.linalg.norm(A)
+    assert min(np.trace(error), np.trace(error[::-1])) < 2e-7
+    assert np.linalg.norm(turned[0] - A) > 0.05 * np.linalg.norm(A)
+    again = [cameras.half_mirrored(v) for v in halves]
+    assert all(min(np.abs(v - values).max() for v in each) < 1e-12 * values.max() for each in again)
+
+
 @pytest.mark.parametrize(
     "changes",
     [

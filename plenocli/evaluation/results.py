@@ -38,6 +38,7 @@ class Result:
         apart, or None.
     scale: by which a dictionary's matrix was divided.
     object_shape: (rows, columns) of a dictionary's atoms, or None.
+    rgb: (3, row, column) linear sRGB of a picture in colour, or None.
     history: what learning a dictionary recorded, name -> values by iteration.
     """
 
@@ -53,6 +54,7 @@ class Result:
     seen: np.ndarray | None = None
     scale: float = 1.0
     object_shape: tuple[int, ...] | None = None
+    rgb: np.ndarray | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property

@@ -25,6 +25,7 @@ def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = 
     name: for the caption.
     centres: (lenslet_row, lenslet_column, 2) px, else the superpixels it tells of.
     """
+    from plenocli.forward.sensor.cfa import preview
     from plenocli.report.pictures import capture_picture
 
     shape = capture.grid.shape if capture.grid else None
@@ -39,7 +40,14 @@ def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = 
         None if not capture.metadata.band_m else f"{capture.metadata.band_m * 1e9:g} nm light",
     ]
     picture = capture_picture(
-        capture.mosaic, capture.units, centres, pitch, float(np.mean(capture.levels.black))
+        capture.mosaic,
+        capture.units,
+        centres,
+        pitch,
+        float(np.mean(capture.levels.black)),
+        None
+        if capture.cfa == "mono" or min(capture.shape) < 2
+        else preview(np.nan_to_num(capture.signal()), capture.cfa, capture.profile),
     )
     return [(picture, ", ".join(str(w) for w in words if w) + ".")]
 
@@ -204,7 +212,7 @@ def image_figures(result: Result, name: str, seen: np.ndarray | None = None) -> 
 
     figures = [
         (
-            picture(result.values, name),
+            picture(result.values if result.rgb is None else np.moveaxis(result.rgb, 0, -1), name),
             f"{name}{': ' + result.method if result.method else ''}; no truth to compare with.",
         )
     ]

@@ -54,6 +54,7 @@ def capture_picture(
     centres: np.ndarray | None = None,
     pitch: tuple[float, ...] | None = None,
     black: float = 0.0,
+    colour: np.ndarray | None = None,
 ) -> bytes:
     """A capture: the whole mosaic with its lenslet grid, and the middle superpixels close up.
 
@@ -63,6 +64,8 @@ def capture_picture(
     pitch: (row, column) px or None, used where centres are missing, for superpixels that tile from
         the corner.
     black: level above which values are shown, on one scale for both parts.
+    colour: (row, column, 3) linear sRGB, the same at half the size, which is shown as a whole
+        instead of values; None of grey captures.
 
     Returns PNG.
     """
@@ -74,7 +77,7 @@ def capture_picture(
     rows, cols = mosaic.shape
     with drawing(10.2, 4.75) as made:
         whole, close = made.figure.subplots(1, 2)
-        shown, step = thumbnail(mosaic)
+        shown, step = thumbnail(mosaic) if colour is None else _smaller(colour)
         whole.imshow(
             shown,
             cmap=LIGHT_MAP,
@@ -103,6 +106,14 @@ def capture_picture(
         whole.add_patch(_outline(box))
         colour_bar(close, image, f"signal [{units}]" if units else "signal")
     return made.png
+
+
+def _smaller(colour: np.ndarray) -> tuple[np.ndarray, int]:
+    """(a thumbnail as the screen takes it, pixels of the sensor in one of its)."""
+    from plenocli.forward.scene.colour import encode_srgb
+
+    layers = [thumbnail(layer) for layer in np.moveaxis(colour, -1, 0)]
+    return encode_srgb(np.stack([layer for layer, _ in layers], axis=-1)), 2 * layers[0][1]
 
 
 def _close_up(

@@ -123,7 +123,7 @@ def test_a_view_stands_where_its_samples_do():
     places = view_places(count, 12.0, pitch)
     centre = np.full_like(offset, pitch)
     for axis in (0, 1):
-        samples = Samples(centre, offset, offset[:, axis] / pitch, pitch)
+        samples = Samples(centre=centre, offset=offset, value=offset[:, axis] / pitch, pitch=pitch)
         found = views(samples, count, (3, 3))[..., 1, 1]
         along = found.mean(axis=1 - axis)
         assert np.abs(along - places).max() < 0.002
@@ -222,7 +222,10 @@ def test_the_page_refocuses_as_the_package_does(browser, tmp_path):
     grid = np.meshgrid(places, places, *2 * [np.arange(lenslets) * pitch], indexing="ij")
     down, across, row, column = (part.ravel()[np.isfinite(seen.ravel())] for part in grid)
     samples = Samples(
-        np.stack([row, column], 1), np.stack([down, across], 1), seen[np.isfinite(seen)], pitch
+        centre=np.stack([row, column], 1),
+        offset=np.stack([down, across], 1),
+        value=seen[np.isfinite(seen)],
+        pitch=pitch,
     )
     canvas, panel = ".picture:not([hidden]) canvas", panels[0]
     for asked in (-0.5, slope):

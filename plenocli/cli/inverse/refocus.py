@@ -98,11 +98,15 @@ def command(
     more OUT (.h5) holds a map of depth with its confidence; where nothing tells the depth it is
     unknown (NaN).
 
+    Of a colour filter array each colour is refocused from its own pixels. Spectra from demux are
+    refocused too, with the calibration of demux: each band is a view through its filter.
+
     \b
     Examples:
       plenocli refocus capture.png --calibration grid.h5 -o planes.h5
       plenocli refocus capture.h5 --camera camera.toml --distance 400mm --distance 550mm \\
           --distance 900mm -o planes.h5
+      plenocli refocus chart.exr --calibration cal.h5 -o bands.h5
       plenocli show planes.h5
     """
     from plenocli.stages.inverse.refocus import run_refocus

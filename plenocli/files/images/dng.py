@@ -23,12 +23,13 @@ from plenocli import __version__
 from plenocli.base.errors import OutputError
 from plenocli.base.text import utf8
 from plenocli.files.seal import SEAL, publish_sealed
+from plenocli.forward.sensor.cfa import ColourProfile
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _FORMAT = {_BYTE: "B", _SHORT: "H", _LONG: "I"}
 _CFA_PHOTOMETRIC, _LINEAR_RAW = 32803, 34892
 _COLOUR_CODE = {"R": 0, "G": 1, "B": 2}
-# XYZ to linear sRGB, D65 (IEC 61966-2-1): the simulated sensor has no profile of its own
+# XYZ to linear sRGB, D65 (IEC 61966-2-1), of a sensor without a profile of its own
 _COLOUR_MATRIX = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
 _OPEN, _CLOSE = "<plenocli:capture>", "</plenocli:capture>"
 _Tag = tuple[int, int, Sequence[int] | bytes]
@@ -48,6 +49,7 @@ def write_dng(
     exposure_s: float | None = None,
     iso: float | None = None,
     xmp_json: Mapping[str, Any] | str | None = None,
+    profile: ColourProfile | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a sensor mosaic as DNG; `rawpy` reads the same numbers back.
@@ -60,6 +62,7 @@ def write_dng(
     iso: speed, for the EXIF tag.
     xmp_json: JSON-able dict or JSON text kept in the XMP packet (attributes of a capture artefact
         by their names, "provenance"); black, white and the seal are added to it.
+    profile: what the colours are.
 
     Raises ValueError (a bug of the caller), UsageError, OutputError.
     """
@@ -72,7 +75,7 @@ def write_dng(
     notes |= {"black": levels.tolist(), "white": float(white)}
     notes["seal"] = SEAL
     head = _headers(
-        values.shape, cfa, levels, int(round(white)), exposure_s, iso, notes, len(pixels)
+        values.shape, cfa, levels, int(round(white)), exposure_s, iso, notes, len(pixels), profile
     )
     publish_sealed(path, [head, pixels], overwrite=overwrite)
 
@@ -113,6 +116,7 @@ def _headers(
     iso: float | None,
     notes: dict[str, Any],
     size: int,
+    profile: ColourProfile | None,
 ) -> bytes:
     """Everything before the pixels.
 
@@ -125,7 +129,7 @@ def _headers(
         exif.append((34855, _SHORT, 1, struct.pack("<H", int(iso))))
     start, pixels = 0, 0
     for _ in range(2):
-        main = _directory(_tags(shape, cfa, black, white, notes, size, pixels, start), 8)
+        main = _directory(_tags(shape, cfa, black, white, notes, size, pixels, start, profile), 8)
         start = 8 + len(main)
         pixels = -(-(start + len(_directory(exif, start))) // 16) * 16
     head = b"II*\0" + struct.pack("<I", 8) + main + _directory(exif, start)
@@ -141,6 +145,7 @@ def _tags(
     size: int,
     pixels: int,
     exif: int,
+    profile: ColourProfile | None,
 ) -> list[_Packed]:
     """Tags of the picture, whose pixels and EXIF directory are at these places of the file."""
     rows, columns = shape
@@ -169,13 +174,15 @@ def _tags(
         *_black_tags(black),
     ]
     if cfa != "mono":
+        matrix = _COLOUR_MATRIX if profile is None else profile.from_xyz().ravel()
+        neutral = [1.0] * 3 if profile is None or profile.neutral is None else profile.neutral
         tags += [
             (33421, _SHORT, [2, 2]),
             (33422, _BYTE, [_COLOUR_CODE[letter] for letter in cfa]),
             (50710, _BYTE, [0, 1, 2]),
             (50711, _SHORT, [1]),
-            (50721, _SRATIONAL, [round(v * 10_000) for v in _COLOUR_MATRIX]),
-            (50728, _RATIONAL, _rationals([1.0] * 3)),
+            (50721, _SRATIONAL, [round(v * 10_000) for v in matrix]),
+            (50728, _RATIONAL, _rationals(neutral)),
             (50778, _SHORT, [21]),
         ]
     return [_packed(*tag) for tag in sorted(tags, key=lambda tag: tag[0])]

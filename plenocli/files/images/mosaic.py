@@ -21,6 +21,7 @@ from plenocli.files.images.exr import read_exr, write_exr
 from plenocli.files.images.pictures import file_type, read_stored
 from plenocli.files.images.raw import RawFile, read_raw
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+from plenocli.forward.sensor.cfa import ColourProfile
 from plenocli.forward.sensor.noise import Noise
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
@@ -136,6 +137,7 @@ def _described(path: Path, values: np.ndarray, said: dict[str, Any], source: str
             cfa=str(said.get("cfa", "mono")),
             levels=Levels(black=black, white=float(said.get("white", np.inf)), gain=gain),
             exposure_s=said.get("exposure_s"),
+            profile=_profile(said),
             **_told(path, source, said, gain),
         )
     if not _CFA.fullmatch(found.cfa):
@@ -187,6 +189,16 @@ def _told(path: Path, source: str, said: dict[str, Any], gain: float | None) -> 
     return {"noise": noise, "metadata": metadata, "grid": grid}
 
 
+def _profile(said: dict[str, Any]) -> ColourProfile | None:
+    if said.get("to_rgb") is None:
+        return None
+    neutral = said.get("neutral")
+    return ColourProfile(
+        to_rgb=np.asarray(said["to_rgb"], float).reshape(3, 3),
+        neutral=None if neutral is None else np.asarray(neutral, float).reshape(3),
+    )
+
+
 def _whole(numbers: Any) -> tuple[int, ...] | None:
     return None if numbers is None else tuple(int(n) for n in np.ravel(numbers))
 
@@ -199,6 +211,7 @@ def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
         cfa=found.cfa,
         levels=Levels(black=found.black, white=found.white, gain=found.gain),
         exposure_s=found.exposure_s,
+        profile=found.profile,
         **told,
     )
 
@@ -286,6 +299,7 @@ def write_capture(
             white=capture.levels.white,
             exposure_s=capture.exposure_s,
             xmp_json=said | {"provenance": asdict(provenance)},
+            profile=capture.profile,
             overwrite=overwrite,
         )
 
@@ -310,6 +324,10 @@ def _attributes(capture: Capture) -> dict[str, Any]:
         "illuminant": metadata.illuminant,
         "band_m": metadata.band_m,
     }
+    if capture.profile is not None:
+        said["to_rgb"] = capture.profile.to_rgb.ravel().tolist()
+        neutral = capture.profile.neutral
+        said["neutral"] = None if neutral is None else neutral.tolist()
     return {name: value for name, value in said.items() if value is not None}
 
 

@@ -20,6 +20,7 @@ from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
 from plenocli.files.outside import outside
 from plenocli.files.seal import require_seal
+from plenocli.forward.sensor.cfa import ColourProfile
 
 _COPIES = 4
 """Of a mosaic that exist at the same time while it is read, in this process and outside."""
@@ -45,6 +46,7 @@ class RawFile:
     white: DN.
     exposure_s: s, None where unknown.
     gain: DN per electron, None where unknown.
+    profile: what its colours are; None of a mono sensor, or where nobody says.
     details: what else the file says, by its names.
     """
 
@@ -54,6 +56,7 @@ class RawFile:
     white: float
     exposure_s: float | None
     gain: float | None
+    profile: ColourProfile | None
     details: dict[str, Any]
 
 
@@ -100,8 +103,24 @@ def read_raw(path: str | Path) -> RawFile:
         white=float(found["white"]),
         exposure_s=notes.get("exposure_s") or _exposure(found),
         gain=1 / notes["gain_e_per_dn"] if notes.get("gain_e_per_dn") else None,
+        profile=None if cfa == "mono" else _profile(found),
         details=details,
     )
+
+
+def _profile(found: dict[str, Any]) -> ColourProfile | None:
+    """The camera's colours by the matrix that the file, or LibRaw of its maker, tells; white is
+    that of the shot.
+    """
+    gains = np.array(found["gains"], float)
+    told = (gains > 0).all() and np.isfinite(gains).all() and np.ptp(gains) > 0
+    neutral = gains.min() / gains if told else None
+    from_xyz, to_rgb = np.array(found["from_xyz"]), np.array(found["to_rgb"])
+    if from_xyz.any():
+        return ColourProfile.of_matrix(from_xyz, neutral)
+    if to_rgb.any() and np.isfinite(to_rgb).all():
+        return ColourProfile(to_rgb=to_rgb, neutral=neutral)
+    return None
 
 
 def _decoded(path: str) -> dict[str, Any]:
@@ -143,6 +162,10 @@ def _mosaic(path: str, raw: Any) -> dict[str, Any]:
         "black": [float(v) for v in raw.black_level_per_channel],
         "white": float(raw.white_level),
         "camera_white": None if camera_white is None else [float(v) for v in camera_white],
+        # XYZ to camera, or camera over white to sRGB; zeros where LibRaw knows none
+        "from_xyz": raw.rgb_xyz_matrix[:3].tolist(),
+        "to_rgb": raw.color_matrix[:, :3].tolist(),
+        "gains": [float(v) for v in raw.camera_whitebalance[:3]],
         "exposure_s": float(raw.other.shutter_speed),
         "iso": float(raw.other.iso_speed),
         "f_number": float(raw.other.aperture),

@@ -1,12 +1,12 @@
 """Planes of refocus, into their artefact and out of it."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.inverse.lightfield.planes import DepthMap, LightField
+from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.inverse.lightfield.refocus import STEP
-from plenocli.inverse.lightfield.samples import Samples
+from plenocli.inverse.lightfield.samples import Channels, Samples
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -35,8 +35,30 @@ def lightfield_artefact(
         data |= {"depth/picture": field.sharp.astype(np.float32)}
     if field.views is not None:
         data |= {"views/value": field.views.astype(np.float32)}
-    attrs = {"refocus": {"pitch": samples.pitch, "step": STEP, "pupil": 2 * samples.reach()}}
+    if field.colours is not None:
+        data |= _colours(field.colours)
+    attrs: dict[str, dict] = {
+        "refocus": {"pitch": samples.pitch, "step": STEP, "pupil": 2 * samples.reach()}
+    }
+    if field.colours is not None:
+        attrs["colour"] = {"channels": list(field.colours.channels.names)}
     return Artefact("lightfield", data, attrs, provenance)
+
+
+def _colours(colours: Colours) -> dict[str, Any]:
+    """The datasets of colours."""
+    channels = colours.channels
+    data = {
+        "colour/value": colours.pictures.astype(np.float32),
+        "colour/to_rgb": channels.to_rgb,
+        "colour/weight": channels.weights,
+        "colour/wavelength": channels.wavelengths,
+    }
+    if colours.sharp is not None:
+        data["colour/picture"] = colours.sharp.astype(np.float32)
+    if colours.views is not None:
+        data["colour/views"] = colours.views.astype(np.float32)
+    return data
 
 
 def pupil_and_pitch(artefact: "Artefact") -> tuple[float, float]:
@@ -54,6 +76,21 @@ def lightfield_of(artefact: "Artefact") -> LightField:
         if "depth/slope" in data
         else None
     )
+    colours = None
+    if "colour/value" in data:
+        names = artefact.attrs.get("colour", {}).get("channels")
+        channels = Channels(
+            names=tuple(names or map(str, range(data["colour/value"].shape[1]))),
+            to_rgb=data["colour/to_rgb"],
+            weights=data["colour/weight"],
+            wavelengths=data.get("colour/wavelength"),
+        )
+        colours = Colours(
+            channels=channels,
+            pictures=data["colour/value"],
+            sharp=data.get("colour/picture"),
+            views=data.get("colour/views"),
+        )
     return LightField(
         pictures=data["refocus/value"],
         slopes=data["refocus/slope"],
@@ -62,4 +99,5 @@ def lightfield_of(artefact: "Artefact") -> LightField:
         depth=depth,
         sharp=data.get("depth/picture"),
         views=data.get("views/value"),
+        colours=colours,
     )

@@ -133,6 +133,7 @@ def result_of(artefact: "Artefact", path: Path | str) -> Result:
         block=_block(attrs.get("notes")),
         told=_told(attrs.get("parameters")),
         seen=data.get("image/seen"),
+        rgb=data.get("image/rgb"),
     )
 
 
@@ -179,11 +180,13 @@ def _from_exr(path: Path) -> Result:
             "give a picture with channel Y, or a spectral EXR",
         )
     values = channels.get("Y", next(iter(channels.values())))
+    colour = [channels[name] for name in "RGB" if name in channels]
     return Result(
         path=path,
         kind="image",
         values=np.asarray(values, dtype=np.float64),
         method=str(attrs.get("method", "")),
+        rgb=np.stack(colour) if len(colour) == 3 else None,
     )
 
 

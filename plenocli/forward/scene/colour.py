@@ -83,6 +83,11 @@ def linear_srgb(values: ArrayLike, white: np.ndarray | None = None) -> np.ndarra
     return rgb / (_SRGB @ d65)  # the published matrix is rounded: make white exactly (1, 1, 1)
 
 
+def xyz_of_linear_srgb() -> np.ndarray:
+    """(3, 3) XYZ (D65) of linear sRGB, the inverse of `linear_srgb`."""
+    return np.linalg.inv(linear_srgb(np.eye(3)).T)
+
+
 def encode_srgb(linear: ArrayLike) -> np.ndarray:
     """Display values 0..1 of linear sRGB, clipped; IEC 61966-2-1."""
     linear = np.clip(linear, 0.0, 1.0)

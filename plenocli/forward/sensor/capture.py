@@ -12,6 +12,7 @@ from plenocli.forward.sensor.frames import tiled
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from plenocli.forward.sensor.cfa import ColourProfile
     from plenocli.forward.sensor.noise import Noise
 
 
@@ -97,6 +98,7 @@ class Capture:
     noise: as far as it is known, in the units of the values; its gain alone where only that is.
     mask: (row, column), True where a pixel counts for nothing; None where all count.
     grid: where its superpixels are, where the capture itself says so.
+    profile: what its colours are; None where unknown.
     metadata: where it comes from.
     """
 
@@ -108,6 +110,7 @@ class Capture:
     noise: Noise | None = None
     mask: np.ndarray | None = None
     grid: SuperpixelGrid | None = None
+    profile: ColourProfile | None = None
     metadata: CaptureMetadata = field(default_factory=CaptureMetadata)
 
     @property

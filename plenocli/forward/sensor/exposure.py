@@ -590,6 +590,8 @@ def _described(
     capture: Capture, camera: Camera, truth: np.ndarray, name: str, band_m: float | None
 ) -> Capture:
     """The capture with what later stages need to know beside the mosaic."""
+    from plenocli.forward.sensor.cfa import colour_profile
+
     metadata = replace(
         capture.metadata,
         scene_shape=tuple(truth.shape[1:]),
@@ -598,4 +600,5 @@ def _described(
         band_m=band_m,
     )
     grid = SuperpixelGrid.tiled(camera.lenslet_array.count, camera.sensor.pixels_per_lenslet)
-    return replace(capture, grid=grid, metadata=metadata)
+    profile = colour_profile(camera)
+    return replace(capture, grid=grid, metadata=metadata, profile=profile)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from plenocli.inverse.lightfield.planes import DepthMap
-from plenocli.inverse.lightfield.refocus import STEP, place, refocus
+from plenocli.inverse.lightfield.refocus import STEP, in_colour, place, refocus
 from plenocli.inverse.lightfield.samples import Samples
 
 ROUNDS = 4
@@ -76,7 +76,7 @@ def all_in_focus(samples: Samples, slope: np.ndarray, shape: tuple[int, int]) ->
     slope: (row, column), one value a pitch; NaN takes the nearest known one.
     shape: (rows, columns) of the map.
 
-    Returns (row, column), like `refocus`; None where no slope is known.
+    Returns (channel, row, column), like `in_colour`; None where no slope is known.
     docs/model.md, "Refocusing and depth".
     """
     from scipy.ndimage import distance_transform_edt
@@ -85,7 +85,7 @@ def all_in_focus(samples: Samples, slope: np.ndarray, shape: tuple[int, int]) ->
     if unknown.all():
         return None
     nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    return refocus(samples, _own(samples, slope[tuple(nearest)]), shape)[0]
+    return in_colour(samples, _own(samples, slope[tuple(nearest)]), shape)
 
 
 def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
@@ -143,21 +143,63 @@ def _contrast(disagreement: np.ndarray) -> np.ndarray:
 def _disagreement(
     samples: Samples, slope: float, shape: tuple[int, int], width: float
 ) -> np.ndarray:
-    """Variance of what meets a point of the plane of this slope, (row, column), NaN where nothing
-    does.
+    """How far apart what meets a point of the plane of this slope is, (row, column), NaN where
+    nothing does: the variance within each colour, by their light, or how little the bands of
+    spectra go together.
     """
-    from scipy.ndimage import gaussian_filter
+    channels, parts = samples.channels, samples.parts()
+    if channels is not None and channels.wavelengths is not None:
+        found = _uncorrelated(in_colour(samples, slope, shape, step=2), width)
+    else:
+        each = [_variance(samples.where(some), slope, shape, width) for some in parts if some.any()]
+        weights = np.ones(1) if channels is None else channels.weights[[s.any() for s in parts]]
+        share = np.isfinite(each) * weights[:, None, None]
+        with np.errstate(invalid="ignore"):
+            total = (np.nan_to_num(each) * share).sum(axis=0)
+            found = total / np.where(share.sum(axis=0) > 0, share.sum(axis=0), np.nan)
+    return found.reshape(shape[0], 2, shape[1], 2).mean(axis=(1, 3))
 
+
+def _variance(samples: Samples, slope: float, shape: tuple[int, int], width: float) -> np.ndarray:
+    """Variance of what meets a point of a plane, two points a pitch, beyond that of the picture's
+    own slant.
+    """
     floor = 1e-9 * float(np.mean(samples.value**2))
     picture, variance = refocus(samples, slope, shape, step=2)
     for part in np.gradient(picture):
         variance = variance - (2 * part) ** 2 / 6  # a tent of a pitch to each side has 1/6
     known = np.isfinite(variance)
+    return np.where(known, np.maximum(_smooth(variance, known, width), 0) + floor, np.nan)
+
+
+def _smooth(values: np.ndarray, known: np.ndarray, width: float) -> np.ndarray:
+    """Mean of the known values around, by a Gaussian of `width` pitches of two points each."""
+    from scipy.ndimage import gaussian_filter
+
     weight = gaussian_filter(known.astype(float), 2 * width)
     with np.errstate(divide="ignore", invalid="ignore"):
-        smooth = gaussian_filter(np.where(known, variance, 0), 2 * width) / weight
-    smooth = np.where(known, np.maximum(smooth, 0) + floor, np.nan)
-    return smooth.reshape(shape[0], 2, shape[1], 2).mean(axis=(1, 3))
+        return gaussian_filter(np.where(known, values, 0.0), 2 * width) / weight
+
+
+def _uncorrelated(pictures: np.ndarray, width: float) -> np.ndarray:
+    """How little pictures (channel, row, column) of one place go together: the determinant of
+    their correlations over a Gaussian, 0 where each tells the others, 1 where none does.
+
+    Bando, Chen and Nishita, Extracting depth and matte using a color-filtered aperture, ACM
+    Transactions on Graphics 27 (2008) 134.
+    """
+    known = np.isfinite(pictures).all(axis=0)
+    values = np.where(known, pictures, 0.0)
+    count = len(values)
+    mean = [_smooth(value, known, width) for value in values]
+    moments = np.empty((*known.shape, count, count))
+    for i in range(count):
+        for j in range(i, count):
+            both = _smooth(values[i] * values[j], known, width) - mean[i] * mean[j]
+            moments[..., i, j] = moments[..., j, i] = both
+    moments = np.nan_to_num(moments) + 1e-5 * np.mean(values**2) * np.eye(count)
+    spread = np.einsum("...ii->...i", moments)
+    return np.where(known, np.linalg.det(moments) / spread.prod(axis=-1), np.nan)
 
 
 def _least(disagreement: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -178,11 +220,33 @@ def _least(disagreement: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np
 def _correction(
     samples: Samples, slope: np.ndarray, shape: tuple[int, int], width: float
 ) -> np.ndarray:
-    """By how much the slope (row, column) should change, from how the samples differ from the
-    picture p at their places: at a wrong slope v - p = ds (grad p . q), solved for ds by least
-    squares over a Gaussian of `width` pitches; at most half a unit.
+    """By how much the slope (row, column) should change, from how the samples of each colour differ
+    from the picture p at their places: at a wrong slope v - p = ds (grad p . q), solved for ds by
+    least squares over a Gaussian of `width` pitches; at most half a unit. 0 for bands, of which a
+    lenslet has one sample each.
     """
-    from scipy.ndimage import gaussian_filter, map_coordinates
+    from scipy.ndimage import gaussian_filter
+
+    if samples.channels is not None and samples.channels.wavelengths is not None:
+        return np.zeros(shape)
+    weights = np.ones(1) if samples.channels is None else samples.channels.weights
+    top, bottom = np.zeros(shape), np.zeros(shape)
+    for some, weight in zip(samples.parts(), weights, strict=True):
+        if some.any():
+            slant, square = _slants(samples.where(some), slope, shape)
+            top += weight * slant
+            bottom += weight * square
+    top, bottom = (gaussian_filter(part, width, mode="constant") for part in (top, bottom))
+    return np.clip(top / np.maximum(bottom, 1e-30 + 1e-6 * bottom.max()), -0.5, 0.5)
+
+
+def _slants(
+    samples: Samples, slope: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over the samples of each lenslet, (row, column): of (v - p)(grad p . q), and of the
+    square of (grad p . q).
+    """
+    from scipy.ndimage import map_coordinates
 
     own = _own(samples, slope)
     picture, _ = refocus(samples, own, shape, step=STEP)
@@ -195,10 +259,8 @@ def _correction(
     along = (down * samples.offset[:, 0] + right * samples.offset[:, 1]) * (STEP / samples.pitch)
     cell = np.clip((samples.centre / samples.pitch).astype(int), 0, np.array(shape) - 1)
     index = cell[:, 0] * shape[1] + cell[:, 1]
-    top, bottom = (
-        gaussian_filter(
-            np.bincount(index, w, shape[0] * shape[1]).reshape(shape), width, mode="constant"
-        )
+    first, second = (
+        np.bincount(index, w, shape[0] * shape[1]).reshape(shape)
         for w in ((samples.value - value) * along, along**2)
     )
-    return np.clip(top / np.maximum(bottom, 1e-30 + 1e-6 * bottom.max()), -0.5, 0.5)
+    return first, second

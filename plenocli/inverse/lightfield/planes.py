@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plenocli.inverse.lightfield.samples import Channels
+
 
 @dataclass(frozen=True)
 class DepthMap:
@@ -35,16 +37,41 @@ class DepthMap:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Colours:
+    """The same pictures in colour.
+
+    channels: what their channels are.
+    pictures: (plane, channel, row, column).
+    sharp: (channel, row, column), or None.
+    views: (view_row, view_column, channel, row, column), NaN where a channel has no samples; or
+        None.
+    """
+
+    channels: Channels
+    pictures: np.ndarray
+    sharp: np.ndarray | None = None
+    views: np.ndarray | None = None
+
+    def rgb(self, values: np.ndarray) -> np.ndarray:
+        """Linear sRGB (3, row, column) of a picture (channel, row, column); NaN where a channel is
+        unknown.
+        """
+        return np.tensordot(self.channels.to_rgb, values, axes=1)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LightField:
     """What refocus makes of one capture.
 
-    pictures: (plane, row, column), relative to white, several points a lenslet pitch.
+    pictures: (plane, row, column), relative to white, several points a lenslet pitch; the mean of
+        the channels where there are several.
     slopes: (plane,) px per px, rising.
     sharpness: (plane,) mean square gradient.
     distances: (plane,) m in front of the main lens, NaN beyond infinity; None without a camera.
     depth: None with fewer than three planes.
     sharp: (row, column), like a picture, everything in focus; None without known depth.
     views: (view_row, view_column, row, column), or None.
+    colours: the same in colour; None of a grey capture.
     """
 
     pictures: np.ndarray
@@ -54,6 +81,7 @@ class LightField:
     depth: DepthMap | None = None
     sharp: np.ndarray | None = None
     views: np.ndarray | None = None
+    colours: Colours | None = None
 
 
 def slope_of(

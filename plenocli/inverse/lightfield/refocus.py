@@ -9,27 +9,59 @@ STEP = 4
 """Points of a refocused picture per lenslet pitch."""
 
 
-def views(samples: Samples, count: int, shape: tuple[int, int]) -> np.ndarray:
-    """Pictures through parts of the pupil, one value a lenslet pitch.
+def views(
+    samples: Samples, count: int, shape: tuple[int, int], reach: float | None = None
+) -> np.ndarray:
+    """Pictures through parts of the pupil, one value a lenslet pitch, whatever channels samples are
+    of.
 
     samples: of one capture.
     count: parts along each side.
     shape: (rows, columns) of a picture.
+    reach: half the width of the pupil's image, px; None: as far as the samples reach.
 
     Returns (view_row, view_column, row, column), NaN where no sample is.
     """
-    reach = samples.reach() * np.sqrt(0.5)
-    edges = np.linspace(-reach, reach, count + 1)
+    half = (samples.reach() if reach is None else reach) * np.sqrt(0.5)
+    edges = np.linspace(-half, half, count + 1) * (1 + 1e-9)  # the outermost are counted
     part_of = np.digitize(samples.offset, edges) - 1
     found = np.zeros((count, count, *shape))
     for row in range(count):
         for column in range(count):
             some = (part_of[:, 0] == row) & (part_of[:, 1] == column)
-            part = Samples(
-                samples.centre[some], samples.offset[some], samples.value[some], samples.pitch
+            found[row, column] = (
+                refocus(samples.where(some), 0.0, shape, step=1)[0] if some.any() else np.nan
             )
-            found[row, column] = refocus(part, 0.0, shape, step=1)[0] if some.any() else np.nan
     return found
+
+
+def views_in_colour(samples: Samples, count: int, shape: tuple[int, int]) -> np.ndarray:
+    """The views of each channel, (view_row, view_column, channel, row, column); they stand where
+    those of all samples do.
+
+    samples, count, shape: as in `views`.
+    """
+    reach = samples.reach()
+    parts = [views(samples.where(some), count, shape, reach) for some in samples.parts()]
+    return np.stack(parts, axis=2)
+
+
+def in_colour(
+    samples: Samples, slope: ArrayLike, shape: tuple[int, int], step: int = STEP
+) -> np.ndarray:
+    """The pictures of a plane in each channel, from the samples of that channel alone.
+
+    samples, slope, shape, step: as in `refocus`.
+
+    Returns (channel, step rows, step columns).
+    """
+    slope = np.asarray(slope, float)
+    return np.stack(
+        [
+            refocus(samples.where(some), slope[some] if slope.ndim else slope, shape, step)[0]
+            for some in samples.parts()
+        ]
+    )
 
 
 def refocus(

@@ -1,11 +1,29 @@
 """What the usable pixels of a capture saw, each from where it stands behind its lenslet."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Channels:
+    """Colours that samples have.
+
+    names: of the channels, letters or wavelengths.
+    to_rgb: (3, channel) linear sRGB of them, white where all are 1.
+    weights: (channel,) shares of the light that each has of white; their sum is 1.
+    wavelengths: (channel,) m, where channels are bands that each saw through a part of the pupil;
+        None for colours of pixels.
+    """
+
+    names: tuple[str, ...]
+    to_rgb: np.ndarray
+    weights: np.ndarray
+    wavelengths: np.ndarray | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Samples:
     """What the usable pixels saw.
 
@@ -13,16 +31,49 @@ class Samples:
     offset: (sample, 2) px, of the pixel from that centre.
     value: (sample,) relative to white.
     pitch: lenslet spacing, px.
+    channel: (sample,) which of `channels`; None with these.
+    channels: None for grey samples.
     """
 
     centre: np.ndarray
     offset: np.ndarray
     value: np.ndarray
     pitch: float
+    channel: np.ndarray | None = None
+    channels: Channels | None = None
 
     def reach(self) -> float:
         """Farthest usable pixel from its centre, px: half of the pupil's image."""
         return float(np.sqrt((self.offset**2).sum(axis=1).max()))
+
+    def where(self, some: np.ndarray) -> "Samples":
+        """Those of the samples that `some` (sample,) bool says."""
+        channel = None if self.channel is None else self.channel[some]
+        return replace(
+            self,
+            centre=self.centre[some],
+            offset=self.offset[some],
+            value=self.value[some],
+            channel=channel,
+        )
+
+    def parts(self) -> list[np.ndarray]:
+        """Which samples (sample,) bool each channel has; of grey ones all."""
+        if self.channels is None or self.channel is None:
+            return [np.ones(len(self.value), bool)]
+        return [self.channel == number for number in range(len(self.channels.names))]
+
+
+def joined(parts: Sequence[Samples], channels: Channels) -> Samples:
+    """Samples of all channels: one part a channel, in their order."""
+    return Samples(
+        centre=np.concatenate([part.centre for part in parts]),
+        offset=np.concatenate([part.offset for part in parts]),
+        value=np.concatenate([part.value for part in parts]),
+        pitch=parts[0].pitch,
+        channel=np.repeat(np.arange(len(parts)), [len(part.value) for part in parts]),
+        channels=channels,
+    )
 
 
 def collect(
@@ -33,9 +84,9 @@ def collect(
     pitch: float,
     threshold: float = 0.5,
 ) -> Samples:
-    """Samples of a mosaic.
+    """Grey samples of a mosaic.
 
-    signal, white: (row, column), dark taken off.
+    signal, white: (row, column), dark taken off; white is 0 where a pixel does not count.
     centres: (lenslet_row, lenslet_column, 2) px, row and column.
     valid: (lenslet_row, lenslet_column) bool.
     pitch: lenslet spacing, px.
@@ -66,8 +117,8 @@ def collect(
         & np.isfinite(signal[rows, columns])
     )
     return Samples(
-        np.broadcast_to(centres[:, :, None, None, :], offset.shape)[used],
-        offset[used],
-        signal[rows, columns][used] / level[used],
-        float(pitch),
+        centre=np.broadcast_to(centres[:, :, None, None, :], offset.shape)[used],
+        offset=offset[used],
+        value=signal[rows, columns][used] / level[used],
+        pitch=float(pitch),
     )

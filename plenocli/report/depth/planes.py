@@ -4,7 +4,7 @@ through the pupil.
 
 import numpy as np
 
-from plenocli.inverse.lightfield.planes import DepthMap, LightField
+from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.report.drawing import COLOURS, LEVEL_MAP, Figures, drawing, show_map, show_picture
 
 MOST = 9
@@ -20,10 +20,21 @@ def lightfield_figures(field: LightField) -> Figures:
     if field.depth is not None:
         figures.append((_depth(field.depth), "Where the views agree best, and how clearly."))
     if field.sharp is not None:
-        figures.append((_sharp(field.sharp), "Everything in focus, by the depth map."))
+        colours = field.colours
+        sharp = _seen(field.colours, field.sharp, None if colours is None else colours.sharp)
+        figures.append((_sharp(sharp), "Everything in focus, by the depth map."))
     if field.views is not None:
-        figures.append((_views(field.views), "The scene through parts of the pupil."))
+        figures.append((_views(field), "The scene through parts of the pupil."))
     return figures
+
+
+def _seen(colours: Colours | None, grey: np.ndarray, channels: np.ndarray | None) -> np.ndarray:
+    """A picture (row, column), or (row, column, 3) of its channels where there are some; what is
+    unknown of a channel counts as none.
+    """
+    if colours is None or channels is None:
+        return grey
+    return np.moveaxis(colours.rgb(np.nan_to_num(channels)), 0, -1)
 
 
 def _label(field: LightField, plane: int) -> str:
@@ -38,7 +49,7 @@ def _top(values: np.ndarray) -> float:
 
 
 def _planes(field: LightField) -> bytes:
-    pictures = field.pictures
+    pictures, colours = field.pictures, field.colours
     chosen = np.unique(
         np.linspace(0, len(pictures) - 1, min(len(pictures), MOST)).round().astype(int)
     )
@@ -50,7 +61,9 @@ def _planes(field: LightField) -> bytes:
         for axes in panels[len(chosen) :]:
             axes.set_visible(False)
         for axes, plane in zip(panels, chosen):
-            show_picture(axes, pictures[plane] / _top(pictures), _label(field, plane))
+            own = None if colours is None else colours.pictures[plane]
+            shown = _seen(colours, pictures[plane], own)
+            show_picture(axes, shown / _top(pictures), _label(field, plane))
     return made.png
 
 
@@ -102,12 +115,19 @@ def _sharp(picture: np.ndarray) -> bytes:
     return made.png
 
 
-def _views(values: np.ndarray) -> bytes:
+def _views(field: LightField) -> bytes:
+    values, colours = field.views, field.colours
+    assert values is not None
     rows, columns, height, width = values.shape
+    own = None if colours is None else colours.views
+    shown = [
+        _seen(colours, values[at], None if own is None else own[at])
+        for at in np.ndindex(rows, columns)
+    ]
     with drawing(1.9 * columns, 1.9 * rows * height / width + 0.1) as made:
         for axes, picture in zip(
             made.figure.subplots(rows, columns, squeeze=False).ravel(),
-            values.reshape(-1, height, width),
+            shown,
         ):
             show_picture(axes, picture / _top(values))
     return made.png

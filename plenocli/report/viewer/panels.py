@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
     from plenocli.inverse.lightfield.planes import LightField
-    from plenocli.inverse.lightfield.samples import Samples
+    from plenocli.inverse.lightfield.samples import Channels, Samples
 
 Map = Literal["light", "level", "sign", "colour"]
 MOST_VIEWS = 15
@@ -75,10 +75,13 @@ class Stack:
 class Field:
     """A light field, focused in the page: every view is moved by slope times its place.
 
-    views: (view_row, view_column, row, column).
+    views: (view_row, view_column, channel, row, column), one channel where they are grey.
     places: (view_row,) and (view_column,), pitches that a view moves at slope 1.
     slopes: least, largest and first one.
-    planes: pictures as the file holds them, each at its slope; None without.
+    channels: names of the channels, none of grey ones.
+    to_rgb: three rows that make linear sRGB of the channels; none of grey ones.
+    planes: pictures (plane, channel, row, column) as the file holds them, each at its slope; None
+        without.
     depth: layers of the depth map, slope first; none without.
     """
 
@@ -89,6 +92,8 @@ class Field:
     slopes: list[float]
     high: float
     step: int
+    channels: list[str]
+    to_rgb: list[list[float]]
     planes: np.ndarray | None
     plane_slopes: list[float]
     plane_labels: list[str]
@@ -171,6 +176,9 @@ def picture_panels(results: Sequence[Result], truth: np.ndarray | None, most: in
         name = result.method or result.name
         name = name if len(results) == 1 or name == result.name else f"{name} ({result.name})"
         layers.append(Layer(name=name, values=values[None], high=top))
+        if result.rgb is not None and truth is None:
+            colour = thinned(result.rgb, share)[0] / top
+            layers.insert(0, Layer(name="colour", values=colour, map="colour"))
     for layer, result in zip(layers[-len(results) :], list(results), strict=True):
         if truth is not None:
             error, span = thinned(result.values - truth, share)[0], 0.0
@@ -266,13 +274,14 @@ def capture_panels(
 
 
 def _captured_field(samples: Samples, shape: tuple[int, int], name: str, most: int) -> Field:
-    reach = samples.reach()
+    reach, channels = samples.reach(), samples.channels
     across = int(np.floor(2 * reach * np.sqrt(0.5) + 1e-6)) + 1
-    count = min(across, MOST_VIEWS, max(1, int(np.sqrt(most / (shape[0] * shape[1])))))
-    views = focus.views(samples, count, shape)
-    return _field(
-        name, views, view_places(count, 2 * reach, samples.pitch), slopes=[-3.0, 3.0, 0.0]
-    )
+    across = across if channels is None else max(1, across // 2)  # a colour has every other pixel
+    each = shape[0] * shape[1] * len(samples.parts())
+    count = min(across, MOST_VIEWS, max(1, int(np.sqrt(most / each))))
+    views = focus.views_in_colour(samples, count, shape)
+    places = view_places(count, 2 * reach, samples.pitch)
+    return _field(name, views, places, slopes=[-3.0, 3.0, 0.0], channels=channels)
 
 
 def view_places(count: int, pupil: float, pitch: float) -> list[float]:
@@ -291,10 +300,11 @@ def _field(
     places: list[float],
     *,
     slopes: list[float],
+    channels: Channels | None = None,
     field: LightField | None = None,
     most: int = 0,
 ) -> Field:
-    planes = None if field is None else field.pictures
+    planes = None if field is None else _planes(field)
     if planes is not None and planes.size > most:
         planes = thinned(planes, most)[0]
     return Field(
@@ -305,7 +315,9 @@ def _field(
         places=[places, places],
         slopes=slopes,
         high=_top(views),
-        step=max(1, min(focus.STEP, 480 // max(views.shape[2:]))),
+        step=max(1, min(focus.STEP, 480 // max(views.shape[3:]))),
+        channels=[] if channels is None else list(channels.names),
+        to_rgb=[] if channels is None else channels.to_rgb.tolist(),
         planes=planes,
         plane_slopes=[] if field is None else field.slopes.tolist(),
         plane_labels=[] if field is None else _plane_labels(field),
@@ -313,10 +325,15 @@ def _field(
     )
 
 
+def _planes(field: LightField) -> np.ndarray:
+    """(plane, channel, row, column)."""
+    return field.pictures[:, None] if field.colours is None else field.colours.pictures
+
+
 def _plane_labels(field: LightField) -> list[str]:
     distances = np.full(len(field.slopes), np.nan) if field.distances is None else field.distances
     return [
-        f"slope {slope:.3g}" + (f", {format_length(float(d))}" if np.isfinite(d) else "")
+        f"slope {slope:.3g}" + (f", {1e3 * d:.4g} mm" if np.isfinite(d) else "")
         for slope, d in zip(field.slopes, distances, strict=True)
     ]
 
@@ -343,12 +360,25 @@ def lightfield_panels(
     if slopes[0] == slopes[1]:
         slopes = [slopes[0] - 1, slopes[1] + 1]
     if field.views is not None:
-        views, block = thinned(field.views, most // 2)
+        colours = field.colours
+        seen = field.views[:, :, None] if colours is None else colours.views
+        assert seen is not None  # views in colour are kept where grey ones are
+        views, block = thinned(seen, most // 2)
         places = [place / block for place in view_places(len(views), *size)]
-        return [_field(name, views, places, slopes=[*slopes, first], field=field, most=most // 2)]
+        channels = None if colours is None else colours.channels
+        made = _field(
+            name,
+            views,
+            places,
+            slopes=[*slopes, first],
+            channels=channels,
+            field=field,
+            most=most // 2,
+        )
+        return [made]
     planes, block = thinned(field.pictures, most)
     layers = [Layer(name="plane", values=planes, high=_top(planes))]
-    made: list[Panel] = [
+    panels: list[Panel] = [
         Stack(
             title=name,
             caption="Planes of the capture.",
@@ -359,8 +389,8 @@ def lightfield_panels(
     ]
     depth = _depth_layers(field)
     if depth:
-        made.append(Stack(title=f"{name}, depth", caption="Depth.", layers=depth, labels=[]))
-    return made
+        panels.append(Stack(title=f"{name}, depth", caption="Depth.", layers=depth, labels=[]))
+    return panels
 
 
 def volume_panels(volume: StoredVolume, name: str, most: int) -> list[Panel]:

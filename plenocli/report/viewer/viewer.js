@@ -87,6 +87,20 @@
         }
       }
     }
+    /** Channels that follow each other in `values`, as colour: rows of `rgb` make R, G and B of them; what is unknown of a channel counts as none. */
+    paintChannels(values, start, rgb, high, gain) {
+      const { pixels } = this, size = this.rows * this.cols, count = rgb[0].length, top = SHADES - 1, scale = top * gain / (high || 1);
+      for (let i = 0; i < size; i++) {
+        let r = 0, g = 0, b = 0, known = false;
+        for (let k = 0, at = start + i; k < count; k++, at += size) {
+          const v = values[at];
+          if (v === v) { known = true; r += rgb[0][k] * v; g += rgb[1][k] * v; b += rgb[2][k] * v; }
+        }
+        if (!known) { pixels[i] = UNKNOWN; continue; }
+        r *= scale; g *= scale; b *= scale;
+        pixels[i] = 0xff000000 | (MAPS.light[b <= 0 ? 0 : b >= top ? top : b | 0] & 0xff0000) | (MAPS.light[g <= 0 ? 0 : g >= top ? top : g | 0] & 0xff00) | (MAPS.light[r <= 0 ? 0 : r >= top ? top : r | 0] & 0xff);
+      }
+    }
     show() { this.pen.putImageData(this.image, 0, 0); }
     /** Row and column under the pointer, whole numbers within the picture. */
     at(event) {
@@ -294,17 +308,18 @@
   class Field extends Panel {
     constructor(data) {
       super(data);
-      const [vr, vc, rows, cols] = data.views.shape;
-      Object.assign(this, { vr, vc, rows, cols, slope: data.slopes[2], view: [vr >> 1, vc >> 1], plane: 0, pull: [0, 0] });
+      const [vr, vc, channels, rows, cols] = data.views.shape;
+      Object.assign(this, { vr, vc, channels, rows, cols, slope: data.slopes[2], view: [vr >> 1, vc >> 1], plane: 0, pull: [0, 0] });
       const step = (this.step = data.step);
       this.layer = { low: 0, high: data.high, map: "light" };
       this.sums = new Float32Array(rows * step * cols * step); this.weights = this.sums.slice(); this.spare = this.sums.slice();
+      this.made = new Float32Array(channels * this.sums.length);
       this.modes = {
         refocus: new Picture(rows * step, cols * step, { smooth: true }),
         views: new Picture(rows, cols),
       };
       if (data.planes) {
-        this.modes.planes = new Picture(data.planes.shape[1], data.planes.shape[2], { smooth: true });
+        this.modes.planes = new Picture(data.planes.shape[2], data.planes.shape[3], { smooth: true });
         const nearest = data.plane_slopes.map((s) => Math.abs(s - this.slope));
         this.plane = nearest.indexOf(Math.min(...nearest));
       }
@@ -335,7 +350,11 @@
     }
     /** The picture of a plane: each value of a view is spread bilinearly where it meets the plane, then smoothed over a pitch. */
     refocus() {
-      const { rows, cols, step, vr, vc, sums, weights, data } = this, views = data.views.values;
+      for (let channel = 0; channel < this.channels; channel++) this.made.set(this.focused(channel), channel * this.sums.length);
+      return this.made;
+    }
+    focused(channel) {
+      const { rows, cols, step, vr, vc, channels, sums, weights, data } = this, views = data.views.values;
       const R = rows * step, C = cols * step;
       sums.fill(0); weights.fill(0);
       for (let i = 0; i < vr; i++) {
@@ -350,7 +369,7 @@
             for (let r = 0; r < rows; r++) {
               const row = r * step + dr;
               if (row < 0 || row >= R) continue;
-              let from = ((i * vc + j) * rows + r) * cols + first, to = row * C + first * step + dc;
+              let from = (((i * vc + j) * channels + channel) * rows + r) * cols + first, to = row * C + first * step + dc;
               for (let c = first; c <= last; c++, from++, to += step) {
                 const v = views[from];
                 if (v === v) { sums[to] += share * v; weights[to] += share; }
@@ -380,13 +399,18 @@
         for (let i = from; i < to; i++) values[i] += w * spare[i + o * C];
       }
     }
+    /** Where the first channel of what is shown begins. */
+    start() {
+      const picture = this.modes[this.mode], number = { refocus: 0, planes: this.plane, views: this.view[0] * this.vc + this.view[1] }[this.mode];
+      return number * this.channels * picture.rows * picture.cols;
+    }
     draw() {
-      const { data, mode } = this, picture = this.modes[mode], size = this.rows * this.cols;
+      const { data, mode } = this, picture = this.modes[mode];
       for (const [name, one] of Object.entries(this.modes)) one.box.hidden = name !== mode;
       for (const button of this.buttons) button.setAttribute("aria-pressed", button.dataset.mode === mode);
-      if (mode === "refocus") picture.paint(this.refocus(), 0, this.layer, this.gain);
-      else if (mode === "planes") picture.paint(data.planes.values, this.plane * picture.rows * picture.cols, this.layer, this.gain);
-      else picture.paint(data.views.values, (this.view[0] * this.vc + this.view[1]) * size, this.layer, this.gain);
+      const values = mode === "refocus" ? this.refocus() : mode === "planes" ? data.planes.values : data.views.values;
+      if (data.to_rgb.length) picture.paintChannels(values, this.start(), data.to_rgb, data.high, this.gain);
+      else picture.paint(values, this.start(), this.layer, this.gain);
       picture.show();
       this.focus.text.textContent = mode === "views" ? `view (${this.view.join(", ")}) of ${this.vr} × ${this.vc}` : `slope ${this.slope.toFixed(2)}`;
       this.stored.text.textContent = data.plane_labels[this.plane] || "";
@@ -423,9 +447,9 @@
     }
     tell(r, c) {
       const { mode, data } = this, picture = this.modes[mode];
-      const start = mode === "planes" ? this.plane * picture.rows * picture.cols : (this.view[0] * this.vc + this.view[1]) * this.rows * this.cols;
-      const value = (mode === "refocus" ? this.sums : mode === "planes" ? data.planes.values : data.views.values)[(mode === "refocus" ? 0 : start) + r * picture.cols + c];
-      this.readout.textContent = `row ${r}, column ${c}: ${told(value)}`;
+      const values = mode === "refocus" ? this.made : mode === "planes" ? data.planes.values : data.views.values;
+      const found = [...Array(this.channels).keys()].map((k) => told(values[this.start() + (k * picture.rows + r) * picture.cols + c]));
+      this.readout.textContent = `row ${r}, column ${c}: ${found.map((v, k) => (data.channels[k] ? data.channels[k] + " " : "") + v).join(" · ")}`;
     }
     key(k) {
       const turn = { w: [-1, 0], s: [1, 0], a: [0, -1], d: [0, 1] }[k], mode = { f: "refocus", p: "planes", v: "views" }[k];

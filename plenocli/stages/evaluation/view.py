@@ -148,7 +148,7 @@ def _truth(truth: Path | str, result: Result) -> Any:
 def _capture(file: OpenedFile, choice: _Choice) -> list[Panel]:
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.calibrations import read_calibration
-    from plenocli.inverse.lightfield.light_field import samples_of
+    from plenocli.inverse.lightfield.gather import samples_of
     from plenocli.report.viewer.panels import capture_panels
 
     capture = read_capture(file.path)
@@ -156,7 +156,7 @@ def _capture(file: OpenedFile, choice: _Choice) -> list[Panel]:
     if choice.calibration is not None:
         calibration = read_calibration(choice.calibration, response=False)
         samples = samples_of(capture, calibration, where=choice.calibration)
-    elif capture.grid is not None and capture.cfa == "mono":
+    elif capture.grid is not None and capture.grid.shape is not None:
         samples = samples_of(capture)
     return capture_panels(capture, file.path.name, samples, choice.most)
 

@@ -26,6 +26,7 @@ from plenocli.files.read.system_matrices import (
     read_lenslet_matrix,
 )
 from plenocli.files.read.training import files_of, read_training
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
@@ -118,6 +119,7 @@ class Solved:
     negative_share: of the values, before they are clipped.
     block: points (rows, columns) of an object, None without a system matrix.
     bands: wavelengths (m) of the bands, () for one picture.
+    rgb: (3, row, column) linear sRGB of a capture whose pixels have colours; None of others.
     """
 
     found: Reconstruction
@@ -126,6 +128,7 @@ class Solved:
     negative_share: float
     block: tuple[int, int] | None = None
     bands: tuple[float, ...] = ()
+    rgb: np.ndarray | None = None
 
     def summary(self, output: Path, *, clipped: bool) -> PictureSummary:
         """What there is to tell of it once it is written to `output`."""
@@ -446,12 +449,9 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     settings = recipe.settings
     if recipe.pif is None and recipe.calibration is not None:
         choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
-        found = Reconstruction(
-            value=_white_normalised(capture, recipe.calibration),
-            method=choice.method,
-            trace=(choice,),
-        )
-        return _solved(found, settings)
+        value, rgb = _white_normalised(capture, recipe.calibration)
+        found = Reconstruction(value=value, method=choice.method, trace=(choice,))
+        return _solved(found, settings, rgb=rgb)
     estimators, method = _estimators(recipe), METHODS[settings.method]
     system = estimators.system
     data = read_superpixels(capture, system, recipe.calibration, each_pixel=method.each_pixel)
@@ -582,25 +582,39 @@ def _truth(
     return to_blocks(picture, shape)
 
 
-def _white_normalised(capture: Path, calibration: Path) -> np.ndarray:
+def _white_normalised(capture: Path, calibration: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the
-    white reference; 0 where it cannot be had.
+    white reference; 0 where it cannot be had. Of pixels with colours also linear sRGB (3,
+    lenslet_row, lenslet_column), each colour's sum over its own of white.
 
     Pixels that the calibration masked (dead, or under dust) are left out of both sums.
     """
     from plenocli.files.images.mosaic import read_capture
+    from plenocli.forward.sensor.cfa import cfa_map
+    from plenocli.forward.sensor.superpixel import extract
 
-    signal, white = windows_of(read_capture(capture), read_white(calibration))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        usable = np.isfinite(signal) & np.isfinite(white)
-        value = np.where(usable, signal, 0).sum(axis=2) / np.where(usable, white, 0).sum(axis=2)
+    shot, known = read_capture(capture), read_white(calibration)
+    signal, white = windows_of(shot, known)
+    usable = np.isfinite(signal) & np.isfinite(white)
+
+    def share(counted: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(counted, signal, 0).sum(2) / np.where(counted, white, 0).sum(2)
+
+    value, rgb = share(usable), None
     lost = ~np.isfinite(value)
+    if shot.cfa != "mono" and not set("RGB") - set(shot.cfa):
+        windows = there(known.windows)
+        colour = cfa_map((shot.shape[0], shot.shape[1]), shot.cfa)
+        places = [extract(colour == letter, windows.origin, windows.shape) == 1 for letter in "RGB"]
+        own = np.nan_to_num(np.stack([share(usable & place) for place in places]), posinf=0.0)
+        rgb = own if shot.profile is None else np.tensordot(shot.profile.to_rgb, own, axes=1)
     if lost.any():
         note(
             f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the "
             "sensor or are dark; they are 0 in the picture"
         )
-    return np.where(lost, 0, value)
+    return np.where(lost, 0, value), rgb
 
 
 def _inputs(
@@ -654,6 +668,7 @@ def _write_exr(
         )
     else:
         channels = {"Y": picture} | ({} if sigma is None else {"sigma": sigma})
+        channels |= {} if solved.rgb is None else dict(zip("RGB", solved.rgb))
         channels = {name: values.astype(np.float32) for name, values in channels.items()}
         write_exr(target, channels, attrs, overwrite=overwrite)
 
@@ -668,6 +683,7 @@ def _write_artefact(
     data |= {} if sigma is None else {"image/sigma": sigma}
     data |= {} if solved.seen is None else {"image/seen": solved.seen.by_point}
     data |= {"image/wavelength": np.array(solved.bands)} if picture.ndim == 3 else {}
+    data |= {} if solved.rgb is None else {"image/rgb": solved.rgb}
     attrs: dict[str, Any] = {
         "method": solved.found.method,
         "parameters": {k: v for k, v in summary.told().items() if k != "method"},

@@ -14,6 +14,7 @@ from plenocli.base.errors import UsageError
 if TYPE_CHECKING:
     from plenocli.inverse.lightfield.light_field import Optics
     from plenocli.inverse.lightfield.planes import DepthMap
+    from plenocli.inverse.lightfield.samples import Samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +74,9 @@ def run_refocus(
     from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
-    from plenocli.files.images.mosaic import read_capture
-    from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.read.cameras import read_camera
     from plenocli.files.results.lightfields import lightfield_artefact
-    from plenocli.inverse.lightfield.light_field import WIDER, Optics, refocused, samples_of
+    from plenocli.inverse.lightfield.light_field import WIDER, Optics, refocused
 
     output = Path(output)
     check_output(
@@ -85,14 +84,8 @@ def run_refocus(
     )
     optics = None if camera is None else Optics.of(read_camera(camera))
     tried = _slopes(slopes, distances, planes, optics)
-    found = None if calibration is None else read_calibration(calibration, response=False)
     grow = not (slopes or distances)
-    samples, shape = samples_of(
-        read_capture(capture),
-        found,
-        planes=len(tried) * (WIDER if grow else 1),
-        where=calibration,
-    )
+    samples, shape = _samples(capture, calibration, len(tried) * (WIDER if grow else 1))
     field = refocused(samples, shape, tried, views=views, optics=optics, grow=grow)
     known, beyond = _told(field.depth, field.slopes)
     inputs = describe_inputs({"capture": capture, "calibration": calibration, "camera": camera})
@@ -114,6 +107,32 @@ def run_refocus(
         depth_known_share=known,
         depth_beyond_share=beyond,
     )
+
+
+def _samples(
+    capture: Path | str, calibration: Path | str | None, planes: int
+) -> tuple[Samples, tuple[int, int]]:
+    """Samples of a capture, or of spectra that demux made of one, and the shape of a picture."""
+    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.opened_file import open_file
+    from plenocli.files.read.calibrations import read_calibration
+    from plenocli.files.results.results import read_result
+    from plenocli.inverse.lightfield.gather import samples_of, samples_of_spectra
+
+    if open_file(capture).kind == "spectra":
+        if calibration is None:
+            raise UsageError(
+                "holds spectra, and the calibration knows through which part of the pupil each "
+                "band came",
+                capture,
+                "give --calibration, the one of demux",
+            )
+        spectra = read_result(capture, ("spectra",))
+        assert spectra.wavelengths is not None
+        known = read_calibration(calibration)
+        return samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
+    found = None if calibration is None else read_calibration(calibration, response=False)
+    return samples_of(read_capture(capture), found, planes=planes, where=calibration)
 
 
 def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:

@@ -69,3 +69,19 @@ def test_a_blurred_volume_is_told_from_a_sharp_one(truth):
 def test_what_cannot_be_compared_is_refused(truth, other):
     with pytest.raises(InputError):
         score_volume(other, truth, SPACING)
+
+
+def test_beads_are_as_wide_as_their_blur_is():
+    """Gaussians: 2.3548 standard deviations wide at half their height."""
+    places = np.zeros((32, 60, 60))
+    places[[8, 16, 24], [12, 30, 45], [40, 15, 44]] = 1
+    truth = gaussian_filter(places, 1.0)
+    score = score_volume(gaussian_filter(places, (3.0, 2.0, 2.0)), truth, SPACING)
+    assert score.beads.bead_depth_m == pytest.approx(2.3548 * 3e-6, rel=0.02)
+    assert score.beads.bead_width_m == pytest.approx(2.3548 * 2 * 0.5e-6, rel=0.02)
+    sheet = np.zeros_like(places)
+    sheet[16] = 1
+    assert (
+        score_volume(gaussian_filter(sheet, 1.0), gaussian_filter(sheet, 1.0), SPACING).beads
+        is None
+    )

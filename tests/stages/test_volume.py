@@ -1,5 +1,6 @@
 """Volumes through their files: kernels, captures, OME-TIFF."""
 
+import csv
 import xml.etree.ElementTree as tree
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import pytest
 import tifffile
 from PIL import Image
 
-from plenocli.base.errors import InputError, UsageError
+from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import collected_notes
+from plenocli.cli.sections import read_options
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_ome_tiff
 from plenocli.files.results.stacks import read_stack
@@ -22,6 +24,7 @@ from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
 from plenocli.stages.inverse.refocus import run_refocus
 from plenocli.stages.inverse.volume import run_volume
+from plenocli.stages.sweep.sweep import run_sweep
 
 MICROSCOPE = """
 [objective]
@@ -264,6 +267,54 @@ def test_what_is_no_tiff_is_told(tmp_path, content):
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(InputError):
         read_tiff_volume(tmp_path / "a.tif")
+
+
+def test_lenslets_of_a_microscope_are_judged_by_the_volume_that_comes_back(tmp_path):
+    (tmp_path / "camera.toml").write_text(MICROSCOPE)
+    (tmp_path / "sweep.toml").write_text(
+        'camera = "camera.toml"\n'
+        '[vary]\n"lenslet_array.focal_length" = ["500 um", "400 um"]\n'
+        '"volume.method" = ["rl", "lmmse"]\n'
+        '[follow]\n"sensor.distance" = "lenslet_array.focal_length"\n'
+        "[simulate-pif]\naccuracy = 5e-2\n"
+        '[capture-sim]\nsnr = "40 dB"\naccuracy = 5e-2\n'
+    )
+    summary = run_sweep(tmp_path / "sweep.toml", tmp_path / "s.h5", read_options=read_options)
+    assert summary.objectives == {"volume_snr_db": "max", "object_points": "max"}
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["0"] * 4
+    assert {float(row["object_points"]) for row in rows} == {7 * 6 * 4 * 3}
+    assert all(float(row["lenslet_field_m"]) == pytest.approx(1.5e-6) for row in rows)
+    # the same by hand: captured twice finer than it is inverted
+    run_simulate_pif(tmp_path / "camera.toml", tmp_path / "k.h5", Settings(accuracy=5e-2))
+    run_capture_sim(
+        tmp_path / "camera.toml",
+        tmp_path / "c.h5",
+        Capture(snr_db=40, accuracy=5e-2, refine=2),
+        volume="phantom:beads",
+        scene_out=tmp_path / "t.h5",
+    )
+    for row, method in zip(rows[:2], ("rl", "lmmse")):
+        made = tmp_path / f"{method}.h5"
+        run_volume(tmp_path / "c.h5", made, tmp_path / "k.h5", method=method)
+        figures = run_score([made], tmp_path / "f.json", truth=tmp_path / "t.h5", overwrite=True)
+        assert float(row["volume_snr_db"]) == pytest.approx(figures.figures["volume_snr_db"])
+    assert float(rows[0]["volume_snr_db"]) != float(rows[2]["volume_snr_db"])
+
+
+def test_a_microscope_goes_through_no_other_chain(tmp_path):
+    (tmp_path / "camera.toml").write_text(MICROSCOPE)
+    text = 'camera = "camera.toml"\nchain = "spatial"\n[vary]\n"light.wavelengths" = [["500 nm"]]\n'
+    (tmp_path / "sweep.toml").write_text(text)
+    with pytest.raises(ConfigError, match="an \\[objective\\]"):
+        run_sweep(tmp_path / "sweep.toml", tmp_path / "s.h5", read_options=read_options)
+    other = text.replace("spatial", "volume").replace(
+        "camera.toml", str(Path("sample_configs/tiny.toml").resolve())
+    )
+    (tmp_path / "sweep.toml").write_text(other)
+    with pytest.raises(ConfigError, match="no \\[objective\\]"):
+        run_sweep(tmp_path / "sweep.toml", tmp_path / "s.h5", read_options=read_options)
 
 
 CAMERA = """

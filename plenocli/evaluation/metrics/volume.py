@@ -13,6 +13,10 @@ BARS = 1.959964
 """Standard deviations that hold 95 % of normal errors."""
 ALIKE = 1 / 7
 """Fourier shell correlation up to which two volumes count as alike."""
+HALF, ROUND = 0.5, 3.0
+"""Of its light, at which a bead ends, and how many times longer than wide it may be."""
+MOST_BEADS = 500
+"""That are measured."""
 BRIGHT = 0.1
 """Of the brightest voxel, from which on a voxel is the object's."""
 
@@ -26,6 +30,12 @@ DEFINITIONS = {
         "below 1/7"
     ),
     "axial_resolution_m": "the same along the axis",
+    "bead_width_m": (
+        "full width at half maximum across the axis at the truth's beads, the median: its "
+        "brightest places from which it falls to half in all directions, at most three times as "
+        "far in one as in another"
+    ),
+    "bead_depth_m": "the same along the axis",
     "volume_z_rms": "root mean square of error over stated standard deviation",
     "volume_coverage": "share of the voxels within their 95 % bars",
     "object_coverage": "the same of those above a tenth of the brightest",
@@ -44,6 +54,14 @@ class BarsScore:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BeadsScore:
+    """How wide beads are; see DEFINITIONS."""
+
+    bead_width_m: float
+    bead_depth_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class VolumeScore:
     """Figures of a volume against the truth; see DEFINITIONS. None where it has no bars, or nothing
     was put aside.
@@ -53,6 +71,7 @@ class VolumeScore:
     volume_snr_db: float
     lateral_resolution_m: float
     axial_resolution_m: float
+    beads: BeadsScore | None = None
     bars: BarsScore | None = None
     held_out_db: float | None = None
     held_out_coverage: list[float] | None = None
@@ -84,13 +103,15 @@ def score_volume(
     if not (np.ptp(found) > 0 and np.ptp(known) > 0):
         raise InputError("is the same everywhere, or its truth is", fix="check both files")
     scale = float((found * known).sum() / (found**2).sum())
-    error = scale * found - known
+    power = float((known**2).mean())
+    missed = max(float(((scale * found - known) ** 2).mean()), 1e-30 * power)
     lateral, axial = resolutions(found, known, spacing)
     return VolumeScore(
         volume_correlation=float(np.corrcoef(found.ravel(), known.ravel())[0, 1]),
-        volume_snr_db=float(10 * np.log10((known**2).mean() / (error**2).mean())),
+        volume_snr_db=float(10 * np.log10(power / missed)),
         lateral_resolution_m=lateral,
         axial_resolution_m=axial,
+        beads=_beads(found, known, spacing),
         bars=None if sigma is None else _bars(found - known, known, sigma.astype(float)),
         held_out_db=held_out_db,
         held_out_coverage=held_out_coverage,
@@ -105,6 +126,46 @@ def _bars(error: np.ndarray, truth: np.ndarray, sigma: np.ndarray) -> BarsScore:
         volume_coverage=float(np.mean(z < BARS)),
         object_coverage=float(np.mean(z[bright] < BARS)) if bright.any() else float("nan"),
     )
+
+
+def _beads(
+    found: np.ndarray, truth: np.ndarray, spacing: tuple[float, float, float]
+) -> BeadsScore | None:
+    """Widths of a volume where the truth has beads; None where it has none."""
+    from scipy.ndimage import maximum_filter
+
+    peaks = (truth == maximum_filter(truth, 5)) & (truth > HALF * truth.max())
+    widths = []
+    for place in np.argwhere(peaks)[:MOST_BEADS]:
+        true = _widths(truth, place, spacing)
+        if np.all(np.isfinite(true)) and true.max() <= ROUND * true.min():
+            widths.append(_widths(found, place, spacing))
+    if not widths:
+        return None
+    depth, rows, columns = np.nanmedian(np.where(np.isfinite(widths), widths, np.nan), axis=0)
+    return BeadsScore(bead_width_m=float(np.sqrt(rows * columns)), bead_depth_m=float(depth))
+
+
+def _widths(
+    volume: np.ndarray, place: np.ndarray, spacing: tuple[float, float, float]
+) -> np.ndarray:
+    """Full widths at half maximum (3,) m through the voxel at `place`; infinite where the volume
+    ends before.
+    """
+    widths = []
+    for axis, step in enumerate(spacing):
+        line = np.moveaxis(volume, axis, 0)[(slice(None), *np.delete(place, axis))]
+        middle = int(place[axis])
+        half, width = HALF * line[middle], 0.0
+        for side in (line[middle::-1], line[middle:]):
+            below = np.flatnonzero(side <= half)
+            if not below.size or half <= 0:
+                width = np.inf
+                break
+            last = int(below[0])
+            width += last - (half - side[last]) / (side[last - 1] - side[last])
+        widths.append(width * step)
+    return np.array(widths)
 
 
 def resolutions(

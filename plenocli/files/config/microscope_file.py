@@ -5,9 +5,10 @@ import re
 from pathlib import Path
 
 from plenocli.base.toml import parse_toml
-from plenocli.files.config.camera_file import section_lines
+from plenocli.files.config.camera_file import section_lines, to_toml
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.microscope import Microscope
+from plenocli.forward.camera.model import Camera
 
 _OBJECTIVE = re.compile(r"^\s*\[\s*objective\s*\]", re.MULTILINE)
 
@@ -44,3 +45,8 @@ def parse_microscope(text: str, where: str | os.PathLike[str] = "camera") -> Mic
 def microscope_toml(microscope: Microscope) -> str:
     """TOML text of a resolved microscope; deterministic."""
     return section_lines(microscope.model_dump(exclude_none=True))
+
+
+def description_toml(camera: Camera | Microscope) -> str:
+    """TOML text of a resolved description, whichever it is; deterministic."""
+    return microscope_toml(camera) if isinstance(camera, Microscope) else to_toml(camera)

@@ -28,6 +28,7 @@ from plenocli.base.units import (
     parse_length,
 )
 from plenocli.files.config.toml_file import read_text
+from plenocli.forward.camera.microscope import Microscope
 from plenocli.forward.camera.model import Camera
 
 STAGES = (
@@ -38,6 +39,7 @@ STAGES = (
     "calibrate",
     "demux",
     "refocus",
+    "volume",
     "score",
 )
 """Stages whose options may be set and varied."""
@@ -132,7 +134,8 @@ class Sweep(Section):
         capture-sim, simulate-response or calibrate, demux, score); default by whether the camera
         has a filter array. "joint" (both: a chart demultiplexed and a picture reconstructed in
         bands), "expected" (simulate-response and what it lets expect of score's classes, nothing
-        captured) and "depth" (capture-sim, refocus, score) only where it is named.
+        captured) and "depth" (capture-sim, refocus, score) only where it is named; "volume"
+        (simulate-pif, capture-sim, volume, score) where the camera has an [objective].
     design: how points are chosen.
     samples: how many points a Latin hypercube has.
     vary: key -> values or range.
@@ -144,7 +147,7 @@ class Sweep(Section):
     """
 
     camera: FileName
-    chain: Literal["spatial", "spectral", "joint", "expected", "depth"] | None = None
+    chain: Literal["spatial", "spectral", "joint", "expected", "depth", "volume"] | None = None
     design: Literal["grid", "latin-hypercube", "list"] = "grid"
     samples: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = None
     vary: dict[str, Any] = {}
@@ -284,10 +287,14 @@ def unknown_key(key: str) -> str | None:
     path = key.split(".")
     if len(path) < 2:
         return f"{key}: write section.key, such as main_lens.f_number or reconstruct.method"
+    kinds = [kind for kind in (Camera, Microscope) if path[0] in kind.model_fields]
     for depth, name in enumerate(path):
         if name.isdigit() or name == "*":
             continue
-        known = known_keys(path[:depth], Camera) if depth else [*Camera.model_fields, *STAGES]
+        known = [key for kind in kinds for key in known_keys(path[:depth], kind)]
+        if not depth:
+            known = [*Camera.model_fields, *Microscope.model_fields, *STAGES]
+        known = list(dict.fromkeys(known))
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.5)
             return f"{key}: unknown key {name}; " + (

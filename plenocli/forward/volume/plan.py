@@ -13,6 +13,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.machine_rate import product_rate
+from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.lenslets import terms_for
 from plenocli.forward.volume.optics import VolumeOptics
@@ -50,7 +51,8 @@ class VolumePlan:
     error: share of a column's light that is elsewhere among the superpixels kept, as tried.
     asked: the same, asked for.
     samples: voxels (rows, columns) of a lenslet; box: points (rows, columns) that stand for one.
-    seconds, bytes: of one core of this machine, and of the kernels.
+    seconds, nominal_seconds: of one core of this machine, and of one at the nominal rate.
+    bytes: of the kernels.
     considered: (rung, error) of all that were tried.
     """
 
@@ -65,6 +67,7 @@ class VolumePlan:
     samples: tuple[int, int]
     box: int
     seconds: float
+    nominal_seconds: float
     bytes: int
     considered: tuple[tuple[str, float], ...]
 
@@ -145,13 +148,18 @@ def plan_volume(
         samples=samples,
         box=box,
         seconds=0.0,
+        nominal_seconds=0.0,
         bytes=4
         * math.prod(optics.pixels)
         * math.prod(samples)
         * sum((2 * r + 1) ** 2 for r in reach),
         considered=tuple(considered),
     )
-    return replace(plan, seconds=_seconds(optics, plan))
+    return replace(
+        plan,
+        seconds=_seconds(optics, plan, product_rate(False)),
+        nominal_seconds=_seconds(optics, plan, NOMINAL_RATE[False]),
+    )
 
 
 def _rungs(model: str, terms: int) -> list[tuple[str, tuple[int, int]]]:
@@ -230,8 +238,8 @@ def unique_places(
     ]
 
 
-def _seconds(optics: VolumeOptics, plan: VolumePlan) -> float:
-    """Of one core of this machine."""
+def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
+    """Of one core that does so many products a second."""
     places = len(unique_places(optics, plan.samples, plan.box))
     if plan.model == "ray":
         count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
@@ -244,4 +252,4 @@ def _seconds(optics: VolumeOptics, plan: VolumePlan) -> float:
         rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
         wide = (lenslets + 2 * plan.neighbours) * plan.terms
         total += 8.0 * rows * window * (wide + columns)
-    return OVERHEAD * places * total / product_rate(False)
+    return OVERHEAD * places * total / rate

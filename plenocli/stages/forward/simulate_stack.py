@@ -31,7 +31,7 @@ class StackSummary:
     reach: superpixels on each side, least and most.
     light_lost: largest share of a point's light beyond them.
     considered: rungs that were tried, with their errors.
-    seconds: of one core of this machine, as planned.
+    seconds, nominal_seconds: of one core, of this machine and at nominal rates, as planned.
     """
 
     output: str | None
@@ -44,6 +44,7 @@ class StackSummary:
     light_lost: float
     considered: tuple[tuple[str, float], ...]
     seconds: float
+    nominal_seconds: float
     bytes: int
 
     def as_json(self) -> dict[str, Any]:
@@ -206,5 +207,6 @@ def _summary(output: str | None, plan: VolumePlan) -> StackSummary:
         light_lost=max(plan.lost),
         considered=plan.considered,
         seconds=plan.seconds,
+        nominal_seconds=plan.nominal_seconds,
         bytes=plan.bytes,
     )

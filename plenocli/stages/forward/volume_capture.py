@@ -13,6 +13,7 @@ import numpy as np
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
+from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY, LONG
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -121,7 +122,6 @@ def _of_specimen(path: str | Path, settings: Settings, volume: str) -> _Recorded
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.forward.volume.cameras import optics_of
     from plenocli.forward.volume.recording import finer, record
-    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
 
     microscope = load_microscope(path)
     coarse = optics_of(microscope)
@@ -157,7 +157,6 @@ def _of_layers(
     from plenocli.forward.volume.cameras import optics_of_camera
     from plenocli.forward.volume.layers import record_layers
     from plenocli.forward.volume.plan import plan_volume
-    from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY
 
     camera = read_camera(path)
     require_tiling(camera, path)
@@ -243,8 +242,9 @@ def _layer(name: str, shape: tuple[int, int], sampling: str) -> Layer:
 
 @contextmanager
 def _shown(plan: VolumePlan) -> Iterator[Callable[[int], None]]:
-    """Says how long it takes, and shows the planes that are done."""
-    note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
+    """Says how long it takes, where it is long, and shows the planes that are done."""
+    if plan.seconds > LONG:
+        note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
     with bar(None, len(plan.reach), "planes") as shown:
         yield shown.update
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from plenocli.stages.sweep.task import (
     Task,
     refused,
 )
+
+if TYPE_CHECKING:
+    from plenocli.stages.sweep.task import Description
 
 _SEEDS = {"white": 1_000_001, "classes": 2_000_001, "picture": 2_000_002}
 _DARK, _BAND = 1_000_002, 1_000_003
@@ -234,6 +237,7 @@ def _without(folder: Path, texts: Iterable[str]) -> tuple[str, ...]:
 
 def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
     from plenocli.stages.forward.simulate_pif import PifSummary, Settings, run_simulate_pif
+    from plenocli.stages.forward.simulate_stack import StackSummary
 
     start = time.process_time()
     report = run_simulate_pif(
@@ -241,7 +245,7 @@ def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
         folder / "pif.h5",
         _settings(Settings, task.options("simulate-pif")),
     )
-    assert isinstance(report, PifSummary)  # nothing was to be explained
+    assert isinstance(report, PifSummary | StackSummary)  # nothing was to be explained
     return MatrixCost(
         matrix_seconds=report.nominal_seconds,
         matrix_bytes=report.bytes,
@@ -260,7 +264,14 @@ def _settings(kind: Any, values: Options) -> Any:
 
 
 def _capture(
-    task: Task, folder: Path, name: str, pif: Path | None, *, seed: int = 0, **changes: Any
+    task: Task,
+    folder: Path,
+    name: str,
+    pif: Path | None,
+    *,
+    seed: int = 0,
+    scene_out: Path | None = None,
+    **changes: Any,
 ) -> Path:
     """Simulate one capture into the folder; `seed`: added to that of the task."""
     from plenocli.stages.forward.capture_sim import Settings, run_capture_sim
@@ -270,13 +281,22 @@ def _capture(
     own = pif is None or values.keys() & OWN_MATRIX
     made = _settings(Settings, values | {"seed": values.get("seed", 0) + seed})
     run_capture_sim(
-        folder / "camera.toml", folder / name, made, scene=scene, pif=None if own else pif
+        folder / "camera.toml",
+        folder / name,
+        made,
+        scene=scene,
+        volume=values.get("volume"),
+        pif=None if own else pif,
+        scene_out=scene_out,
     )
     return folder / name
 
 
 def _captures(task: Task, folder: Path, pif: Path | None) -> list[Path]:
     """The captures that a chain begins with."""
+    if task.chain == "volume":
+        truth = folder / "truth.h5"
+        return [_capture(task, folder, "capture.h5", None, scene_out=truth), truth]
     return [
         _capture(task, folder, f"{name}.h5", pif, seed=_SEEDS.get(name, 0), **changes)
         for name, changes in task.shown.items()
@@ -344,6 +364,17 @@ def _depth(run: _Run) -> dict[str, float]:
     return run.score("planes.h5", truth=format_length(load_camera(camera).object.distance))
 
 
+def _volume(run: _Run) -> dict[str, float]:
+    from plenocli.stages.inverse.volume import run_volume
+
+    pif = run.matrix()
+    captures = run.captures(None)
+    options = run.task.options("volume")
+    with run.stage("volume"):
+        run_volume(captures["capture"], run.folder / "volume.h5", pif, **options)
+    return run.score("volume.h5", truth=captures["truth"])
+
+
 def _spectral(run: _Run) -> dict[str, float]:
     pif = run.matrix() if run.task.needs_matrix else None
     return _spectra(run, run.captures(pif), pif)
@@ -407,6 +438,7 @@ _CHAINS = {
     "joint": _joint,
     "expected": _expected,
     "depth": _depth,
+    "volume": _volume,
 }
 
 
@@ -463,10 +495,18 @@ def _measured(task: Task, folder: Path, pif: Path | None, white: Path) -> Path:
 def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:
     """Figures of the design itself, those of DESIGN."""
     from plenocli.files.config.camera_file import load_camera
+    from plenocli.files.config.microscope_file import describes_microscope, load_microscope
 
-    camera = load_camera(camera_path)
-    array = camera.lenslet_array
-    lenslets = array.count[0] * array.count[1]
+    camera: Description
+    if describes_microscope(camera_path):
+        microscope = camera = load_microscope(camera_path)
+        planes = len(microscope.object.planes)
+        field = microscope.lenslet_array.pitch / microscope.objective.magnification
+    else:
+        photographic = camera = load_camera(camera_path)
+        array, planes = photographic.lenslet_array, 1
+        field = array.pitch * photographic.object.distance / array.distance
+    lenslets = camera.lenslet_array.count[0] * camera.lenslet_array.count[1]
     pixels, samples = camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet
     matrix = (
         {}
@@ -479,6 +519,6 @@ def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:
     return matrix | {
         "lenslets": float(lenslets),
         "sensor_pixels": float(lenslets * pixels[0] * pixels[1]),
-        "object_points": float(lenslets * samples[0] * samples[1]),
-        "lenslet_field_m": array.pitch * camera.object.distance / array.distance,
+        "object_points": float(lenslets * samples[0] * samples[1] * planes),
+        "lenslet_field_m": field,
     }

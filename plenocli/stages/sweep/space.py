@@ -26,13 +26,13 @@ from plenocli.stages.sweep.task import (
 
 if TYPE_CHECKING:
     from plenocli.files.config.sweep_file import Choice, Range, Sweep
-    from plenocli.forward.camera.model import Camera
+    from plenocli.stages.sweep.task import Description
 
 ReadOptions = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 
 _FILES = ("aperture_image", "wavefront", "prescription")
 """Keys of the main lens that name files."""
-_EXTERNAL = ("scene", "dictionary", "training", "classes", "prior")
+_EXTERNAL = ("scene", "volume", "dictionary", "training", "classes", "prior")
 """Options that may name files, or folders of spectra."""
 
 
@@ -113,11 +113,14 @@ class Space:
             capture=capture_key(task, self.files),
         )
 
-    def _camera(self, data: dict[str, Any]) -> Camera:
+    def _camera(self, data: dict[str, Any]) -> Description:
         from pydantic import ValidationError
 
         from plenocli.base.toml import violations
+        from plenocli.forward.camera.microscope import Microscope
         from plenocli.forward.camera.model import Camera
+
+        kind: type[Description] = Microscope if self.chain == "volume" else Camera
 
         lens = data.get("main_lens")
         if isinstance(lens, dict):
@@ -125,9 +128,9 @@ class Space:
                 if isinstance(lens.get(name), str):
                     lens[name] = self._digested((self.camera_path.parent / lens[name]).resolve())
         try:
-            return Camera.model_validate(data)
+            return kind.model_validate(data)
         except ValidationError as error:
-            raise violations(error, "camera", Camera) from None
+            raise violations(error, "camera", kind) from None
 
     def _digested(self, path: Path) -> str:
         """The path as text; its content is known from now on."""
@@ -178,7 +181,16 @@ def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Sp
         base = with_curves(tomllib.loads(read_text(camera_path, "camera")), camera_path.parent)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", camera_path, "mend the line") from None
-    chain = sweep.chain or ("spectral" if "filter_array" in base else "spatial")
+    usual = "spectral" if "filter_array" in base else "spatial"
+    microscope = "objective" in base
+    chain = sweep.chain or ("volume" if microscope else usual)
+    if (chain == "volume") != microscope:
+        raise ConfigError(
+            f"the camera has {'an' if microscope else 'no'} [objective]: chain {chain!r} is not "
+            "one that it goes through",
+            path,
+            "leave chain out" if microscope else "name a microscope's description as camera",
+        )
     named = [
         *sweep.options,
         *(head for key in [*sweep.varied, *sweep.set] if (head := key.partition(".")[0]) in STAGES),

@@ -32,6 +32,7 @@ FRONTS = {
     "joint": {"psnr_db": "max", "six_patch_rmse": "min"},
     "expected": {"class_accuracy_expected": "max", "rmse_expected": "min"},
     "depth": {"depth_slope_error": "min", "sensor_pixels": "min"},
+    "volume": {"volume_snr_db": "max", "object_points": "max"},
 }
 """What counts as better where the file does not say."""
 MOST_SHOWN = 20

@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from plenocli.base.errors import PlenoError
+    from plenocli.forward.camera.microscope import Microscope
     from plenocli.forward.camera.model import Camera
+
+    Description = Camera | Microscope
 
 Options = Mapping[str, Any]
 """Option -> value of one stage, JSON-able."""
@@ -31,6 +34,7 @@ CHAINS = {
     ),
     "expected": ("simulate-response", "demux", "score"),
     "depth": ("capture-sim", "refocus", "score"),
+    "volume": ("simulate-pif", "capture-sim", "volume", "score"),
 }
 """Stages of each chain, whose options may be set."""
 
@@ -91,24 +95,29 @@ class Task:
         """Whether another matrix makes the capture than inverts it."""
         if "capture-sim" not in CHAINS[self.chain]:
             return False
-        return self.chain == "depth" or bool(OWN_MATRIX & self.options("capture-sim").keys())
+        return self.chain in ("depth", "volume") or bool(
+            OWN_MATRIX & self.options("capture-sim").keys()
+        )
 
     @property
     def needs_matrix(self) -> bool:
         """Whether something is captured, or inverted, with the matrix of simulate-pif."""
         if "simulate-pif" not in CHAINS[self.chain]:
             return False
-        return "reconstruct" in CHAINS[self.chain] or not self.foreign_capture
+        inverted = {"reconstruct", "volume"} & set(CHAINS[self.chain])
+        return bool(inverted) or not self.foreign_capture
 
     @property
     def shown(self) -> dict[str, Options]:
         """What the chain captures, the first thing first: name -> options of capture-sim instead
-        of those given.
+        of those given; of a volume the capture and, in its place of one, what it shows.
 
         Where pictures and spectra are captured, --scene is the picture and --target has the
         spectra; classes that are to be told apart have a chart of their own.
         """
         given = self.options("capture-sim")
+        if self.chain == "volume":
+            return {"capture": {}, "truth": {}}
         if "demux" not in CHAINS[self.chain]:
             return {"capture": {}}
         picture = "reconstruct" in CHAINS[self.chain]
@@ -260,17 +269,20 @@ def refused(error: PlenoError) -> PointResult:
     return PointResult(status=error.exit_code, reason=str(error))
 
 
-def task_of(chain: str, camera: Camera, options: Mapping[str, Options], seed: int) -> Task:
+def task_of(chain: str, camera: Description, options: Mapping[str, Options], seed: int) -> Task:
     """The task of one point, with what the chain supposes.
 
     options: stage -> options as the command line reads them, only those given.
     seed: of captures and reconstructions, where none is given.
     """
-    from plenocli.files.config.camera_file import to_toml
+    from plenocli.files.config.microscope_file import description_toml
 
     spectra = "demux" in CHAINS[chain]
     capture: dict[str, Any] = {"seed": seed}
-    if chain == "joint":
+    if chain == "volume":
+        # finer than it is inverted
+        capture |= {"volume": "phantom:beads", "refine": 2}
+    elif chain == "joint":
         capture |= {"target": "colorchecker", "scene": "skimage:astronaut"}
     elif not options.get("capture-sim", {}).keys() & {"scene", "target"}:
         capture |= {"target": "colorchecker"} if spectra else {"scene": "skimage:astronaut"}
@@ -280,13 +292,14 @@ def task_of(chain: str, camera: Camera, options: Mapping[str, Options], seed: in
         "simulate-pif": {"spectral_step": "auto"} if banded else {},
         # auto would try several methods at every point
         "reconstruct": {"method": "lmmse", "seed": seed},
+        "volume": {"method": "rl", "seed": seed},
     }
     settings = {
         stage: {**supposed.get(stage, {}), **options.get(stage, {})}
         for stage in CHAINS[chain]
         if stage != "calibrate" or stage in options
     }
-    return Task(chain=chain, camera=to_toml(camera), settings=settings)
+    return Task(chain=chain, camera=description_toml(camera), settings=settings)
 
 
 def point_key(task: Task, files: Mapping[str, str]) -> str:
@@ -308,7 +321,7 @@ def capture_key(task: Task, files: Mapping[str, str]) -> str:
     return digest_of(asked, files) if task.foreign_capture else ""
 
 
-def matrix_key(task: Task, camera: Camera, files: Mapping[str, str]) -> str:
+def matrix_key(task: Task, camera: Description, files: Mapping[str, str]) -> str:
     """What the matrix of a point is known by: of the camera only what A depends on, so that points
     share it. "" where the chain needs none.
 

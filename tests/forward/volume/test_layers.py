@@ -45,6 +45,7 @@ PLAN = VolumePlan(
     samples=POINTS,
     box=1,
     seconds=0.0,
+    nominal_seconds=0.0,
     bytes=0,
     considered=(),
 )

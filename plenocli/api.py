@@ -53,7 +53,8 @@ from plenocli.inverse.fit.captures import believed_model, captured_lenslets
 from plenocli.inverse.fit.fit import fit_camera as fit_to_captures
 from plenocli.inverse.fit.optics import parameters_without
 from plenocli.inverse.lightfield.gather import samples_of
-from plenocli.inverse.lightfield.light_field import Optics, refocused, usual_slopes
+from plenocli.inverse.lightfield.light_field import refocused, usual_slopes
+from plenocli.inverse.lightfield.optics import Optics
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options

@@ -213,7 +213,7 @@ def test_the_page_refocuses_as_the_package_does(browser, tmp_path):
         slopes=np.array([-2.0, 2.0]),
         sharpness=np.ones(2),
         views=seen,
-        depth=DepthMap(depth, np.ones_like(depth)),
+        depth=DepthMap(slope=depth, confidence=np.ones_like(depth)),
     )
     panels = lightfield_panels(field, "wall", (pupil, pitch), 10**6)
     browser.resize(1280, 900)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-SURE = 0.4
+SURE = 0.9
 """Confidence from which on a lenslet counts."""
 
 DEFINITIONS = {

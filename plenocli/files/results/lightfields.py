@@ -29,7 +29,10 @@ def lightfield_artefact(
         data |= {
             "depth/slope": field.depth.slope,
             "depth/confidence": field.depth.confidence,
+            "depth/sigma": field.depth.sigma,
+            "depth/edge": field.depth.edge,
             "depth/distance": field.depth.distance,
+            "depth/distance_sigma": field.depth.distance_sigma,
         }
     if field.sharp is not None:
         data |= {"depth/picture": field.sharp.astype(np.float32)}
@@ -38,7 +41,13 @@ def lightfield_artefact(
     if field.colours is not None:
         data |= _colours(field.colours)
     attrs: dict[str, dict] = {
-        "refocus": {"pitch": samples.pitch, "step": STEP, "pupil": 2 * samples.reach()}
+        "refocus": {
+            "pitch": samples.pitch,
+            "step": STEP,
+            "pupil": 2 * samples.reach(),
+            "spacing": field.spacing,
+            "microscope": field.microscope or None,
+        }
     }
     if field.colours is not None:
         attrs["colour"] = {"channels": list(field.colours.channels.names)}
@@ -72,7 +81,14 @@ def lightfield_of(artefact: "Artefact") -> LightField:
     """The light field that an artefact holds."""
     data = artefact.data
     depth = (
-        DepthMap(data["depth/slope"], data["depth/confidence"], data.get("depth/distance"))
+        DepthMap(
+            slope=data["depth/slope"],
+            confidence=data["depth/confidence"],
+            sigma=data.get("depth/sigma"),
+            edge=data.get("depth/edge"),
+            distance=data.get("depth/distance"),
+            distance_sigma=data.get("depth/distance_sigma"),
+        )
         if "depth/slope" in data
         else None
     )
@@ -96,6 +112,8 @@ def lightfield_of(artefact: "Artefact") -> LightField:
         slopes=data["refocus/slope"],
         sharpness=data["refocus/sharpness"],
         distances=data.get("refocus/distance"),
+        spacing=artefact.attrs.get("refocus", {}).get("spacing"),
+        microscope=bool(artefact.attrs.get("refocus", {}).get("microscope")),
         depth=depth,
         sharp=data.get("depth/picture"),
         views=data.get("views/value"),

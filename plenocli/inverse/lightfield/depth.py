@@ -12,6 +12,16 @@ ROUNDS = 4
 """Corrections of a depth map by least squares."""
 FLAT = 0.1
 """Confidence up to which a lenslet has no texture that would tell its depth."""
+LOOKS = 20.0
+"""Half the number of independent looks at a lenslet's disagreement, found on traced scenes of six
+photographs (`pipelines/benchmarks/depth_confidence.py`); others are told as well.
+"""
+LIKELY = 0.5
+"""Confidence below which a slope is unknown."""
+LEAST_SIGMA = 0.1
+"""Of a slope: what tents, lenslets of one value and rims of the pupil leave at best."""
+EDGE = 2
+"""Lenslets to each side within which a step of the geometric limit makes an occlusion edge."""
 FEW = 0.05
 """Share of the lenslets that may lie beyond a range before it grows."""
 MOST = 12.0
@@ -32,8 +42,9 @@ def depth(
 
     Disagreement is the variance of what meets a point beyond that of the picture's own slant within
     a lenslet's width; its least value is found on a parabola, and corrected by least squares. A
-    lenslet whose views agree best on the first or the last plane lies beyond the slopes, and one
-    whose disagreement hardly changes has no texture: both are unknown, NaN with confidence 0.
+    lenslet whose views agree best on the first or the last plane lies beyond the slopes, one whose
+    disagreement hardly changes has no texture, and one may have several slopes alike: they are
+    unknown, NaN with confidence 0.
 
     docs/model.md, "Refocusing and depth".
     """
@@ -97,20 +108,59 @@ def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
 
 def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:
     """The map of the least disagreement (plane, row, column)."""
-    least, confidence = _least(disagreement, tried)
+    least, contrast = _least(disagreement, tried)
     shape = (least.shape[0], least.shape[1])
-    textured = confidence > FLAT
+    textured = contrast > FLAT
     beyond = textured & _at_edge(disagreement)
     found = least
     for _ in range(ROUNDS):
         found = np.clip(found + _correction(samples, found, shape, width), tried[0], tried[-1])
     inside = (found > tried[0]) & (found < tried[-1])
-    known = textured & ~beyond & inside
+    confidence, sigma = _certainty(disagreement, tried, found)
+    known = textured & ~beyond & inside & (confidence >= LIKELY)
+    slope = np.where(known, found, np.nan)
     return DepthMap(
-        np.where(known, found, np.nan),
-        np.where(known, np.clip(confidence, 0, 1), 0.0),
-        beyond=float(np.mean(textured & ~known)),
+        slope=slope,
+        confidence=np.where(known, confidence, 0.0),
+        sigma=np.where(known, sigma, np.nan),
+        edge=_edges(slope),
+        beyond=float(np.mean(textured & (beyond | ~inside))),
     )
+
+
+def _certainty(
+    disagreement: np.ndarray, tried: np.ndarray, found: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(probability that the slope found is within one, the geometric limit; its standard
+    deviation), (row, column) each.
+
+    Of variances D as disagreement, and LOOKS pairs of looks at them, the likelihood of a slope goes
+    with D^-LOOKS; every slope tried was as likely before. The standard deviation is that about the
+    slope found or, where planes stand too far apart to tell, of the parabola through the least.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = np.log(disagreement)
+    level = np.where(np.isfinite(level).all(axis=0), level, 0.0)
+    like = np.exp(-LOOKS * (level - level.min(axis=0)))
+    share = like / like.sum(axis=0)
+    away = tried[:, None, None] - found
+    confidence = (share * (np.abs(away) < 1)).sum(axis=0)
+    best = np.clip(level.argmin(axis=0), 1, len(tried) - 2)
+    before, least, after = (np.take_along_axis(level, (best + k)[None], 0)[0] for k in (-1, 0, 1))
+    down, up = tried[best] - tried[best - 1], tried[best + 1] - tried[best]
+    bend = 2 * ((after - least) / up - (least - before) / down) / (up + down)
+    variance = np.maximum(1 / (LOOKS * np.maximum(bend, 1e-6)), (share * away**2).sum(axis=0))
+    return np.clip(confidence, 0, 1), np.sqrt(variance + LEAST_SIGMA**2)
+
+
+def _edges(slope: np.ndarray) -> np.ndarray:
+    """Where (row, column) known slopes differ by the geometric limit or more within EDGE."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    known, size = np.isfinite(slope), 2 * EDGE + 1
+    top = maximum_filter(np.where(known, slope, -np.inf), size)
+    bottom = minimum_filter(np.where(known, slope, np.inf), size)
+    return known & (top - bottom >= 1)
 
 
 def _disagreements(

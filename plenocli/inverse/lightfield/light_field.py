@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from plenocli.inverse.lightfield import refocus as focus
 from plenocli.inverse.lightfield.depth import all_in_focus, depth, depth_in_reach
-from plenocli.inverse.lightfield.planes import Colours, LightField, distance_of, slope_of
+from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
+from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.inverse.lightfield.samples import Samples
-
-if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera
 
 RANGE = 3.0
 """Slopes from -RANGE to RANGE are searched first where no distances are given: a lenslet's width of
@@ -28,42 +25,13 @@ def usual_slopes(planes: int = 13) -> np.ndarray:
     return np.linspace(-RANGE, RANGE, planes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Optics:
-    """Distances of a camera, m: focal length of the main lens, from it to the lenslets, from these
-    to the sensor.
-    """
-
-    focal_length: float
-    image_distance: float
-    sensor_distance: float
-
-    @classmethod
-    def of(cls, camera: Camera) -> Optics:
-        """The distances of a camera."""
-        return cls(
-            focal_length=camera.main_lens.focal_length,
-            image_distance=camera.lenslet_array.distance,
-            sensor_distance=camera.sensor.distance,
-        )
-
-    def slope(self, distance: float) -> float:
-        """Of the plane at `distance` m."""
-        return slope_of(distance, self.focal_length, self.image_distance, self.sensor_distance)
-
-    def distance(self, slopes: np.ndarray) -> np.ndarray:
-        """Of planes of these slopes, m; NaN beyond infinity."""
-        found = distance_of(slopes, self.focal_length, self.image_distance, self.sensor_distance)
-        return np.where(np.isfinite(found), found, np.nan)
-
-
 def refocused(
     samples: Samples,
     shape: tuple[int, int],
     slopes: np.ndarray,
     *,
     views: int = 3,
-    optics: Optics | None = None,
+    optics: Optics | MicroscopeOptics | None = None,
     grow: bool = False,
 ) -> LightField:
     """Planes, depth map and views of the samples of a capture.
@@ -82,7 +50,7 @@ def refocused(
     elif len(slopes) >= 3:
         found = depth(samples, slopes.tolist(), shape)
     if found is not None and optics is not None:
-        found = replace(found, distance=optics.distance(found.slope))
+        found = in_metres(found, optics)
     pictures = np.stack([focus.in_colour(samples, slope, shape) for slope in slopes])
     sharp = None if found is None else all_in_focus(samples, found.slope, shape)
     seen = focus.views_in_colour(samples, views, shape) if views else None
@@ -92,6 +60,8 @@ def refocused(
         slopes=slopes,
         sharpness=np.array([focus.sharpness(p) for p in grey]),
         distances=None if optics is None else optics.distance(slopes),
+        spacing=None if optics is None else optics.spacing,
+        microscope=isinstance(optics, MicroscopeOptics),
         depth=found,
         sharp=None if sharp is None else known_mean(sharp, 0),
         views=None if seen is None else known_mean(seen, 2),
@@ -99,6 +69,15 @@ def refocused(
         if samples.channels is None
         else Colours(channels=samples.channels, pictures=pictures, sharp=sharp, views=seen),
     )
+
+
+def in_metres(depth: DepthMap, optics: Optics | MicroscopeOptics) -> DepthMap:
+    """The depth map with distances and their standard deviation."""
+    sigma = depth.sigma
+    around = None if sigma is None else np.abs(
+        optics.distance(depth.slope + sigma) - optics.distance(depth.slope - sigma)
+    ) / 2
+    return replace(depth, distance=optics.distance(depth.slope), distance_sigma=around)
 
 
 def known_mean(values: np.ndarray, axis: int) -> np.ndarray:

@@ -19,20 +19,28 @@ from numpy.typing import ArrayLike
 from plenocli.inverse.lightfield.samples import Channels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthMap:
     """Where the views agree best, (row, column) each, one value a lenslet pitch.
 
     slope: px per px, NaN where nothing is known.
-    confidence: 0 where nothing is known, towards 1 where one slope stands out.
-    distance: m in front of the main lens, NaN beyond infinity; None without a camera.
+    confidence: probability that the slope is right within one, the geometric limit; 0 where nothing
+        is known.
+    sigma: standard deviation of the slope, NaN where nothing is known; None where it was not kept.
+    edge: bool, where slopes around differ by the geometric limit or more: one thing hides another,
+        and depths are mixtures; None where it was not kept.
+    distance: m, as of the light field's planes, NaN beyond infinity; None without a camera.
+    distance_sigma: m, standard deviation of it; None where it was not kept.
     beyond: share of the map that has texture but lies beyond the slopes tried; None where it was
         not kept.
     """
 
     slope: np.ndarray
     confidence: np.ndarray
+    sigma: np.ndarray | None = None
+    edge: np.ndarray | None = None
     distance: np.ndarray | None = None
+    distance_sigma: np.ndarray | None = None
     beyond: float | None = None
 
 
@@ -67,7 +75,10 @@ class LightField:
         the channels where there are several.
     slopes: (plane,) px per px, rising.
     sharpness: (plane,) mean square gradient.
-    distances: (plane,) m in front of the main lens, NaN beyond infinity; None without a camera.
+    distances: (plane,) m in front of the main lens, NaN beyond infinity; of a microscope from the
+        plane focused on its lenslets, away from the objective; None without a camera.
+    spacing: m between lenslets as seen on the plane focused on them; None without a camera.
+    microscope: whether distances are depths before an objective.
     depth: None with fewer than three planes.
     sharp: (row, column), like a picture, everything in focus; None without known depth.
     views: (view_row, view_column, row, column), or None.
@@ -78,6 +89,8 @@ class LightField:
     slopes: np.ndarray
     sharpness: np.ndarray
     distances: np.ndarray | None = None
+    spacing: float | None = None
+    microscope: bool = False
     depth: DepthMap | None = None
     sharp: np.ndarray | None = None
     views: np.ndarray | None = None

@@ -113,12 +113,12 @@ def test_nothing_decodes_a_picture_or_a_raw_file_in_this_process(tmp_path):
 
     from plenocli.files.images.dng import write_dng
     from plenocli.files.images.exr import write_exr
-    from plenocli.files.images.tiff_stack import write_ome_tiff
+    from plenocli.files.images.tiff_stack import write_volume_tiff
 
     values = np.arange(900, dtype=np.uint16).reshape(30, 30)
     write_dng(tmp_path / "x.dng", values, cfa="RGGB", black=0, white=16383)
     write_exr(tmp_path / "x.exr", {"Y": values.astype(np.float32)})
-    write_ome_tiff(
+    write_volume_tiff(
         tmp_path / "x.tif", np.ones((2, 4, 4)), None, np.array([0.0, 1e-6]), (1e-6, 1e-6)
     )
     output = oiio.ImageOutput.create("png")

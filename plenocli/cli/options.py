@@ -92,6 +92,7 @@ LENGTH = _Quantity(
 DISTANCE = _Quantity(
     "length", parse_length, 0.0, exclusive=True, show=LENGTH.show, limits=(1e-6, 1e6)
 )
+PLANE = _Quantity("length", parse_length, show=LENGTH.show, limits=(1e-9, 1e6))
 WAVELENGTH = _Quantity("length", parse_wavelength, show=LENGTH.show)
 DECIBEL = _Quantity(
     "decibel", parse_decibel, show=lambda value: f"{value:.12g}dB", limits=(-300.0, 300.0)

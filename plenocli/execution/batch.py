@@ -37,6 +37,7 @@ def plan_batch(
     *,
     overwrite: bool,
     inputs: Sequence[str | Path | None],
+    suffixes: Sequence[str] = (".exr", ".h5"),
 ) -> Batch:
     """Where the result of each capture goes.
 
@@ -47,6 +48,7 @@ def plan_batch(
     what: the result in words, for messages, such as "spectra are".
     overwrite: results that are there already are made again, not skipped.
     inputs: all files that are read, which no result may replace.
+    suffixes: that a single result may have.
 
     Raises UsageError, OutputError.
     """
@@ -55,9 +57,10 @@ def plan_batch(
     shots, output = [Path(c) for c in captures], Path(output)
     # Path.is_dir raises where a name is too long
     if len(shots) == 1 and output.suffix and not os.path.isdir(output):
-        if output.suffix not in (".exr", ".h5"):
+        if output.suffix not in suffixes:
+            known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
             raise UsageError(
-                f"{what} written as .exr or .h5, not {output.suffix}",
+                f"{what} written as {known}, not {output.suffix}",
                 output,
                 "change the suffix of OUT",
             )

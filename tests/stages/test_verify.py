@@ -13,7 +13,7 @@ from plenocli.base.errors import InputError, OutputError, UsageError
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.mosaic import read_capture
-from plenocli.files.images.tiff_stack import read_tiff_volume, write_ome_tiff
+from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.manifest import NAME, SIGNATURE, read_manifest
 from plenocli.stages.evaluation.seal import EDITED, run_seal
 from plenocli.stages.evaluation.verify import run_verify
@@ -169,7 +169,7 @@ def test_a_volume_for_other_programs_is_sealed_and_the_same_each_time(tmp_path):
     paths = [tmp_path / f"{name}.ome.tif" for name in "ab"]
     value = np.random.default_rng(2).random((3, 8, 9)).astype(np.float32)
     for path in paths:
-        write_ome_tiff(path, value, value, np.arange(3) * 1e-6, (1e-6, 1e-6))
+        write_volume_tiff(path, value, value, np.arange(3) * 1e-6, (1e-6, 1e-6))
     content = paths[0].read_bytes()
     assert content == paths[1].read_bytes()
     run_verify(paths[0])

@@ -14,7 +14,7 @@ from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
 from plenocli.files.images.mosaic import read_capture
-from plenocli.files.images.tiff_stack import read_tiff_volume, write_ome_tiff
+from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
 from plenocli.stages.evaluation.score import run_score
@@ -240,7 +240,7 @@ def test_ome_tiff_is_what_another_reader_reads(tmp_path):
     rng = np.random.default_rng(1)
     value, sigma = rng.random((2, 4, 9, 7)).astype(np.float32)
     depth = np.array([-3, -1, 1, 3]) * 1e-6
-    write_ome_tiff(tmp_path / "v.ome.tif", value, sigma, depth, (0.5e-6, 0.25e-6))
+    write_volume_tiff(tmp_path / "v.ome.tif", value, sigma, depth, (0.5e-6, 0.25e-6))
     planes, number = [], 0
     while True:
         source = oiio.ImageInput.open(str(tmp_path / "v.ome.tif"))

@@ -1043,7 +1043,11 @@ LIGHTFIELD = Schema(
             attribute("step", "number", "1", "points of a picture per pitch"),
             attribute("pupil", "number", "px", "width of the pupil's image"),
             attribute(
-                "spacing", "number", "m", "of lenslets as seen on the plane focused on them", minimum=0
+                "spacing",
+                "number",
+                "m",
+                "of lenslets as seen on the plane focused on them",
+                minimum=0,
             ),
             attribute("microscope", "json", "", "whether distances are depths before an objective"),
             _NOTES,

@@ -1,14 +1,15 @@
-"""Volumes as TIFF: OME-TIFF with voxel sizes for Fiji and its kin, and stacks of any program."""
+"""Stacks as TIFF: OME-TIFF with sizes for Fiji and its kin, and volumes of any program."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,7 +38,73 @@ class TiffVolume:
     spacing: tuple[float, float] | None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """One image of an OME-TIFF, a stack of pictures of one size.
+
+    name: of the image.
+    values: (plane, channel, row, column).
+    channels: their names.
+    spacing: m between rows and columns; None where nobody says.
+    positions: (plane,) m along the axis, in order; None where nobody says.
+    along: what the planes go along: "Z" through space, "T" otherwise.
+    """
+
+    name: str
+    values: np.ndarray
+    channels: list[str]
+    spacing: tuple[float, float] | None = None
+    positions: np.ndarray | None = None
+    along: str = "Z"
+
+    def metadata(self) -> dict[str, Any]:
+        """What OME-XML says of it, in micrometres."""
+        found: dict[str, Any] = {
+            "axes": f"{self.along}CYX",
+            "Name": self.name,
+            "Channel": {"Name": self.channels},
+        }
+        if self.spacing is not None:
+            for axis, size in zip("YX", self.spacing):
+                found |= {f"PhysicalSize{axis}": size * 1e6, f"PhysicalSize{axis}Unit": "µm"}
+        if self.positions is not None and np.isfinite(self.positions).all():
+            count = len(self.channels)
+            if len(self.positions) > 1:
+                step = float(np.mean(np.abs(np.diff(self.positions))))
+                found |= {"PhysicalSizeZ": step * 1e6, "PhysicalSizeZUnit": "µm"}
+            where = np.repeat(self.positions * 1e6, count).tolist()
+            found["Plane"] = {"PositionZ": where, "PositionZUnit": ["µm"] * len(where)}
+        return found
+
+
 def write_ome_tiff(
+    path: str | os.PathLike, series: Sequence[Series], *, overwrite: bool = False
+) -> None:
+    """Write an OME-TIFF of float32: the same images give the same bytes.
+
+    Raises UsageError where the file exists, OutputError where it cannot be written.
+    """
+    import tifffile
+
+    digest = hashlib.sha256()
+    planes = [np.ascontiguousarray(one.values, dtype=np.float32) for one in series]
+    for values in planes:
+        digest.update(values.tobytes())
+    # else it has the clock and the machine in it
+    name = uuid.uuid5(uuid.NAMESPACE_OID, digest.hexdigest()).urn
+    memory = BytesIO()
+    with tifffile.TiffWriter(memory, ome=True) as file:
+        for one, values in zip(series, planes, strict=True):
+            file.write(
+                values,
+                photometric="minisblack",
+                metadata=one.metadata() | {"UUID": name},
+                software=SEAL,
+            )
+    publish_sealed(path, [memory.getbuffer()], overwrite=overwrite)
+
+
+def write_volume_tiff(
     path: str | os.PathLike,
     value: np.ndarray,
     sigma: np.ndarray | None,
@@ -53,28 +120,16 @@ def write_ome_tiff(
 
     Raises UsageError where the file exists, OutputError where it cannot be written.
     """
-    import tifffile
-
-    channels = [value] if sigma is None else [value, sigma]
-    names = ["volume", "sigma"][: len(channels)]
-    planes = np.stack(channels).astype(np.float32)
-    metadata = {
-        "axes": "CZYX",
-        # else it has the clock and the machine in it
-        "UUID": uuid.uuid5(uuid.NAMESPACE_OID, hashlib.sha256(planes.tobytes()).hexdigest()).urn,
-        "PhysicalSizeX": spacing[1] * 1e6,
-        "PhysicalSizeXUnit": "µm",
-        "PhysicalSizeY": spacing[0] * 1e6,
-        "PhysicalSizeYUnit": "µm",
-        "Channel": {"Name": names},
-    }
-    if len(depth) > 1:
-        step = float(np.mean(np.diff(depth)))
-        metadata |= {"PhysicalSizeZ": step * 1e6, "PhysicalSizeZUnit": "µm"}
-    memory = BytesIO()
-    with tifffile.TiffWriter(memory, ome=True) as file:
-        file.write(planes, photometric="minisblack", metadata=metadata, software=SEAL)
-    publish_sealed(path, [memory.getbuffer()], overwrite=overwrite)
+    both = [value] if sigma is None else [value, sigma]
+    names = ["volume", "sigma"][: len(both)]
+    one = Series(
+        name="volume",
+        values=np.stack(both, axis=1),
+        channels=names,
+        spacing=spacing,
+        positions=np.asarray(depth, float),
+    )
+    write_ome_tiff(path, [one], overwrite=overwrite)
 
 
 def read_tiff_volume(path: str | os.PathLike) -> TiffVolume:

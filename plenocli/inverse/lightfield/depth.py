@@ -123,7 +123,7 @@ def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: f
         slope=slope,
         confidence=np.where(known, confidence, 0.0),
         sigma=np.where(known, sigma, np.nan),
-        edge=_edges(slope),
+        edge=_edges(slope, sigma),
         beyond=float(np.mean(textured & (beyond | ~inside))),
     )
 
@@ -153,13 +153,15 @@ def _certainty(
     return np.clip(confidence, 0, 1), np.sqrt(variance + LEAST_SIGMA**2)
 
 
-def _edges(slope: np.ndarray) -> np.ndarray:
-    """Where (row, column) known slopes differ by the geometric limit or more within EDGE."""
+def _edges(slope: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Where (row, column) known slopes, each nearer by its standard deviation, differ by the
+    geometric limit or more within EDGE.
+    """
     from scipy.ndimage import maximum_filter, minimum_filter
 
     known, size = np.isfinite(slope), 2 * EDGE + 1
-    top = maximum_filter(np.where(known, slope, -np.inf), size)
-    bottom = minimum_filter(np.where(known, slope, np.inf), size)
+    top = maximum_filter(np.where(known, slope - sigma, -np.inf), size)
+    bottom = minimum_filter(np.where(known, slope + sigma, np.inf), size)
     return known & (top - bottom >= 1)
 
 

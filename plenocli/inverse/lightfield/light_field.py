@@ -74,9 +74,11 @@ def refocused(
 def in_metres(depth: DepthMap, optics: Optics | MicroscopeOptics) -> DepthMap:
     """The depth map with distances and their standard deviation."""
     sigma = depth.sigma
-    around = None if sigma is None else np.abs(
-        optics.distance(depth.slope + sigma) - optics.distance(depth.slope - sigma)
-    ) / 2
+    around = (
+        None
+        if sigma is None
+        else np.abs(optics.distance(depth.slope + sigma) - optics.distance(depth.slope - sigma)) / 2
+    )
     return replace(depth, distance=optics.distance(depth.slope), distance_sigma=around)
 
 

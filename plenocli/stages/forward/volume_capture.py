@@ -254,12 +254,14 @@ def _write_truth(
 ) -> None:
     """What was recorded, as its artefact (.h5) or OME-TIFF."""
     from plenocli.files.artefacts.container import write_artefact
-    from plenocli.files.images.tiff_stack import write_ome_tiff
+    from plenocli.files.images.tiff_stack import write_volume_tiff
     from plenocli.files.results.volumes import truth_artefact
 
     if Path(path).suffix.lower() in (".tif", ".tiff"):
         rows, columns = found.spacing.mean(axis=0).tolist()
-        write_ome_tiff(path, found.volume, None, found.depth, (rows, columns), overwrite=overwrite)
+        write_volume_tiff(
+            path, found.volume, None, found.depth, (rows, columns), overwrite=overwrite
+        )
         return
     artefact = truth_artefact(found.volume, found.depth, found.spacing, provenance, found.opacity)
     write_artefact(path, artefact, overwrite=overwrite)

@@ -1,19 +1,23 @@
-"""refocus: views, pictures focused at other distances and a depth map from one capture."""
+"""refocus: views, pictures focused at other distances and depth maps of captures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import UsageError
+from plenocli.execution.batch import outcomes, plan_batch, summarise
+from plenocli.execution.pool import open_pool
 
 if TYPE_CHECKING:
-    from plenocli.inverse.lightfield.light_field import Optics
-    from plenocli.inverse.lightfield.planes import DepthMap
+    from plenocli.execution.batch import BatchSummary
+    from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
+    from plenocli.inverse.lightfield.planes import DepthMap, LightField
     from plenocli.inverse.lightfield.samples import Samples
 
 
@@ -21,7 +25,9 @@ if TYPE_CHECKING:
 class RefocusSummary:
     """What refocus made.
 
+    capture, output: files.
     lenslets: rows and columns of a picture, in lenslet pitches.
+    channels: colours or bands; none of a grey capture.
     sharpest_slope: of the plane whose picture is the sharpest, px per px.
     slopes, sharpness: of every plane.
     sharpest_distance_m: None without a camera or beyond infinity.
@@ -29,9 +35,11 @@ class RefocusSummary:
     depth_beyond_share: of the depth map, with texture but beyond the slopes tried.
     """
 
+    capture: str
     output: str
     planes: int
     lenslets: list[int]
+    channels: list[str]
     sharpest_slope: float
     slopes: list[float]
     sharpness: list[float]
@@ -44,62 +52,134 @@ class RefocusSummary:
         return asdict(self)
 
 
-def run_refocus(
-    capture: Path | str,
-    output: Path | str,
-    *,
-    calibration: Path | str | None = None,
-    camera: Path | str | None = None,
-    distances: Sequence[float] = (),
-    slopes: Sequence[float] = (),
-    planes: int = 13,
-    views: int = 3,
-    overwrite: bool = False,
-    seed: int = 0,
-    command: str = "",
-) -> RefocusSummary:
-    """Refocus one capture and write a light-field artefact.
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How captures are refocused.
 
-    capture: mosaic, raw file or capture artefact.
-    calibration: its lenslet grid and white image; a simulated capture needs none.
-    camera: description (.toml) that turns slopes into distances.
-    distances: of planes in front of the main lens, m (needs `camera`).
+    calibration: their lenslet grid and white image; a simulated capture needs none.
+    camera: description (.toml), of a photographic camera or a microscope, that turns slopes into
+        distances.
+    distances: of planes in front of the main lens, or depths before an objective, m (needs
+        `camera`).
     slopes: of planes; without either, `planes` slopes around the lenslets' own plane, and more
         of them, as far apart, while what has texture lies beyond. A depth map needs at least three
         planes.
     views: along each side, 0 for none.
-
-    Raises UsageError, InputError, OutputError.
     """
-    from plenocli.files.artefacts.container import write_artefact
-    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
-    from plenocli.files.atomic import check_output
-    from plenocli.files.read.cameras import read_camera
-    from plenocli.files.results.lightfields import lightfield_artefact
-    from plenocli.inverse.lightfield.light_field import WIDER, Optics, refocused
 
-    output = Path(output)
-    check_output(
-        output, overwrite=overwrite, inputs=[capture, calibration, camera], suffixes=(".h5",)
-    )
-    optics = None if camera is None else Optics.of(read_camera(camera))
-    tried = _slopes(slopes, distances, planes, optics)
-    grow = not (slopes or distances)
-    samples, shape = _samples(capture, calibration, len(tried) * (WIDER if grow else 1))
-    field = refocused(samples, shape, tried, views=views, optics=optics, grow=grow)
-    known, beyond = _told(field.depth, field.slopes)
-    inputs = describe_inputs({"capture": capture, "calibration": calibration, "camera": camera})
-    write_artefact(
+    calibration: Path | None = None
+    camera: Path | None = None
+    distances: tuple[float, ...] = ()
+    slopes: tuple[float, ...] = ()
+    planes: int = 13
+    views: int = 3
+
+
+def run_refocus(
+    captures: Sequence[Path | str],
+    output: Path | str,
+    settings: Settings = Settings(),
+    *,
+    suffix: str = ".h5",
+    workers: int = 1,
+    overwrite: bool = False,
+    command: str = "",
+) -> BatchSummary:
+    """Refocus captures: one gives the file `output` (.h5, OME-TIFF or .exr), several a folder with
+    one file each, in which finished ones are skipped unless overwrite. One that fails does not stop
+    the others.
+
+    captures: mosaics, raw files, capture artefacts or spectra of demux; folders and patterns of
+        them.
+    suffix: of the files in a folder.
+    workers: captures at the same time, in threads; the results do not depend on it.
+
+    Raises UsageError, InputError, OutputError; at the end, with the exit code of the worst, where
+    some of several failed.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from plenocli.files.read.captures import named_captures
+    from plenocli.files.results.lightfields import SUFFIXES
+
+    others = [settings.calibration, settings.camera]
+    captures = named_captures(captures, others)
+    batch = plan_batch(
+        captures,
         output,
-        lightfield_artefact(field, samples, Provenance(command=command, inputs=inputs, seed=seed)),
+        suffix,
+        "planes are",
         overwrite=overwrite,
+        inputs=[*captures, *others],
+        suffixes=SUFFIXES,
     )
+    if not batch.todo:
+        return summarise(batch, ())
+    optics = None if settings.camera is None else _optics(settings.camera)
+    tried = _slopes(settings, optics)
+    work = partial(_refocused, settings=settings, optics=optics, tried=tried)
+    write = partial(_write, settings=settings, overwrite=overwrite, command=command)
+    with (
+        threadpool_limits(1, "blas"),
+        open_pool(min(workers, len(batch.todo)), None, threads=True) as pool,
+    ):
+        return summarise(batch, outcomes(batch, pool, work, write))
+
+
+def _optics(camera: Path) -> Optics | MicroscopeOptics:
+    from plenocli.files.config.microscope_file import describes_microscope, load_microscope
+    from plenocli.files.read.cameras import read_camera
+    from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
+
+    if describes_microscope(camera):
+        return MicroscopeOptics.of(load_microscope(camera))
+    return Optics.of(read_camera(camera))
+
+
+def _refocused(
+    capture: Path,
+    *,
+    settings: Settings,
+    optics: Optics | MicroscopeOptics | None,
+    tried: np.ndarray,
+) -> tuple[LightField, Samples, tuple[int, int]]:
+    """The light field of one capture, what it was made from, and its lenslets."""
+    from plenocli.inverse.lightfield.light_field import WIDER, refocused
+
+    grow = not (settings.slopes or settings.distances)
+    samples, shape = _samples(capture, settings.calibration, len(tried) * (WIDER if grow else 1))
+    field = refocused(samples, shape, tried, views=settings.views, optics=optics, grow=grow)
+    return field, samples, shape
+
+
+def _write(
+    done: tuple[LightField, Samples, tuple[int, int]],
+    capture: Path,
+    target: Path,
+    *,
+    settings: Settings,
+    overwrite: bool,
+    command: str,
+) -> RefocusSummary:
+    """Write one light field."""
+    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.results.lightfields import write_lightfield
+
+    field, samples, shape = done
+    inputs = describe_inputs(
+        {"capture": capture, "calibration": settings.calibration, "camera": settings.camera}
+    )
+    provenance = Provenance(command=command, inputs=inputs, seed=0)
+    write_lightfield(target, field, samples, provenance, overwrite=overwrite)
+    known, beyond = _told(field.depth, field.slopes)
     best = int(np.argmax(field.sharpness))
     distance = np.nan if field.distances is None else float(field.distances[best])
     return RefocusSummary(
-        output=str(output),
+        capture=str(capture),
+        output=str(target),
         planes=len(field.slopes),
         lenslets=list(shape),
+        channels=[] if field.colours is None else list(field.colours.channels.names),
         sharpest_slope=float(field.slopes[best]),
         slopes=field.slopes.tolist(),
         sharpness=field.sharpness.tolist(),
@@ -110,7 +190,7 @@ def run_refocus(
 
 
 def _samples(
-    capture: Path | str, calibration: Path | str | None, planes: int
+    capture: Path, calibration: Path | None, planes: int
 ) -> tuple[Samples, tuple[int, int]]:
     """Samples of a capture, or of spectra that demux made of one, and the shape of a picture."""
     from plenocli.files.images.mosaic import read_capture
@@ -150,24 +230,30 @@ def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, flo
     return float(np.isfinite(depth.slope).mean()), beyond
 
 
-def _slopes(
-    slopes: Sequence[float], distances: Sequence[float], planes: int, optics: Optics | None
-) -> np.ndarray:
+def _slopes(settings: Settings, optics: Optics | MicroscopeOptics | None) -> np.ndarray:
     """Slopes of the planes asked for, rising, each once."""
-    if slopes and distances:
+    from plenocli.inverse.lightfield.light_field import usual_slopes
+    from plenocli.inverse.lightfield.optics import Optics
+
+    slopes: Sequence[float] = settings.slopes
+    if slopes and settings.distances:
         raise UsageError(
             "give planes as --distance or as --slope, not both", "--slope", "leave one of them out"
         )
-    if distances:
+    if settings.distances:
         if optics is None:
             raise UsageError(
                 "distances need the camera's description",
                 "--distance",
                 "give --camera, or name planes by --slope",
             )
-        slopes = [optics.slope(d) for d in distances]
+        if min(settings.distances) <= 0 and isinstance(optics, Optics):
+            raise UsageError(
+                "planes before a main lens are farther than 0",
+                "--distance",
+                "give for example 500mm",
+            )
+        slopes = [optics.slope(d) for d in settings.distances]
     elif not slopes:
-        from plenocli.inverse.lightfield.light_field import usual_slopes
-
-        slopes = usual_slopes(planes).tolist()
+        slopes = usual_slopes(settings.planes).tolist()
     return np.array(sorted(set(float(s) for s in slopes)))

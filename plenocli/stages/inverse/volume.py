@@ -169,7 +169,7 @@ def _write(
 ) -> None:
     """The volume as artefact or OME-TIFF."""
     from plenocli.files.artefacts.container import write_artefact
-    from plenocli.files.images.tiff_stack import write_ome_tiff
+    from plenocli.files.images.tiff_stack import write_volume_tiff
     from plenocli.files.results.volumes import volume_artefact
 
     if path.suffix == ".h5":
@@ -177,6 +177,6 @@ def _write(
         write_artefact(path, made, overwrite=overwrite)
         return
     rows, columns = stack.spacing.mean(axis=0).tolist()
-    write_ome_tiff(
+    write_volume_tiff(
         path, volume.value, volume.sigma, stack.depth, (rows, columns), overwrite=overwrite
     )

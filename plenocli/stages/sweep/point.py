@@ -355,12 +355,16 @@ def _picture(run: _Run, capture: Path, pif: Path) -> dict[str, float]:
 def _depth(run: _Run) -> dict[str, float]:
     from plenocli.base.units import format_length
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.stages.inverse.refocus import run_refocus
+    from plenocli.stages.inverse.refocus import Settings, run_refocus
 
     camera = run.folder / "camera.toml"
     [capture] = run.captures(None).values()
     with run.stage("refocus"):
-        run_refocus(capture, run.folder / "planes.h5", camera=camera, **run.task.options("refocus"))
+        run_refocus(
+            [capture],
+            run.folder / "planes.h5",
+            _settings(Settings, dict(run.task.options("refocus")) | {"camera": camera}),
+        )
     return run.score("planes.h5", truth=format_length(load_camera(camera).object.distance))
 
 

@@ -18,9 +18,27 @@ from plenocli.cli import options
     "--white",
     "whites",
     multiple=True,
-    required=True,
     type=options.FILE,
     help="White image: even light through the main lens. Repeatable: frames are averaged.",
+)
+@click.option(
+    "--scene",
+    "scenes",
+    multiple=True,
+    type=options.FILE,
+    help=(
+        "Capture of any scene, where there is no white image: the grid with the error to expect. "
+        "Repeatable, which makes it surer; beside a --white of another day: how lenslets moved "
+        "since."
+    ),
+)
+@click.option(
+    "--grid-error",
+    type=options.POSITIVE,
+    default=0.1,
+    show_default=True,
+    metavar="PX",
+    help="Largest expected error (rms) of a grid from --scene that is accepted.",
 )
 @click.option(
     "--dark",
@@ -98,6 +116,8 @@ def command(
     ctx: click.Context,
     *,
     whites: tuple[Path, ...],
+    scenes: tuple[Path, ...],
+    grid_error: float,
     darks: tuple[Path, ...],
     bands: tuple[tuple[float, Path], ...],
     radiances: tuple[tuple[float, float], ...],
@@ -120,6 +140,7 @@ def command(
     \b
     Examples:
       plenocli calibrate --white white.png --dark dark.png -o grid.h5
+      plenocli calibrate --scene scene.png --dark dark.png -o grid.h5
       plenocli calibrate --white w1.NEF --white w2.NEF --dark d.NEF --band 450nm=b450.NEF \\
           --band 540nm=b540.NEF -o cal.h5
       plenocli calibrate --white white.dng --band 450nm=450.dng --band-radiance 450nm=0.8 \\
@@ -134,6 +155,8 @@ def command(
         radiances=radiances,
         command=options.command_line(ctx),
         whites=whites,
+        scenes=scenes,
+        grid_error=grid_error,
         darks=darks,
         bands=bands,
         camera=camera,
@@ -149,6 +172,8 @@ def command(
         f"{summary.angle_deg:.3f} deg, {summary.lenslets} lenslets, residual "
         f"{summary.rms_px:.3f} px rms ({summary.model})"
     )
+    if summary.expected_error_px is not None:
+        line += f", expected error {summary.expected_error_px:.3f} px rms"
     if measured := summary.response:
         line += (
             f"; F: {len(measured.bands_nm)} bands, condition {measured.condition:.3g}, "

@@ -177,6 +177,7 @@ def _grid(data: Datasets, attrs: Attributes) -> LensletGrid:
         valid=data["grid/valid"].astype(bool),
         residual=data.get("grid/residual"),
         rms=float(attrs.get("rms", np.nan)),
+        expected_error=attrs.get("expected_error"),
     )
 
 
@@ -231,6 +232,7 @@ def _grid_attrs(grid: LensletGrid) -> Attributes:
         "pitch": [float(p) for p in grid.pitch],
         "angle": grid.angle,
         "rms": grid.rms,
+        "expected_error": grid.expected_error,
         "lenslets": int(grid.valid.sum()),
         "offset": [float(c) for c in grid.centres[0, 0]],
         "model": {

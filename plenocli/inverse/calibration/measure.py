@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.base.progress import bar
+from plenocli.base.progress import bar, note
 from plenocli.base.text import by
 from plenocli.forward.sensor.detector import ROUNDING, SensorModel
 from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
@@ -24,6 +24,7 @@ from plenocli.inverse.calibration.calibration import (
 from plenocli.inverse.calibration.measured_response import GatheredResponses, measured_response
 from plenocli.inverse.calibration.quality import mean_of_known
 from plenocli.inverse.grid.detect import find_grid
+from plenocli.inverse.grid.scenes import find_scene_grid, moved_grid, shifted_mosaic
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -100,6 +101,8 @@ def calibrate(
     *,
     darks: Sequence[Capture] = (),
     bands: NarrowBands | None = None,
+    scenes: Sequence[Capture] = (),
+    grid_error: float = np.inf,
     camera: Camera | None = None,
     response: str = "auto",
     lattice: str = "auto",
@@ -107,9 +110,12 @@ def calibrate(
 ) -> Measured:
     """Grid, white, dark and (from narrow-band captures) the response F of a camera.
 
-    whites: captures of an evenly lit white, at one or several exposure times.
+    whites: captures of an evenly lit white, at one or several exposure times; none: the grid comes
+        from `scenes` alone, and what all superpixels have in common there is the white reference.
     darks: captures without light.
     bands: captures under narrow-band light; None: no response.
+    scenes: captures of any scene; beside whites of another day they tell how lenslets moved since.
+    grid_error: px rms, the largest expected error of a grid from scenes that is accepted.
     camera: description, for gain and read noise, how many lenslets there are, and whether a filter
         array parts the superpixels; None: as the captures tell.
     response: "own", "shared", "low-rank" or "auto" (measured_response).
@@ -117,33 +123,37 @@ def calibrate(
     near: (row, column) px close to any superpixel's centre (plenocli.inverse.grid.detect).
 
     Raises InputError for captures that do not go together or are saturated, NumericsError where
-    there is no lattice or no light.
+    there is no lattice or no light, or the error of a grid from scenes is expected to be larger.
     docs/model.md, section 9.
     """
     check_exposure_times(whites)
-    first = whites[0]
-    for capture in (*whites[1:], *darks):
+    first = (whites or scenes)[0]
+    for capture in (*whites[1:], *scenes, *darks):
         require_alike(capture, first)
     dark = make_dark(
         [e.mosaic for e in darks], [e.exposure_s for e in darks], first.levels.black, first.shape
     )
     del darks  # whoever read them for this may have them gone
-    noise = _told_by(whites, dark, _noise(whites, dark, camera))
-    signal, _ = merge(
-        [e.mosaic for e in whites],
-        [e.exposure_s for e in whites],
-        dark,
-        first.levels.white,
-        first.exposure_s,
-    )
-    _check_saturation(signal, first)
-    found = _grid(signal, first, camera, lattice, near)
+    noise = _told_by(whites, dark, _noise(whites or scenes, dark, camera))
+    shots = [_filled(_signal([scene], dark)) for scene in scenes]
+    if whites:
+        signal = _signal(whites, dark)
+        _check_saturation(signal, first)
+        found = _grid(signal, first, camera, lattice, near)
+        if scenes:
+            found, signal = _moved(found, signal, shots, first.cfa)
+    else:
+        found = _grid(shots, first, camera, lattice, near)
+        signal = np.asarray(np.mean(shots, axis=0), np.float32)
+    _check_expected(found, grid_error, bool(whites), len(scenes))
     windows, valid = windows_on(found, first.shape)
     step = 1 if first.cfa == "mono" else 2
     bad = bad_pixels(signal, dark, first.levels.white, step) | np.isnan(signal)
     reference = White.measured(np.where(bad, np.float32(np.nan), signal), windows, valid)
     valid = valid & (there(reference.level) > 0)
-    del signal
+    if not whites:
+        reference = _in_common(reference, windows, valid, signal.shape)
+    del signal, shots
     grid, measured = replace(found, valid=valid), None
     if bands is not None:
         light = _Light(first, dark, bad)
@@ -162,6 +172,83 @@ def calibrate(
         response=measured,
     )
     return Measured(grid=found, calibration=calibration, noise=noise)
+
+
+def _signal(group: Sequence[Capture], dark: Dark) -> np.ndarray:
+    """Captures of one light as one, without the dark; NaN where all are saturated."""
+    first = group[0]
+    signal, _ = merge(
+        [e.mosaic for e in group],
+        [e.exposure_s for e in group],
+        dark,
+        first.levels.white,
+        first.exposure_s,
+    )
+    return signal
+
+
+def _filled(signal: np.ndarray) -> np.ndarray:
+    """The signal with as much light as anywhere where it is saturated."""
+    lost = np.isnan(signal)
+    return np.where(lost, np.nanmax(signal), signal) if lost.any() and not lost.all() else signal
+
+
+def _moved(
+    grid: LensletGrid, white: np.ndarray, scenes: Sequence[np.ndarray], cfa: str
+) -> tuple[LensletGrid, np.ndarray]:
+    """(the grid of a white image where captures of scenes have it, the white image moved along)."""
+    found = moved_grid(grid, _filled(white), scenes, cfa)
+    error = there(found.grid.expected_error)
+    if not found.moved:
+        note(
+            "lenslets are where the white image has them, as far as the captures tell "
+            f"({found.rms:.2f} px, expected error {error:.2f} px)"
+        )
+        return found.grid, white
+    note(
+        f"lenslets moved by {found.rms:.2f} px since the white image (expected error {error:.2f} "
+        "px)"
+    )
+    step = np.median((found.grid.centres - grid.centres)[grid.valid], axis=0)
+    return found.grid, shifted_mosaic(white, step, cfa)
+
+
+def _check_expected(grid: LensletGrid, most: float, white: bool, scenes: int) -> None:
+    """Refuse a grid from scenes whose expected error is too large."""
+    error = grid.expected_error
+    if error is None or error <= most:
+        return
+    raise NumericsError(
+        f"the {'motion since the white image' if white else 'grid'} is expected to be off by "
+        f"{error:.2f} px rms (lenslets are {grid.pitch.min():.1f} px apart), more than {most:g}: "
+        "light is uneven within superpixels where the scene is",
+        fix=(
+            f"give {'more' if scenes > 1 else 'several'} captures of different scenes or a white "
+            f"image{' of the day' if white else ''}, or accept it with --grid-error "
+            f"{np.ceil(error * 100 + 1e-9) / 100:.2f}"
+        ),
+    )
+
+
+def _in_common(
+    reference: White, windows: Windows, valid: np.ndarray, shape: tuple[int, ...]
+) -> White:
+    """The white reference that is what superpixels which show a scene have in common, at their
+    median level: what the camera does to all of them.
+
+    shape: rows and columns of the sensor, px.
+    """
+    level = there(reference.level)[valid]
+    look = np.nanmedian(there(reference.superpixels)[valid] / level[:, None], axis=0)
+    white = np.full(shape, np.nan, np.float32)
+    for row, column in windows.origin[valid]:
+        white[row : row + windows.shape[0], column : column + windows.shape[1]] = np.reshape(
+            look * np.median(level), windows.shape
+        )
+    return replace(
+        White.measured(white, windows, valid),
+        superpixels=(look * np.median(level)).astype(np.float32),
+    )
 
 
 def _check_saturation(signal: np.ndarray, white: Capture) -> None:
@@ -255,19 +342,23 @@ def _told_by(group: Sequence[Capture], dark: Dark, noise: KnownNoise) -> KnownNo
 
 
 def _grid(
-    signal: np.ndarray,
+    signal: np.ndarray | Sequence[np.ndarray],
     white: Capture,
     camera: Camera | None,
     lattice: str,
     near: tuple[float, float] | None,
 ) -> LensletGrid:
-    """The grid, of as many lenslets as the camera's description or else the capture says."""
+    """The grid, of as many lenslets as the camera's description or else the capture says.
+
+    signal: of the white image, or those of several captures of scenes.
+    """
     parts = camera is not None and camera.filter_array is not None
     said = camera.lenslet_array.count if camera is not None else None
     count = said or (white.grid.count if white.grid else None)
-    filled = np.where(np.isnan(signal), np.nanmax(signal), signal)
     try:
-        return find_grid(filled, white.cfa, None, lattice, near, parts=parts, count=count)
+        if not isinstance(signal, np.ndarray):
+            return find_scene_grid(signal, white.cfa, lattice, near, parts=parts, count=count)
+        return find_grid(_filled(signal), white.cfa, None, lattice, near, parts=parts, count=count)
     except (NumericsError, InputError) as error:
         raise error.at(white.metadata.path) from None
 

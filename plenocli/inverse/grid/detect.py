@@ -19,6 +19,7 @@ from plenocli.base.text import by
 from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
 from plenocli.inverse.grid.distortion import GridModel
+from plenocli.inverse.grid.lattice import Periodicity
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 STRUCTURED = 0.2
@@ -43,6 +44,12 @@ ALIKE = 0.7
 """Of the chosen lines' depth, from which on others might as well be the superpixels' borders."""
 FRAME_TOLERANCE = 0.4
 """px by which a cell's edge may seem to lie outside the frame: sensors end where the array does."""
+FEWEST = 100
+"""Lenslets from which on a scene can be told from what repeats in it."""
+LIGHT = 0.6
+"""Of how far the grid of a scene moves if slopes of light within superpixels are taken for shifts:
+how far off it is for what light does beyond a slope. Measured on real and simulated captures.
+"""
 FIX = (
     "give a white image (even light through the main lens) of a lenslet array "
     "in focus on the sensor"
@@ -59,6 +66,7 @@ def find_grid(
     *,
     parts: bool = False,
     count: Sequence[int] | None = None,
+    scene: Periodicity | None = None,
 ) -> LensletGrid:
     """Find the lenslet grid of a white image.
 
@@ -75,6 +83,8 @@ def find_grid(
         array do: one that is much brighter than the others passes for all of the superpixel.
     count: lenslets (rows, columns), where they are known: of several phases that of this count is
         taken.
+    scene: how the image repeats if it is no white one but captures of a scene, evened
+        (plenocli.inverse.grid.scenes); then the error that is expected is found, too.
 
     Raises NumericsError, saying what was seen, where there is no lattice or none with a centre
     near `near`, InputError for an image too small or not finite. Notes where several phases would
@@ -84,15 +94,24 @@ def find_grid(
     mosaic = prepare(white, cfa, dark)
     # what is left of the 2x2 pattern goes
     image = mosaic if cfa == "mono" else template.smoothed(mosaic)
-    basis, kind, several = _basis(_brightest_crop(image, crop), lattice_kind)
+    period = scene or lattice.find_basis(brightest_crop(image, crop))
+    basis, kind, several = _basis(period, lattice_kind)
     structured = several or parts
     pitch = float(np.hypot(*basis.T).min())
-    index, position, clean, slope = _measured_sites(image, basis, kind, pitch, structured)
-    inside = _whole(position, image.shape, 0.5 * pitch) & clean
-    model, weight = _first_model(index, position, inside, kind, pitch)
-    position[inside], model = _registered(
-        mosaic, model, index[inside], basis, slope[inside], weight, symmetric=not structured
+    index, position, clean, slope = _measured_sites(
+        image, basis, kind, pitch, structured, even=scene is None
     )
+    inside = _whole(position, image.shape, 0.5 * pitch) & clean
+    model, weight = _first_model(index, position, inside, kind, pitch, even=scene is None)
+    error = None
+    if scene is not None:
+        position[inside], model, error = _registered_scene(
+            mosaic, model, index[inside], basis, weight, symmetric=not structured
+        )
+    else:
+        position[inside], model = _registered(
+            mosaic, model, index[inside], basis, slope[inside], weight, symmetric=not structured
+        )
     lit = None
     if structured and kind == "square":
         moved = _to_dark_borders(image, model, index[inside], pitch, near=near, count=count)
@@ -102,6 +121,7 @@ def find_grid(
     if near is not None:
         _check_near(model, near, pitch)
     found = _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
+    found = replace(found, expected_error=error)
     if count is not None and found.valid.shape != tuple(count):
         note(
             f"warning: {by(found.valid.shape)} lenslets are found where {by(count)} are known: "
@@ -139,6 +159,33 @@ def _registered(
     return (mixed, straight) if straight.kind in distortion.STRAIGHT else (position, model)
 
 
+def _registered_scene(
+    image: np.ndarray,
+    model: GridModel,
+    index: np.ndarray,
+    basis: np.ndarray,
+    weight: np.ndarray,
+    *,
+    symmetric: bool,
+) -> tuple[np.ndarray, GridModel, float]:
+    """(places (N, 2) px of the sites `index` by their edges, the map through them, the error that
+    is expected of it, px rms): of captures of a scene.
+    """
+    if weight.sum() < FEWEST:
+        raise NumericsError(
+            f"only {len(index)} superpixels are seen, too few to tell lenslets from what repeats "
+            "in a scene",
+            fix=FIX,
+        )
+    first = model.at(index)
+    position, _, _ = template.register(image, first, basis, None, symmetric, tilted=True)
+    model, error = distortion.choose_by_blocks(index, position, weight)
+    shifted, _, _ = template.register(image, first, basis, None, symmetric, share=1.0)
+    other = distortion.fit_model(model.kind, index, shifted, weight)
+    light = LIGHT * np.sqrt(np.mean(np.sum((other.at(index) - model.at(index)) ** 2, axis=1)))
+    return position, model, float(np.hypot(error, light))
+
+
 def _check_near(model: GridModel, near: Sequence[float], pitch: float) -> None:
     """Refuse a grid that has no centre within a quarter of the pitch of `near` (row, column) px."""
     centre = model.at(np.rint(_index_at(model, near)))
@@ -150,11 +197,10 @@ def _check_near(model: GridModel, near: Sequence[float], pitch: float) -> None:
         )
 
 
-def _basis(image: np.ndarray, lattice_kind: str) -> tuple[np.ndarray, str, bool]:
+def _basis(found: Periodicity, lattice_kind: str) -> tuple[np.ndarray, str, bool]:
     """(lattice vectors [down, right], kind of lattice, whether superpixels hold several bright
     parts).
     """
-    found = lattice.find_basis(image)
     if found.basis is None:
         raise NumericsError(f"no lenslet lattice in the image: {found.reason}", fix=FIX)
     kind = lattice.kind_of(found.basis) if lattice_kind == "auto" else lattice_kind
@@ -172,9 +218,17 @@ def _basis(image: np.ndarray, lattice_kind: str) -> tuple[np.ndarray, str, bool]
 
 
 def _first_model(
-    index: np.ndarray, position: np.ndarray, inside: np.ndarray, kind: str, pitch: float
+    index: np.ndarray,
+    position: np.ndarray,
+    inside: np.ndarray,
+    kind: str,
+    pitch: float,
+    *,
+    even: bool,
 ) -> tuple[GridModel, np.ndarray]:
-    """(map through the centroids of the sites inside the frame, weights of those sites)."""
+    """(map through the centroids of the sites inside the frame, weights of those sites); where the
+    light is not `even` some may lie far off.
+    """
     if inside.sum() < 9 or (np.ptp(index[inside], axis=0) < 2).any():
         raise NumericsError(
             (
@@ -187,7 +241,8 @@ def _first_model(
     few = slice(None, None, -(-int(inside.sum()) // distortion.ENOUGH))
     model, _ = distortion.choose_model(index[inside][few], position[inside][few], weight[few])
     miss = np.hypot(*(position - model.at(index)).T)
-    if np.sqrt(np.mean(miss[inside] ** 2)) > SCATTER * pitch:
+    scatter = np.sqrt((np.mean if even else np.median)(miss[inside] ** 2))
+    if scatter > SCATTER * pitch:
         raise NumericsError(
             (
                 f"no lenslet lattice in the image: spots {pitch:.1f} px apart scatter by "
@@ -250,7 +305,7 @@ def _replace_dead(image: np.ndarray, step: int) -> np.ndarray:
     return out
 
 
-def _brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
+def brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
     """Up to `most` px a side around the centroid of the light."""
     clipped = np.clip(image[::4, ::4], 0, None).astype(float)
     total = clipped.sum()
@@ -268,9 +323,17 @@ def _brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
 
 
 def _measured_sites(
-    image: np.ndarray, basis: np.ndarray, kind: str, pitch: float, structured: bool
+    image: np.ndarray,
+    basis: np.ndarray,
+    kind: str,
+    pitch: float,
+    structured: bool,
+    *,
+    even: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool."""
+    """Numbered centroids on the flattened image: index (N, 2), position (N, 2), clean (N,) bool,
+    slope of the light (N, 2); lenslets that are not lit evenly are refused where `even`.
+    """
     window = spots.WIDE_WINDOW if structured else spots.WINDOW
     maxima = spots.find_maxima(image, pitch, 0.28 if structured else 0.18)
     if len(maxima) < 9:
@@ -301,7 +364,7 @@ def _measured_sites(
     slope = slope / np.maximum(surface, 1e-9)[:, None]
     level = flux / np.maximum(surface, 1e-9)
     spread = 1.48 * np.median(np.abs(level - np.median(level)))
-    if spread > 0.1:  # real white images have 0.02 at most
+    if even and spread > 0.1:  # real white images have 0.02 at most
         raise NumericsError(
             (
                 f"no lenslet lattice in the image: patches repeat every {pitch:.1f} px, but their "

@@ -4,6 +4,7 @@ distortion, polynomials; fitted robustly and chosen by the data.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,10 @@ STRAIGHT = ("affine", "homography")
 """Maps that keep lines straight."""
 CERTAIN = 4.0
 """Standard deviations from which on a lattice is believed that it would bend."""
+BLOCKS = 5
+"""Blocks a side of the array, of which the map must foretell each from the others where
+neighbouring places err alike.
+"""
 ENOUGH = 2000
 """Sites for the first, rough part of a fit."""
 
@@ -130,6 +135,42 @@ def choose_model(
     best = min(error.values())
     kind = next(kind for kind in allowed if error[kind] <= margin * best + 1e-9)
     return fitted[kind], error
+
+
+def choose_by_blocks(
+    index: np.ndarray,
+    position: np.ndarray,
+    weight: np.ndarray,
+    kinds: Sequence[str] = ("affine", "homography", "radial", "poly3"),
+) -> tuple[GridModel, float]:
+    """The simplest map that foretells blocks of lenslets, each left out in turn, nearly as well as
+    the best one, and how far off it is expected to be, px rms over the sites (the jackknife over
+    blocks): for places whose errors neighbours share, as those in captures of a scene.
+
+    kinds: of maps, simplest first; the others as choose_model's.
+    """
+    place = (index - index.min(axis=0)) / (np.ptp(index, axis=0) + 1)
+    block = np.floor(place * BLOCKS).astype(int) @ (BLOCKS, 1)
+    labels, block = np.unique(block, return_inverse=True)
+    found = {}
+    for kind in kinds:
+        model = fit_model(kind, index, position, weight)
+        heavy = weight * _tukey(_miss(model, index, position))
+        spread, misses = np.zeros(len(index)), []
+        for label in range(len(labels)):
+            out = block == label
+            part = model
+            for _ in range(1 if kind in ORDER else 2):
+                part = _least_squares(part, index, position, np.where(out, 0.0, heavy))
+            spread += ((part.at(index) - model.at(index)) ** 2).sum(axis=1)
+            if heavy[out].sum() > 0:
+                miss = (position[out] - part.at(index[out])) * heavy[out, None]
+                misses.append((miss.sum(axis=0) / heavy[out].sum()) ** 2)
+        share = (len(labels) - 1) / len(labels)
+        found[kind] = model, np.sqrt(np.mean(misses)), np.sqrt(share * spread.mean())
+    best = min(miss for _, miss, _ in found.values())
+    model, _, error = next(one for one in found.values() if one[1] <= (1 + MARGIN) * best)
+    return model, float(error)
 
 
 def share_between(

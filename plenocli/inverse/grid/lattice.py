@@ -53,11 +53,13 @@ class Periodicity:
     basis: (2, 2) px, the two shortest independent vectors; None: there is no lattice of peaks.
     structure: the correlation half a step away relative to a whole step: above about 0.3 the
         superpixels hold several bright parts (filters in the pupil) rather than one spot.
+    strength: correlation at the strongest repeat.
     reason: why there is no lattice, in words.
     """
 
     basis: np.ndarray | None = None
     structure: float = 0.0
+    strength: float = 0.0
     reason: str = ""
 
 
@@ -107,7 +109,7 @@ def find_basis(image: np.ndarray) -> Periodicity:
     basis = _refine_basis(smooth, centre, reduced(np.array([first, rest[0]], float)))
     basis = reduced(basis)
     half = np.rint(centre + 0.5 * np.array([basis[0], basis[1], basis[0] + basis[1]])).astype(int)
-    return Periodicity(basis, float(smooth[tuple(half.T)].max()) / strength)
+    return Periodicity(basis, float(smooth[tuple(half.T)].max()) / strength, strength)
 
 
 def reduced(basis: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ class LensletGrid:
     residual: (lenslet_row, lenslet_column) px, distance of the measured place from the map, NaN
         where not measured; None where nothing is known of it.
     rms: px, of the residuals of valid sites.
+    expected_error: px rms, by which the map may be off as a whole: of a grid from captures of a
+        scene; None: nothing is known beyond the residuals.
     """
 
     lattice: str
@@ -30,6 +32,7 @@ class LensletGrid:
     valid: np.ndarray
     residual: np.ndarray | None
     rms: float
+    expected_error: float | None = None
 
     def window_shape(self) -> tuple[int, int]:
         """Rows and columns of a superpixel's window, px: the pitch, whole; a hexagonal cell's

@@ -57,6 +57,11 @@ class _Patch:
             np.float32
         )
 
+    @property
+    def arms(self) -> np.ndarray:
+        """(P, P, 2) px, of each pixel from the middle of the superpixel that it belongs to."""
+        return (self.place - self.owner).astype(np.float32)
+
     def lever(self, share: float) -> np.ndarray:
         """Arms (P, P, 2), px, on which the illumination's slope acts: see `register`."""
         return (share * self.place + (1 - share) * self.owner).astype(np.float32)
@@ -69,6 +74,7 @@ def register(
     slope: np.ndarray | None = None,
     symmetric: bool = True,
     share: float | None = None,
+    tilted: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Places of superpixels by a fit of their common look.
 
@@ -82,6 +88,8 @@ def register(
         (superpixels of several parts) the median shift is zero: the phase stays that of `centres`.
     share: of the light's slope that is continuous, 0 to 1; None: what the pixels say, 1 where they
         say nothing.
+    tilted: light falls off within each superpixel by a slope of its own, as in captures of a scene;
+        then edges alone tell places.
 
     Returns positions (N, 2) px, quality (N,), the share of a patch's pixels that follow the
     template, and whether the share is known: given, or said by the pixels.
@@ -99,14 +107,16 @@ def register(
         if turn == 1:  # edges sharper than two pixels cannot be interpolated
             small = smoothed(small)
         template = _template(small, place, slope, window.lever(share), quality, window)
-        bank = _bank(template, window)
+        bank = _bank(template, window, tilted=tilted)
         spread = _usual_miss(small, place, slope, window.lever(share), bank, window)
-        if turn == 0 and not told:
+        if turn == 0 and not told and not tilted:
             said = _share_within(small, place, slope, bank, spread, window)
             share = 1.0 if said is None else said
         place, quality = _fit_all(small, place, slope, window.lever(share), bank, spread, window)
         place = place + (
-            _centre(template, window) if symmetric else -np.median(place - first, axis=0)
+            _centre(template, window, tilted=tilted)
+            if symmetric
+            else -np.median(place - first, axis=0)
         )
     place = place + share * VARIANCE * slope
     return place * shrink + (shrink - 1) / 2, quality, said is not None
@@ -162,9 +172,9 @@ def _make_patch(basis: np.ndarray) -> _Patch:
     )
 
 
-def _centre(template: np.ndarray, window: _Patch) -> np.ndarray:
+def _centre(template: np.ndarray, window: _Patch, *, tilted: bool) -> np.ndarray:
     """Centre (2,), px, of the template: about which it, smoothed as far as its sampling demands,
-    is best its own point reflection.
+    is best its own point reflection, but for a slope of its light if it may be `tilted`.
     """
     from scipy.ndimage import gaussian_filter, shift
 
@@ -175,14 +185,17 @@ def _centre(template: np.ndarray, window: _Patch) -> np.ndarray:
         here = shift(smooth, -centre, mode="nearest")
         even, odd = (here + here[::-1, ::-1]) / 2, (here - here[::-1, ::-1]) / 2
         columns = np.stack([-g.ravel() for g in np.gradient(even)])
+        if tilted:
+            columns = np.concatenate([columns, even.ravel() * window.arms.reshape(-1, 2).T])
         heavy = columns * weight
-        centre = centre + np.linalg.lstsq(heavy @ columns.T, heavy @ odd.ravel(), rcond=1e-6)[0]
+        step = np.linalg.lstsq(heavy @ columns.T, heavy @ odd.ravel(), rcond=1e-6)[0]
+        centre = centre + step[:2]
     return centre
 
 
-def _bank(template: np.ndarray, window: _Patch) -> np.ndarray:
-    """The template at all sub-pixel phases: columns (PHASES^2, 4, K) template, minus
-    its gradient, one.
+def _bank(template: np.ndarray, window: _Patch, *, tilted: bool = False) -> np.ndarray:
+    """The template at all sub-pixel phases: columns (PHASES^2, 4 or 6, K) template, minus
+    its gradient, one, and if `tilted` the template times both arms.
     """
     phases = (np.arange(PHASES) + 0.5) / PHASES - 0.5
     back = window.shifted(-phases), window.shifted(-phases, 1)
@@ -192,7 +205,8 @@ def _bank(template: np.ndarray, window: _Patch) -> np.ndarray:
         for a, b in ((down, back[0]), (-right, back[0]), (-down, back[1]))
     ]
     columns = [c.reshape(PHASES**2, -1)[:, window.flat] for c in columns]
-    return np.stack([*columns, np.ones_like(columns[0])], axis=1)
+    slopes = [columns[0] * arm for arm in window.arms.reshape(-1, 2)[window.flat].T]
+    return np.stack([*columns, np.ones_like(columns[0]), *(slopes if tilted else [])], axis=1)
 
 
 def _groups(
@@ -358,7 +372,7 @@ def _fit_all(
         patch, inside = _patches(image, pixel, slope[sites], lever, window)
         base = np.broadcast_to(inside * (window.taper / spread**2), patch.shape)
         level, _ = _solve(columns[[0, 3]], patch, base)
-        fit = np.zeros((len(sites), 4))
+        fit = np.zeros((len(sites), len(columns)))
         fit[:, [0, 3]] = level
         for _ in range(iterations):
             trust = _trust(fit, columns, patch, spread)
@@ -389,7 +403,7 @@ def _share_within(
     """
     chosen = _sample(place, image.shape, window.half, np.ones(len(place)), 2000)
     whole = window.lever(0)
-    arms = (window.lever(1) - whole).reshape(-1, 2)[window.flat].T
+    arms = window.arms.reshape(-1, 2)[window.flat].T
     value, trust, total = [], [], []
     for number, _, sites, pixel in _groups(place[chosen], 1 + 400_000 // len(spread)):
         tilt = slope[chosen[sites]]

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Name = str | Path
 
+GRID_ERROR = 0.1
+"""px rms, the expected error up to which a grid from scenes is accepted unasked."""
 ASTRAY = 1.0
 """px rms by which centres may miss those that a simulated capture knows before a warning."""
 
@@ -57,6 +59,7 @@ class CalibrateSummary:
     noise: where gain and read noise come from, in words.
     gain_dn_per_e: None where it is not known.
     response: None without --band captures.
+    expected_error_px: of a grid from captures of a scene.
     deviation_px: root mean square distance from the true centres, of a simulated capture.
     """
 
@@ -75,21 +78,25 @@ class CalibrateSummary:
     noise: str
     gain_dn_per_e: float | None
     response: ResponseSummary | None = None
+    expected_error_px: float | None = None
     deviation_px: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The summary as --json prints it: one flat object, without what there is none of."""
         flat = asdict(self)
         response = flat.pop("response")
-        if flat["deviation_px"] is None:
-            del flat["deviation_px"]
+        for name in ("deviation_px", "expected_error_px"):
+            if flat[name] is None:
+                del flat[name]
         return flat | (response or {})
 
 
 def run_calibrate(
     output: Name,
     *,
-    whites: Sequence[Name],
+    whites: Sequence[Name] = (),
+    scenes: Sequence[Name] = (),
+    grid_error: float = GRID_ERROR,
     darks: Sequence[Name] = (),
     bands: Sequence[tuple[float, Name]] = (),
     radiances: Sequence[tuple[float, float]] = (),
@@ -103,7 +110,8 @@ def run_calibrate(
 ) -> CalibrateSummary:
     """Calibrate a camera and write `output`.
 
-    whites, darks: captures.
+    whites, scenes, darks: captures; whites or scenes at least.
+    grid_error: px rms, the largest expected error of a grid from scenes that is accepted.
     bands: (wavelength m, capture) pairs, several a band allowed.
     radiances: (wavelength m, relative radiance of that source) pairs, 1 where not given.
     camera: TOML for gain and read noise.
@@ -120,10 +128,15 @@ def run_calibrate(
     from plenocli.files.read.calibrations import write_calibration
     from plenocli.files.read.cameras import camera_files, read_camera
 
+    if not whites and not scenes:
+        raise UsageError("there is neither --white nor --scene", fix="give one of them")
+    if bands and not whites:
+        raise UsageError("--band needs --white: a scene does not tell how bright white is")
     bands = sorted(bands, key=lambda pair: pair[0])
     _check_radiances(radiances, bands)
     roles: dict[str, Any] = {
         "white": list(whites),
+        "scene": list(scenes),
         "dark": list(darks),
         "camera": camera,
         **_band_roles(bands),
@@ -131,17 +144,20 @@ def run_calibrate(
     check_output(
         output,
         overwrite=overwrite,
-        inputs=[*whites, *darks, camera, *(path for _, path in bands)],
+        inputs=[*whites, *scenes, *darks, camera, *(path for _, path in bands)],
         suffixes=(".h5",),
     )
     description = read_camera(camera) if camera else None
     roles |= camera_files(camera, description) if camera and description else {}
     cfa = cfa or (description.sensor.cfa if description else None)
-    white = read_series(whites, cfa=cfa)
+    captures = read_series([*whites, *scenes], cfa=cfa)
+    white = captures[: len(whites)]
     wavelengths = list(dict.fromkeys(w for w, _ in bands))
     found = calibrate(
         white,
-        darks=read_series(darks, white[0], cfa),
+        scenes=captures[len(whites) :],
+        grid_error=grid_error,
+        darks=read_series(darks, captures[0], cfa),
         bands=NarrowBands(
             wavelengths=wavelengths,
             # a band's captures are held while they are looked at
@@ -157,7 +173,7 @@ def run_calibrate(
         lattice=lattice,
         near=near,
     )
-    summary = _summary(output, found, whites[0])
+    summary = _summary(output, found, [*whites, *scenes][0])
     config = to_toml(description) if description else ""
     provenance = Provenance(
         command=command, inputs=describe_inputs(roles), seed=None, config=config
@@ -206,6 +222,7 @@ def _summary(output: Name, measured: Measured, white: Name) -> CalibrateSummary:
         noise=noise.source,
         gain_dn_per_e=noise.gain,
         response=None if response is None else _response_summary(response),
+        expected_error_px=grid.expected_error,
         deviation_px=_deviation(grid, white),
     )
 

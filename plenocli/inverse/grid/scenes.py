@@ -1,0 +1,174 @@
+"""The lenslet grid from captures of any scene, where there is no white image or an old one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plenocli.base.errors import NumericsError
+from plenocli.inverse.grid import detect, distortion, lattice, template
+from plenocli.inverse.grid.lenslet_grid import LensletGrid
+
+SCALES = (4, 8, 16, 32, 64)
+"""px of Gaussians that take the scene off before repeats are looked for."""
+AGREE = 0.03
+"""By which the pitch of another scale or direction may differ."""
+DARK = 0.02
+"""Of the usual light, which is no light."""
+HALF = 0.5
+"""Of the mean light of a cell, which counts half as much as any highlight."""
+SURE = 2.0
+"""Standard deviations from which on lenslets are believed to have moved."""
+
+
+def find_scene_grid(
+    captures: Sequence[np.ndarray],
+    cfa: str = "mono",
+    lattice_kind: str = "auto",
+    near: Sequence[float] | None = None,
+    *,
+    parts: bool = False,
+    count: Sequence[int] | None = None,
+) -> LensletGrid:
+    """The grid of lenslets behind which there is a scene, with the error that is expected of it.
+
+    The light of each cell is evened, so that what is left is what all superpixels have in common;
+    slopes of light within superpixels are fitted beside their places, so that edges tell these.
+    captures: one or several (row, column), without dark, of lenslets that did not move between;
+        the rest as plenocli.inverse.grid.detect.find_grid's.
+
+    Raises as find_grid, and NumericsError where no period stands out of the scene.
+    docs/model.md, section 9.
+    """
+    pictures = [detect.prepare(capture, cfa) for capture in captures]
+    period = _period([_without_colours(p, cfa) for p in pictures])
+    pitch = _pitch(period)
+    evened = np.mean([even_light(_without_colours(p, cfa), pitch) for p in pictures], axis=0)
+    grid = detect.find_grid(
+        evened, "mono", None, lattice_kind, near, parts=parts, count=count, scene=period
+    )
+    if np.ptp(grid.pitch) > AGREE * grid.pitch.min():
+        raise NumericsError(
+            f"no lenslet lattice in the capture: superpixels {grid.pitch[0]:.1f} x "
+            f"{grid.pitch[1]:.1f} px apart are those of a pattern in the scene",
+            fix="give a capture of another scene, or a white image",
+        )
+    return grid
+
+
+@dataclass(frozen=True)
+class GridMotion:
+    """How lenslets moved since a white image.
+
+    grid: where they are.
+    rms: px, by which they seem to have moved; grid is where they were unless that is more than
+        SURE times its expected_error.
+    moved: whether it is.
+    """
+
+    grid: LensletGrid
+    rms: float
+    moved: bool
+
+
+def moved_grid(
+    grid: LensletGrid, white: np.ndarray, captures: Sequence[np.ndarray], cfa: str = "mono"
+) -> GridMotion:
+    """The grid of an older white image, carried to captures of a scene.
+
+    Shift, turn and stretch since the white image: what slopes of light do to places is the same in
+    both as far as light is.
+    white: (row, column), the image that `grid` comes from, without dark; captures: as
+        find_scene_grid's.
+    """
+    pitch, where = float(grid.pitch.min()), grid.valid
+    index, centres = np.argwhere(where), grid.centres[where]
+    images = [
+        np.mean(
+            [even_light(_without_colours(detect.prepare(p, cfa), cfa), pitch) for p in group],
+            axis=0,
+        )
+        for group in ([white], captures)
+    ]
+    way = []
+    for tilted in (True, False):
+        old, new = (
+            template.register(image, centres, grid.basis, share=1.0, tilted=tilted)[0]
+            for image in images
+        )
+        way.append(new - old)
+    weight = np.where(lattice.surrounded(index, "square"), 1.0, detect.BORDER_WEIGHT)
+    motion, error = distortion.choose_by_blocks(centres, way[0], weight, ("affine",))
+    other = distortion.fit_model("affine", centres, way[1], weight)
+    light = np.sqrt(np.mean(np.sum((motion.at(centres) - other.at(centres)) ** 2, axis=1)))
+    error = float(np.hypot(error, detect.LIGHT * light))
+    rms = float(np.sqrt(np.mean(np.sum(motion.at(centres) ** 2, axis=1))))
+    moved = rms > SURE * error
+    return GridMotion(
+        replace(
+            grid,
+            centres=grid.centres + motion.at(grid.centres) if moved else grid.centres,
+            expected_error=error,
+        ),
+        rms,
+        moved,
+    )
+
+
+def shifted_mosaic(mosaic: np.ndarray, step: np.ndarray, cfa: str) -> np.ndarray:
+    """A mosaic (row, column) moved by `step` (2,) px, each colour by linear interpolation; NaN
+    stays beside NaN.
+    """
+    from scipy.ndimage import shift
+
+    period = 1 if cfa == "mono" else 2
+    out = np.empty(mosaic.shape, np.float32)
+    for i in range(period):
+        for j in range(period):
+            plane = mosaic[i::period, j::period]
+            out[i::period, j::period] = shift(plane, step / period, order=1, mode="nearest")
+    return out
+
+
+def even_light(image: np.ndarray, pitch: float) -> np.ndarray:
+    """An image (row, column) over its mean within a cell, r, as r / (r + HALF): highlights of the
+    scene hardly count, gaps between superpixels fully.
+    """
+    from scipy.ndimage import uniform_filter
+
+    light = np.maximum(image, 0)
+    size = max(3, round(pitch))
+    around = uniform_filter(uniform_filter(light, size), size)
+    out = light / (around + DARK * around.mean() + np.finfo(np.float32).tiny)
+    return (out / (out + HALF)).astype(np.float32)
+
+
+def _without_colours(picture: np.ndarray, cfa: str) -> np.ndarray:
+    return picture if cfa == "mono" else template.smoothed(picture)
+
+
+def _pitch(found: lattice.Periodicity) -> float:
+    return float("nan") if found.basis is None else float(np.hypot(*found.basis.T).min())
+
+
+def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
+    """The period that stands out most where slow changes of brightness are taken off, and does so
+    at two scales at least; as long in one direction as in the other, which a scene's is not.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    found, reason = [], "no period is the same at two scales and in two directions"
+    for picture in pictures:
+        part = np.maximum(detect.brightest_crop(picture, 1024), 0)
+        logarithm = np.log(part + DARK * part.mean())
+        for scale in SCALES:
+            seen = lattice.find_basis(logarithm - gaussian_filter(logarithm, scale))
+            if seen.basis is not None and np.ptp(np.hypot(*seen.basis.T)) < AGREE * _pitch(seen):
+                found.append(seen)
+    for best in sorted(found, key=lambda one: -one.strength):
+        alike = [one for one in found if abs(_pitch(one) - _pitch(best)) < AGREE * _pitch(best)]
+        if len(alike) > len(pictures):
+            return best
+    raise NumericsError(f"no lenslet lattice in the capture: {reason}", fix=detect.FIX)

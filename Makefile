@@ -17,19 +17,35 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env demo test lint extremes honesty faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env requirements sbom demo test lint extremes honesty faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-env: $(READY) ## make the environment in .venv with the versions of constraints.txt
+env: $(READY) ## make the environment in .venv: the files of requirements.txt, by their hashes
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml requirements.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "plenocli needs Python 3.11 or newer; say which: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
 	@echo "making the environment in $(VENV) (once, a few minutes)"
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plot,fast,ml,dev]'
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.txt
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
+
+# tools that must not be among what they look at
+TOOLS := $(VENV)-tools
+$(TOOLS)/.ready: constraints.txt
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt uv cyclonedx-bom
+	@touch $@
+
+requirements: $(TOOLS)/.ready ## requirements.txt anew: the hashes of all files of the versions in constraints.txt
+	$(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
+	  --extra plot --extra fast --extra ml --extra dev -c constraints.txt pyproject.toml -o requirements.txt
+
+sbom: $(READY) $(TOOLS)/.ready ## what the environment holds, with licences, as CycloneDX: dist/sbom.json
+	@mkdir -p dist
+	$(TOOLS)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON -o dist/sbom.json $(VENV)
 
 demo: $(READY) ## both experiments at a small size, with pictures: runs/demo/report.html
 	$(PIPELINE) pipelines/demo.mk $(ALL_CORES) RUN=$(RUNS)/demo

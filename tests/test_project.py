@@ -90,3 +90,32 @@ def test_nobody_is_told_to_install_plenocli_by_its_name() -> None:
     assert not sent.search("pip install dist/plenocli-0.2.0-py3-none-any.whl")
     telling = [p for p in TEXTS if sent.search(p.read_text(encoding="utf-8"))]
     assert telling == [ROOT / "tests" / "test_project.py"], "itself only"
+
+
+def _name(requirement: str) -> str:
+    return re.sub(r"[-_.]+", "-", re.split(r"[<>=\[ ;]", requirement)[0]).lower()
+
+
+def test_every_package_of_the_environment_has_one_version_and_its_hashes() -> None:
+    """`make env` takes nothing else: requirements.txt is constraints.txt with hashes, and holds
+    what pyproject.toml asks for; `make requirements` makes it anew.
+    """
+    blocks = re.split(r"\n(?=\S)", (ROOT / "requirements.txt").read_text().strip())
+    found = {_name(block): block for block in blocks}
+    assert len(found) == len(blocks)
+    for name, block in found.items():
+        hashes = re.findall(r"--hash=sha256:[0-9a-f]{64}\b", block)
+        assert hashes and len(hashes) == block.count("--hash"), name
+    constraints = (ROOT / "constraints.txt").read_text().split()
+    pinned = dict(re.split("==", line) for line in constraints)
+    pinned = {_name(name): version for name, version in pinned.items()}
+    assert {name: re.search(r"==([^ ;]+)", block)[1] for name, block in found.items()} == {
+        name: pinned.get(name) for name in found
+    }
+    extra = PROJECT["optional-dependencies"]
+    asked = PROJECT["dependencies"] + [
+        one for name in ("plot", "fast", "ml", "dev") for one in extra[name]
+    ]
+    assert {_name(one) for one in asked} <= set(found)
+    recipe = (ROOT / "Makefile").read_text()
+    assert "--require-hashes -r requirements.txt" in recipe and "--no-deps" in recipe

@@ -392,9 +392,9 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
         ) from error
-    address = _address(scheduler)
+    address, security = _address(scheduler)
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout="10s", security=security, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
             f"no Dask scheduler answers at {scheduler} ({type(error).__name__})",
@@ -408,18 +408,49 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         yield client
 
 
-def _address(scheduler: str) -> str:
-    """Where a scheduler answers: the address, or that in the file which the scheduler wrote."""
-    address = scheduler
+_TLS = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
+"""Options of an address, by what Dask calls them."""
+_TLS_FIX = "write for example tls://10.0.0.1:8786?ca=ca.pem&cert=cert.pem&key=key.pem"
+
+
+def _address(scheduler: str) -> tuple[str, Any]:
+    """(where a scheduler answers, Dask's Security): an address, or that in the file
+    which the scheduler wrote, and after a question mark the files of TLS.
+    """
+    named, _, after = scheduler.partition("?")
+    if os.path.exists(scheduler):
+        named, after = scheduler, ""
+    address = named
     with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
-        address = str(json.loads(Path(scheduler).read_bytes())["address"])
+        address = str(json.loads(Path(named).read_bytes())["address"])
     if not address.startswith(("tcp://", "tls://", "ucx://")):
         raise UsageError(
             f"{scheduler!r} is no address of a Dask scheduler and no whole file that one wrote",
             "--scheduler",
             "write for example tcp://10.0.0.1:8786",
         )
-    return address
+    options = dict(part.partition("=")[::2] for part in after.split("&") if after)
+    missing = [name for name in options.values() if not os.path.isfile(name)]
+    if options and not address.startswith("tls://") or options.keys() - _TLS.keys() or missing:
+        raise UsageError(
+            f"{scheduler!r} has options that are not the files of TLS"
+            + (f" (there is no {missing[0]})" if missing else ""),
+            "--scheduler",
+            _TLS_FIX,
+        )
+    from distributed.security import Security
+
+    # without options, what Dask's own configuration says
+    security = Security(**{_TLS[name]: file for name, file in options.items()})
+    try:
+        has_context = security.get_connection_args("client").get("ssl_context")
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"the files of TLS cannot be used ({error})", "--scheduler", _TLS_FIX
+        ) from None
+    if address.startswith("tls://") and not has_context:
+        raise UsageError(f"{scheduler!r} needs the files of TLS", "--scheduler", _TLS_FIX)
+    return address, security
 
 
 def _on_cluster(client: Any) -> _Executing:

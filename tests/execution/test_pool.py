@@ -3,6 +3,7 @@ that go with their parent.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -201,6 +202,62 @@ def test_a_cluster_that_is_not_there_is_a_usage_error(address):
     pytest.importorskip("distributed")
     with pytest.raises(UsageError, match="scheduler"), open_pool(1, address):
         pass
+
+
+@pytest.mark.parametrize(
+    "options",
+    ["?ca=nowhere.pem", "?ca=ca.pem", "?password=ca.pem", "?ca", "tcp://127.0.0.1:1?ca=ca.pem"],
+)
+def test_options_of_an_address_are_files_of_tls(options, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ca.pem").write_text("x")
+    address = options if "://" in options else f"tls://127.0.0.1:1{options}"
+    with pytest.raises(UsageError, match="files? of TLS"), open_pool(1, address):
+        pass
+
+
+def certificates(folder):
+    """Options of an address whose files openssl makes."""
+    for name in ("own", "other"):
+        subprocess.run(
+            ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+            + ["-nodes", "-keyout", f"{name}.key", "-out", f"{name}.pem", "-days", "2"]
+            + ["-subj", "/CN=plenocli"],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+        )
+    return {
+        name: f"ca={folder}/own.pem&cert={folder}/{name}.pem&key={folder}/{name}.key"
+        for name in ("own", "other")
+    }
+
+
+@pytest.mark.skipif(not shutil.which("openssl"), reason="needs openssl")
+@pytest.mark.filterwarnings("default")  # what Dask's own threads warn of is not ours
+def test_a_cluster_behind_tls_takes_the_files_of_its_address_and_no_others(tasks, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    options = certificates(tmp_path)
+    own = dict(part.split("=") for part in options["own"].split("&"))
+    names = {"tls_ca_file": own["ca"], "require_encryption": True}
+    for role in ("scheduler", "worker", "client"):
+        names |= {f"tls_{role}_cert": own["cert"], f"tls_{role}_key": own["key"]}
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tls://",
+        dashboard_address=None,
+        security=distributed.Security(**names),
+    ) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith("tls://")
+        with open_pool(1, f"{address}?{options['own']}") as pool:
+            assert results(pool, tasks.square, [3]) == {3: 9}
+        for wrong, said in (("", "needs the files"), (f"?{options['other']}", "answers")):
+            with pytest.raises(UsageError, match=said), open_pool(1, address + wrong):
+                pass
 
 
 def test_partial_functions_travel(tasks):

@@ -410,7 +410,7 @@ def _cluster(scheduler: str) -> Iterator[Any]:
 
 _TLS = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
 """Options of an address, by what Dask calls them."""
-_TLS_FIX = "write for example tls://10.0.0.1:8786?ca=ca.pem&cert=cert.pem&key=key.pem"
+_TLS_FIX = "write for example tls://10.0.0.1:8786?ca=ca.pem,cert=cert.pem,key=key.pem"
 
 
 def _address(scheduler: str) -> tuple[str, Any]:
@@ -429,7 +429,7 @@ def _address(scheduler: str) -> tuple[str, Any]:
             "--scheduler",
             "write for example tcp://10.0.0.1:8786",
         )
-    options = dict(part.partition("=")[::2] for part in after.split("&") if after)
+    options = dict(part.partition("=")[::2] for part in after.split(",") if after)
     missing = [name for name in options.values() if not os.path.isfile(name)]
     if options and not address.startswith("tls://") or options.keys() - _TLS.keys() or missing:
         raise UsageError(

@@ -229,7 +229,7 @@ def certificates(folder):
             capture_output=True,
         )
     return {
-        name: f"ca={folder}/own.pem&cert={folder}/{name}.pem&key={folder}/{name}.key"
+        name: f"ca={folder}/own.pem,cert={folder}/{name}.pem,key={folder}/{name}.key"
         for name in ("own", "other")
     }
 
@@ -239,7 +239,7 @@ def certificates(folder):
 def test_a_cluster_behind_tls_takes_the_files_of_its_address_and_no_others(tasks, tmp_path):
     distributed = pytest.importorskip("distributed")
     options = certificates(tmp_path)
-    own = dict(part.split("=") for part in options["own"].split("&"))
+    own = dict(part.split("=") for part in options["own"].split(","))
     names = {"tls_ca_file": own["ca"], "require_encryption": True}
     for role in ("scheduler", "worker", "client"):
         names |= {f"tls_{role}_cert": own["cert"], f"tls_{role}_key": own["key"]}

@@ -14,6 +14,7 @@ from typing import Any
 
 from plenocli.base.errors import OutputError, remedy
 from plenocli.base.text import json_value
+from plenocli.files.atomic import sync_folder
 
 
 class Journal:
@@ -52,6 +53,8 @@ class Journal:
                 self.records[known[0]] = known[1]
         if content and not content.endswith(b"\n"):
             self._write(b"\n")  # ends the torn line
+        if not content:
+            sync_folder(self.path.parent)  # else the power may take a new file with all its lines
 
     def add(self, key: str, record: Any) -> None:
         """Keep a record (JSON-able) for good before this returns."""

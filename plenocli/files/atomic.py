@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import stat
 from collections.abc import Iterable, Iterator, Sequence
@@ -38,6 +39,7 @@ def check_output(
     suffix is none of `suffixes` (where given); OutputError if `path` is a folder or not an ordinary
     file, its name is impossible, its folder is missing or read-only, or it is one of `inputs`.
     """
+    settle(path)
     path, target = Path(path), _target(path)
     folder = target.parent
     try:
@@ -149,8 +151,9 @@ def together() -> Iterator[list[_Staged]]:
     """All files that are written within the block appear when it ends well; of a failure, of one
     of them or between them, every file stays as it was and nothing is left.
 
-    A block within another is part of that. Files of several names cannot appear at one instant: a
-    process that is killed just while they take their places leaves some of them old.
+    A block within another is part of that. Files of several names cannot appear at one instant:
+    where a process is killed, or the power goes, just while they take their places, the next one
+    that reads or writes any of them lets the others follow (`settle`).
 
     Raises UsageError where a file appeared meanwhile, OutputError where one cannot take its place.
     """
@@ -248,21 +251,92 @@ def _commit(staged: Sequence[_Staged]) -> None:
                 "pass --overwrite or choose another name",
             )
     placed: list[tuple[_Staged, Path | None]] = []
-    try:
-        for file in staged:
-            with _told(file.path):
-                # a single file needs no way back
-                placed.append((file, _kept(file.target) if len(staged) > 1 else None))
-                os.replace(file.partial, file.target)
-    except BaseException:
-        for file, before in placed:
-            _put_back(file, before)
-        raise
-    for _, before in placed:
-        if before is not None:
-            before.unlink(missing_ok=True)
-    for folder in dict.fromkeys(file.target.parent for file in staged):
-        _sync_folder(folder)
+    with _announced(staged) as announcements:
+        try:
+            for file in staged:
+                with _told(file.path):
+                    # a single file needs no way back
+                    placed.append((file, _kept(file.target) if len(staged) > 1 else None))
+                    os.replace(file.partial, file.target)
+        except BaseException:
+            for announcement in announcements:
+                announcement.unlink(missing_ok=True)
+            for file, before in placed:
+                _put_back(file, before)
+            raise
+        for _, before in placed:
+            if before is not None:
+                before.unlink(missing_ok=True)
+        for folder in dict.fromkeys(file.target.parent for file in staged):
+            sync_folder(folder)
+
+
+def _announcement(target: Path) -> Path:
+    """Where it says which files take their places together with this one."""
+    return target.with_name(f".{target.name}.together")
+
+
+@contextlib.contextmanager
+def _announced(staged: Sequence[_Staged]) -> Iterator[list[Path]]:
+    """Beside each of several files of one folder it says, for good, what all of them are, until
+    the block ends well.
+    """
+    folders: dict[Path, list[_Staged]] = {}
+    for file in staged:
+        folders.setdefault(file.target.parent, []).append(file)
+    folders = {folder: files for folder, files in folders.items() if len(files) > 1}
+    announcements = [_announcement(file.target) for files in folders.values() for file in files]
+    how = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+    with contextlib.ExitStack() as held:
+        try:
+            for folder, files in folders.items():
+                told = [[file.target.name, *_about(file.descriptor)] for file in files]
+                for file in files:
+                    with _told(file.path):
+                        made = os.open(_announcement(file.target), how, 0o600)
+                        held.callback(os.close, made)
+                        fcntl.flock(made, fcntl.LOCK_EX)
+                        os.ftruncate(made, 0)
+                        write_at(made, 0, json.dumps(told).encode())
+                        os.fsync(made)
+                sync_folder(folder)
+            yield announcements
+        finally:
+            for announcement in announcements:
+                with contextlib.suppress(OSError):
+                    announcement.unlink(missing_ok=True)
+
+
+def settle(path: str | os.PathLike) -> None:
+    """Where the several results of one command, of which the file at `path` is one, were cut off
+    while they took their places, let the rest follow; else nothing, at the cost of one look.
+    """
+    how = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        announcement = _announcement(_target(path))
+        if not os.path.lexists(announcement):
+            return
+        descriptor = os.open(announcement, how)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # until a command that is about it has ended
+            told = json.loads(os.pread(descriptor, 1 << 20, 0))
+            # names of this folder only: who could write the announcement could write them, too
+            targets = [announcement.with_name(name) for name, *_ in told]
+            for target, (_, *about) in zip(targets, told):
+                partial = partial_path(target)
+                if os.path.lexists(partial) and _about(partial) == about:
+                    os.replace(partial, target)
+            sync_folder(announcement.parent)
+            for target in targets:
+                _announcement(target).unlink(missing_ok=True)
+        finally:
+            os.close(descriptor)
+
+
+def _about(file: Path | int) -> list[int]:
+    """What tells a finished temporary file from one that is written anew."""
+    found = os.stat(file, follow_symlinks=isinstance(file, int))
+    return [found.st_size, found.st_mtime_ns]
 
 
 def _kept(target: Path) -> Path | None:
@@ -362,7 +436,7 @@ def reserve(descriptor: int, size: int) -> None:
             raise
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make the rename survive a power cut.
 
     Some network file systems refuse this; the file is then whole all the same.

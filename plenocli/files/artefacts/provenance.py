@@ -15,6 +15,7 @@ from typing import Any
 
 from plenocli.base.errors import InputError
 from plenocli.base.text import printable, utf8
+from plenocli.files.atomic import settle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +142,7 @@ def require_file(path: str | os.PathLike) -> int:
     Returns its size in bytes.
     """
     path = Path(path)
+    settle(path)
     try:
         if path.is_dir():
             raise InputError("is a folder, not a file", path, "name a file in it")

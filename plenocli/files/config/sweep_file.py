@@ -27,6 +27,7 @@ from plenocli.base.units import (
     parse_duration,
     parse_length,
 )
+from plenocli.files.artefacts.schema import FURTHEST
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.microscope import Microscope
 from plenocli.forward.camera.model import Camera
@@ -385,6 +386,8 @@ def _axis(values: Any) -> Axis:
             'from = "50 um", to = "250 um", steps = 5 }'
         )
     for i, value in enumerate(values):
+        if isinstance(value, float) and not abs(value) <= FURTHEST:
+            raise ValueError(f"{value!r} is not finite, or no quantity")
         if value in values[:i] and any(type(value) is type(v) and value == v for v in values[:i]):
             raise ValueError(f"{value!r} stands twice")
     return Choice(values)
@@ -410,8 +413,8 @@ def _measure(value: Any) -> tuple[float, str | None]:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{shown(value)} is no number and no number with a unit")
     if not isinstance(value, str):
-        if not np.isfinite(value):
-            raise ValueError(f"{value!r} is not finite")
+        if not abs(value) <= FURTHEST:
+            raise ValueError(f"{value!r} is not finite, or no quantity")
         return float(value), None
     for parse, unit in ((parse_length, "m"), (parse_duration, "s")):
         try:

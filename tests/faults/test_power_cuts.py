@@ -34,8 +34,8 @@ CALLS = (
 
 @dataclass
 class Moment:
-    """After a call: names -> file number, file number -> bytes and when these were written; bytes as
-    far as they are safe.
+    """After a call: names -> file number; file number -> bytes, when they were written, and what
+    of them is safe.
 
     history: names as they were after each call since the folder was last fsynced.
     """

@@ -17,6 +17,8 @@ DEMUX = "demux colorchecker.dng --calibration X --reference white.dng -o o.h5"
 RECONSTRUCT = "reconstruct X --pif pif.h5 --method tikhonov -o o.h5"
 BY_DICTIONARY = "reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary X -o o.h5"
 SIMULATE = "capture-sim camera.toml --pif X --scene photo.png -o o.h5"
+RESUME = "learn-dict photo.png --pif pif.h5 --resume X --iterations 3 -o o.h5"
+AXES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"}
 SCORE = "score X --truth capture.h5 -o o.json"
 
 
@@ -50,6 +52,19 @@ def values(where, change):
         with np.errstate(all="ignore"):
             stored = file[where][()]
             file[where][...] = np.asarray(change(stored)).astype(stored.dtype)
+
+    return edit
+
+
+def other(where, change):
+    """An edit: a dataset of another shape or type in the place of one."""
+
+    def edit(file):
+        stored, attributes = file[where][()], dict(file[where].attrs)
+        del file[where]
+        file[where] = change(stored)
+        for name in attributes.keys() - AXES:
+            file[where].attrs[name] = attributes[name]
 
     return edit
 
@@ -104,6 +119,8 @@ IMPOSSIBLE = [
     ("dictionary.h5", BY_DICTIONARY, values("dictionary/atoms", lambda v: v * 0 + 1e300)),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "lambda", -1.0)),
     ("image.h5", SCORE, values("image/value", lambda v: v * 0 + 1e300)),
+    ("dictionary.h5", RESUME, other("dictionary/state/atoms", lambda v: v[:, :1])),
+    ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
 ]
 
 

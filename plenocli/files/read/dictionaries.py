@@ -89,8 +89,14 @@ def read_unfinished(path: Path, system: LensletMatrix, *, kept: bool) -> Unfinis
     fields = {k.removeprefix(prefix): v for k, v in artefact.data.items() if k.startswith(prefix)}
     try:
         parameters = artefact.attrs["dictionary"]["parameters"]
+        state = State.load(fields)
+        if (
+            not np.isfinite(state.atoms).all()
+            or state.atoms.shape != artefact.data["dictionary/atoms"].shape
+        ):
+            raise ValueError("the atoms of its state are not those that it shows")
         return Unfinished(
-            state=State.load(fields),
+            state=state,
             settings=Settings(**parameters["settings"]),
             training=tuple(parameters["training"]),
         )

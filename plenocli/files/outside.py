@@ -39,7 +39,7 @@ CPU_S = 90
 _HEAD_BYTES = 256 << 20
 _FIX = "make or copy it again"
 _THREADED = ("OpenImageIO", "rawpy", "numba", "distributed")
-"""Libraries with threads of their own, which a forked child would miss."""
+"""Libraries that may have threads of their own, which a forked child would miss."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Threads map memory."""
 
@@ -238,11 +238,10 @@ def _say_once(missing: str) -> None:
 
 def _may_fork() -> bool:
     """Whether a copy of this process would lack no thread that it needs."""
-    return (
-        sys.platform == "linux"
-        and threading.active_count() == 1
-        and not any(name in sys.modules for name in _THREADED)
-    )
+    if sys.platform != "linux" or threading.active_count() > 1:
+        return False
+    # OpenBLAS, which numpy loads, knows how to go on in a copy
+    return len(os.listdir("/proc/self/task")) == 1 or not any(n in sys.modules for n in _THREADED)
 
 
 def _forked(theirs: socket.socket, memory: int) -> int:

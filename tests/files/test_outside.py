@@ -129,9 +129,9 @@ def ways_out(path):
 # --- tests ----------------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=["forked", "started"], autouse=True)
+@pytest.fixture(params=["forked", pytest.param("started", marks=pytest.mark.slow)], autouse=True)
 def way(request, monkeypatch):
-    """Both ways to start a child, each test with new ones."""
+    """Both ways to start a child, each test with new ones; `test_both_ways` is not slow."""
     outside_module.close()
     monkeypatch.setattr(outside_module, "_may_fork", lambda: request.param == "forked")
     yield request.param
@@ -157,8 +157,14 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("deed", HOSTILE, ids=lambda deed: deed.__name__)
-@pytest.mark.parametrize("is_first", [True, False], ids=["cold", "warm"])
+WARM = (crash, spin)  # a file before may have left it broken: all but time is tried anew
+
+
+@pytest.mark.parametrize(
+    "deed, is_first",
+    [*((deed, True) for deed in HOSTILE if deed is not spin), *((deed, False) for deed in WARM)],
+    ids=lambda value: getattr(value, "__name__", "cold" if value else "warm"),
+)
 def test_whatever_a_file_does_is_one_message_and_the_next_is_read(path, deed, is_first):
     if not is_first:
         outside(pid, path)
@@ -200,6 +206,16 @@ def test_values_come_back_as_they_were(tmp_path):
     assert first.dtype == np.uint16 and empty.shape == (0, 3) and number == 0.5
     assert found["nothing"] == {} and found["one"].shape == () and found["one"] == 2.5
     assert found["large"].shape == (3000, 1000) and (found["large"] == 7.25).all()
+
+
+def test_both_ways(path, monkeypatch):
+    for may_fork in (True, False):
+        outside_module.close()
+        monkeypatch.setattr(outside_module, "_may_fork", lambda may=may_fork: may)
+        assert outside(several, path, 3)["numbers"][0] == 3
+        with pytest.raises(InputError, match="signal 11"):
+            outside(crash, path)
+        assert outside(pid, path) > 0
 
 
 def test_one_child_decodes_file_after_file(path):

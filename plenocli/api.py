@@ -67,6 +67,7 @@ from plenocli.inverse.sparse import dictionary as sparse
 from plenocli.inverse.sparse.dictionary import INCOHERENCE, PULL, Dictionary
 from plenocli.inverse.sparse.learning import advance, learner_for
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
+from plenocli.inverse.spectra.polarisation import stokes
 from plenocli.inverse.spectra.spectra import Spectra
 
 __all__ = [
@@ -320,9 +321,9 @@ def demultiplex(
         )
         found = solver.estimate(_capture(capture), "capture")
         if white is None:
-            return found
+            return stokes(found)
         reference = solver.estimate(_capture(white), "white", method_of_white(method))
-        return found.relative_to(reference, reflectance)
+        return stokes(found.relative_to(reference, reflectance))
 
 
 def reconstruct(

@@ -2,11 +2,13 @@
 pixels behind 12x16 lenslets, scenes of random reflectances (CIE 224 surfaces of random brightness),
 errors of `demux --method auto` and of the pseudo-inverse against the reflectance that the filters
 let through and against the answer for an even object, with the stated errors; and the time of one
-solution for 10,000 lenslets. Captures come from the exact model over --superpixels and --samples
-points, the neighbours' light from the description (12 points), with the sensor 1 % further away and
-the filters 1 % larger where --wrong says so.
+solution for 10,000 lenslets. `choice` compares what `auto` takes with every method on cameras of
+random filters, charts and exposures. Captures come from the exact model over --superpixels and
+--samples points, the neighbours' light from the description (12 points), with the sensor 1 %
+further away and the filters 1 % larger where --wrong says so.
 
     python pipelines/benchmarks/neighbours.py four
+    python pipelines/benchmarks/neighbours.py choice --cases 40
 """
 
 import argparse
@@ -53,24 +55,77 @@ class Patches:
         return values[self.order[(i[:, None] * 37 + j[None]) % 4000]].astype(np.float32)
 
 
+class Spots:
+    """A scene that shares nothing with Patches: discs of a few pigments, each a product of smooth
+    steps in wavelength, on a ground that changes slowly.
+    """
+
+    spectral = True
+
+    def __init__(self, seed):
+        rng = np.random.default_rng([seed, 77])
+        self.steps = rng.uniform(400e-9, 690e-9, (12, 2)), rng.uniform(8e-9, 60e-9, (12, 2))
+        self.ends = rng.uniform(0.03, 0.95, (12, 3))
+        self.discs = rng.uniform(0, 1, (int(rng.integers(6, 90)), 2))
+        self.sizes = rng.uniform(0.02, 0.35, len(self.discs)) * np.sqrt(6 / len(self.discs))
+        self.tilt = rng.uniform(-0.5, 0.5, 2)
+
+    def at(self, wavelength, rows, columns):
+        """Reflectance on rows x columns points."""
+        rise = 1 / (1 + np.exp((self.steps[0] - wavelength) / self.steps[1] * 4))
+        ends = self.ends
+        pigments = ends[:, 0] + ((ends[:, 1:] - ends[:, :1]) * rise).mean(axis=1)
+        y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (rows, columns)), indexing="ij")
+        out = pigments[0] * (1 + self.tilt[0] * (y - 0.5) + self.tilt[1] * (x - 0.5))
+        for k, ((cy, cx), size) in enumerate(zip(self.discs, self.sizes)):
+            out[np.hypot(y - cy, (x - cx) * 4 / 3) < size] = pigments[1 + k % 11]
+        return np.clip(out, 0.01, 0.98).astype(np.float32)
+
+
+def drawn(seed):
+    """A camera of random filters in front of a random lens."""
+    from plenocli.forward.camera.model import Camera
+
+    rng = np.random.default_rng([seed, 5])
+    layout = [(1, 2), (2, 2), (2, 2), (2, 3), (3, 3)][int(rng.integers(5))]
+    count = layout[0] * layout[1]
+    width = rng.uniform(12e-9, 45e-9)
+    centres = np.linspace(430e-9, 670e-9, count) + rng.uniform(-8e-9, 8e-9, count)
+    data = camera_of("four" if rng.uniform() < 0.7 else "singlet").model_dump()
+    data["light"] |= {"wavelengths": tuple(sorted(centres))}
+    data["filter_array"] = {
+        "layout": layout,
+        "gap": rng.uniform(0, 0.3e-3),
+        "size": rng.uniform(5.6e-3, 6.6e-3),
+        "filters": [
+            {"center": c, "fwhm": width * rng.uniform(0.8, 1.2), "peak": rng.uniform(0.4, 0.9)}
+            for c in rng.permutation(centres)
+        ],
+    }
+    well = rng.uniform(5e3, 5e4)
+    data["sensor"] |= {"read_noise": rng.uniform(1, 12), "full_well": well, "gain": 3600 / well}
+    return Camera.model_validate(data, context={"si": True})
+
+
+def camera_of(name):
+    """A spectral camera of the samples with 20x20 pixels behind 12x16 lenslets."""
+    from plenocli.files.read.cameras import read_camera
+
+    small = {"sensor.pixels_per_lenslet": (20, 20), "sensor.pixel_pitch": 5.2e-6}
+    described = read_camera(ROOT / "sample_configs" / CAMERAS[name])
+    return described.replace(**{"lenslet_array.count": COUNT}, **small)
+
+
 class Bench:
     """One camera, its captures and its calibration."""
 
-    def __init__(self, name, superpixels, samples):
-        from plenocli.files.read.cameras import read_camera
+    def __init__(self, described, superpixels, samples):
         from plenocli.forward.accuracy.dial import pif_builder
         from plenocli.forward.scene.light import broadband
         from plenocli.forward.scene.tables import illuminant
         from plenocli.forward.sensor.exposure import StoredMatrix
 
-        self.described = read_camera(ROOT / "sample_configs" / CAMERAS[name]).replace(
-            **{
-                "lenslet_array.count": COUNT,
-                "sensor.pixels_per_lenslet": (20, 20),
-                "sensor.pixel_pitch": 5.2e-6,
-            }
-        )
-        self.samples = samples
+        self.described, self.samples = described, samples
         self.camera = self.described.replace(**{"object.samples_per_lenslet": (samples, samples)})
         self.light = broadband(self.camera, lambda w: illuminant("D65", w), None)
         self.matrices = {}
@@ -114,7 +169,7 @@ class Bench:
         from plenocli.forward.camera.pupil import filter_transmittance
 
         back = np.linalg.pinv(np.asarray(self.calibration.response.matrix, float))
-        filters = self.camera.filter_array.filters
+        filters = sorted(self.camera.filter_array.filters, key=lambda one: one.center)
         through, even = [], []
         for photons, w in zip(self.light.photons, self.light.wavelengths):
             through.append([photons * filter_transmittance(f, w) for f in filters])
@@ -169,6 +224,41 @@ def rms(value, sigma, truth, white):
     )
 
 
+def choice(cases, first, superpixels, samples):
+    """Print what auto takes in random cases, beside the best method; how often it is within 5 %."""
+    from plenocli.inverse.spectra.demultiplexer import Demultiplexer
+
+    print("| case | bands | scene | exposure | auto took | error | best | its error | ratio |")
+    ratios = []
+    for number in range(cases):
+        seed = first + number
+        rng = np.random.default_rng([seed, 9])
+        if number % 4 == 0:
+            bench = Bench(drawn(seed), superpixels, samples)
+            solver = Demultiplexer(bench.calibration, camera=bench.described, ratio=True)
+        kind = ["spots", "spots", *SCENES][int(rng.integers(2 + len(SCENES)))]
+        scene = Spots(seed) if kind == "spots" else Patches(kind, seed)
+        exposure = float(2 ** -rng.uniform(0, 7))
+        truth, shot = bench.truths(scene)[0], bench.shoot(scene, seed, exposure)
+        errors, zs, took = {}, {}, ""
+        for method in ("auto", "single-pixel", "pinv", "wls", "lmmse", "coupled", "fine"):
+            found = solver.estimate(shot, "shot", method)
+            errors[method], zs[method] = rms(found.value, found.sigma, truth, bench.white)
+            took = took or found.method
+        best = min((m for m in errors if m != "auto"), key=errors.__getitem__)
+        ratios.append(errors["auto"] / errors[best])
+        print(
+            f"| {seed} | {len(truth)} | {kind} | {exposure:.3f} | {took} (z {zs['auto']:.2f}) | "
+            f"{errors['auto']:.5f} | {best} | {errors[best]:.5f} | {ratios[-1]:.3f} | "
+            + " ".join(f"{m} {e:.4f}" for m, e in errors.items()),
+            flush=True,
+        )
+    within = np.mean(np.array(ratios) <= 1.05)
+    print(
+        f"within 5 % of the best method in {within:.0%} of {cases}; worst {max(ratios):.2f} times"
+    )
+
+
 def speed(bench):
     """CPU seconds of both solutions for 100 x 100 lenslets of 400 pixels."""
     from plenocli.inverse.spectra.coupled import coupled, fine
@@ -205,13 +295,18 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("camera", choices=CAMERAS)
+    parser.add_argument("camera", choices=[*CAMERAS, "choice"])
+    parser.add_argument("--cases", type=int, default=40, help="of choice")
+    parser.add_argument("--first", type=int, default=9000, help="seed of the first case of choice")
     parser.add_argument("--superpixels", type=int, default=3, help="a side, of the captures")
     parser.add_argument("--samples", type=int, default=12, help="points a side, of the captures")
     parser.add_argument("--wrong", action="store_true", help="distance and filters 1 % off")
     parser.add_argument("--seeds", type=int, nargs="+", default=[21])
     options = parser.parse_args()
-    bench = Bench(options.camera, options.superpixels, options.samples)
+    if options.camera == "choice":
+        choice(options.cases, options.first, options.superpixels, options.samples)
+        return
+    bench = Bench(camera_of(options.camera), options.superpixels, options.samples)
     table(bench, options.wrong, options.seeds)
     speed(bench)
 

@@ -117,6 +117,9 @@ Wavelength = Annotated[float, quantity(parse_length, "550 nm", 100e-9, 100e-6, f
 SignedLength = Annotated[float, quantity(parse_length, "20 nm", -1e-3, 1e-3, format_length)]
 
 
+Place = Annotated[float, quantity(parse_length, "-2 mm", -10.0, 10.0, format_length)]
+
+
 Electrons = Annotated[float, quantity(_suffix("e"), "15000 e", 0.0, 1e12, _plain("e"))]
 
 

@@ -30,6 +30,7 @@ class Result:
     values: (row, column) or (band, row, column) float64; atoms (point, atom) of a dictionary.
     wavelengths: (band,) m, None for a single picture.
     sigma: like values, or None.
+    s1: like values, what is polarised of spectra (plenocli.inverse.spectra.spectra), or None.
     quantity: "radiance", "reflectance", or "" for pictures.
     method: how it was computed, "" where nobody says.
     block: (rows, columns) of object points under a lenslet, where the file says so.
@@ -47,6 +48,7 @@ class Result:
     values: np.ndarray
     wavelengths: np.ndarray | None = None
     sigma: np.ndarray | None = None
+    s1: np.ndarray | None = None
     quantity: str = ""
     method: str = ""
     block: tuple[int, int] | None = None

@@ -160,9 +160,10 @@ def response_errors(
 
 def _filter_name(one: "Filter") -> str:
     """What stands in a cell: its wavelength in nm, or how much it lets through."""
+    state = f"\n{one.polariser.removesuffix(' deg')}\N{DEGREE SIGN}" if one.polariser else ""
     if one.middle is not None:
-        return f"{one.middle * 1e9:.4g}"
-    return "clear" if one.transmittance == 1 else f"{one.transmittance:.3g}"
+        return f"{one.middle * 1e9:.4g}{state}"
+    return ("clear" if one.transmittance == 1 else f"{one.transmittance:.3g}") + state
 
 
 def filters_picture(camera: "Camera") -> bytes:
@@ -171,7 +172,7 @@ def filters_picture(camera: "Camera") -> bytes:
     """
     from matplotlib.patches import Circle, Rectangle
 
-    from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
+    from plenocli.forward.camera.pupil import filter_places, filter_transmittance
     from plenocli.forward.sensor.cfa import sensitivity
 
     if camera.filter_array is None:
@@ -187,21 +188,24 @@ def filters_picture(camera: "Camera") -> bytes:
             if square
             else Circle((0, 0), half, color="#444444")
         )
-        for number, (((y0, y1, x0, x1), _), one) in enumerate(
-            zip(filter_cells(camera, 550e-9) or (), filters, strict=True)
+        for number, (cells, one) in enumerate(
+            zip(filter_places(camera.filter_array), filters, strict=True)
         ):
             colour = COLOURS[number % len(COLOURS)]
-            pupil.add_patch(
-                Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour)
-            )
-            pupil.text(
-                (x0 + x1) * 500,
-                (y0 + y1) * 500,
-                _filter_name(one),
-                ha="center",
-                va="center",
-                color="white",
-            )
+            for y0, y1, x0, x1 in cells:
+                pupil.add_patch(
+                    Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour)
+                )
+            if cells:
+                y0, y1, x0, x1 = max(cells, key=lambda c: (c[1] - c[0]) * (c[3] - c[2]))
+                pupil.text(
+                    (x0 + x1) * 500,
+                    (y0 + y1) * 500,
+                    _filter_name(one),
+                    ha="center",
+                    va="center",
+                    color="white",
+                )
             through.plot(
                 wavelengths * 1e9, [filter_transmittance(one, w) for w in wavelengths], color=colour
             )

@@ -27,6 +27,15 @@ from plenocli.cli import options
     ),
 )
 @click.option(
+    "--polarisation",
+    metavar="DEGREE|PICTURE",
+    help=(
+        "Degree of linear polarisation of the scene's light, from -1 (all at 90 degrees) to 1 (all "
+        "at 0), as a number or a picture: an EXR of one channel, or a grey PNG from 0 to 1. "
+        "Default: not polarised."
+    ),
+)
+@click.option(
     "--volume",
     metavar="VOLUME",
     help=(
@@ -139,6 +148,7 @@ def command(
     *,
     scene: str | None,
     target: str | None,
+    polarisation: str | None,
     volume: str | None,
     layers: tuple[str, ...],
     output: Path,
@@ -171,6 +181,7 @@ def command(
       plenocli capture-sim camera.toml --scene photo.png --snr 60dB -o capture.h5
       plenocli capture-sim camera.toml --target mono:450nm --seed 3 -o band450.dng
       plenocli capture-sim camera.toml --target colorchecker --exposure 2.5ms -o chart.dng
+      plenocli capture-sim camera.toml --scene photo.png --polarisation 0.4 -o capture.h5
       plenocli capture-sim camera.toml --scene photo.png --refine 3 --superpixels 3x3 \\
           --snr 60dB -o fine.h5
       plenocli capture-sim microscope.toml --volume phantom:shells --refine 2 --snr 40dB \\
@@ -197,6 +208,7 @@ def command(
             coherent_ring=coherent_ring,
             accuracy=accuracy,
             field_nodes=field_nodes,
+            polarisation=polarisation,
             model=model,
             seed=seed,
         ),

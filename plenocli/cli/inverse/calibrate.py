@@ -58,6 +58,16 @@ from plenocli.cli import options
     ),
 )
 @click.option(
+    "--band-across",
+    "across",
+    type=options.Pair("FILE", Path),
+    multiple=True,
+    help=(
+        "For cameras with polarisers: the same under light along 90 degrees, where that of --band "
+        "is along 0. Repeatable."
+    ),
+)
+@click.option(
     "--band-radiance",
     "radiances",
     multiple=True,
@@ -120,6 +130,7 @@ def command(
     grid_error: float,
     darks: tuple[Path, ...],
     bands: tuple[tuple[float, Path], ...],
+    across: tuple[tuple[float, Path], ...],
     radiances: tuple[tuple[float, float], ...],
     camera: Path | None,
     response: str,
@@ -159,6 +170,7 @@ def command(
         grid_error=grid_error,
         darks=darks,
         bands=bands,
+        across=across,
         camera=camera,
         response=response,
         lattice=lattice,

@@ -24,6 +24,10 @@ DEFINITIONS = {
         "RMSE over a patch's lenslets (Berkner et al. 2013)"
     ),
     "six_patch_rmse": "mean of six_patch_rmse_per_band over the bands",
+    "s1_rmse": (
+        "root mean square error over lenslets and bands of the Stokes parameter s1, the light "
+        "polarised along 0 degrees less that along 90, in units of reflectance"
+    ),
     "spectral_angle_deg": (
         "mean angle between spectrum and truth as vectors, degrees; blind to brightness"
     ),
@@ -79,6 +83,21 @@ class PatchesScore:
     patch_rmse_per_band: list[float] | None
     six_patches_seen: int
     six: SixPatchScore | None
+
+
+@dataclass(frozen=True)
+class PolarisationScore:
+    """Error of what is polarised of the light; see DEFINITIONS."""
+
+    s1_rmse: float
+
+
+def score_polarisation(s1: np.ndarray, truth: np.ndarray) -> PolarisationScore | None:
+    """The score of s1 (band, row, column) against the true one where it can be told, or None."""
+    known = np.isfinite(s1)
+    if not known.any():
+        return None
+    return PolarisationScore(float(np.sqrt(np.mean((s1 - truth)[known] ** 2))))
 
 
 def rmse_per_band(estimate: ArrayLike, truth: ArrayLike) -> np.ndarray:

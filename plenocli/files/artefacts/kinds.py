@@ -282,6 +282,15 @@ CAPTURE = Schema(
             minimum=0,
             ascending=True,
         ),
+        dataset(
+            "capture/polarisation",
+            "scene_row scene_column",
+            "f",
+            "1",
+            "degree of linear polarisation of capture/scene, from -1 (90 degrees) to 1 (0 degrees)",
+            optional=True,
+            minimum=-1,
+        ),
     ),
     attrs={
         "capture": (
@@ -388,6 +397,7 @@ def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
         ("response/F", "response/window"),
         ("response/window", "response/origin"),
         ("response/origin", "response/window"),
+        ("response/polarised", "response/F"),
     ):
         if name in data and needed not in data:
             return f"'{name}' lacks '{needed}'"
@@ -493,6 +503,15 @@ CALIBRATION = Schema(
             optional=True,
             maskable=True,
             minimum=0,
+        ),
+        dataset(
+            "response/polarised",
+            "lenslet_row lenslet_column pixel band | pixel band",
+            "f",
+            "DN",
+            "what F has more of light along 0 degrees, and less of light along 90 degrees",
+            optional=True,
+            maskable=True,
         ),
         dataset(
             "response/wavelength",
@@ -634,6 +653,26 @@ SPECTRA = Schema(
             "f",
             "1",
             "mean square of what F b leaves of a superpixel over its noise; 1 is noise alone",
+            optional=True,
+            maskable=True,
+            minimum=0,
+        ),
+        dataset(
+            "spectra/s1",
+            "band lenslet_row lenslet_column",
+            "f",
+            "1",
+            "Stokes parameter s1, where spectra/value is s0: light along 0 less that along 90 "
+            "degrees",
+            optional=True,
+            maskable=True,
+        ),
+        dataset(
+            "spectra/s1_sigma",
+            "band lenslet_row lenslet_column",
+            "f",
+            "1",
+            "predicted standard deviation of s1",
             optional=True,
             maskable=True,
             minimum=0,

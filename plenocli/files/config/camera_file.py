@@ -28,15 +28,19 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
 
 
 def with_curves(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A description whose filters have the curves that they name by file: what is written of the
-    camera later holds the values.
+    """A description whose filters have the curves and the drawing that they name by file: what is
+    written of the camera later holds the values.
 
-    data: the tables of a camera file; curves are put into it.
+    data: the tables of a camera file; curves and drawing are put into it.
     folder: of that file, to which names are relative.
 
-    Raises InputError for a file that holds no curve.
+    Raises InputError for a file that holds no curve, or no drawing.
     """
+    from plenocli.files.images.maps import read_drawing
+
     section = data.get("filter_array")
+    if isinstance(section, dict) and isinstance(section.get("drawing"), str):
+        section["drawing"] = read_drawing(folder / section["drawing"])
     filters = section.get("filters") if isinstance(section, dict) else None
     for one in filters if isinstance(filters, list) else ():
         if isinstance(one, dict) and isinstance(one.get("curve"), str):
@@ -88,6 +92,7 @@ _NUMBERS = {
     "transmission",
     "transmittance",
     "index",
+    "leak",
     "pixel_shift",
     "prnu",
     "hot_pixels",

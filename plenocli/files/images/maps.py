@@ -38,13 +38,42 @@ def read_transmittance(path: str | os.PathLike[str]) -> np.ndarray:
         return _one_channel(path)
     if kind != "png":
         raise InputError("is neither PNG nor EXR", path, "give the transmittance as .png or .exr")
-    stored, names, bits = read_stored(path, kind, most=MAX_BYTES)
+    stored, bits = _grey(path, "a transmittance")
+    return stored.astype(float) / (2 ** max(bits, 8) - 1)
+
+
+def read_drawing(path: str | os.PathLike[str]) -> list[str]:
+    """Places of filters from a grey PNG, as plenocli.forward.camera.model.FilterArray draws them:
+    its levels above 0, from dark to bright, are the filters in their order; 0 is none.
+
+    Returns a text for each row.
+    Raises InputError.
+    """
+    from plenocli.forward.camera.model import FILTER_SIGNS
+
+    _require_small(path)
+    if file_type(path) != "png":
+        raise InputError("is no PNG", path, "give the drawing of the filters as a grey .png")
+    stored = _grey(path, "a drawing of filters")[0]
+    levels = np.union1d(stored, [0])
+    if len(levels) > len(FILTER_SIGNS):
+        raise InputError(
+            f"holds {len(levels) - 1} levels of grey; there are at most {len(FILTER_SIGNS) - 1} "
+            "filters",
+            path,
+            "draw every filter in one level, without smoothed edges",
+        )
+    numbers = np.searchsorted(levels, stored)
+    return ["".join(FILTER_SIGNS[n] for n in row) for row in numbers.tolist()]
+
+
+def _grey(path: str | os.PathLike[str], what: str) -> tuple[np.ndarray, int]:
+    """Stored numbers (row, column) of a PNG without colour, and their bits; alpha is ignored."""
+    stored, names, bits = read_stored(path, "png", most=MAX_BYTES)
     colours = stored[..., [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]]
     if np.any(colours != colours[..., :1]):
-        raise InputError(
-            "is a colour picture; a transmittance has one channel", path, "convert it to grey"
-        )
-    return colours[..., 0].astype(float) / (2 ** max(bits, 8) - 1)
+        raise InputError(f"is a colour picture; {what} has one channel", path, "convert it to grey")
+    return colours[..., 0], bits
 
 
 def read_wavefront(path: str | os.PathLike[str]) -> np.ndarray:

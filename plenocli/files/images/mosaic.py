@@ -253,6 +253,7 @@ def write_capture(
     *,
     scene: np.ndarray | None = None,
     wavelengths: np.ndarray | None = None,
+    degree: np.ndarray | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a simulated capture as .h5, .exr or .dng.
@@ -263,6 +264,7 @@ def write_capture(
     provenance: where it came from.
     scene: (band, scene_row, scene_column) the object as sampled, which an .h5 keeps.
     wavelengths: (band,) of the scene, m.
+    degree: (scene_row, scene_column), of its polarisation.
     overwrite: replace a file that is there.
 
     Raises ValueError (a bug of the caller), UsageError, OutputError.
@@ -278,6 +280,7 @@ def write_capture(
             "lenslet_centre": capture.grid.centre if capture.grid else None,
             "scene": scene,
             "wavelength": wavelengths,
+            "polarisation": degree,
         }
         data = {f"capture/{name}": v for name, v in data.items() if v is not None}
         artefact = Artefact("capture", data, {"capture": said}, provenance)

@@ -68,6 +68,8 @@ def _write_artefact(
         "spectra/sigma": spectra.sigma.astype(np.float32),
         "spectra/wavelength": spectra.wavelength,
         "spectra/residual": spectra.residual,
+        "spectra/s1": spectra.s1,
+        "spectra/s1_sigma": spectra.s1_sigma,
     }
     write_artefact(
         path, Artefact("spectra", data, {"spectra": attrs}, provenance), overwrite=overwrite
@@ -95,6 +97,11 @@ def _write_exr(path: str | Path, spectra: Spectra, provenance: Provenance, overw
         spectra.quantity,
         rgb=rgb,
         sigma=sigma,
+        others={
+            name: values.astype(np.float32)
+            for name, values in (("s1", spectra.s1), ("s1_sigma", spectra.s1_sigma))
+            if values is not None
+        },
         attrs=texts,
         overwrite=overwrite,
     )

@@ -75,6 +75,7 @@ def write_spectral_exr(
     sigma: np.ndarray | None = None,
     attrs: Mapping[str, str] | None = None,
     *,
+    others: Mapping[str, np.ndarray] | None = None,
     overwrite: bool = False,
     compression: str = "zip",
 ) -> None:
@@ -87,6 +88,7 @@ def write_spectral_exr(
     rgb: (3, row, column) linear preview; computed where None.
     sigma: like the cube, into channels "sigma.<wavelength>" that other readers skip.
     attrs: text by its names.
+    others: further cubes, each in channels of its name that other readers skip likewise.
 
     Raises ValueError, UsageError, OutputError.
     """
@@ -105,10 +107,9 @@ def write_spectral_exr(
     channels = {
         f"{_PREFIX[quantity]}.{label}": plane for label, plane in zip(labels, cube, strict=True)
     }
-    if sigma is not None:
-        channels |= {
-            f"sigma.{label}": plane for label, plane in zip(labels, np.asarray(sigma), strict=True)
-        }
+    beside = dict(others or {}) | ({} if sigma is None else {"sigma": np.asarray(sigma)})
+    for name, values in beside.items():
+        channels |= {f"{name}.{label}": one for label, one in zip(labels, values, strict=True)}
     channels |= dict(zip("RGB", preview(wavelengths, cube) if rgb is None else rgb, strict=True))
     layout = {"spectralLayoutVersion": "1.0"}
     if quantity == "radiance":

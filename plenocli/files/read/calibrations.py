@@ -138,6 +138,7 @@ def write_calibration(
             "response/F": c.response.matrix,
             "response/covariance": c.response.variance,
             "response/wavelength": c.response.wavelengths,
+            "response/polarised": c.response.polarised,
             "response/energy": c.response.energy,
         }
         attrs["response"] = _response_attrs(c.response, c.sensor)
@@ -217,6 +218,7 @@ def _response(data: Datasets, attrs: Attributes) -> Response:
         matrix=data["response/F"],
         variance=data.get("response/covariance"),
         wavelengths=data["response/wavelength"],
+        polarised=data.get("response/polarised"),
         energy=data.get("response/energy"),
         quality=quality,
         notes=notes if isinstance(notes, dict) else None,

@@ -6,13 +6,18 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.errors import UsageError
+from plenocli.base.errors import InputError, UsageError
+from plenocli.base.progress import note
 from plenocli.files.read.class_table import read_labelled
 from plenocli.forward.scene.labelled import SpectraChart
-from plenocli.forward.scene.scenes import Chart, Cube, Photograph
+from plenocli.forward.scene.scenes import Chart, Cube, Photograph, Polarised, Scene
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
 
 EMBEDDED = "skimage:"
 
@@ -50,6 +55,40 @@ def read_scene(
     if picture.wavelengths is not None:
         return Cube(picture.wavelengths, np.moveaxis(picture.values, -1, 0), sampling)
     return Photograph(picture.values, sampling, spectral)
+
+
+def read_polarised(scene: Scene, degree: str, camera: Camera, sampling: str = "fit") -> Polarised:
+    """A scene whose light is polarised in part.
+
+    degree: of linear polarisation, -1 to 1: a number, or the path of a grey PNG or an EXR of one
+        channel.
+    camera: that looks at it, whose light must be that of both polarisations.
+    sampling: as read_scene's, of the picture.
+
+    Raises InputError for a picture, UsageError for a number, that no light has.
+    """
+    from plenocli.files.images.maps import read_transmittance
+    from plenocli.forward.camera.pupil import tells_polarisation
+
+    if camera.light.polarisation is not None:
+        raise UsageError(
+            f"the camera's light is polarised at {camera.light.polarisation} already",
+            "--polarisation",
+            "leave one of the two out",
+        )
+    if not tells_polarisation(camera):
+        note("the camera has no polarisers: it does not tell how the light is polarised")
+    try:
+        values = np.array([[float(degree)]])
+    except ValueError:
+        values = read_transmittance(degree)
+        if not (np.isfinite(values).all() and np.abs(values).max() <= 1):
+            raise InputError(
+                "holds values that are no degree of polarisation", degree, "use -1 to 1"
+            ) from None
+    if not np.abs(values).max() <= 1:
+        raise UsageError(f"{degree} is no degree of polarisation", "--polarisation", "use -1 to 1")
+    return Polarised(scene, values[:, :, None] if values.size > 1 else values, sampling)
 
 
 @lru_cache(maxsize=16)

@@ -128,6 +128,7 @@ def result_of(artefact: "Artefact", path: Path | str) -> Result:
         values=values,
         wavelengths=data.get(f"{kind}/wavelength") if values.ndim == 3 else None,
         sigma=data.get(f"{kind}/sigma"),
+        s1=data.get("spectra/s1"),
         quantity=str(attrs.get("quantity", "")),
         method=method,
         block=_block(attrs.get("notes")),

@@ -57,6 +57,23 @@ def read_truth(
     return values if spectral else values[0]
 
 
+def read_true_s1(truth: Path | str, result: Result) -> np.ndarray | None:
+    """What is polarised of the light of a capture's scene, as read_truth has all of it: s1; None
+    where the truth does not say it.
+    """
+    if Path(truth).suffix != ".h5":
+        return None
+    from plenocli.files.artefacts.container import read_artefact
+
+    artefact = read_artefact(truth, ("capture", "spectra", "image"))
+    degree = artefact.data.get("capture/polarisation")
+    if degree is None or "capture/scene" not in artefact.data:
+        return None
+    values = np.asarray(artefact.data["capture/scene"], float) * degree
+    values = _at_wavelengths(values, artefact.data.get("capture/wavelength"), result.bands, truth)
+    return np.array([_coarser(plane, *result.grid) for plane in values])
+
+
 def _scene_truth(
     truth: Path | str, result: Result, sampling: str, camera: Camera | None
 ) -> np.ndarray:

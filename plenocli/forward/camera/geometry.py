@@ -424,3 +424,14 @@ def lenslet_shift(camera: Camera, row: int, column: int) -> tuple[int, int, tupl
         # a billionth of a pixel is rounding
         shift.append(0.0 if abs(nearest - ideal) < 1e-9 else nearest - ideal)
     return first[0], first[1], (shift[0], shift[1])
+
+
+def finely_sampled(camera: Camera, wavelength: float) -> Camera:
+    """The camera with as many object points behind a lenslet as its field has diffraction cells:
+    fewer leave fringes that an even object has not.
+
+    wavelength: m.
+    """
+    least = math.ceil(geometry(camera, wavelength).diffraction_cells) + 1
+    samples = tuple(max(n, least) for n in camera.object.samples_per_lenslet)
+    return camera.replace(**{"object.samples_per_lenslet": samples})

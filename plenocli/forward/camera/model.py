@@ -35,6 +35,7 @@ from plenocli.base.quantities import (
     Length,
     Luminance,
     Pair,
+    Place,
     Radiance,
     Section,
     SignedLength,
@@ -392,6 +393,10 @@ class Band(Section):
         return self
 
 
+Polarisation = Literal["0 deg", "90 deg"]
+"""Direction of the electric field: along the rows of the pupil (+x), or across them."""
+
+
 class Light(Section):
     """What lights the scene.
 
@@ -403,6 +408,7 @@ class Light(Section):
 
     Exactly one of `wavelengths` (lines) and `band` is given; with a band, `wavelengths`
     resolves to its centre. A camera with filters may leave both out: its bands are their centres.
+    `polarisation`: of all light; without it light is unpolarised, or as polarised as the scene.
     """
 
     wavelengths: Resolved[
@@ -411,6 +417,7 @@ class Light(Section):
     band: Band | None = None
     design_wavelength: Resolved[Wavelength] = _LEFT_OUT
     illuminant: str = "D65"
+    polarisation: Polarisation | None = None
     white_exposure: Duration = 0.01
     illuminance: Illuminance | None = None
     luminance: Luminance | None = None
@@ -476,6 +483,10 @@ class Filter(Section):
     - `transmittance` alike at all wavelengths: 1 is a clear cell, less a neutral one;
     - a measured `curve`, in a file of two columns.
 
+    polariser: direction of the electric field that it lets through, "0 deg" along rows (+x) or "90
+        deg"; the numbers above are those of light of this state.
+    leak: transmittance for the crossed state over that for its own.
+    polygon: its corners [y, x] in the pupil, instead of a cell of a layout; y downwards.
     index: effective refractive index of an interference filter, whose band moves to shorter
         wavelengths with the angle of the light: T(l) becomes T(l / sqrt(1 - (sin t / index)^2)).
     """
@@ -486,10 +497,17 @@ class Filter(Section):
     blocking: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
     transmittance: Unit | None = None
     curve: Curve | None = None
+    polariser: Polarisation | None = None
+    leak: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    polygon: (
+        Annotated[tuple[tuple[Place, Place], ...], Field(min_length=3, max_length=1000)] | None
+    ) = None
     index: Annotated[float, Field(ge=1.0, le=5.0)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
+        if self.leak is not None and self.polariser is None:
+            raise ValueError("leak goes with polariser")
         band = self.center is not None or self.fwhm is not None
         kinds = [band, self.transmittance is not None, self.curve is not None]
         if sum(kinds) != 1:
@@ -507,6 +525,13 @@ class Filter(Section):
             whole = {"peak": self.peak or 0.8, "blocking": self.blocking or 0.0}
             self.__dict__.update(whole)
         return self
+
+    def passes(self, state: str | None) -> float:
+        """Share of light of a polarisation that it leaves; state None: unpolarised light."""
+        if self.polariser is None or self.polariser == state:
+            return 1.0
+        leak = self.leak or 0.0
+        return leak if state is not None else (1 + leak) / 2
 
     @property
     def middle(self) -> float | None:
@@ -552,6 +577,8 @@ GAUSSIAN_FLANK = 2 * math.sqrt(2 * math.log(2)) * math.exp(-0.5)
 """Steepest slope of a Gaussian band of unit peak and full width at half maximum."""
 
 
+FILTER_SIGNS = ".123456789abcdefghijklmnopqrstuvwxyz"
+"""What names filters in a drawing, by their number from 1."""
 SAME_BAND = 1e-9
 """m; filters whose centres are nearer have one band."""
 _OF_BANDS = ("light", "filter_array")
@@ -559,30 +586,63 @@ _OF_BANDS = ("light", "filter_array")
 PixelShift = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
+Drawn = Annotated[str, Field(min_length=1, max_length=256, pattern="^[.0-9a-z]+$")]
+
+
 class FilterArray(Section):
-    """Filters in the main lens, in cells row by row.
+    """Filters in the main lens, by one of
+    - `layout`: as many cells by rows and columns, row by row, with a `gap` between them;
+    - `drawing`: rows of a picture over the square of side `size`, a character a place: "1" to "9"
+      and "a" to "z" for the filters from the first on, "." for none; a file may name a grey PNG
+      instead, whose levels from dark to bright are the filters in their order, 0 is none;
+    - a polygon of each filter.
 
     side: of the main lens that they stand on, which says at which angles light crosses them: those
         of the cone from the object point, or of that to its image on the array.
     """
 
-    layout: Pair
+    layout: Pair | None = None
+    drawing: Annotated[tuple[Drawn, ...], Field(min_length=1, max_length=256)] | None = None
     gap: Gap = 0.0
-    size: Resolved[Length] = _LEFT_OUT
+    size: Length | None = None
     side: Literal["object", "image"] | None = None
     filters: tuple[Filter, ...]
 
     @model_validator(mode="after")
-    def _one_filter_a_cell(self) -> Self:
-        rows, columns = self.layout
-        if len(self.filters) != rows * columns:
+    def _one_place_a_filter(self) -> Self:
+        outlined = [one.polygon is not None for one in self.filters]
+        if [self.layout is not None, self.drawing is not None, any(outlined)].count(True) != 1:
+            raise ValueError(
+                "say where the filters are by exactly one of layout, drawing and a polygon of each"
+            )
+        if self.layout is not None and len(self.filters) != math.prod(self.layout):
+            rows, columns = self.layout
             raise ValueError(
                 f"layout {rows} x {columns} needs {rows * columns} filters, row by row; there are "
                 f"{len(self.filters)}"
             )
+        if any(outlined) and not all(outlined):
+            raise ValueError(f"filters.{outlined.index(False)} has no polygon, others have")
+        if self.gap and self.layout is None:
+            raise ValueError("gap goes with layout")
+        if self.size is not None and any(outlined):
+            raise ValueError("size goes with layout or drawing; polygons have lengths of their own")
+        self._check_drawing()
         if self.side is not None and all(one.index is None for one in self.filters):
             raise ValueError("side goes with filters whose index says how far their bands move")
         return self
+
+    def _check_drawing(self) -> None:
+        rows = self.drawing or ("1",)
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError("rows of drawing are not of one length")
+        used = {FILTER_SIGNS.index(sign) for row in rows for sign in row if sign not in ".0"}
+        missing = set(range(1, len(self.filters) + 1)) ^ used if self.drawing else set()
+        if missing:
+            raise ValueError(
+                f"drawing and filters differ: {FILTER_SIGNS[min(missing)]!r} is not in both; there "
+                f"are {len(self.filters)} filters"
+            )
 
 
 class Fitted(Section):
@@ -708,15 +768,18 @@ class Camera(Section):
     def _fitting(self, cells: FilterArray) -> FilterArray:
         """The filter array with its size; ValueError where it does not fit into the pupil."""
         lens = self.main_lens
+        if cells.size is None and any(one.polygon is not None for one in cells.filters):
+            return cells
         if cells.size is None:
-            within = 1 if lens.aperture_shape == "square" else math.sqrt(0.5)
+            inscribed = cells.layout is not None and lens.aperture_shape != "square"
+            within = math.sqrt(0.5) if inscribed else 1
             cells = cells.model_copy(update={"size": lens.aperture_diameter * within})
         elif cells.size > lens.aperture_diameter * (1 + 1e-9):
             raise ValueError(
                 f"filter_array.size {format_length(cells.size)} is wider than the pupil, "
                 f"{format_length(lens.aperture_diameter)}"
             )
-        if cells.gap * max(cells.layout) >= cells.size:
+        if cells.layout is not None and cells.gap * max(cells.layout) >= (cells.size or 0):
             raise ValueError("filter_array.gap leaves no room for the filters")
         return cells
 

@@ -14,17 +14,28 @@ on by half a cell to the edge of the square.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.forward.camera.model import noll_indices
+from plenocli.base.errors import ConfigError
+from plenocli.forward.camera.model import FILTER_SIGNS, noll_indices
 from plenocli.forward.camera.quadrature import Cell
 
 if TYPE_CHECKING:
     from scipy.interpolate import NdBSpline
 
-    from plenocli.forward.camera.model import Aberration, Camera, Filter, MainLens
+    from plenocli.forward.camera.model import Aberration, Camera, Filter, FilterArray, MainLens
+
+POLARISATIONS = "0 deg", "90 deg"
+"""Two orthogonal states of light."""
+STRIPS = 64
+"""By which polygons are scanned, at least."""
+Polygon = Sequence[tuple[float, float]]
+"""Corners (y, x), m."""
 
 
 def aperture_area(lens: MainLens) -> float:
@@ -85,35 +96,151 @@ def filter_transmittance(filter_: Filter, wavelength: float) -> float:
 
 
 def filter_cells(camera: Camera, wavelength: float) -> list[tuple[Cell, float]] | None:
-    """Cells of the filter array.
+    """Rectangles of the filter array, for light of the polarisation that the camera's has.
 
-    Of a filter whose band moves with the angle, a cell has the mean over the angles at which light
-    crosses it; how the angle differs within the cell, and with the place of the object point, is
+    Of a filter whose band moves with the angle, a rectangle has the mean over the angles at which
+    light crosses it; how the angle differs within it, and with the place of the object point, is
     left out.
     wavelength: m.
 
     Returns [((y0, y1, x0, x1) m, intensity transmittance)], None where there is no array.
     """
-    array = camera.filter_array
-    if array is None:
+    if camera.filter_array is None:
         return None
+    return [
+        (cell, _through(camera, filter_, cell, wavelength))
+        for filter_, cells in zip(camera.filter_array.filters, filter_places(camera.filter_array))
+        for cell in cells
+    ]
+
+
+@lru_cache(maxsize=32)
+def filter_places(array: FilterArray) -> tuple[tuple[Cell, ...], ...]:
+    """The rectangles (y0, y1, x0, x1), m, that each filter of an array consists of.
+
+    Raises ConfigError for polygons that overlap.
+    """
+    if array.layout is None and array.drawing is None:
+        return _polygons([one.polygon or () for one in array.filters])
+    assert array.size is not None
+    if array.drawing is not None:
+        return _drawn(array.drawing, len(array.filters), array.size)
+    assert array.layout is not None
     rows, columns = array.layout
-    gap = array.gap or 0.0
     high, wide = (
-        (array.size - (rows - 1) * gap) / rows,
-        (array.size - (columns - 1) * gap) / columns,
+        (array.size - (rows - 1) * array.gap) / rows,
+        (array.size - (columns - 1) * array.gap) / columns,
     )
-    cells = []
-    for index, filter_ in enumerate(array.filters):
-        top = -array.size / 2 + (index // columns) * (high + gap)
-        left = -array.size / 2 + (index % columns) * (wide + gap)
-        cell = (top, top + high, left, left + wide)
-        cells.append((cell, _through(camera, filter_, cell, wavelength)))
-    return cells
+    corners = [
+        (-array.size / 2 + row * (high + array.gap), -array.size / 2 + column * (wide + array.gap))
+        for row in range(rows)
+        for column in range(columns)
+    ]
+    return tuple(((top, top + high, left, left + wide),) for top, left in corners)
+
+
+def _drawn(rows: tuple[str, ...], count: int, size: float) -> tuple[tuple[Cell, ...], ...]:
+    """Places of `count` filters drawn over a square of side `size`, m."""
+    down, across = (np.linspace(-size / 2, size / 2, n + 1) for n in (len(rows), len(rows[0])))
+    lines = [
+        (
+            float(down[k]),
+            float(down[k + 1]),
+            [
+                [(float(across[i]), float(across[j])) for i, j in _runs(row, sign)]
+                for sign in FILTER_SIGNS[1 : count + 1]
+            ],
+        )
+        for k, row in enumerate(rows)
+    ]
+    return _stacked(lines, count)
+
+
+def _runs(row: str, sign: str) -> list[tuple[int, int]]:
+    """First and behind the last place of each run of a sign."""
+    return [(found.start(), found.end()) for found in re.finditer(re.escape(sign) + "+", row)]
+
+
+def _polygons(polygons: Sequence[Polygon]) -> tuple[tuple[Cell, ...], ...]:
+    """Polygons as strips, each as wide as the polygon in its middle, so that areas are exact to
+    second order; strips end at corners.
+    """
+    heights = [y for polygon in polygons for y, _ in polygon]
+    even = np.linspace(min(heights), max(heights), STRIPS + 1)
+    ends = np.unique(np.concatenate([heights, even]))
+    lines = []
+    for top, bottom in zip(ends[:-1].tolist(), ends[1:].tolist()):
+        spans = [_crossed(polygon, (top + bottom) / 2) for polygon in polygons]
+        ordered = sorted(span for one in spans for span in one)
+        if any(right - left > 1e-9 for (_, right), (left, _) in zip(ordered, ordered[1:])):
+            where = f"{(top + bottom) / 2 * 1e3:.3g} mm below the axis"
+            raise ConfigError(f"polygons of filters overlap {where}", "filter_array.filters")
+        lines.append((top, bottom, spans))
+    return _stacked(lines, len(polygons))
+
+
+def _crossed(polygon: Polygon, y: float) -> list[tuple[float, float]]:
+    """What of the line at height y lies in a polygon, by pairs of crossings."""
+    edges = zip(polygon, (*polygon[1:], polygon[0]))
+    x = sorted(
+        x0 + (y - y0) / (y1 - y0) * (x1 - x0)
+        for (y0, x0), (y1, x1) in edges
+        if (y0 > y) != (y1 > y)
+    )
+    return list(zip(x[::2], x[1::2]))
+
+
+def _stacked(
+    lines: Sequence[tuple[float, float, Sequence[Sequence[tuple[float, float]]]]], count: int
+) -> tuple[tuple[Cell, ...], ...]:
+    """Rectangles of each filter from lines (top, bottom, its spans); spans that go on below are
+    one rectangle.
+    """
+    done: list[list[Cell]] = [[] for _ in range(count)]
+    open_: dict[tuple[int, tuple[float, float]], float] = {}
+    bottom = 0.0
+    for top, following, spans in [*lines, (lines[-1][1], lines[-1][1], [()] * count)]:
+        now = {(k, span) for k, one in enumerate(spans) for span in one}
+        for key in [key for key in open_ if key not in now]:
+            done[key[0]].append((open_.pop(key), bottom, *key[1]))
+        for key in sorted(now - open_.keys()):
+            open_[key] = top
+        bottom = following
+    return tuple(tuple(cells) for cells in done)
+
+
+def polarised(camera: Camera, state: str) -> Camera:
+    """The camera in light of one polarisation, "0 deg" or "90 deg"."""
+    light = camera.light.model_copy(update={"polarisation": state})
+    return camera.model_copy(update={"light": light})
+
+
+def polarisations(camera: Camera) -> tuple[Camera, ...]:
+    """The camera in the light of each polarisation that its light consists of and its filters tell
+    apart; the camera itself where they tell none.
+
+    Filters along 0 and 90 degrees leave these two states apart from each other: each is carried by
+    itself, and their intensities add.
+    """
+    if camera.light.polarisation is None and tells_polarisation(camera):
+        return tuple(polarised(camera, state) for state in POLARISATIONS)
+    return (camera,)
+
+
+def tells_polarisation(camera: Camera) -> bool:
+    """Whether filters of the camera polarise."""
+    array = camera.filter_array
+    return array is not None and any(one.polariser is not None for one in array.filters)
 
 
 def _through(camera: Camera, filter_: Filter, cell: Cell, wavelength: float) -> float:
     """Mean intensity transmittance of a filter over a cell (y0, y1, x0, x1) m of the pupil."""
+    passed = filter_.passes(camera.light.polarisation)
+    return passed * _transmittance(camera, filter_, cell, wavelength)
+
+
+def _transmittance(camera: Camera, filter_: Filter, cell: Cell, wavelength: float) -> float:
+    """The same for light of the filter's own polarisation."""
     if filter_.index is None:
         return filter_transmittance(filter_, wavelength)
     behind = camera.filter_array is not None and camera.filter_array.side == "image"

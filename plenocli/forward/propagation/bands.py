@@ -144,12 +144,19 @@ def node_count(geometry: Geometry, band: Band, accuracy: float, window: int | No
 
 
 class BandFields(LensletFields):
-    """Fields at several wavelengths as one: pixel energies are the weighted sums of theirs."""
+    """Fields at several wavelengths, or of both polarisations, as one: pixel energies are the
+    weighted sums of theirs.
+    """
 
     def __init__(
-        self, fields: Sequence[LensletFields], weights: Sequence[float] | np.ndarray
+        self,
+        fields: Sequence[LensletFields],
+        weights: Sequence[float] | np.ndarray,
+        nodes: int | None = None,
     ) -> None:
-        """`fields` of one camera and plan, and the share of the photons of each."""
+        """`fields` of one plan, the share of the photons of each, and how many wavelengths they
+        are; None: as many as each of them has.
+        """
         self._fields, self._weights = list(fields), [float(w) for w in weights]
         self.superpixels, self.shared_axis = fields[0].superpixels, fields[0].shared_axis
         rows, columns, turn = (all(flags) for flags in zip(*(f.symmetry for f in fields)))
@@ -160,7 +167,7 @@ class BandFields(LensletFields):
             notes[0],
             separable_terms=max(n.separable_terms for n in notes),
             field_tail=max(n.field_tail for n in notes),
-            band_nodes=len(notes),
+            band_nodes=notes[0].band_nodes if nodes is None else nodes,
         )
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -216,4 +223,5 @@ def band_fields(
             for w in wavelengths
         ],
         weights,
+        plan.band_nodes,
     )

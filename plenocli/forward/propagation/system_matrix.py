@@ -19,8 +19,9 @@ from plenocli.base.budget import one_thread, spread
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.camera.pupil import polarisations
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
-from plenocli.forward.propagation.bands import band_fields
+from plenocli.forward.propagation.bands import BandFields, band_fields
 from plenocli.forward.propagation.models import model_named
 from plenocli.forward.propagation.sampling import PSF_CUT_EFFECT
 from plenocli.forward.propagation.symmetry import (
@@ -166,11 +167,13 @@ class PifBuilder:
         for library in model.libraries:
             importlib.import_module(library)
         with one_thread():
-            self.lenslets: LensletFields
-            if plan.band_nodes:
-                self.lenslets = band_fields(model, camera, self.geometry, plan, band)
-            else:
-                self.lenslets = model.fields(camera, self.geometry, plan, band)
+            parts: list[LensletFields] = [
+                band_fields(model, seen, self.geometry, plan, band)
+                if plan.band_nodes
+                else model.fields(seen, self.geometry, plan, band)
+                for seen in polarisations(camera)
+            ]
+            self.lenslets = parts[0] if len(parts) == 1 else BandFields(parts, [0.5, 0.5])
         # a column's energy, and the light that enters, are known to this
         self._sampling = max(band.sampling, PSF_CUT_EFFECT * band.spread_cut / band.faintest)
         self._entered: np.ndarray | None = None

@@ -83,6 +83,31 @@ class Cube:
         )
 
 
+class Polarised:
+    """A scene whose light is linearly polarised in part, alike at all wavelengths.
+
+    scene: its reflectance, of both states together.
+    degree: (row, column, 1) or (1, 1), the degree of linear polarisation s1/s0 from -1 (all along
+        90 degrees) to 1 (all along 0).
+    """
+
+    def __init__(self, scene: Scene, degree: np.ndarray, sampling: str) -> None:
+        self.scene, self.degree, self.sampling = scene, degree, sampling
+        self.spectral = scene.spectral
+
+    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m), of both states together."""
+        return self.scene.at(wavelength, rows, columns)
+
+    def degree_at(self, rows: int, columns: int) -> np.ndarray:
+        """Degree of polarisation (row, column)."""
+        from plenocli.forward.scene.sample import sample_picture
+
+        if self.degree.size == 1:
+            return np.full((rows, columns), self.degree.item(), np.float32)
+        return sample_picture(self.degree, rows, columns, self.sampling).reshape(rows, columns)
+
+
 class Chart:
     """The ColorChecker over the whole array."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from plenocli.base.errors import ConfigError, InputError
+from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
-from plenocli.forward.scene.scenes import Uniform
+from plenocli.forward.camera.pupil import polarisations
+from plenocli.forward.scene.scenes import Polarised, Uniform
 from plenocli.forward.scene.white_reference import WHITE_LEVEL
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
 
@@ -66,12 +68,15 @@ class SimulatedCapture:
     scene: (band, row, column) reflectance of the object on the points of reconstruction.
     wavelengths: (band,) m, of the scene's bands.
     saturated: share of the pixels over full well, None in relative units.
+    degree: (row, column) degree of polarisation on the points of reconstruction, None where light
+        is not polarised.
     """
 
     capture: Capture
     scene: np.ndarray
     wavelengths: np.ndarray
     saturated: float | None
+    degree: np.ndarray | None = None
 
 
 def simulate_capture(
@@ -104,6 +109,7 @@ def simulate_capture(
         scene=light.scene,
         wavelengths=np.array(camera.light.wavelengths[: len(light.scene)]),
         saturated=saturated,
+        degree=light.degree,
     )
 
 
@@ -209,12 +215,14 @@ class SensorLight:
     superpixels: (colour, lenslet_row, lenslet_column, pixel) of the scene.
     white: (colour, pixel) a superpixel of a uniform white object.
     scene: (band, row, column) reflectance of the object as sampled.
+    degree: (row, column) its degree of polarisation, or None.
     """
 
     colours: tuple[str, ...]
     superpixels: np.ndarray
     white: np.ndarray
     scene: np.ndarray
+    degree: np.ndarray | None
 
 
 def require_tiling(camera: Camera, where: str | Path) -> None:
@@ -320,44 +328,75 @@ def carry_light(
     matrix: Mapping[float, MatrixByPoints | StoredField] | None,
 ) -> SensorLight:
     """Light of the scene on every superpixel, band by band through the system matrix."""
-    from plenocli.base.budget import budget
     from plenocli.forward.sensor.cfa import sensitivity
-    from plenocli.forward.sensor.irradiance import superpixel_light
 
     letters, efficiency = sensitivity(camera, source.wavelengths)
     count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
     fine = (samples[0] * options.refine, samples[1] * options.refine)
     grid = (count[0] * fine[0], count[1] * fine[1])
     finer = camera.replace(**{"object.samples_per_lenslet": fine}) if options.refine > 1 else camera
-    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
     light, whites, picture = np.zeros(()), np.zeros(()), None
+    degree = scene.degree_at(*grid) if isinstance(scene, Polarised) else None
+    states: list[tuple[Camera, np.ndarray | float]] = [(finer, 1.0)]
+    if degree is not None and len(polarisations(finer)) > 1:
+        if matrix is not None:
+            raise UsageError(
+                "the system matrices are those of light that is not polarised",
+                "--pif",
+                "leave --pif out: each polarisation has matrices of its own",
+            )
+        # each state has half of the light of a white that is not polarised
+        states = list(zip(polarisations(finer), ((1 + degree) / 2, (1 - degree) / 2)))
     for index, wavelength in enumerate(
         bar(source.wavelengths, len(source.wavelengths), "wavelengths")
     ):
-        system = matrix[wavelength] if matrix else _build(finer, wavelength, options)
         if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
             picture = scene.at(wavelength, *grid)
-        size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
-        if isinstance(system, StoredField):
-            even = np.full(grid, scene.level) if isinstance(scene, Uniform) else picture
-            carried, white = _carried_over_the_field(system, camera, even, fine)
-        else:
-            carried, white = superpixel_light(system.blocks(size), system.offsets, picture, fine)
-            if isinstance(scene, Uniform):
-                carried = np.broadcast_to(scene.level * white, (*count, pixels))
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / options.refine**2
-        light = light + weight[:, :, None, None] * carried[None]
-        whites = whites + weight * white[None]
+        for seen, share in states:
+            system = matrix[wavelength] if matrix else _build(seen, wavelength, options)
+            part = (
+                scene.level
+                if isinstance(scene, Uniform)
+                else share * np.asarray(picture, np.float32)
+            )
+            carried, white = _carried(system, camera, part, fine)
+            light = light + weight[:, :, None, None] * carried[None]
+            whites = whites + weight * white[None] / len(states)
     return SensorLight(
         colours=letters,
         superpixels=light,
         white=whites,
         scene=_truth(camera, scene, grid, options.refine),
+        degree=None if degree is None else _coarser(degree, options.refine),
     )
 
 
+def _carried(
+    system: MatrixByPoints | StoredField,
+    camera: Camera,
+    scene: np.ndarray | float,
+    samples: tuple[int, int],
+) -> tuple[np.ndarray, np.ndarray]:
+    """As superpixel_light, of a picture or of an even object by its level."""
+    from plenocli.base.budget import budget
+    from plenocli.forward.sensor.irradiance import superpixel_light
+
+    count, pixels = camera.lenslet_array.count, math.prod(camera.sensor.pixels_per_lenslet)
+    picture = scene if isinstance(scene, np.ndarray) else None
+    if isinstance(system, StoredField):
+        grid = (count[0] * samples[0], count[1] * samples[1])
+        whole = np.full(grid, scene) if picture is None else picture
+        return _carried_over_the_field(system, camera, whole, samples)
+    size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
+    carried, white = superpixel_light(system.blocks(size), system.offsets, picture, samples)
+    if picture is None:
+        carried = np.broadcast_to(scene * white, (*count, pixels))
+    return carried, white
+
+
 def _carried_over_the_field(
-    system: StoredField, camera: Camera, picture: np.ndarray | None, samples: tuple[int, int]
+    system: StoredField, camera: Camera, picture: np.ndarray, samples: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """As superpixel_light, every object through the matrix of its own lenslet; white is that of the
     axis.
@@ -365,7 +404,6 @@ def _carried_over_the_field(
     from plenocli.forward.sensor.irradiance import superpixel_light
 
     light: np.ndarray = np.zeros(())
-    assert picture is not None
     for matrix, weight in system.parts(camera):
         share = picture * np.kron(weight, np.ones(samples))
         light = light + superpixel_light(matrix.blocks(), matrix.offsets, share, samples)[0]
@@ -410,12 +448,15 @@ def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> 
     """The object (band, row, column) on the grid that reconstruction uses: area
     averages of the finer one.
     """
+    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
+    return np.stack([_coarser(scene.at(w, *grid), refine) for w in bands])
+
+
+def _coarser(picture: np.ndarray, refine: int) -> np.ndarray:
+    """A picture on points that are `refine` times as wide, float32."""
     from plenocli.forward.scene.sample import block_mean
 
-    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
-    return np.stack([block_mean(scene.at(w, *grid), (refine, refine)) for w in bands]).astype(
-        np.float32
-    )
+    return block_mean(picture, (refine, refine)).astype(np.float32)
 
 
 def detect(

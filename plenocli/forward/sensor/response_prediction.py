@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import ConfigError, UsageError
+from plenocli.forward.camera.geometry import finely_sampled
+from plenocli.forward.camera.pupil import polarisations
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.response import (
     field_response,
@@ -149,7 +151,7 @@ class ResponsePrediction:
         if self.closed:
             return uniform_response(self.camera, wavelength, self.model, self.kinds.shifts)
         builder = pif_builder(
-            self._finely(wavelength),
+            finely_sampled(self.camera, wavelength),
             wavelength,
             model=self.model,
             accuracy=self.options.accuracy,
@@ -160,16 +162,6 @@ class ResponsePrediction:
         found = field_response(builder)
         own = found[(builder.offsets == 0).all(axis=1)] if self.options.own_field else found
         return np.broadcast_to(own.sum(axis=0), (len(self.kinds.shifts), found.shape[1]))
-
-    def _finely(self, wavelength: float) -> Camera:
-        """The camera with as many object points as an even object has diffraction cells: fewer
-        leave fringes that an even object has not.
-        """
-        from plenocli.forward.camera.geometry import geometry
-
-        least = int(np.ceil(geometry(self.camera, wavelength).diffraction_cells)) + 1
-        samples = tuple(max(n, least) for n in self.camera.object.samples_per_lenslet)
-        return self.camera.replace(**{"object.samples_per_lenslet": samples})
 
     def white_signal(
         self, source: Quadrature, exposure: float | None, *, lamp: bool = False
@@ -188,6 +180,27 @@ class ResponsePrediction:
             light = light + part
         scale, seconds = self._exposed(source, light, exposure, lamp)
         return self._mosaicked(light) * scale, seconds
+
+    def polarised_signal(self, lamp: Quadrature, exposure: float | None) -> np.ndarray | None:
+        """By how much the signal of the white reference grows where a lamp's light is all along 0
+        degrees, and falls where it is along 90 degrees.
+
+        lamp, exposure: as white_signal's.
+
+        Returns (kind, pixel) DN, None for a camera that does not tell them apart.
+        """
+        seen = polarisations(self.camera)
+        if len(seen) == 1:
+            return None
+        along, across = (
+            np.sum(
+                list(ResponsePrediction(one, self.options, self.kinds, "camera")._light(lamp)),
+                axis=0,
+            )
+            for one in seen
+        )
+        scale, _ = self._exposed(lamp, (along + across) / 2, exposure, True)
+        return self._mosaicked((along - across) / 2) * scale
 
     def spectral_signal(
         self, source: Quadrature, exposure: float | None

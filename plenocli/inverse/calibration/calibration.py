@@ -156,6 +156,10 @@ class Response:
         it is not known.
     variance: of its entries, (pixel, band) in the square of its unit; None: unknown.
     wavelengths: (band,) m.
+    polarised: like matrix, what F has more of light along 0 degrees, and less of light along 90
+        degrees, than of light that is not polarised; None: it tells none apart.
+    states: (band,) polarisation of the light of each band in degrees, NaN for light that is not
+        polarised; None: of no band.
     energy: (band,), relative radiance of the source of each band, or None.
     quality: None where the file does not say it.
     notes: how it came about, as JSON ("source": "predicted" for one from a description).
@@ -164,6 +168,8 @@ class Response:
     matrix: np.ndarray
     variance: np.ndarray | None
     wavelengths: np.ndarray
+    polarised: np.ndarray | None = None
+    states: np.ndarray | None = None
     energy: np.ndarray | None = None
     quality: Quality | None = None
     notes: dict[str, Any] | None = None

@@ -22,7 +22,7 @@ from plenocli.inverse.calibration.calibration import (
     windows_on,
 )
 from plenocli.inverse.calibration.measured_response import GatheredResponses, measured_response
-from plenocli.inverse.calibration.quality import mean_of_known
+from plenocli.inverse.calibration.quality import mean_of_known, quality_of_one
 from plenocli.inverse.grid.detect import find_grid
 from plenocli.inverse.grid.scenes import find_scene_grid, moved_grid, shifted_mosaic
 
@@ -89,11 +89,14 @@ class NarrowBands:
     wavelengths: (band,) m, ascending.
     captures: those of a wavelength (m), read when they are asked for.
     radiances: of the sources relative to each other, by wavelength (m); 1 where not given.
+    across: the same under light polarised along 90 degrees, where `captures` are under light along
+        0 degrees; None: light is not polarised.
     """
 
     wavelengths: Sequence[float]
     captures: Callable[[float], Sequence[Capture]]
     radiances: Mapping[float, float] = field(default_factory=dict)
+    across: Callable[[float], Sequence[Capture]] | None = None
 
 
 def calibrate(
@@ -158,6 +161,11 @@ def calibrate(
     if bands is not None:
         light = _Light(first, dark, bad)
         measured, noise = _response(bands, light, noise, response, grid, windows)
+        if bands.across is not None:
+            crossed = replace(bands, captures=bands.across, across=None)
+            alike = there(measured.notes)["response"]
+            second, noise = _response(crossed, light, noise, alike, grid, windows)
+            measured = _of_both(measured, second)
         if measured.shared:
             reference = replace(
                 reference, superpixels=mean_of_known(there(reference.superpixels)[valid])
@@ -248,6 +256,21 @@ def _in_common(
     return replace(
         White.measured(white, windows, valid),
         superpixels=(look * np.median(level)).astype(np.float32),
+    )
+
+
+def _of_both(along: Response, across: Response) -> Response:
+    """The response to light that is not polarised, and what polarised light changes, from those to
+    light along 0 and along 90 degrees.
+    """
+    one, two = (np.asarray(part.matrix) for part in (along, across))
+    both = (one + two) / 2
+    variance = None
+    if along.variance is not None and across.variance is not None:
+        variance = (along.variance + across.variance) / 4
+    quality = quality_of_one(both if both.ndim == 2 else mean_of_known(both))
+    return replace(
+        along, matrix=both, polarised=(one - two) / 2, variance=variance, quality=quality
     )
 
 

@@ -5,6 +5,7 @@ rehearsed on the capture that the found picture would make. docs/model.md, secti
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -136,11 +137,10 @@ def _spectra(
     trace: Trace,
     method: str | None = None,
 ) -> Spectra:
-    return Spectra(
+    return replace(
+        like,
         value=value,
         sigma=sigma,
-        wavelength=like.wavelength,
-        quantity=like.quantity,
         method=method or like.method,
         trace=trace,
         residual=residual,

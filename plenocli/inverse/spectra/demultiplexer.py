@@ -19,6 +19,7 @@ from plenocli.inverse.spectra.crosstalk import (
     sensor_of,
     windows_of,
 )
+from plenocli.inverse.spectra.polarisation import by_state
 from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -74,6 +75,7 @@ class Demultiplexer:
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
             that tells no neighbours' light.
         """
+        calibration = by_state(calibration)
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, camera) if self.neighbours else None
@@ -113,6 +115,7 @@ class Demultiplexer:
         path: of the capture, for messages.
         method: instead of the usual one.
 
+        Returns Spectra whose bands may come in two states (plenocli.inverse.spectra.polarisation).
         Raises InputError where capture and calibration do not go together, NumericsError where no
         lenslet can be demultiplexed.
         """

@@ -4,12 +4,15 @@ of the camera, scaled to the response that was measured. docs/model.md, section 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError
+from plenocli.forward.camera.geometry import finely_sampled
+from plenocli.forward.camera.pupil import polarised
 from plenocli.inverse.registration.smooth_response import DEGREE
 
 if TYPE_CHECKING:
@@ -149,7 +152,11 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
         for far in [np.minimum(np.abs(offsets).max(axis=1), 2)]
         for ring in (1, 2)
     ]
-    changes += [_predicted(other, calibration)[1] - light for other in _other_optics(camera)]
+    # what other optics change needs no fine picture
+    coarse, *others = (
+        _predicted(one, calibration, fine=False)[1] for one in (camera, *_other_optics(camera))
+    )
+    changes += [other - coarse for other in others]
     share = light.sum(axis=(1, 2)) / light.sum(axis=(0, 1, 2))
     kept = (share.max(axis=1) >= LEAST_SHARE) | (offsets == 0).all(axis=1)
     return NeighbourLight(
@@ -157,25 +164,41 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
     )
 
 
-def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+def _predicted(
+    camera: Camera, calibration: Calibration, *, fine: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
     band as the calibrated response.
+
+    fine: by as many object points as a field has diffraction cells, since fewer leave fringes, and
+        too little light on neighbours; else by those of the description.
     """
     from plenocli.forward.accuracy.dial import pif_builder
-    from plenocli.inverse.calibration.calibration import there
 
-    sampled, measured, bands = _in_thirds(camera), _typical(calibration), []
+    measured, bands = _typical(calibration), []
     offsets = np.zeros((0, 2), int)
-    for wavelength in there(calibration.response).wavelengths:
-        builder = pif_builder(
-            sampled, float(wavelength), superpixels=(REACH, REACH), accuracy=KNOWN_TO
-        )
+    for wavelength, seen in _by_band(camera, calibration):
+        sampled = _in_thirds(finely_sampled(seen, wavelength) if fine else seen)
+        builder = pif_builder(sampled, wavelength, superpixels=(REACH, REACH), accuracy=KNOWN_TO)
         offsets = builder.offsets
         matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
         bands.append(_thirds(matrix, sampled))
     light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
     known = np.where(np.isfinite(measured), light.sum(axis=(0, 2)), 0).sum(axis=0)
     return offsets, light * (np.nansum(measured, axis=0) / np.maximum(known, 1e-300))
+
+
+def _by_band(camera: Camera, calibration: Calibration) -> list[tuple[float, Camera]]:
+    """The wavelength (m) of each band of the response, and the camera in its light."""
+    from plenocli.inverse.calibration.calibration import there
+
+    response = there(calibration.response)
+    states = np.full(len(response.wavelengths), np.nan)
+    states = states if response.states is None else response.states
+    return [
+        (float(w), camera if np.isnan(state) else polarised(camera, f"{state:.0f} deg"))
+        for w, state in zip(response.wavelengths, states)
+    ]
 
 
 def _other_optics(camera: Camera) -> list[Camera]:
@@ -209,10 +232,7 @@ class MovingResponse:
         why = valid_for(camera, "fresnel")
         if why is not None or calibration.sensor.cfa != "mono":
             raise ConfigError(why or "a colour filter array", "camera", "leave it to splines")
-        self.camera, self.measured = camera, _typical(calibration)
-        from plenocli.inverse.calibration.calibration import there
-
-        self.wavelengths = there(calibration.response).wavelengths
+        self.measured, self.bands = _typical(calibration), _by_band(camera, calibration)
         here = self._even(np.zeros(2))
         self.scale = np.nansum(self.measured, axis=0) / here.sum(axis=0)
         self.here = here * self.scale
@@ -221,8 +241,8 @@ class MovingResponse:
         from plenocli.forward.propagation.response import uniform_response
 
         found = [
-            uniform_response(self.camera, float(w), "fresnel", [-displacement])[0]
-            for w in self.wavelengths
+            uniform_response(seen, wavelength, "fresnel", [-displacement])[0]
+            for wavelength, seen in self.bands
         ]
         return np.stack(found, axis=-1)
 
@@ -275,7 +295,7 @@ def _check(camera: Camera, calibration: Calibration) -> None:
 
 def _in_thirds(camera: Camera) -> Camera:
     """The camera with a number of object points that divides into POINTS a side."""
-    samples = tuple(max(1, round(n / POINTS)) * POINTS for n in camera.object.samples_per_lenslet)
+    samples = tuple(math.ceil(n / POINTS) * POINTS for n in camera.object.samples_per_lenslet)
     return camera.replace(**{"object.samples_per_lenslet": samples})
 
 

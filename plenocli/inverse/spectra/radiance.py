@@ -15,6 +15,7 @@ import numpy as np
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration.calibration import there
+from plenocli.inverse.spectra.polarisation import with_polarisation
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
@@ -124,6 +125,8 @@ def light_prior(c: LensletResponses, known: LabelledSpectra | None = None) -> Pr
     mean, covariance = reflectance_statistics(
         surfaces(c.wavelengths) if known is None else known.at(c.wavelengths)
     )
+    if c.states is not None:
+        covariance = with_polarisation(covariance, mean, c.states)
     # narrow neighbouring bands are nearly the same number on most surfaces
     covariance = covariance + 1e-4 * np.eye(len(mean))
     return radiance_statistics(mean, covariance, light)
@@ -188,6 +191,7 @@ def estimate(
         method=used,
         trace=Trace(asked=method, reason=why),
         residual=None if noise is None else job.residual(sums),
+        states=c.states,
     )
 
 

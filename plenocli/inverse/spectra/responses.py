@@ -59,6 +59,11 @@ class LensletResponses:
         return there(self.calibration.response).wavelengths
 
     @property
+    def states(self) -> np.ndarray | None:
+        """Polarisation of the light of the bands, (band,) degrees, as Response has it."""
+        return there(self.calibration.response).states
+
+    @property
     def window(self) -> tuple[int, int]:
         """Rows and columns of a superpixel, px."""
         return there(self.calibration.windows).shape

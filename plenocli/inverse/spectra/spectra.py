@@ -41,6 +41,10 @@ class Spectra:
     residual: (lenslet_row, lenslet_column), mean square of x - F b over its expected one, 1 is
         noise alone; None where the noise is not known.
     reference_reflectance: of the white reference that reflectances are relative to, or None.
+    states: (band,) polarisation of the light of each band, degrees, NaN where it is all light;
+        None: all light in every band.
+    s1, s1_sigma: like value, the light along 0 degrees less that along 90, where value is that of
+        both; NaN where it cannot be told; None: in no band.
     """
 
     value: np.ndarray
@@ -51,6 +55,9 @@ class Spectra:
     trace: Trace
     residual: np.ndarray | None = None
     reference_reflectance: float | None = None
+    states: np.ndarray | None = None
+    s1: np.ndarray | None = None
+    s1_sigma: np.ndarray | None = None
 
     def relative_to(self, white: Spectra, reflectance: float) -> Spectra:
         """Reflectances: the ratio to the white reference times its reflectance, with both relative

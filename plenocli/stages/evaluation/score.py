@@ -22,6 +22,7 @@ from plenocli.evaluation.metrics.figures import figures
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
 from plenocli.evaluation.metrics.response import score_response
 from plenocli.evaluation.metrics.snr import snr_sensor
+from plenocli.evaluation.metrics.spectral import PolarisationScore, score_polarisation
 from plenocli.evaluation.response_score import ComparedResponse, paired_responses
 from plenocli.evaluation.results import Result, WhiteTarget
 from plenocli.evaluation.scores import InputFile, ResultScore, ScoreDocument
@@ -40,7 +41,7 @@ from plenocli.files.results.results import (
     read_scored,
     read_whites,
 )
-from plenocli.files.results.truths import CHART, read_labels, read_truth
+from plenocli.files.results.truths import CHART, read_labels, read_true_s1, read_truth
 from plenocli.files.results.volumes import StoredVolume, read_volume, score_stored, volume_of
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.stages.evaluation.expected import run_expected
@@ -441,6 +442,14 @@ def _distance(truth: Path | str | None, path: Path | str) -> float:
     return parse_camera(config, truth).object.distance
 
 
+def _polarised(result: Result, truth: Path | str) -> PolarisationScore | None:
+    """What spectra tell of polarisation against what the truth says of it."""
+    if result.s1 is None or result.quantity != "reflectance":
+        return None
+    true = read_true_s1(truth, result)
+    return None if true is None else score_polarisation(result.s1, true)
+
+
 def _score_image(result: Result, comparison: _Comparison) -> _Scored:
     """A picture, or spectra, against the truth."""
     from plenocli.report.score_page import Compared
@@ -457,7 +466,7 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
     truth = read_truth(comparison.truth, result, comparison.sampling, comparison.camera)
     if not np.isfinite(truth).any():
         raise InputError("holds no finite value", comparison.truth, "name a truth that has values")
-    block, patches, spectra = None, None, None
+    block, patches, spectra, polarised = None, None, None, None
     bands: tuple[float, ...] = ()
     if result.wavelengths is None:
         block = _block(result, comparison)
@@ -477,6 +486,7 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             learnt=comparison.learnt,
         )
         spectra = own
+        polarised = _polarised(result, comparison.truth)
     sensor = comparison.sensor_snr
     return _Scored(
         score=ResultScore(
@@ -486,6 +496,7 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             wavelengths_nm=bands,
             figures={
                 **figures(own),
+                **({} if polarised is None else figures(polarised)),
                 **figures(result.told),
                 **({} if sensor is None else {"snr_sensor_db": json_value(sensor)}),
             },

@@ -27,6 +27,8 @@ class Settings:
     exposure: s, None for the camera's own.
     field_nodes: places of the field along an axis whose matrices stand for all lenslets, None for
         the axis alone.
+    polarisation: degree of linear polarisation of the scene's light, a number or the name of a
+        picture, None where it is not polarised.
     seed: of the noise.
     """
 
@@ -43,6 +45,7 @@ class Settings:
     noise: str = "sensor"
     exposure: float | None = None
     field_nodes: int | None = None
+    polarisation: str | None = None
     seed: int = 0
 
     @property

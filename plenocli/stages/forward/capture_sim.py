@@ -10,7 +10,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import note
-from plenocli.files.read.scenes import read_scene
+from plenocli.files.read.scenes import read_polarised, read_scene
 from plenocli.forward.camera.model import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.scene.scenes import Chart, Scene, Uniform
@@ -77,13 +77,14 @@ def run_capture_sim(
             settings,
             volume,
             layers,
-            {"--scene": scene, "--pif": pif},
+            {"--scene": scene, "--pif": pif, "--polarisation": settings.polarisation},
             scene_out=scene_out,
             overwrite=overwrite,
             command=command,
         )
     output = Path(output)
-    _check_outputs(output, scene_out, settings, [camera_path, pif, scene], overwrite)
+    others = {"pif": pif, "scene": _file(scene), "polarisation": _file(settings.polarisation)}
+    _check_outputs(output, scene_out, settings, [camera_path, *others.values()], overwrite)
     camera = read_camera(camera_path)
     options = settings.options
     require_tiling(camera, camera_path)
@@ -92,23 +93,15 @@ def run_capture_sim(
     found = dark_capture(camera, options) if settings.target == "dark" and not pif else None
     accuracy: dict[str, Any] = {}
     if found is None:
-        if pif:
-            matrices, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path)
-        else:
-            matrices = None
-            accuracy = planned_accuracy(camera, options, source.wavelengths).as_json()
+        matrices, accuracy = _matrices(pif, camera, settings, source.wavelengths, camera_path)
         _tell_of_the_field(AccuracyRecord.from_json(accuracy))
         name, band = settings.target or str(scene), _band(settings.target)
         found = simulate_capture(
             camera, source, what, options, matrices=matrices, name=name, band_m=band
         )
-    roles = camera_files(camera_path, camera) | {
-        "pif": pif,
-        "scene": scene if scene and Path(scene).exists() else None,
-    }
     provenance = Provenance(
         command=command,
-        inputs=describe_inputs(roles),
+        inputs=describe_inputs(camera_files(camera_path, camera) | others),
         seed=settings.seed,
         config=to_toml(camera),
         accuracy=accuracy,
@@ -116,11 +109,22 @@ def run_capture_sim(
     truth, bands = found.scene, found.wavelengths
     with together():
         write_capture(
-            output, found.capture, provenance, scene=truth, wavelengths=bands, overwrite=overwrite
+            output,
+            found.capture,
+            provenance,
+            scene=truth,
+            wavelengths=bands,
+            degree=found.degree,
+            overwrite=overwrite,
         )
         if scene_out:
             _write_scene(scene_out, truth, bands, provenance, overwrite)
     return _summary(output, found, len(source.wavelengths))
+
+
+def _file(name: str | Path | None) -> str | Path | None:
+    """The name, where it is that of a file or folder."""
+    return name if name and Path(name).exists() else None
 
 
 def _of_volume(
@@ -229,7 +233,17 @@ def _band(target: str | None) -> float | None:
 def _source(
     camera: Camera, settings: Settings, scene: str | Path | None
 ) -> tuple[Quadrature, Scene]:
-    """The light, and what is in front of the camera, from --target and --scene."""
+    """The light, and what is in front of the camera, from --target, --scene and --polarisation."""
+    source, what = _light_and_scene(camera, settings, scene)
+    if settings.polarisation is None:
+        return source, what
+    return source, read_polarised(what, settings.polarisation, camera, settings.sampling)
+
+
+def _light_and_scene(
+    camera: Camera, settings: Settings, scene: str | Path | None
+) -> tuple[Quadrature, Scene]:
+    """The same of light that is not polarised."""
     from plenocli.base.units import UnitError, parse_wavelength
     from plenocli.forward.scene.light import broadband, broadened, has_colour, narrow_band
     from plenocli.forward.scene.tables import illuminant
@@ -292,6 +306,19 @@ def _tell_of_the_field(record: AccuracyRecord | None) -> None:
         )
 
 
+def _matrices(
+    pif: str | Path | None,
+    camera: Camera,
+    settings: Settings,
+    wavelengths: np.ndarray,
+    camera_path: str | Path,
+) -> tuple[dict[float, StoredMatrix | StoredField] | None, dict[str, Any]]:
+    """As _read_pif; without a pif None, and the accuracy record of what will be computed."""
+    if pif:
+        return _read_pif(pif, camera, settings, wavelengths, camera_path)
+    return None, planned_accuracy(camera, settings.options, wavelengths).as_json()
+
+
 def _read_pif(
     path: str | Path,
     camera: Camera,
@@ -330,6 +357,10 @@ def _read_pif(
                 "run simulate-pif on this camera",
             )
     require_same_files(camera_path, camera, artefact, path)
+    if camera.light.polarisation != made_for.light.polarisation:
+        raise InputError(
+            "was made for light of another polarisation", path, "run simulate-pif on this camera"
+        )
     known, offsets = (artefact.data[f"pif/{part}"] for part in ("wavelength", "lenslet_offset"))
     shapes = artefact.data["pif/pixel_shape"], artefact.data["pif/object_shape"]
     stored: dict[float, StoredMatrix | StoredField] = {}

@@ -131,12 +131,15 @@ def run_simulate_response(
     bands = tuple(sorted(set(settings.wavelengths))) or camera.light.wavelengths
     known = measured or _described(camera, prediction, settings)
     seconds = settings.exposure if measured else known.sensor.exposure
-    lamps = _narrow(bands, settings)
-    matrix = np.stack(
-        [prediction.white_signal(lamp, seconds, lamp=True)[0] for lamp in lamps], axis=-1
-    )
+    signals, more = [], []
+    for lamp in _narrow(bands, settings):
+        signals.append(prediction.white_signal(lamp, seconds, lamp=True)[0])
+        more.append(prediction.polarised_signal(lamp, seconds))
+    matrix = np.stack(signals, axis=-1)
+    apart = [one for one in more if one is not None]
+    polarised = np.stack(apart, axis=-1) if apart else None
     notes = prediction.notes(bands)
-    calibration = _with_response(known, kinds, matrix, bands, notes)
+    calibration = _with_response(known, kinds, matrix, polarised, bands, notes)
     provenance = Provenance(
         command=command,
         inputs=describe_inputs(camera_files(camera_path, camera) | {"grid": grid}),
@@ -259,10 +262,13 @@ def _with_response(
     known: Calibration,
     kinds: SuperpixelKinds,
     matrix: np.ndarray,
+    polarised: np.ndarray | None,
     bands: tuple[float, ...],
     notes: PredictionNotes,
 ) -> Calibration:
-    """The calibration with F = `matrix` (kind, pixel, band)."""
+    """The calibration with F = `matrix` (kind, pixel, band), and what it has more of polarised
+    light.
+    """
     from plenocli.inverse.calibration.calibration import Response
     from plenocli.inverse.calibration.quality import quality_of_one
 
@@ -273,6 +279,7 @@ def _with_response(
         matrix=kinds.by_lenslet(matrix),
         variance=np.tile(error**2, (matrix.shape[1], 1)),
         wavelengths=np.array(bands),
+        polarised=None if polarised is None else kinds.by_lenslet(polarised),
         quality=quality_of_one(matrix[kinds.commonest]),
         notes=notes.as_json(),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.calibration.measure import Measured, NarrowBands, calibrate
 
 if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Response
     from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
@@ -99,6 +100,7 @@ def run_calibrate(
     grid_error: float = GRID_ERROR,
     darks: Sequence[Name] = (),
     bands: Sequence[tuple[float, Name]] = (),
+    across: Sequence[tuple[float, Name]] = (),
     radiances: Sequence[tuple[float, float]] = (),
     camera: Name | None = None,
     response: str = "auto",
@@ -113,6 +115,7 @@ def run_calibrate(
     whites, scenes, darks: captures; whites or scenes at least.
     grid_error: px rms, the largest expected error of a grid from scenes that is accepted.
     bands: (wavelength m, capture) pairs, several a band allowed.
+    across: the same under light polarised along 90 degrees, where that of `bands` is along 0.
     radiances: (wavelength m, relative radiance of that source) pairs, 1 where not given.
     camera: TOML for gain and read noise.
     response: own, shared, low-rank or auto (plenocli.inverse.calibration.measured_response).
@@ -133,18 +136,27 @@ def run_calibrate(
     if bands and not whites:
         raise UsageError("--band needs --white: a scene does not tell how bright white is")
     bands = sorted(bands, key=lambda pair: pair[0])
+    across = sorted(across, key=lambda pair: pair[0])
     _check_radiances(radiances, bands)
+    _check_across(across, bands)
     roles: dict[str, Any] = {
         "white": list(whites),
         "scene": list(scenes),
         "dark": list(darks),
         "camera": camera,
         **_band_roles(bands),
+        **_band_roles(across, " across"),
     }
     check_output(
         output,
         overwrite=overwrite,
-        inputs=[*whites, *scenes, *darks, camera, *(path for _, path in bands)],
+        inputs=[
+            *whites,
+            *scenes,
+            *darks,
+            camera,
+            *(path for _, path in (*bands, *across)),
+        ],
         suffixes=(".h5",),
     )
     description = read_camera(camera) if camera else None
@@ -152,22 +164,12 @@ def run_calibrate(
     cfa = cfa or (description.sensor.cfa if description else None)
     captures = read_series([*whites, *scenes], cfa=cfa)
     white = captures[: len(whites)]
-    wavelengths = list(dict.fromkeys(w for w, _ in bands))
     found = calibrate(
         white,
         scenes=captures[len(whites) :],
         grid_error=grid_error,
         darks=read_series(darks, captures[0], cfa),
-        bands=NarrowBands(
-            wavelengths=wavelengths,
-            # a band's captures are held while they are looked at
-            captures=lambda wavelength: read_series(
-                [path for w, path in bands if w == wavelength], white[0], white[0].cfa
-            ),
-            radiances=dict(radiances),
-        )
-        if bands
-        else None,
+        bands=_narrow_bands(bands, across, dict(radiances), white[0]) if bands else None,
         camera=description,
         response=response,
         lattice=lattice,
@@ -192,10 +194,42 @@ def _check_radiances(
         )
 
 
-def _band_roles(bands: Sequence[tuple[float, Name]]) -> dict[str, list[Name]]:
+def _check_across(
+    across: Sequence[tuple[float, Name]], bands: Sequence[tuple[float, Name]]
+) -> None:
+    """Refuse bands that are known in one polarisation alone."""
+    if across and {w for w, _ in across} != {w for w, _ in bands}:
+        raise UsageError(
+            "--band and --band-across are not of the same bands",
+            fix="give each band under light along 0 degrees (--band) and along 90 (--band-across)",
+        )
+
+
+def _narrow_bands(
+    bands: Sequence[tuple[float, Name]],
+    across: Sequence[tuple[float, Name]],
+    radiances: dict[float, float],
+    white: Capture,
+) -> NarrowBands:
+    """The captures of the bands, each read when it is looked at."""
+
+    def of(pairs: Sequence[tuple[float, Name]]) -> Callable[[float], Sequence[Capture]]:
+        return lambda wavelength: read_series(
+            [path for w, path in pairs if w == wavelength], white, white.cfa
+        )
+
+    return NarrowBands(
+        wavelengths=list(dict.fromkeys(w for w, _ in bands)),
+        captures=of(bands),
+        across=of(across) if across else None,
+        radiances=radiances,
+    )
+
+
+def _band_roles(bands: Sequence[tuple[float, Name]], suffix: str = "") -> dict[str, list[Name]]:
     roles: dict[str, list[Name]] = {}
     for wavelength, path in bands:
-        roles.setdefault(f"band {wavelength * 1e9:.6g}nm", []).append(path)
+        roles.setdefault(f"band {wavelength * 1e9:.6g}nm{suffix}", []).append(path)
     return roles
 
 

@@ -20,6 +20,7 @@ from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.captures import named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
+from plenocli.inverse.spectra.polarisation import stokes
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary
@@ -363,6 +364,7 @@ class CaptureDemultiplexer:
                 raise NumericsError(
                     "no lenslet has light in capture and reference", capture, "check the reference"
                 )
+        found = stokes(found)
         write_spectra(
             target,
             found,

@@ -185,3 +185,86 @@ def test_single_wavelengths_do_not_stand_for_bands_behind_a_clear_cell():
     bands, weights = band_weights(camera, fine.wavelengths, even)
     assert bands.tolist() == [450e-9, 540e-9, 650e-9]
     np.testing.assert_allclose(weights.sum(axis=0), fine.photons)
+
+
+def placed(rest):
+    """The camera with another place for its filters, by what takes the place of the layout."""
+    return described(BAND, BAND.replace("540", "650")).replace("layout = [1, 2]", rest)
+
+
+def sector(first, last, count=40):
+    """Corners of a sector that reaches beyond the pupil, as text."""
+    angles = np.linspace(first, last, count)
+    corners = [(0.0, 0.0), *((10 * np.sin(t), 10 * np.cos(t)) for t in angles)]
+    return "[" + ", ".join(f'["{y:.6f} mm", "{x:.6f} mm"]' for y, x in corners) + "]"
+
+
+def outlined(*polygons):
+    filters = [
+        f'{{ center = "{nm} nm", fwhm = "30 nm", polygon = {polygon} }}'
+        for nm, polygon in zip((450, 540, 650), polygons)
+    ]
+    text = described("A", "B").replace("layout = [1, 2]\n", "").replace('"square"', '"circle"')
+    return text.replace("[A, B]", "[" + ",\n".join(filters) + "]")
+
+
+def test_a_drawing_is_the_layout_that_it_draws(tmp_path):
+    from PIL import Image
+
+    cells = filter_cells(parse_camera(placed("layout = [1, 2]")), 540e-9)
+    drawn = parse_camera(placed('drawing = ["1122", "1122", "1122"]'))
+    np.testing.assert_allclose([c for c, _ in filter_cells(drawn, 540e-9)], [c for c, _ in cells])
+    assert parse_camera(to_toml(drawn)) == drawn
+    picture = np.repeat([[90, 90, 0, 255]], 4, axis=0).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "cells.png")
+    (tmp_path / "camera.toml").write_text(placed('drawing = "cells.png"'))
+    assert load_camera(tmp_path / "camera.toml").filter_array.drawing == ("11.2",) * 4
+    # places of one filter need not hang together, and none is counted twice
+    ring = parse_camera(placed('drawing = ["1111", "1221", "12.1", "1111"]'))
+    area = sum((y1 - y0) * (x1 - x0) for (y0, y1, x0, x1), _ in filter_cells(ring, 540e-9))
+    assert area == pytest.approx(ring.filter_array.size**2 * 15 / 16)
+
+
+def test_light_through_sectors_is_their_share_of_the_pupil():
+    thirds = [sector(2 * np.pi * k / 3, 2 * np.pi * (k + 1) / 3) for k in range(3)]
+    camera = parse_camera(outlined(*thirds))
+    clear = camera.model_copy(update={"filter_array": None})
+    whole = uniform_response(clear, 540e-9, "ray", np.zeros((1, 2)))[0]
+    for nm, peak in ((450, 0.8), (540, 0.8), (650, 0.8)):
+        light = uniform_response(camera, nm * 1e-9, "ray", np.zeros((1, 2)))[0]
+        assert light.sum() == pytest.approx(peak * whole.sum() / 3, rel=2e-3)
+    # and it comes out on its own side: the second sector is to the left of the pupil, its light
+    # right of the superpixel's middle, as the lenslet turns its picture around
+    light = uniform_response(camera, 540e-9, "ray", np.zeros((1, 2)))[0].reshape(26, 26)
+    column = (light.sum(axis=0) @ np.arange(26)) / light.sum()
+    assert column > 12.5 + 3
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (placed(""), "exactly one of layout, drawing and a polygon"),
+        (placed('layout = [1, 2]\ndrawing = ["12"]'), "exactly one of"),
+        (placed('drawing = ["12", "1"]'), "not of one length"),
+        (placed('drawing = ["11"]'), "'2' is not in both"),
+        (placed('drawing = ["123"]'), "'3' is not in both"),
+        (placed('gap = "0.1 mm"\ndrawing = ["12"]'), "gap goes with layout"),
+        (outlined(sector(0, 2), sector(1.5, 3)), "overlap"),
+        (described("{ transmittance = 1, leak = 0.1 }"), "leak goes with polariser"),
+    ],
+)
+def test_places_that_are_not_are_refused(text, said):
+    with pytest.raises(ConfigError, match=said):
+        filter_cells(parse_camera(text), 540e-9)
+
+
+def test_polarisers_pass_their_state_and_leak_the_other():
+    camera = parse_camera(
+        described(
+            '{ transmittance = 0.5, polariser = "0 deg", leak = 0.1 }',
+            '{ transmittance = 1, polariser = "90 deg" }',
+        )
+    )
+    assert shares(camera, 550e-9) == [0.5 * 1.1 / 2, 0.5]
+    for state, seen in (("0 deg", [0.5, 0.0]), ("90 deg", [0.05, 1.0])):
+        assert shares(camera.replace(**{"light.polarisation": state}), 550e-9) == seen

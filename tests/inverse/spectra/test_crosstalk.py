@@ -53,7 +53,7 @@ class Mosaic:
 
 @pytest.fixture(scope="module")
 def bench():
-    """(camera, calibration, white, shoot): a real camera whose fields have more points, filters 0.5
+    """(camera, calibration, white, shoot): a real camera, its fields sampled finely, filters 0.5
     % larger and the sensor 0.5 % further away than its description says.
     """
     described = pc.read_camera(SAMPLES / "seed_spectral.toml").replace(
@@ -65,7 +65,7 @@ def bench():
     )
     camera = described.replace(
         **{
-            "object.samples_per_lenslet": (15, 15),
+            "object.samples_per_lenslet": (30, 30),
             "sensor.distance": described.sensor.distance * 1.005,
             "filter_array.size": described.filter_array.size * 1.005,
         }

@@ -135,20 +135,29 @@ def _chain(_run):
 def _columns(run):
     matrix = matrix_of(read_pif(run / "pif.h5"))
     rows, columns = matrix.object_shape
-    steps = (0, columns // 16, columns // 8, columns // 2 - 1)
+    steps = (0, columns // 8, columns // 3 - 1, columns // 2 - 1)
     points = [(rows // 2, columns // 2 + step) for step in steps]
-    first, *others = (matrix.own[:, r * columns + c].reshape(matrix.pixel_shape) for r, c in points)
+    seen = np.array([matrix.own[:, r * columns + c] for r, c in points])
+    first, *others = seen.reshape(-1, *matrix.pixel_shape)
     alike = [_best_correlation(first, other) for other in others]
-    found = ", ".join(f"{a:.3f} ({k})" for a, k in zip(alike, steps[1:], strict=True))
+    # what all points have in common is the image of the pupil
+    mean = matrix.own.mean(axis=1)
+    fringes = seen - np.outer(seen.sum(axis=1) / mean.sum(), mean)
+    moved = np.corrcoef(fringes)[0, 1:]
+    found = ", ".join(
+        f"{a:.3f} and {m:.2f} ({k})" for a, m, k in zip(alike, moved, steps[1:], strict=True)
+    )
+    share = np.linalg.norm(fringes[0]) / np.linalg.norm(seen[0])
     return figures.matrix_figures(matrix, points)[:1], [
         (
             "Of a point on the axis and of points a small distance off it the sensor sees quite "
             "different patterns, which no geometric model gives",
-            f"correlation with the pattern on the axis after the best shift, of points so many of "
-            f"{columns} off: {found}",
+            f"correlation with the pattern on the axis after the best shift, and of the fringes on "
+            f"it ({share:.0%} of it), of points so many of {columns} off: {found}",
             _word(alike[1] < 0.9),
             "the object is in focus here and the lens free of aberrations: every point lights the "
-            "image of the pupil, and only fringes differ but at the lenslet's edge",
+            "image of the pupil, and only fringes change but at the lenslet's edge; these change "
+            "as the paper says, and no geometric model has them",
         )
     ]
 
@@ -200,9 +209,11 @@ def _bands(run):
     return drawn, [
         (
             "Calibration at 540 and 650 nm: each band lights other pixels of a superpixel",
-            f"cosine of the two responses {unit[:, 1] @ unit[:, 3]:.2f}",
+            f"cosine of the two responses {unit[:, 1] @ unit[:, 3]:.2f}; of 540 and 570 nm, on "
+            f"pixels of one colour, {unit[:, 1] @ unit[:, 2]:.2f}",
             "agrees",
-            "bands light their own part; how far they overlap cannot be read off the paper's print",
+            "540 and 650 nm light pixels of other colours; the filters' images are blurred here, "
+            "so that there is something to demultiplex, more than in the paper's print",
         )
     ]
 

@@ -227,7 +227,7 @@ def pif_columns(
         )
         points, across = [(i, j) for i in rows for j in columns], len(columns)
     else:
-        across = min(3, len(points))
+        across = min(4 if len(points) == 4 else 3, len(points))
     lines = -(-len(points) // across)
     with drawing(2.4 * max(across, 2) + 0.6, 2.35 * lines + 0.15) as made:
         panels = made.figure.subplots(lines, across, squeeze=False)

@@ -166,6 +166,25 @@ def _filter_name(one: "Filter") -> str:
     return ("clear" if one.transmittance == 1 else f"{one.transmittance:.3g}") + state
 
 
+def _filter_colour(one: "Filter") -> tuple[float, float, float]:
+    """The colour (red, green, blue) in which a filter is drawn: that of its light, as bright as the
+    screen shows it; grey where it lets all through alike.
+    """
+    from plenocli.forward.camera.pupil import filter_transmittance
+    from plenocli.forward.scene.colour import preview_rgb
+
+    if one.middle is None:
+        return (0.6, 0.6, 0.6)
+    wavelengths = np.linspace(400e-9, 700e-9, 61)
+    through = [filter_transmittance(one, w) for w in wavelengths]
+    red, green, blue = np.clip(preview_rgb(wavelengths, np.reshape(through, (-1, 1, 1))), 0, None)[
+        :, 0, 0
+    ]
+    top = max(red, green, blue, 1e-9)
+    red, green, blue = (float(0.85 * (c / top) ** (1 / 2.2)) for c in (red, green, blue))
+    return red, green, blue
+
+
 def filters_picture(camera: "Camera") -> bytes:
     """The filter array in the pupil of the main lens, and what filters and sensor let through, by
     wavelength, as PNG; nothing without filters.
@@ -188,10 +207,8 @@ def filters_picture(camera: "Camera") -> bytes:
             if square
             else Circle((0, 0), half, color="#444444")
         )
-        for number, (cells, one) in enumerate(
-            zip(filter_places(camera.filter_array), filters, strict=True)
-        ):
-            colour = COLOURS[number % len(COLOURS)]
+        for cells, one in zip(filter_places(camera.filter_array), filters, strict=True):
+            colour = _filter_colour(one)
             for y0, y1, x0, x1 in cells:
                 pupil.add_patch(
                     Rectangle((x0 * 1e3, y0 * 1e3), (x1 - x0) * 1e3, (y1 - y0) * 1e3, color=colour)
@@ -204,7 +221,7 @@ def filters_picture(camera: "Camera") -> bytes:
                     _filter_name(one),
                     ha="center",
                     va="center",
-                    color="white",
+                    color="black" if np.dot(colour, (0.2, 0.7, 0.1)) > 0.5 else "white",
                 )
             through.plot(
                 wavelengths * 1e9, [filter_transmittance(one, w) for w in wavelengths], color=colour

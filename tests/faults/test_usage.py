@@ -141,7 +141,7 @@ def gives_an_example(said, kind):
 
 
 def test_every_option_has_a_type_that_refuses_something():
-    """Free text is only what names a scene, its polarisation, a target, a method of grouping or a title."""
+    """Free text is only what names a scene, a target, a method of grouping or a title."""
     free = {
         option.opts[-1]
         for _, option in COMMANDS_AND_OPTIONS

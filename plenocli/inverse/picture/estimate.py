@@ -115,7 +115,10 @@ def estimate(
     if method.sees is Sees.LENSLET_AS_IS:
         bare = clean(estimators, data, look=False)
         bare.tell()
-        found = method.reconstruct(estimators, bare.data, truth)
+        data = bare.data
+        if data.noise is not None:
+            data = replace(data, noise=replace(data.noise, model=model_error))
+        found = method.reconstruct(estimators, data, truth)
         return replace(found, trace=(*bare.findings, *found.trace)), None
     unit = _unit(estimators, data.y)
     estimators, data = _at_unit(estimators, data, unit)

@@ -476,7 +476,7 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
         estimators, fit = with_fitted_camera(estimators, data, capture)
         fitted = fit.accepted
     limits = _limits(estimators, data)
-    plain = look and not fitted and field is None
+    plain = (look or method.each_pixel) and not fitted and field is None
     if plain and limits is not None and limits.limited_by == "model":
         estimators = _finer(recipe) or estimators
         limits = _limits(estimators, data)

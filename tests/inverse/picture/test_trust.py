@@ -294,6 +294,19 @@ def dictionary():
     )
 
 
+@pytest.mark.slow
+def test_what_the_model_is_off_by_is_noise_to_weighted_pixels():
+    """Of a capture by the exact model, by the paraxial matrix and what its record says."""
+    data, shared = captured(matrix(model="exact")), estimators()
+    with collected_notes():
+        bare, told = (
+            estimate(shared, METHODS["weighted"], data, model_error=off)[0] for off in (0.0, 0.028)
+        )
+    inside = [np.mean(np.abs(f.value - scene()) < 1.96 * f.sigma) for f in (bare, told)]
+    assert psnr(told) > psnr(bare) + 1
+    assert inside[1] > inside[0] + 0.05
+
+
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "auto"])
 def test_units_and_brightness_change_nothing_but_units(method):
     """By powers of two to the bit; else to what the method makes of the rounding of the data."""

@@ -116,12 +116,13 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 
 def _weights(estimators: Estimators, data: Superpixels) -> np.ndarray:
-    """One over the variance of every pixel, with that of the matrix by its own record; 0 where it
-    counts for nothing.
+    """One over the variance of every pixel, with that of the matrix by its own record and of its
+    model, as far as that is in the noise; 0 where it counts for nothing.
     """
     record = estimators.system.accuracy
     error = 0.0 if record is None or record.estimated is None else record.estimated
-    model = (error * np.nan_to_num(data.y)) ** 2
+    of_model = 0.0 if data.noise is None else data.noise.model
+    model = (max(error, of_model) * np.nan_to_num(data.y)) ** 2
     if data.variance is not None:
         return np.where(np.isfinite(data.variance), 1 / (data.variance + model), 0.0)
     sigma = estimators.options.noise_sigma or data.sigma or 0.0

@@ -4,6 +4,7 @@ defective and saturated pixels count for nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import InputError
+from plenocli.base.progress import note
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.fit.problem import CapturedLenslets, described_matrix
 from plenocli.inverse.picture.estimators import Estimators, Options
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
+
+TURNED = 0.02
+"""px: how far a grid's rotation may move a superpixel's corner before that is told."""
 
 
 def captured_lenslets(
@@ -43,6 +48,8 @@ def captured_lenslets(
     Raises InputError where sizes disagree, the noise is not known or there is no light.
     """
     path = capture.metadata.path
+    if calibration is not None:
+        tell_rotation(calibration.grid.angle, camera.sensor.pixels_per_lenslet)
     system = _lenslet_matrix(camera, described_matrix(camera), path or "capture")
     data = superpixels(capture, system, calibration, where=where)
     sigma = data.sigma if noise_sigma is None else noise_sigma
@@ -51,6 +58,20 @@ def captured_lenslets(
     if not np.nan_to_num(data.y).any():
         raise InputError("holds no light that a fit could look at", path, "give another capture")
     return CapturedLenslets(np.asarray(data.y, float), sigma, data.saturated)
+
+
+def tell_rotation(angle: float, shape: tuple[int, int]) -> None:
+    """A note of what a grid that is turned by `angle` (degrees) does to superpixels of `shape`
+    (rows, columns): their places are known, their pixels stay upright.
+    """
+    turn = math.radians(angle)
+    corner = abs(turn) * math.hypot(*shape) / 2
+    if corner > TURNED:
+        note(
+            f"the lenslets are turned by {1e3 * turn:+.2g} mrad against the pixels: superpixels "
+            "are cut out where they are, but no parameter turns their pixels, whose corners are "
+            f"off by {corner:.2g} px"
+        )
 
 
 class Mender:

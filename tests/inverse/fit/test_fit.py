@@ -8,10 +8,12 @@ import pytest
 from skimage import data
 
 from plenocli.base.errors import InputError
+from plenocli.base.progress import collected_notes
 from plenocli.base.tiling import to_blocks
 from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.system_matrix import build_pif
+from plenocli.inverse.fit.captures import tell_rotation
 from plenocli.inverse.fit.fit import accepted_ratios, fit_camera
 from plenocli.inverse.fit.optics import CameraFamily, all_parameters
 from plenocli.inverse.fit.problem import CapturedLenslets
@@ -176,3 +178,11 @@ def test_few_pixels_and_quiet_captures_may_look_noisier():
     assert near == pytest.approx(far, rel=1e-6) and near > 1.2
     near, far = accepted_ratios(10**6, 1000.0)
     assert 1.01 < near < 1.02 < far < 1.15
+
+
+def test_a_grid_that_is_turned_is_said():
+    with collected_notes() as notes:
+        tell_rotation(np.degrees(2e-4), (52, 52))
+        assert not notes
+        tell_rotation(np.degrees(-1e-3), (52, 52))
+    assert "-1 mrad" in notes[0] and "0.037 px" in notes[0]

@@ -16,6 +16,14 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
+from plenocli.files.images.containers import (
+    BIO,
+    LYTRO,
+    Contained,
+    read_bio,
+    read_lytro,
+    read_pages,
+)
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import read_exr, write_exr
 from plenocli.files.images.pictures import file_type, read_stored
@@ -36,7 +44,8 @@ _CFA = re.compile(r"mono|[RGB]{4}")
 def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
     """Read the capture at `path`, never demosaiced.
 
-    path: .h5, .exr, RAW, DNG, PNG or TIFF, known by its first bytes.
+    path: .h5, .exr, RAW, DNG, PNG, TIFF or a Lytro's .lfp or .lfr, known by its first bytes; .czi
+        or .nd2 (extra `[bio]`).
     cfa: colour filter array of a PNG or TIFF, which cannot say it (default mono); for other files
         it must agree with theirs.
 
@@ -56,6 +65,10 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
         )
     elif is_hdf5(path):
         found = _from_artefact(path)
+    elif first_bytes(path, len(LYTRO)) == LYTRO:
+        found = _contained(path, read_lytro(path))
+    elif path.suffix.lower() in BIO:
+        found = _of_values(path, read_bio(path), cfa or "mono")
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
         found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path))
@@ -216,7 +229,33 @@ def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
     )
 
 
+def _contained(path: Path, found: Contained) -> Capture:
+    with _sensible(path):
+        told = _told(path, "raw", found.details, None)
+    return Capture(
+        mosaic=found.values,
+        cfa=found.cfa,
+        levels=Levels(black=found.black, white=found.white),
+        exposure_s=found.exposure_s,
+        profile=found.profile,
+        **told,
+    )
+
+
+def _of_values(path: Path, values: np.ndarray, cfa: str, white: float | None = None) -> Capture:
+    """A mosaic of which a file says nothing but its numbers."""
+    if values.dtype.kind not in "uf":
+        raise InputError(f"holds {values.dtype} values", path, "give unsigned integers or float")
+    if white is None:
+        white = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else np.inf
+    metadata = CaptureMetadata(source="image", path=path, details={"verified": False})
+    return Capture(mosaic=values, cfa=cfa, levels=Levels(white=white), metadata=metadata)
+
+
 def _from_image(path: Path, kind: str, cfa: str) -> Capture:
+    pages = read_pages(path) if kind == "tiff" else None
+    if pages is not None:
+        return _of_values(path, pages.values, cfa, pages.white)
     values, names, bits = read_stored(path, kind)
     keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
     values = values[..., keep]

@@ -16,7 +16,7 @@ from plenocli.inverse.picture.superpixels import superpixels
 
 SUFFIXES = tuple(
     ".h5 .exr .dng .png .tif .tiff .3fr .arw .cr2 .cr3 .crw .erf .fff .iiq .kdc .mef .mos .mrw "
-    ".nef .nrw .orf .pef .raf .raw .rw2 .rwl .srw .x3f".split()
+    ".nef .nrw .orf .pef .raf .raw .rw2 .rwl .srw .x3f .lfp .lfr .czi .nd2".split()
 )
 """Of the files in a folder that are taken for captures; JPEGs and notes lie beside them."""
 

@@ -109,11 +109,10 @@ def _pages(path: str) -> dict[str, Any] | None:
             budget().require_declared(path, size, 2 * size)
             pages = int(np.prod([n for a, n in counted.items() if a in _AVERAGED]))
             several = set(counted) - set("YX" + _AVERAGED)
-            if several:
-                values = np.zeros((1, 1))
-            elif len(axes) > len(series.axes):
+            values: np.ndarray = np.zeros((1, 1))
+            if not several and len(axes) > len(series.axes):
                 values = np.stack([one.asarray() for one in alike])
-            else:
+            elif not several:
                 values = series.asarray()
     except (PlenoError, MemoryError):
         raise

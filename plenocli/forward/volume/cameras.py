@@ -13,7 +13,7 @@ from plenocli.forward.volume.optics import Term, VolumeOptics
 
 
 def optics_of(camera: Microscope) -> VolumeOptics:
-    """Objective, lenslets and pixels of a microscope at its design wavelength.
+    """Objective, lenslets and pixels of a microscope over the wavelengths of its light.
 
     camera: the description.
     """
@@ -23,6 +23,7 @@ def optics_of(camera: Microscope) -> VolumeOptics:
         mismatch = (lens.medium_index, lens.specimen_depth)
     return VolumeOptics(
         wavelength=camera.light.design_wavelength,
+        band=camera.light.wavelengths if len(camera.light.wavelengths) > 1 else (),
         aperture=lens.numerical_aperture,
         index=lens.specimen_index or lens.medium_index,
         magnification=lens.magnification,
@@ -44,7 +45,8 @@ def optics_of(camera: Microscope) -> VolumeOptics:
 
 
 def optics_of_camera(camera: Camera) -> VolumeOptics:
-    """A photographic camera with [object] planes, as a thin lens at its design wavelength.
+    """A photographic camera with [object] planes, as a thin lens without colour, over the
+    wavelengths of its light.
 
     A point at distance z1 is behind the lens in focus 1/z1 = 1/f - 1/z2 - eps: its wave at the
     lenslets is that of a point z2^2 eps away from focus, paraxially, seen through a pupil z2 away.
@@ -81,6 +83,7 @@ def optics_of_camera(camera: Camera) -> VolumeOptics:
     out_of_focus = (1 / lens.focal_length - 1 / np.array(planes) - 1 / z2) * z2**2
     return VolumeOptics(
         wavelength=camera.light.design_wavelength,
+        band=camera.light.wavelengths if len(camera.light.wavelengths) > 1 else (),
         aperture=lens.aperture_diameter / 2 / z2,
         index=math.inf,
         magnification=1.0,

@@ -9,7 +9,7 @@ from the plane that is focused on the array, away from the objective. docs/model
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,9 +31,10 @@ class Term:
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeOptics:
-    """Objective, lenslets and pixels at one wavelength.
+    """Objective, lenslets and pixels, at one wavelength or over a band of them.
 
     wavelength: m, in vacuum.
+    band: wavelengths of a broad light, m, each of the same strength; empty for the one alone.
     aperture: largest direction s of the light that is used.
     index: refractive index of the specimen; infinite paraxially, where depth bends phases by s^2/2.
     magnification: from the specimen to the lenslet array.
@@ -70,7 +71,15 @@ class VolumeOptics:
     apodised: bool
     rings: tuple[float, ...] = ()
     mismatch: tuple[float, float] | None = None
+    band: tuple[float, ...] = ()
     terms: tuple[Term, ...] = ()
+
+    @property
+    def lines(self) -> tuple[VolumeOptics, ...]:
+        """The same at each wavelength of the band."""
+        if not self.band:
+            return (self,)
+        return tuple(replace(self, wavelength=wavelength, band=()) for wavelength in self.band)
 
     @property
     def k(self) -> float:

@@ -120,7 +120,8 @@ def plan_volume(
             "object.planes",
             "keep to planes nearer the focus, or ask for less accuracy",
         )
-    terms = terms_for(optics, min(1e-3, accuracy / 10))
+    # the shortest waves need the most
+    terms = max(terms_for(line, min(1e-3, accuracy / 10)) for line in optics.lines)
     considered: list[tuple[str, float]] = []
     found = None
     for name, candidate in _rungs(model, terms):
@@ -244,7 +245,7 @@ def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
     if plan.model == "ray":
         count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
         per_plane = places * count * 4e-7
-        return per_plane * len(plan.reach)
+        return len(optics.lines) * per_plane * len(plan.reach)
     total = 0.0
     window = (2 * plan.neighbours + 1) * plan.terms
     for reach in plan.reach:
@@ -252,4 +253,4 @@ def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
         rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
         wide = (lenslets + 2 * plan.neighbours) * plan.terms
         total += 8.0 * rows * window * (wide + columns)
-    return OVERHEAD * places * total / rate
+    return len(optics.lines) * OVERHEAD * places * total / rate

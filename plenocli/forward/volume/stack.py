@@ -135,20 +135,24 @@ def plane_kernels(
     optics: VolumeOptics, plan: VolumePlan, number: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Kernels of one plane: points at the unique places, the others by symmetry, averaged over the
-    voxels' boxes.
+    voxels' boxes and the band.
 
     number: of the plane.
 
     Returns (entry, pixel, point) and lenslet offsets (entry, 2), as Stack has them.
     Raises NumericsError where a point's light on the sensor is not what entered its lenslets.
     """
-    plane, half = plan.plane(optics, number), 2 * plan.reach[number] + 1
+    lines, half = [plan.plane(o, number) for o in optics.lines], 2 * plan.reach[number] + 1
     fine = tuple(n * plan.box for n in plan.samples)
     rows, columns = optics.pixels
     total = np.zeros((*plan.samples, half, rows, half, columns), np.float32)
     for i, j in unique_places(optics, plan.samples, plan.box):
         places = [((k + 0.5) / n - 0.5) * optics.object_pitch for k, n in zip((i, j), fine)]
-        column, entered = plane.column(*places)
+        column, entered = lines[0].column(*places)
+        for line in lines[1:]:
+            other, also = line.column(*places)
+            column, entered = column + other, entered + also
+        column, entered = column / len(lines), entered / len(lines)
         _guard(optics, number, float(column.sum(dtype=float)), entered, plan)
         for (a, b), image in _images((i, j), column, fine, optics).items():
             total[a // plan.box, b // plan.box] += image

@@ -141,6 +141,17 @@ def test_voxels_by_symmetry_are_those_computed_one_by_one():
     assert stacks[0].A.shape[2] == 6
 
 
+def test_light_of_a_band_lands_where_its_lines_do():
+    optics = replace(OPTICS, depths=(3e-6,), places=(3e-6,), scales=(1.0,))
+    lines = [replace(optics, wavelength=w) for w in (0.45e-6, 0.55e-6)]
+    band = replace(optics, band=(0.45e-6, 0.55e-6))
+    plan = plan_volume(band, (2, 2), accuracy=5e-2)
+    assert plan.terms >= plan_volume(optics, (2, 2), accuracy=5e-2).terms
+    whole, *parts = (build_stack(each, plan).A for each in (band, *lines))
+    assert np.allclose(whole, (parts[0] + parts[1]) / 2, atol=1e-6 * whole.max())
+    assert np.abs(parts[0] - parts[1]).max() > 0.1 * whole.max()
+
+
 def test_too_few_terms_are_refused_by_the_light_that_they_make_or_lose():
     plan = replace(plan_volume(OPTICS, (3, 3), accuracy=2e-2), terms=3)
     with pytest.raises(NumericsError, match="enters the lenslets"):

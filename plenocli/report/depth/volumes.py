@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from plenocli.files.results.volumes import StoredVolume
     from plenocli.forward.volume.stack import Stack
 
-DEEP = 3.0
-"""Depth over width from which on a volume is shown plane by plane alone."""
+DEEP, FEW = 3.0, 3
+"""Depth over width from which on, and planes up to which, volumes are shown plane by plane alone."""
 SLICES = 6
 """Planes drawn, evenly from all."""
 
@@ -25,7 +25,8 @@ def volume_figures(volume: StoredVolume, name: str) -> Figures:
     """[(PNG, caption)] of a volume."""
     slices = (_slices(volume), f"{name}: planes by their depth.")
     width = max(n * d for n, d in zip(volume.value.shape[1:], volume.spacing))
-    if len(volume.depth) * volume.step > DEEP * width:
+    planes = len(volume.depth)
+    if planes <= FEW or planes * volume.step > DEEP * width:
         # a photographic camera's planes are layers far apart
         return [slices]
     figures = [
@@ -101,7 +102,11 @@ def _projections(values: np.ndarray, volume: StoredVolume, what: Callable = np.m
             bare(axes, title)
         bar = made.figure.add_subplot(grid[1, 1])
         bare(bar)
-        span = "\n".join(f"{size * 1e6:.4g} um" for size in reversed(sizes))
+        names = ("columns", "rows", "planes")
+        span = "\n".join(
+            f"{name} {format_length(float(f'{size:.4g}'))}"
+            for name, size in zip(names, reversed(sizes))
+        )
         bar.text(0.5, 0.5, span, ha="center", va="center", fontsize=7)
     return made.png
 

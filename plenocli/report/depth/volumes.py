@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from plenocli.forward.volume.stack import Stack
 
 DEEP, FEW = 3.0, 3
-"""Depth over width from which on, and planes up to which, volumes are shown plane by plane alone."""
+"""Depth over width from which on, and planes up to which, planes alone are shown."""
 SLICES = 6
 """Planes drawn, evenly from all."""
 

@@ -172,9 +172,12 @@ def rows(options):
         side = (2 * reach + 1) * PIXELS
         truth = fine.column(0.0, 0.0)[0].reshape(side, side)
         own = plan.plane(camera, z).column(0.0, 0.0)[0].reshape(side, side)
+        # whichever way its depth runs
+        both = [theirs[f"column {n}"] for n in (z, options.planes - 1 - z)]
+        other = min(elsewhere(column, truth) for column in both)
         yield (
             f"column at {camera.depths[z] * 1e6:+.0f} um, light elsewhere | "
-            f"{elsewhere(own, truth):.1e} | | {elsewhere(theirs[f'column {z}'], truth):.2f} |"
+            f"{elsewhere(own, truth):.1e} | | {other:.2f} |"
         )
     for name, (signal, variance) in captures.items():
         problem = Problem(op, Measurement(signal=signal, read_variance=variance), voxels)

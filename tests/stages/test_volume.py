@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from plenocli.base.errors import ConfigError, InputError, UsageError
+from plenocli.base.errors import ConfigError, InputError, NumericsError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
 from plenocli.files.images.mosaic import read_capture
@@ -398,6 +398,18 @@ def test_layers_that_cannot_be_are_refused(sheets, tmp_path, layers, others, mat
         run_capture_sim(
             sheets / "camera.toml", tmp_path / "a.h5", Capture(), layers=layers, **others
         )
+    assert not list(tmp_path.iterdir())
+
+
+def test_layers_and_truths_that_files_do_not_hold_are_refused(sheets, tmp_path):
+    layer = f"{sheets}/near.png@480mm"
+    given = {"layers": [layer], "scene_out": tmp_path / "truth.exr"}
+    with pytest.raises(UsageError, match="exr"):
+        run_capture_sim(sheets / "camera.toml", tmp_path / "a.h5", Capture(), **given)
+    # inside the focal length light comes down everywhere
+    with pytest.raises(NumericsError, match="superpixels"):
+        given = {"layers": [layer.replace("480mm", "5mm")]}
+        run_capture_sim(sheets / "camera.toml", tmp_path / "a.h5", Capture(), **given)
     assert not list(tmp_path.iterdir())
 
 

@@ -63,13 +63,13 @@ def optics_of_camera(camera: Camera) -> VolumeOptics:
         raise ConfigError(
             "volumes are computed behind square lenslets on a square lattice",
             "lenslet_array",
-            "leave [object] planes out",
+            "leave [object] planes and layers out",
         )
     if lens.aperture_shape != "circle" or camera.filter_array is not None:
         raise ConfigError(
             "volumes are computed through a clear round pupil",
             "main_lens.aperture_shape",
-            "leave [object] planes out",
+            "leave [object] planes and layers out",
         )
     if lens.prescription is not None or lens.wavefront is not None or lens.field:
         raise ConfigError(

@@ -208,10 +208,12 @@ def _reach(optics: VolumeOptics, depth: float, lost: float) -> tuple[int, float]
     that is lost then.
     """
     pitch = optics.object_pitch
+    near = math.ceil(_blur(optics, depth) / pitch)
+    if near > MOST_REACH:
+        return near, 1.0
     reach = _blur(optics, depth) / pitch + 2
     while True:
         field = ArrivingField(optics, depth, (reach + 1) * pitch, error=1e-4)
-        near = math.ceil(_blur(optics, depth) / pitch)
         for tried in range(near, math.floor(reach) + 1):
             kept = field.kept(max(tried, 0.5) * pitch)
             if 1 - kept <= lost:

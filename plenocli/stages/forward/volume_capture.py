@@ -84,7 +84,12 @@ def run_volume_capture(
         output, overwrite=overwrite, inputs=[path, *files], suffixes=(".h5", ".exr", ".dng")
     )
     if scene_out:
-        check_output(scene_out, overwrite=overwrite, inputs=[path, *files, output])
+        check_output(
+            scene_out,
+            overwrite=overwrite,
+            inputs=[path, *files, output],
+            suffixes=(".h5", ".tif", ".tiff"),
+        )
     if volume is not None:
         found, name = _of_specimen(path, settings, volume), volume
     else:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from plenocli.inverse.volume.tiles import Tiles
     from plenocli.inverse.volume.volume import Trial, Volume
 
+WORTH_SAYING = 5e-3
+"""Share of the light from which on haze is told."""
 SUFFIXES = (".h5", ".tif", ".tiff")
 
 
@@ -157,7 +159,8 @@ def _supported(tiles: Tiles, most: int) -> tuple[Stack, tuple[Trial, ...]]:
 
 def _take_haze(tiles: Tiles) -> None:
     """Take haze off, where held-out pixels agree, and say how much it was."""
-    if share := tiles.without_haze():
+    share = tiles.without_haze()
+    if share > WORTH_SAYING:
         note(
             f"{share:.0%} of the light is haze, much the same behind all lenslets: it is taken "
             "off (--background 0 keeps it)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -64,8 +65,34 @@ def note(text: str) -> None:
     collected = _COLLECTED.get()
     if collected is not None:
         collected.append(text)
-    elif not quiet:
+    elif not quiet and not (_told and _is_repeat(text)):
         tell(f"plenocli: {text}", error=True)
+
+
+_told: list[dict[str, list[str]]] = []
+"""Of each block of repeats_counted that lasts, the notes of one kind each."""
+
+
+def _is_repeat(text: str) -> bool:
+    """Count a note; whether one of its kind was told."""
+    kind = re.sub(r"\S*[\d./]\S*", "#", text)
+    alike = _told[-1].setdefault(kind, [])
+    alike.append(text)
+    return len(alike) > 1
+
+
+@contextlib.contextmanager
+def repeats_counted() -> Iterator[None]:
+    """While the block lasts, notes that differ from an earlier one in numbers and names alone are
+    counted instead of told; how many there were is told at its end.
+    """
+    _told.append({})
+    try:
+        yield
+    finally:
+        for alike in _told.pop().values():
+            if len(alike) > 1:
+                note(f"{len(alike)} times in all, with other names and numbers: {alike[0]}")
 
 
 def tell(text: str, *, error: bool = False) -> None:

@@ -2,15 +2,22 @@
 happens when some fail.
 """
 
+import contextlib
+import csv
+import io
+import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import OutputError, PlenoError, UsageError
-from plenocli.base.progress import bar, note
+from plenocli.base.progress import bar, repeats_counted, tell
 from plenocli.execution.pool import Pool, absolute, attempt, run_all
+
+SUMMARY = "summary"
+"""Name of the files that say what became of every capture, without .json and .csv."""
 
 
 @dataclass(frozen=True)
@@ -164,14 +171,15 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
     """
     reports: list[tuple[Path, Any]] = []
     errors: list[tuple[Path, PlenoError]] = []
-    for capture, outcome in ended:
-        if not isinstance(outcome, PlenoError):
-            reports.append((capture, outcome))
-        elif not batch.several:
-            raise outcome
-        else:
-            note(f"error: {outcome}")
-            errors.append((capture, outcome))
+    with repeats_counted() if batch.several else contextlib.nullcontext():
+        for capture, outcome in ended:
+            if not isinstance(outcome, PlenoError):
+                reports.append((capture, outcome))
+            elif not batch.several:
+                raise outcome
+            else:
+                tell(f"plenocli: error: {outcome}", error=True)
+                errors.append((capture, outcome))
     order = {capture: number for number, (capture, _) in enumerate(batch.jobs)}
     reports.sort(key=lambda pair: order[pair[0]])
     errors.sort(key=lambda pair: order[pair[0]])
@@ -180,6 +188,8 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
         len(batch.jobs) - len(batch.todo),
         tuple(report for _, report in reports),
     )
+    if batch.several:
+        _write_summary(batch, dict(reports), dict(errors))
     if errors:
         raise failed_together(
             errors,
@@ -189,6 +199,50 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
             f"{len(batch.jobs) - len(errors)} are done; see the messages above",
         ) from PartialFailure(done, errors)
     return done
+
+
+def _write_summary(
+    batch: Batch, reports: Mapping[Path, Any], errors: Mapping[Path, PlenoError]
+) -> None:
+    """Write SUMMARY.json and SUMMARY.csv beside the results: a row for every capture, what an
+    earlier run said of those that were finished before.
+    """
+    from plenocli.base.text import json_value
+    from plenocli.files.atomic import publish
+    from plenocli.files.images.raw import captured_at
+
+    path = batch.output / f"{SUMMARY}.json"
+    try:
+        known = {row["capture"]: row for row in json.loads(path.read_text())["captures"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        known = {}
+    rows = []
+    for capture, target in batch.jobs:
+        row: dict[str, Any] = {"capture": str(capture), "output": str(target)}
+        if capture in reports:
+            row |= {"state": "done", "error": None, "captured": captured_at(capture)}
+            row |= reports[capture].as_json() | row
+        elif capture in errors:
+            row |= {"state": "failed", "error": str(errors[capture])}
+        else:
+            row |= known.get(str(capture), {}) | row | {"state": "finished before", "error": None}
+        rows.append(json_value(row))
+    document = json.dumps({"captures": rows}, indent=1, ensure_ascii=False, allow_nan=False)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = io.StringIO()
+    writer = csv.DictWriter(table, names, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow(
+            {
+                name: json.dumps(value, ensure_ascii=False)
+                if isinstance(value, (dict, list))
+                else value
+                for name, value in row.items()
+            }
+        )
+    publish(path, document.encode() + b"\n", overwrite=True)
+    publish(path.with_suffix(".csv"), table.getvalue().encode(), overwrite=True)
 
 
 def failed_together(

@@ -2,10 +2,25 @@
 
 import numpy as np
 
-from plenocli.base.progress import bar, collected_notes
+from plenocli.base import progress
+from plenocli.base.progress import bar, collected_notes, note, repeats_counted
 
 
 def test_a_silent_bar_takes_arrays_and_nothing():
     with collected_notes():
         assert list(bar(np.array([4e-7, 5e-7]))) == [4e-7, 5e-7]
         assert list(bar([])) == [] and list(bar(None, 3)) == []
+
+
+def test_notes_that_repeat_are_counted(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "quiet", False)
+    with repeats_counted():
+        for number in range(45):
+            note(f"a{number}.nef: {number} of 90 lenslets lie partly off the sensor")
+        note("another thing")
+    note("a1.nef: 1 of 90 lenslets lie partly off the sensor")
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "plenocli: a0.nef: 0 of 90 lenslets lie partly off the sensor"
+    assert told[1] == "plenocli: another thing"
+    assert told[2].startswith("plenocli: 45 times in all") and told[2].endswith(told[0][10:])
+    assert len(told) == 4

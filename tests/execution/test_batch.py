@@ -2,6 +2,7 @@
 threads, one writer.
 """
 
+import csv
 import json
 import os
 import signal
@@ -68,6 +69,12 @@ def shots(folder):
     return sorted(folder.glob("shot*.h5"))
 
 
+def results(folder):
+    """What came of the captures, beside the summary."""
+    assert {p.name for p in folder.glob("summary.*")} == {"summary.csv", "summary.json"}
+    return sorted(p for p in folder.iterdir() if p.stem != "summary")
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path, seed):
     """Killed at a random moment after a random number of results, then run again: the same
@@ -103,10 +110,8 @@ def test_a_run_that_is_killed_loses_nothing_and_repeats_nothing(folder, tmp_path
     assert (report.done, report.skipped) == (FILES - len(before), len(before))
     assert all((out / name).stat().st_mtime_ns == stamp for name, stamp in before.items())
     # nothing half-written is left
-    assert sorted(p.name for p in out.iterdir()) == sorted(
-        p.name for p in (folder / "whole").iterdir()
-    )
-    for path in out.iterdir():
+    assert [p.name for p in results(out)] == [p.name for p in results(folder / "whole")]
+    for path in results(out):
         assert path.read_bytes() == (folder / "whole" / path.name).read_bytes()
 
 
@@ -144,9 +149,7 @@ def test_a_bad_file_stops_no_other(folder, tmp_path, workers, capsys):
         run_demux(
             files, tmp_path / "out", calibration=folder / "c.h5", suffix=".h5", workers=workers
         )
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        p.name for p in shots(folder)[:6]
-    ]
+    assert [p.name for p in results(tmp_path / "out")] == [p.name for p in shots(folder)[:6]]
     err = capsys.readouterr().err
     assert str(bad) in err and "missing.h5" in err
 
@@ -161,7 +164,7 @@ def test_a_folder_is_the_captures_in_it(folder, tmp_path):
     calibration, names = tmp_path / "c.h5", ["shot00.h5", "shot01.h5", "shot02.h5"]
     done = run_demux([tmp_path], tmp_path / "out", calibration=calibration)
     assert [Path(one.capture).name for one in done.captures] == names
-    assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == [n[:-3] for n in names]
+    assert [path.stem for path in results(tmp_path / "out")] == [n[:-3] for n in names]
     again = run_demux([tmp_path], tmp_path / "out", calibration=calibration)
     assert (again.done, again.skipped) == (0, 3)
     pattern = [tmp_path / "shot0[12].h5", tmp_path / "shot01.h5"]
@@ -182,6 +185,26 @@ def test_a_batch_that_fails_in_part_tells_one_document(folder, tmp_path, capsys)
     assert [one["capture"] for one in told["captures"]] == [p.name for p in shots(folder)[:2]]
     assert [one["capture"] for one in told["failed"]] == [str(bad)]
     assert str(bad) in told["failed"][0]["error"]
+
+
+def test_a_summary_has_a_row_for_every_capture(folder, tmp_path):
+    """Of runs that fail in part and of those that find most done, too."""
+    bad, out = tmp_path / "bad.h5", tmp_path / "out"
+    bad.write_bytes(shots(folder)[0].read_bytes()[:-40])
+
+    def rows(count):
+        with pytest.raises(InputError, match=f"1 of {count + 1} captures failed"):
+            run_demux([*shots(folder)[:count], bad], out, calibration=folder / "c.h5")
+        with open(out / "summary.csv", newline="") as stream:
+            table = list(csv.DictReader(stream))
+        found = json.loads((out / "summary.json").read_text())["captures"]
+        assert [row["capture"] for row in table] == [row["capture"] for row in found]
+        return found
+
+    first, again = rows(2), rows(3)
+    assert [row["state"] for row in first] == ["done", "done", "failed"]
+    assert [row["state"] for row in again] == ["finished before"] * 2 + ["done", "failed"]
+    assert again[0]["mean"] == first[0]["mean"] and str(bad) in again[-1]["error"]
 
 
 def test_work_overlaps_writing_does_not_and_few_results_wait(tmp_path):

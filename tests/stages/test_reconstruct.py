@@ -420,7 +420,7 @@ def test_several_captures_go_to_a_folder(single, tmp_path, capsys):
         str(tmp_path / "out"),
     ]
     assert run(arguments) == 3
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.h5", "b.h5"]
+    assert sorted(p.name for p in (tmp_path / "out").glob("*.h5")) == ["a.h5", "b.h5"]
     (tmp_path / "bad.h5").unlink()
     assert run([*arguments[:3], *arguments[4:], "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["skipped"] == 2

@@ -71,7 +71,10 @@ def provenance_texts(provenance: Provenance) -> dict[str, str]:
         for name, value in (("inputs", provenance.inputs), ("accuracy", provenance.accuracy))
         if value
     }
-    return {_TEXT.format(name): text for name, text in texts.items() if text}
+    captured = provenance.inputs.get("capture", {}).get("captured")
+    # the camera's clock, as EXIF and OpenEXR's capDate write it
+    clock = {"DateTime": captured.replace("-", ":").replace("T", " ")} if captured else {}
+    return {_TEXT.format(name): text for name, text in texts.items() if text} | clock
 
 
 def read_provenance_texts(attrs: Mapping[str, str]) -> Provenance:

@@ -168,7 +168,8 @@ def _spec(
     for name, value in attrs.items():
         spec.attribute(name, value)
     spec.attribute("compression", compression)
-    spec.attribute("DateTime", "2000:01:01 00:00:00")  # left out, OpenImageIO writes the clock
+    if "DateTime" not in attrs:
+        spec.attribute("DateTime", "2000:01:01 00:00:00")  # left out, OpenImageIO writes the clock
     spec.attribute("Software", f"plenocli {__version__}")
     return spec
 

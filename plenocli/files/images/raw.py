@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from plenocli.forward.sensor.cfa import ColourProfile
 _COPIES = 4
 """Of a mosaic that exist at the same time while it is read, in this process and outside."""
 _FIX = "give an intact camera RAW or DNG with a colour filter mosaic"
+_CLOCK = re.compile(r"([12]\d{3}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 _REASONS = {
     "LibRawFileUnsupportedError": (
         "is not a RAW file that LibRaw knows, or too damaged to be recognised"
@@ -178,8 +180,18 @@ def _mosaic(path: str, raw: Any) -> dict[str, Any]:
     return found
 
 
+def captured_at(path: str | Path) -> str | None:
+    """When a camera took a RAW, DNG or TIFF by its own clock, "2026-11-24T07:30:00"; None where the
+    file does not say it.
+    """
+    if Path(path).suffix.lower() in (".h5", ".exr", ".png"):
+        return None
+    when = outside(_exif, path).get("captured")
+    return None if when is None else str(when)
+
+
 def _exif(path: str) -> dict[str, Any]:
-    """Make, model and exposure from the EXIF tags, as far as they can be read."""
+    """Make, model, exposure and time from the EXIF tags, as far as they can be read."""
     import exifread
 
     logging.disable(logging.CRITICAL)
@@ -197,6 +209,9 @@ def _exif(path: str) -> dict[str, Any]:
             found.setdefault("exposure_s", float(tags[key].values[0]))
         except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError, AttributeError):
             continue
+    for key in ("EXIF DateTimeOriginal", "Image DateTime"):
+        if clock := _CLOCK.match(str(tags.get(key, ""))):
+            found.setdefault("captured", "{}-{}-{}T{}".format(*clock.groups()))
     return found
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plenocli.base.errors import ConfigError, InputError
+from plenocli.base.progress import note
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -28,11 +29,14 @@ def read_camera(path: Name) -> Camera:
     from plenocli.files.config.camera_file import load_camera
     from plenocli.files.config.lens_file import load_lens
     from plenocli.files.images.maps import read_transmittance, read_wavefront
+    from plenocli.forward.camera import model
 
     readers: dict[str, Callable[[Path], Any]] = dict(
         zip(_NAMED, (read_transmittance, read_wavefront, load_lens))
     )
     camera = load_camera(path)
+    if isinstance(camera, model.Camera) and (asked := camera.unusual_lengths()):
+        note(f"warning: {Path(path).name}: {asked}")
     for key, file in _named(path, camera).items():
         values = readers[key](file)
         try:

@@ -39,6 +39,15 @@ def named_captures(
     return list(found)
 
 
+def describe_capture(path: str | Path) -> dict[str, dict[str, str]]:
+    """A capture among the inputs of a Provenance: name, digest and when it was taken, if known."""
+    from plenocli.files.artefacts.provenance import describe_inputs
+    from plenocli.files.images.raw import captured_at
+
+    inputs, when = describe_inputs({"capture": path}), captured_at(path)
+    return {"capture": inputs["capture"] | ({"captured": when} if when else {})}
+
+
 def _meant(name: Path, apart: set[Path]) -> list[Path]:
     """What one name of named_captures stands for."""
     try:

@@ -49,7 +49,7 @@ from plenocli.base.quantities import (
 from plenocli.base.text import by
 from plenocli.base.toml import violations
 from plenocli.base.units import UnitError, format_length, parse_length, parse_wavelength
-from plenocli.forward.camera.plausible import Lengths, implausible
+from plenocli.forward.camera.plausible import Lengths, implausible, unusual
 from plenocli.forward.camera.quadrature import Disc
 
 ROW_SPACING = math.sqrt(3) / 2
@@ -764,6 +764,10 @@ class Camera(Section):
             pixels=max(sensor.pixels_per_lenslet),
             wavelengths=(min(wavelengths), max(wavelengths)),
         )
+
+    def unusual_lengths(self) -> str | None:
+        """What its lengths may have been meant to be (plausible.unusual)."""
+        return unusual(self._lengths())
 
     def _fitting(self, cells: FilterArray) -> FilterArray:
         """The filter array with its size; ValueError where it does not fit into the pupil."""

@@ -29,6 +29,18 @@ SMALLEST_FILTERS = 0.01
 """Width of the filter array in pupils."""
 UNITS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
 """What a slip of the unit multiplies a length by."""
+USUAL = {
+    "main_lens.focal_length": (0.5e-3, 5.0),
+    "main_lens.aperture_diameter": (20e-6, 1.0),
+    "object.distance": (0.5e-3, 1e6),
+    "lenslet_array.distance": (0.5e-3, 5.0),
+    "lenslet_array.pitch": (2e-6, 5e-3),
+    "lenslet_array.superpixel_pitch": (2e-6, 5e-3),
+    "lenslet_array.focal_length": (5e-6, 0.1),
+    "sensor.distance": (5e-6, 0.1),
+    "sensor.pixel_pitch": (0.2e-6, 0.2e-3),
+}
+"""m: what is outside can be computed, but is no camera's that anybody has built."""
 _TYPICAL_F = 8.0
 
 
@@ -76,6 +88,22 @@ def implausible(lengths: Lengths) -> str | None:
     if worst.excess <= 1e-9:
         return None
     return worst.sentence + _meant(lengths)
+
+
+def unusual(lengths: Lengths) -> str | None:
+    """The lengths that are far from those of cameras, each with what may have been meant, in one
+    sentence; None where there are none. Ratios do not show where all are in a wrong unit.
+    """
+    asked = []
+    for key, value in lengths.by_key.items():
+        low, high = USUAL.get(key, (0.0, math.inf))
+        meant = next((value * f for f in UNITS if low <= value * f <= high), None)
+        derived = (
+            key == "lenslet_array.pitch" and "lenslet_array.superpixel_pitch" in lengths.by_key
+        )
+        if not low <= value <= high and meant is not None and not derived:
+            asked.append(f"{key} is {_text(value)}: did you mean {_text(meant)}?")
+    return "; ".join(asked) or None
 
 
 @dataclass(frozen=True, kw_only=True)

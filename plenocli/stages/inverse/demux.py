@@ -17,7 +17,7 @@ from plenocli.base.progress import note
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
-from plenocli.files.read.captures import named_captures
+from plenocli.files.read.captures import describe_capture, named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
 from plenocli.inverse.spectra.polarisation import stokes
@@ -343,10 +343,8 @@ class CaptureDemultiplexer:
 
         method: instead of the settings' one.
         """
-        from plenocli.files.artefacts.provenance import describe_inputs
-
         capture = read_capture(path, cfa=self.solver.responses.cfa)
-        return self.solver.estimate(capture, path, method), describe_inputs({"capture": path})
+        return self.solver.estimate(capture, path, method), describe_capture(path)
 
     def write(
         self, done: tuple[Spectra, dict[str, Any]], capture: Name, target: Name

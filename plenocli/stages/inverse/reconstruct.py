@@ -18,7 +18,12 @@ from plenocli.base.tiling import to_blocks
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
 from plenocli.files.kept import kept
-from plenocli.files.read.captures import named_captures, read_superpixels, read_white
+from plenocli.files.read.captures import (
+    describe_capture,
+    named_captures,
+    read_superpixels,
+    read_white,
+)
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import (
     FieldMatrix,
@@ -623,9 +628,8 @@ def _inputs(
     """The files that a picture was made from, for its provenance."""
     from plenocli.files.artefacts.provenance import describe_inputs
 
-    return describe_inputs(
+    return describe_capture(capture) | describe_inputs(
         {
-            "capture": capture,
             "pif": pif,
             "calibration": calibration,
             "dictionary": settings.dictionary,

@@ -9,6 +9,7 @@ import pytest
 from plenocli.base.errors import ConfigError, UsageError
 from plenocli.base.units import format_length
 from plenocli.files.config.camera_file import parse_camera
+from plenocli.files.read.cameras import read_camera
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.plausible import UNITS
 from tests.forward.propagation.cameras import small_camera
@@ -75,3 +76,23 @@ def test_usual_cameras_are_none_of_its_business():
 def test_wavelengths_wider_than_lenslets_are_refused():
     with pytest.raises(UsageError, match="longer than lenslets are wide"):
         plan_pif(small_camera(), wavelengths=(90e-6,))
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in SAMPLES.glob("*.toml")))
+def test_lengths_in_a_wrong_unit_throughout_are_asked_about(name, tmp_path, capsys):
+    """Ratios are those of a camera; sizes are not. The samples themselves are usual."""
+    text = (SAMPLES / name).read_text()
+    if "[objective]" in text:
+        return
+    assert read_camera(SAMPLES / name).unusual_lengths() is None
+    (tmp_path / name).write_text(text.replace(' um"', ' mm"'))
+    try:
+        camera = read_camera(tmp_path / name)
+    except ConfigError as error:
+        assert "was" in str(error) and "meant?" in str(error)
+        return
+    assert f"{name}: " in capsys.readouterr().err
+    pixel = 1e6 * read_camera(SAMPLES / name).sensor.pixel_pitch
+    assert f"sensor.pixel_pitch is {pixel:.4g} mm: did you mean {pixel:.4g} um?" in str(
+        camera.unusual_lengths()
+    )

@@ -245,12 +245,19 @@ class Ring(click.ParamType):
 
 class _File(click.Path):
     """A path with a name: an empty one, often a shell variable that is not set, would mean
-    the current folder.
+    the current folder, and '-' a stream.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the file name is empty", param, ctx)
+        if value == "-":
+            self.fail(
+                "files are checked and sealed, so that '-' is none of them: name a file (--json "
+                "prints a summary to standard output; ./- is a file of that name)",
+                param,
+                ctx,
+            )
         return super().convert(value, param, ctx)
 
 

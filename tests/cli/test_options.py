@@ -100,6 +100,7 @@ def test_json_has_no_nan_and_no_arrays(capsys):
         (options.Pair("NUMBER", options.positive), "450nm=inf"),
         (options.Pair("NUMBER", options.positive), "450nm=0"),
         (options.FILE, ""),
+        (options.FILE, "-"),
     ],
 )
 def test_values_that_would_overflow_later_are_refused(kind, value):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, PlenoError
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
 from plenocli.files.outside import outside
@@ -186,7 +186,10 @@ def captured_at(path: str | Path) -> str | None:
     """
     if Path(path).suffix.lower() in (".h5", ".exr", ".png"):
         return None
-    when = outside(_exif, path).get("captured")
+    try:
+        when = outside(_exif, path).get("captured")
+    except PlenoError:  # a courtesy
+        return None
     return None if when is None else str(when)
 
 

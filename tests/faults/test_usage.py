@@ -152,6 +152,7 @@ def test_every_option_has_a_type_that_refuses_something():
     assert free <= {
         "--scheduler",
         "--volume",
+        "--layer",
         "--fix",
         "--detect",
         "--patches",

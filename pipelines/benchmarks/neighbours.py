@@ -4,8 +4,9 @@ errors of `demux --method auto` and of the pseudo-inverse against the reflectanc
 let through and against the answer for an even object, with the stated errors; and the time of one
 solution for 10,000 lenslets. `choice` compares what `auto` takes with every method on cameras of
 random filters, charts and exposures. Captures come from the exact model over --superpixels and
---samples points, the neighbours' light from the description (12 points), with the sensor 1 %
-further away and the filters 1 % larger where --wrong says so.
+--samples points a side (as many as a field has diffraction cells, as objects have no points), the
+neighbours' light from the description, with the sensor 1 % further away and the filters 1 % larger
+where --wrong says so.
 
     python pipelines/benchmarks/neighbours.py four
     python pipelines/benchmarks/neighbours.py choice --cases 40
@@ -119,18 +120,23 @@ def camera_of(name):
 class Bench:
     """One camera, its captures and its calibration."""
 
-    def __init__(self, described, superpixels, samples):
+    def __init__(self, described, superpixels, samples, lines=False):
         from plenocli.forward.accuracy.dial import pif_builder
-        from plenocli.forward.scene.light import broadband
+        from plenocli.forward.scene.light import Quadrature, broadband
         from plenocli.forward.scene.tables import illuminant
         from plenocli.forward.sensor.exposure import StoredMatrix
 
         self.described, self.samples = described, samples
         self.camera = self.described.replace(**{"object.samples_per_lenslet": (samples, samples)})
         self.light = broadband(self.camera, lambda w: illuminant("D65", w), None)
+        if lines:
+            bands = np.array(self.camera.light.wavelengths)
+            self.light = Quadrature(bands, np.full(len(bands), 1 / len(bands)))
+        model = "fresnel" if lines else "auto"
         self.matrices = {}
         for w in {*map(float, self.light.wavelengths), *self.camera.light.wavelengths}:
-            builder = pif_builder(self.camera, w, superpixels=(superpixels, superpixels))
+            sides = (superpixels, superpixels)
+            builder = pif_builder(self.camera, w, superpixels=sides, model=model)
             matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
             self.matrices[w] = StoredMatrix(matrix, builder.offsets)
         self.calibration, white = self._calibrated()
@@ -299,14 +305,20 @@ def main():
     parser.add_argument("--cases", type=int, default=40, help="of choice")
     parser.add_argument("--first", type=int, default=9000, help="seed of the first case of choice")
     parser.add_argument("--superpixels", type=int, default=3, help="a side, of the captures")
-    parser.add_argument("--samples", type=int, default=12, help="points a side, of the captures")
+    parser.add_argument("--samples", type=int, default=24, help="points a side, of the captures")
+    parser.add_argument(
+        "--lines",
+        action="store_true",
+        help="light of four lines, by the paraxial model: nothing but neighbours, in minutes",
+    )
     parser.add_argument("--wrong", action="store_true", help="distance and filters 1 % off")
     parser.add_argument("--seeds", type=int, nargs="+", default=[21])
     options = parser.parse_args()
     if options.camera == "choice":
         choice(options.cases, options.first, options.superpixels, options.samples)
         return
-    bench = Bench(camera_of(options.camera), options.superpixels, options.samples)
+    described = camera_of(options.camera)
+    bench = Bench(described, options.superpixels, options.samples, options.lines)
     table(bench, options.wrong, options.seeds)
     speed(bench)
 

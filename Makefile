@@ -17,7 +17,7 @@ PIPELINE = +PATH="$(BIN):$$PATH" $(MAKE) --no-print-directory -f
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 ALL_CORES = $(if $(filter -j%,$(MAKEFLAGS)),,-j$(CORES))
 
-.PHONY: help env requirements sbom demo test lint extremes honesty faults fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
+.PHONY: help env requirements sbom demo test lint extremes honesty faults kills fuzz test-slow spatial spatial-250um mismatch spectral dslr colorchecker raw sweep trade dictionary bench-sparse bench-reconstruct tiny paper tradeoff bench-pif docs wheel clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -70,6 +70,9 @@ honesty: $(READY) ## 2,000 random cameras of all shapes at random accuracies, an
 
 faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults
+
+kills: $(READY) ## 400 kills at random times of each kind: every stage, make, and client, workers and scheduler of a sweep on Dask (hours)
+	KILLS=400 OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults/test_kills.py tests/faults/test_cluster_kills.py
 
 fuzz: $(READY) ## ten minutes of coverage-guided fuzzing of every reader; what breaks one stays in runs/fuzz
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fuzz]'

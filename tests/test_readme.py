@@ -109,3 +109,16 @@ def test_files_named_in_makefiles_exist():
         named = r"\b(?:tests|pipelines|sample_configs)/[\w./-]+\w"
         for name in re.findall(named, page.read_text()):
             assert (ROOT / name).exists(), (page.name, name)
+
+
+def test_every_row_of_limits_names_a_test_that_is_there():
+    table = (ROOT / "README.md").read_text().partition("## Limits")[2].partition("\n## ")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) > 8
+    for row in rows:
+        *_, last = row.strip("| ").split(" | ")
+        named = re.findall(r"`([a-z/_0-9]+\.py)`", last)
+        folder = named[0].rpartition("/")[0] if named else ""
+        known = [ROOT / "tests" / name for name in named]
+        known = [p if "/" in n else ROOT / "tests" / folder / n for p, n in zip(known, named)]
+        assert named and all(path.is_file() for path in known), row

@@ -388,6 +388,7 @@ def _environment() -> Iterator[None]:
 def _cluster(scheduler: str) -> Iterator[Any]:
     try:
         from distributed import Client
+        from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
@@ -401,11 +402,16 @@ def _cluster(scheduler: str) -> Iterator[Any]:
             "--scheduler",
             "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
         ) from None
-    with client:
-        if not client.nthreads():
-            note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
-            client.wait_for_workers(1)
-        yield client
+    try:
+        with client:
+            if not client.nthreads():
+                note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
+                client.wait_for_workers(1)
+            yield client
+    except CommClosedError as error:
+        lost = _trouble(error)
+        assert lost is not None
+        raise lost from None
 
 
 _TLS = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}

@@ -202,6 +202,18 @@ def test_poor_environments(folder, environment):
 
 
 @pytest.mark.parametrize(
+    "limit, code", [("-n 12", 0), ("-f 8", 4), ("-s 256", 0), ("-d 100000", 5), ("-c 0", 0)]
+)
+def test_limits_of_the_shell(folder, limit, code):
+    """Files open, file size, stack, memory: done as always, or one message."""
+    found, _, error = shell(f"ulimit {limit}; plenocli {' '.join(PICTURE)}", folder)
+    assert found == code and b"Traceback" not in error and b"internal error" not in error, error
+    done = (folder / "out.h5").exists()
+    assert done == (code == 0)
+    assert not done or (folder / "out.h5").read_bytes() == (folder / "image.h5").read_bytes()
+
+
+@pytest.mark.parametrize(
     "content", [b"", b'{"type": "Scheduler", "addr', b"{}", b"[1]", b'{"address": 3}', b"\xff\xfe"]
 )
 def test_a_half_written_file_of_a_dask_scheduler(runner, folder, content):

@@ -46,7 +46,7 @@ def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campa
     assert tree(target.parent) == whole
     empty(target.parent)
     rng, killed, finished = np.random.default_rng(list(name.encode())), 0, 0
-    while killed < campaign(4, 200):
+    while killed < int(os.environ.get("KILLS", campaign(4, 200))):
         outcome = runner.run(command, tmp_path, kill_after=rng.uniform(0, usual))
         if outcome.code == 0:
             finished += 1
@@ -103,7 +103,7 @@ def test_make_after_a_kill_gives_the_tree_of_an_uninterrupted_run(tmp_path, camp
     start = time.monotonic()
     assert make(tmp_path / "whole" / "run").wait() == 0
     usual, rng, killed = time.monotonic() - start, np.random.default_rng(8), 0
-    for _ in range(campaign(3, 20)):
+    for _ in range(int(os.environ.get("KILLS", campaign(3, 20)))):
         child = make(tmp_path / "killed" / "run")
         try:
             assert child.wait(timeout=rng.uniform(0.02, 0.3) * usual) == 0

@@ -11,6 +11,8 @@ from plenocli.base.errors import InputError
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.scene.labelled import LabelledSpectra
 
+LARGEST = 1e30
+"""Of a spectrum, which is carried in single precision."""
 WANTED = (
     "give a .csv whose first column are wavelengths in nm, and every other the reflectances of one "
     "spectrum below the name of its class; or a folder with a folder, a .csv or a spectral image "
@@ -65,7 +67,7 @@ def _table(path: Path) -> LabelledSpectra:
     if numbers.ndim != 2 or numbers.shape[1] != len(head) or len(numbers) < 2:
         raise InputError("has lines of different length, or fewer than three", path, WANTED)
     numbers = numbers[np.argsort(numbers[:, 0])]
-    if not np.isfinite(numbers).all() or (np.diff(numbers[:, 0]) <= 0).any():
+    if not (np.abs(numbers) <= LARGEST).all() or (np.diff(numbers[:, 0]) <= 0).any():
         raise InputError("has a wavelength twice, or values that are not finite", path, WANTED)
     return LabelledSpectra(labels, numbers[:, 0] * 1e-9, numbers[:, 1:].T)
 
@@ -87,7 +89,7 @@ def _image(path: Path, label: str) -> LabelledSpectra:
     if nodes is None or len(nodes) < 2:
         raise InputError("has no wavelengths, or one", path, "give a spectral image")
     pixels = np.asarray(values, float).reshape(len(nodes), -1).T
-    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    pixels = pixels[(np.abs(pixels) <= LARGEST).all(axis=1)]
     if not len(pixels):
         raise InputError("has no pixel with values in all bands", path, WANTED)
     pixels = pixels[:: -(-len(pixels) // MOST)]

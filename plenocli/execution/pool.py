@@ -388,7 +388,6 @@ def _environment() -> Iterator[None]:
 def _cluster(scheduler: str) -> Iterator[Any]:
     try:
         from distributed import Client
-        from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
@@ -408,10 +407,10 @@ def _cluster(scheduler: str) -> Iterator[Any]:
                 note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
                 client.wait_for_workers(1)
             yield client
-    except CommClosedError as error:
-        lost = _trouble(error)
-        assert lost is not None
-        raise lost from None
+    except OSError as error:
+        if error.errno is not None:  # of a file, not of Dask
+            raise
+        raise _broken(error) from None
 
 
 _TLS = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
@@ -483,8 +482,12 @@ def _trouble(error: Exception) -> PlenoError | None:
             "install the same plenocli and its extras where the workers run",
         )
     if name in ("CancelledError", "FutureCancelledError", "CommClosedError"):
-        return Lost(
-            f"the connection to the Dask scheduler broke ({name})",
-            fix="what is finished is kept: run again",
-        )
+        return _broken(error)
     return None
+
+
+def _broken(error: Exception) -> Lost:
+    return Lost(
+        f"the connection to the Dask scheduler broke ({type(error).__name__})",
+        fix="what is finished is kept: run again",
+    )

@@ -270,7 +270,8 @@ def band_pictures(
     from plenocli.forward.scene.colour import preview_rgb
 
     cube = np.asarray(cube, dtype=np.float64)
-    top = float(np.nanpercentile(cube, 99.5)) or 1.0
+    known = cube[np.isfinite(cube)]
+    top = (float(np.percentile(known, 99.5)) if known.size else 0.0) or 1.0
     scale = 1.0 if quantity == "reflectance" else top
     shown = min(len(wavelengths), 8)
     chosen = np.unique(np.round(np.linspace(0, len(wavelengths) - 1, shown)).astype(int))

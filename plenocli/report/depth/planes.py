@@ -45,7 +45,8 @@ def _label(field: LightField, plane: int) -> str:
 
 
 def _top(values: np.ndarray) -> float:
-    return max(float(np.nanpercentile(values, 99.5)), 1e-30)
+    known = values[np.isfinite(values)]
+    return max(float(np.percentile(known, 99.5)), 1e-30) if known.size else 1.0
 
 
 def _planes(field: LightField) -> bytes:

@@ -2,7 +2,9 @@
 reader refuses each, naming the file; what keeps all rules but is extreme is no bug of any command.
 """
 
+import hashlib
 import io
+import shutil
 
 import h5py
 import numpy as np
@@ -11,7 +13,8 @@ import pytest
 from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.artefacts.kinds import SCHEMAS
-from tests.faults.test_resealed import attribute, other, resealed, values, without
+from tests.faults.harness import mutants
+from tests.faults.test_resealed import MAGIC, attribute, other, resealed, values, without
 
 FILES = (
     "pif.h5",
@@ -130,3 +133,20 @@ def test_every_rule_of_a_table_is_looked_at(stages, tmp_path, campaign, count, n
             assert error.where == str(path), what
     assert read == []
     count("rules of tables broken in sealed files", broken=len(tried), read_nevertheless=0)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_hdf5_that_is_damaged_below_a_true_digest_crashes_nothing(
+    runner, stages, tmp_path, campaign, count, name
+):
+    """Segmentation faults of HDF5 that such files cause stay in the child that decodes."""
+    content, codes = (stages[0] / name).read_bytes(), []
+    if name == "shards.h5":
+        shutil.copytree(stages[0], tmp_path, dirs_exist_ok=True)
+    for image in mutants(content[512:], campaign(1, 150), np.random.default_rng(len(content))):
+        said = f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()
+        (tmp_path / "x.h5").write_bytes((MAGIC + said).ljust(512, b"\0") + image)
+        outcome = runner.run(["inspect", "x.h5"], tmp_path)
+        assert outcome.code in (0, 3) and not outcome.hung, outcome
+        codes.append(outcome.code)
+    count("damaged HDF5 below a true digest", files=len(codes), read=codes.count(0), signals=0)

@@ -26,7 +26,6 @@ import numpy as np
 from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.memory import can_have
 from plenocli.base.text import utf8
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
@@ -34,8 +33,10 @@ from plenocli.files.artefacts.provenance import Provenance, first_bytes, require
 from plenocli.files.artefacts.sparse import SparseFile
 from plenocli.files.artefacts.structure import (
     EMPTY_AXIS,
+    READING,
     attribute_names,
-    look,
+    compressed_values,
+    no_hdf5,
     read_attribute,
     survey,
 )
@@ -49,8 +50,10 @@ _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18
 _CHUNK_BYTES = 1 << 20
 _READ_BYTES = 1 << 22
 _NUMBER = itertools.count()
-_LOOK_S = 10
-"""Processor time in which HDF5 finds all objects of any file that is sound."""
+_LOOK_S, _SLOWEST = 10, 5 << 20
+"""Processor time, s, in which HDF5 finds all objects of any file that is sound, and bytes a second
+that it unpacks at least.
+"""
 _LONG_TEXT = 60_000  # an attribute in the oldest HDF5 layout ends at 64 KiB
 
 
@@ -148,21 +151,17 @@ def _parsed(
     """What the HDF5 part of a file, its `image`, holds; errors as read_artefact."""
     try:
         content = image(path)
-        outside(look, path, seconds=_LOOK_S)
+        seconds = _LOOK_S + len(content) // _SLOWEST
+        values = outside(compressed_values, path, sorted(skip), seconds=seconds)
         # which keeps a copy: ours goes
         opened = _open_image(content)
         del content
         with h5py.File(opened, "r") as file:
-            return _parse(path, file, kind, skip)
+            return _parse(path, file, kind, skip, values)
     except (PlenoError, MemoryError):
         raise
     except Exception as error:  # h5py raises half a dozen types for a malformed file
-        # HDF5 does not say when it got no memory, and the digest said that the file is whole
-        if not can_have(READING * path.stat().st_size + (1 << 20)):
-            raise MemoryError(str(error)) from error
-        raise InputError(
-            f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again"
-        ) from error
+        raise no_hdf5(path, error) from error
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -412,12 +411,6 @@ def _storage(values: np.ndarray) -> dict[str, Any]:
     }
 
 
-READING = 3
-"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies
-of them while it opens, then the values.
-"""
-
-
 # --- reading --------------------------------------------------------------------------------------
 
 
@@ -483,8 +476,13 @@ def _open_image(image: bytes | memoryview) -> Any:
 
 
 def _parse(
-    path: Path, file: h5py.File, kind: str | tuple[str, ...] | None, skip: Collection[str]
+    path: Path,
+    file: h5py.File,
+    kind: str | tuple[str, ...] | None,
+    skip: Collection[str],
+    compressed: dict[str, np.ndarray],
 ) -> Artefact:
+    """What an open file holds; `compressed`: the values that were read outside."""
     declared = survey(path, file)
     root = {
         name: read_attribute(path, file, name)
@@ -500,7 +498,11 @@ def _parse(
     problems = tables.declared_problems(schema, declared)
     attrs = _read_attributes(path, file, schema, declared, problems)
     if not problems:
-        data = {name: file[name][()] for name in declared if name not in skip}
+        data = {
+            name: compressed[name] if file[name].chunks is not None else file[name][()]
+            for name in declared
+            if name not in skip
+        }
         data = {
             name: values if isinstance(values, np.ndarray) else np.asarray(values)
             for name, values in data.items()

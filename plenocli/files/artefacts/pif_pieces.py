@@ -13,7 +13,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import NumericsError
-from plenocli.files.artefacts.container import READING
+from plenocli.files.artefacts.structure import READING
 from plenocli.forward.propagation import diagnosis
 
 if TYPE_CHECKING:

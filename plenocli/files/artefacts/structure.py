@@ -4,7 +4,6 @@ the rest declares.
 
 from __future__ import annotations
 
-import contextlib
 import os
 from typing import Any, TypeAlias
 
@@ -13,7 +12,8 @@ import numpy as np
 from h5py import h5d, h5ds, h5l, h5t, h5z
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.memory import can_have
 
 Name: TypeAlias = str | os.PathLike[str]
 _FIX = (
@@ -75,14 +75,37 @@ def survey(path: Name, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.d
     return dict(sorted(declared.items()))
 
 
-def look(path: str) -> None:
-    """Survey the file at `path` and walk the indices of its pieces; runs outside, so that what
-    crashes or holds up HDF5 does so there. What else is wrong is said by whoever reads the file.
+def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:
+    """Dataset path -> values of those that are stored in pieces, which a damaged index of pieces
+    may lead HDF5 astray in; runs outside.
+
+    skip: datasets that are not wanted.
+
+    Raises as survey; InputError and MemoryError for what HDF5 cannot read.
     """
-    with contextlib.suppress(Exception), h5py.File(path, "r", locking=False) as file:
-        for name in survey(path, file):
-            if file[name].chunks is not None:
-                file[name].id.get_num_chunks()
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            wanted = [name for name in survey(path, file) if name not in skip]
+            return {name: file[name][()] for name in wanted if file[name].chunks is not None}
+    except (PlenoError, MemoryError):
+        raise
+    except Exception as error:  # h5py raises half a dozen types for a malformed file
+        raise no_hdf5(path, error) from error
+
+
+READING = 3
+"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies
+of them while it opens, then the values.
+"""
+
+
+def no_hdf5(path: Name, error: Exception) -> Exception:
+    """The error for what HDF5 says of a whole file: it does not say when it got no memory."""
+    if not can_have(READING * os.path.getsize(path) + (1 << 20)):
+        return MemoryError(str(error))
+    return InputError(
+        f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again"
+    )
 
 
 def _text(path: Name, name: bytes) -> str:

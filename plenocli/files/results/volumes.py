@@ -103,6 +103,8 @@ def volume_artefact(
         }
     made.attrs["volume"] = about
     if volume.held_out is not None:
+        from plenocli.inverse.volume.volume import all_known
+
         held = volume.held_out
         made.data |= {
             "held_out/index": held.index.astype(np.int32),
@@ -111,9 +113,9 @@ def volume_artefact(
             "held_out/sigma": held.sigma,
         }
         made.attrs["held_out"] = {
-            "explained_db": held.explained_db,
-            "z_rms": list(held.z_rms),
-            "held_by_bars": list(held.held_by_bars),
+            "explained_db": (all_known([held.explained_db]) or [None])[0],
+            "z_rms": all_known(held.z_rms),
+            "held_by_bars": all_known(held.held_by_bars),
         }
     return made
 

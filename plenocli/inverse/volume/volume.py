@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,21 +32,32 @@ class HeldOut:
     def explained_db(self) -> float:
         """Of the pixels' variance."""
         error = np.mean((self.measured - self.predicted) ** 2)
-        return float(10 * np.log10(np.var(self.measured) / error))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(10 * np.log10(np.var(self.measured) / error))
 
     @property
     def z_rms(self) -> tuple[float, ...]:
         """Root mean square of error over sigma by quartile of predicted brightness."""
-        return tuple(float(np.sqrt(np.mean(z**2))) for z in self._by_quartile())
+        return tuple(float(np.sqrt(_mean(z**2))) for z in self._by_quartile())
 
     @property
     def held_by_bars(self) -> tuple[float, ...]:
         """Share of the pixels within their 95 % bars, by quartile of predicted brightness."""
-        return tuple(float(np.mean(np.abs(z) < BARS)) for z in self._by_quartile())
+        return tuple(_mean(np.abs(z) < BARS) for z in self._by_quartile())
 
     def _by_quartile(self) -> list[np.ndarray]:
-        z = (self.measured - self.predicted) / self.sigma
+        with np.errstate(divide="ignore", invalid="ignore"):  # bars of no width
+            z = (self.measured - self.predicted) / self.sigma
         return np.array_split(z[np.argsort(self.predicted, kind="stable")], 4)
+
+
+def all_known(numbers: Sequence[float]) -> list[float] | None:
+    """Figures of held-out pixels; None where these were too few, or without any error, to say."""
+    return list(numbers) if np.isfinite(numbers).all() else None
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if values.size else float("nan")
 
 
 def predictive_sigma(measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:

@@ -94,6 +94,7 @@ def run_volume(
     from plenocli.files.results.stacks import read_stack
     from plenocli.inverse.volume.superpixels import measured
     from plenocli.inverse.volume.tiles import Tiles
+    from plenocli.inverse.volume.volume import all_known
 
     output = Path(output)
     check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
@@ -137,8 +138,8 @@ def run_volume(
         depths=stack.depth.tolist(),
         method=volume.method,
         tried=[(trial.what, trial.misfit) for trial in volume.trace],
-        explained_db=None if held is None else held.explained_db,
-        held_by_bars=None if held is None else list(held.held_by_bars),
+        explained_db=None if held is None else (all_known([held.explained_db]) or [None])[0],
+        held_by_bars=None if held is None else all_known(held.held_by_bars),
         margin=volume.margin,
     )
 

@@ -113,7 +113,7 @@ def volume_artefact(
             "held_out/sigma": held.sigma,
         }
         made.attrs["held_out"] = {
-            "explained_db": (all_known([held.explained_db]) or [None])[0],
+            "explained_db": held.explained_db if np.isfinite(held.explained_db) else None,
             "z_rms": all_known(held.z_rms),
             "held_by_bars": all_known(held.held_by_bars),
         }

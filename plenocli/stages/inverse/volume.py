@@ -138,7 +138,9 @@ def run_volume(
         depths=stack.depth.tolist(),
         method=volume.method,
         tried=[(trial.what, trial.misfit) for trial in volume.trace],
-        explained_db=None if held is None else (all_known([held.explained_db]) or [None])[0],
+        explained_db=held.explained_db
+        if held is not None and np.isfinite(held.explained_db)
+        else None,
         held_by_bars=None if held is None else all_known(held.held_by_bars),
         margin=volume.margin,
     )

@@ -132,15 +132,14 @@ def run_volume(
     )
     _write(output, volume, stack, provenance, overwrite)
     held = volume.held_out
+    explained = None if held is None else all_known([held.explained_db])
     return VolumeSummary(
         output=str(output),
         shape=list(volume.value.shape),
         depths=stack.depth.tolist(),
         method=volume.method,
         tried=[(trial.what, trial.misfit) for trial in volume.trace],
-        explained_db=held.explained_db
-        if held is not None and np.isfinite(held.explained_db)
-        else None,
+        explained_db=None if explained is None else explained[0],
         held_by_bars=None if held is None else all_known(held.held_by_bars),
         margin=volume.margin,
     )

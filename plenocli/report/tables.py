@@ -128,8 +128,10 @@ def _band_name(results: Sequence[ResultScore], band: int) -> str:
 def _cell(name: str, given: bool, value: Figure) -> str:
     if not given:
         return ""
-    if value is None:
+    if value is None or value == []:
         return "none"
+    if isinstance(value, list):  # where another result has one number
+        return ", ".join(_cell(name, True, one) for one in value[:9])
     if isinstance(value, (int, str)):
         return str(value)
     if name.endswith("_db"):

@@ -225,6 +225,8 @@ def test_options_of_a_point_go_over_those_of_the_file(described):
         ),
         ('[vary]\n"main_lens.f_number" = 6\n', "no list of values and no range"),
         ('[vary]\n"main_lens.f_number" = [6, 8, 6]\n', "stands twice"),
+        ('[vary]\n"main_lens.f_number" = [6, nan]\n', "nan is not finite"),
+        ('[vary]\n"main_lens.f_number" = [1e300, 6]\n', "no quantity"),
         ('[varies]\n"main_lens.f_number" = [6]\n', "did you mean vary"),
         (
             '[reconstruction]\nmethod = "lmmse"\n[vary]\n"main_lens.f_number" = [6]\n',

@@ -165,6 +165,8 @@ def read_spectral_exr(path: str | os.PathLike[str], quantity: str | None = None)
     wavelengths = np.array(sorted(planes))
     sigma = bands.get("sigma", {})
     complete = set(sigma) == set(planes)
+    if any((plane < 0).any() for plane in sigma.values()):
+        raise InputError("holds standard deviations below 0", path, "make it again")
     return Spectral(
         wavelengths=wavelengths,
         values=np.stack([planes[w] for w in wavelengths]),

@@ -221,7 +221,7 @@ def test_places_where_nothing_can_be_written(runner, workshop, name):
     ):
         outcome = runner.run([*command[:place], where, *command[place + 1 :]], folder)
         assert is_clean_refusal(outcome, 4, where), outcome
-    if command[0] not in ("demux", "reconstruct"):  # which put their result into a folder
+    if command[0] not in ("demux", "reconstruct", "refocus"):  # which put results into a folder
         outcome = runner.run([*command[:place], "a-folder", *command[place + 1 :]], folder)
         assert is_clean_refusal(outcome, (2, 4), "a-folder") and not list(
             (folder / "a-folder").iterdir()

@@ -86,6 +86,10 @@ def senseless(kind):
         return ("", "abc", "-1", "0", "nan", "inf", "5nm")
     if type(kind).__name__ == "_Slope":
         return ("", "abc", "nan", "inf", "1e9", "5nm")
+    if type(kind).__name__ == "_Distance":
+        return tuple(
+            value for value in QUANTITIES["length"] if value not in ("-5nm", "0nm", "1e-999nm")
+        )
     if type(kind).__name__ == "_Background":
         return ("", "abc", "-1", "nan", "inf", "5nm")
     if kind.name == "angle":
@@ -153,6 +157,7 @@ def test_every_option_has_a_type_that_refuses_something():
         "--scheduler",
         "--volume",
         "--layer",
+        "--polarisation",
         "--fix",
         "--detect",
         "--patches",

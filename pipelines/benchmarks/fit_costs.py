@@ -45,7 +45,7 @@ from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation import costs
 from plenocli.forward.propagation.costs import Features, Law, priced
-from plenocli.forward.propagation.exact import cost_law
+from plenocli.forward.propagation.exact import cost_law, openings
 from plenocli.forward.propagation.exact.term_counts import ExactBand, TermLaw
 from plenocli.forward.propagation.fresnel import shaped, square_cost
 from plenocli.forward.propagation.fresnel.spread_terms import SpreadLaw
@@ -55,7 +55,7 @@ from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.system_matrix import PifBuilder
 
 EXACT, SPREAD = "exact, low rank", "spread function"
-HARMONICS = "exact, harmonics"
+HARMONICS, OPENINGS = "exact, harmonics", "exact, openings"
 SHAPES: dict[str, dict[str, object]] = {
     ", round": {"lenslet_array.aperture_shape": "circle"},
     ", hexagonal": {
@@ -72,6 +72,7 @@ FEATURES: dict[str, tuple[str, Callable[..., Features]]] = {
     "fresnel, triple product": ("fresnel", shaped.features),
     EXACT: ("exact", cost_law.features),
     HARMONICS: ("exact", harmonic_cost.features),
+    OPENINGS: ("exact", openings.features),
 }
 """Name of a model in the file: name in a request, what counts its features."""
 SAMPLES = ("hexagonal", "demo_spatial", "demo_spectral", "dslr", "tiny")
@@ -195,7 +196,7 @@ def drawn(most: float, seed: int) -> Iterator[Case]:
     chance, groups = random.Random(seed), []
     for model in FEATURES:
         for scope in SCOPES:
-            ends = SHAPES if model == HARMONICS else [""]
+            ends = SHAPES if model in (HARMONICS, OPENINGS) else [""]
             names = [camera + end for camera in (*CAMERAS, *SAMPLES) for end in ends]
             group = [Case(model, scope, c, a) for c in names for a in ACCURACIES]
             chance.shuffle(group)

@@ -9,6 +9,7 @@ import numpy as np
 
 from tests.reference.fresnel import sensor_nodes
 from tests.reference.rayleigh import lens_phase, nodes, rayleigh_products
+from tests.reference.tensor import weights
 
 try:
     from numba import njit
@@ -141,6 +142,16 @@ def _loops(y, x, py, px, weight, before, z, k):
 _fast_spheres = njit(fastmath=True, error_model="numpy", cache=True)(_loops) if njit else None
 
 
+def _opening(shape, half, slope):
+    """Nodes of the rectangle around an opening, and their weights: (y, x, (len(y), len(x)))."""
+    high = half * (2 / np.sqrt(3) if shape == "hexagon" else 1)
+    if shape == "square":
+        (y, wy), (x, wx) = nodes(-half, half, slope), nodes(-half, half, slope)
+        return y, x, np.outer(wy, wx)
+    t = nodes(-1, 1, 2 * slope * high)[0]
+    return high * t, half * t, high * half * weights(shape, len(t))
+
+
 def oblique_columns(
     camera,
     wavelength,
@@ -187,7 +198,8 @@ def oblique_columns(
     for row, column in lenslets:
         middle = place[0] + row * array.pitch, place[1] + column * array.pitch
         half = width / 2
-        edge, ways = np.linspace(-half, half, 41), []
+        tall = half * (2 / np.sqrt(3) if array.aperture_shape == "hexagon" else 1)
+        edge, ways = np.linspace(-tall, tall, 41), []
         other = np.hypot(*middle) / array.distance
         for ends, m in ((v, middle[0]), (u, middle[1])):
             d = np.array([[ends.min()], [ends.max()]]) - m - edge
@@ -198,8 +210,8 @@ def oblique_columns(
             bend = edge / array.focal_length
             ways.append(np.abs(come - bend - d / far).max())
         slope = density * k * (max(ways) * 1.1 + 0.3 * other**2 * np.ptp(edge) / z)
-        (y, wy), (x, wx) = nodes(-half, half, slope), nodes(-half, half, slope)
-        lens = lens_phase(array.profile, array.focal_length, y, x, k) * wy[:, None] * wx
+        y, x, weight = _opening(array.aperture_shape, half, slope)
+        lens = lens_phase(array.profile, array.focal_length, y, x, k) * weight
         fields = []
         for point in image_points:
             at = tuple(p + q for p, q in zip(place, point))

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING
 
-from plenocli.forward.propagation.exact import cost_law
+from plenocli.forward.propagation.exact import cost_law, openings
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact.oblique import neglected
 from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
@@ -183,12 +183,26 @@ class ExactHarmonics(Model):
         return 0.0
 
 
+class ExactOpenings(Model):
+    """Scalar waves without the paraxial approximation, through openings of any shape."""
+
+    name, kind, lenslets = "exact, openings", "exact", openings.OpenLenslets
+    valid_for = staticmethod(openings.valid_for)
+    size = staticmethod(openings.opening_band)
+    cost = staticmethod(openings.cost)
+
+    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+        """As of ExactLowRank."""
+        return min(1.0, neglected(geometry))
+
+
 MODELS: tuple[Model, ...] = (
     Rays(),
     FresnelLowRank(),
     FresnelTripleProduct(),
     ExactLowRank(),
     ExactHarmonics(),
+    ExactOpenings(),
 )
 """Coarse to fine; of two that serve, the dial takes the one that costs less."""
 

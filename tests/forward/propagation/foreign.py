@@ -23,6 +23,7 @@ WIDEST = math.sqrt(0.75)
 """Opening over pitch from which squares on a hexagonal lattice, or hexagons on a square one, would
 overlap.
 """
+OBLIQUE_SHAPES = "square", "circle", "hexagon"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +143,7 @@ def case(seed, number, model=None):
 
 
 def oblique_case(seed, number):
-    """A case of a square lenslet up to 20 degrees off the axis: (camera, request)."""
+    """A case of a lenslet up to 20 degrees off the axis: (camera, request)."""
     rng = np.random.default_rng((seed, number, 1))
     camera = random_camera(rng)
     array, turn = camera.lenslet_array, rng.uniform(0, math.pi / 2)
@@ -152,7 +153,10 @@ def oblique_case(seed, number):
     camera = camera.replace(
         **{
             "lenslet_array.lattice": "square",
-            "lenslet_array.aperture_shape": "square",
+            "lenslet_array.aperture_shape": OBLIQUE_SHAPES[number % 3],
+            "lenslet_array.fill_factor": min(
+                array.fill_factor, 0.999 * WIDEST if number % 3 == 2 else 1.0
+            ),
             "lenslet_array.count": (2 * row + 1, 2 * column + 1),
             "main_lens.aberrations": (),
         }

@@ -31,6 +31,9 @@ from tests.reference.rayleigh import (
 )
 from tests.reference.rayleigh import nodes as rayleigh_nodes
 
+pytestmark = pytest.mark.usefixtures("without_openings")
+
+
 ISOLATED = [(0, 0)]
 NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
 ROWS = [0, 4]

@@ -51,7 +51,7 @@ def test_a_sample_of_lenslets_off_the_axis_holds(count):
     assert len(summed(cases, count)) >= 4
 
 
-def test_a_sample_of_harmonics_holds(count):
+def test_a_sample_of_harmonics_holds(count, without_openings):
     cases = [foreign.answer(41, n, "auto") for n in CENTRED]
     assert all(c.rung == "exact, harmonics" for c in summed(cases, count))
 
@@ -65,7 +65,7 @@ def test_lenslets_off_the_axis_hold(part, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(CENTRED_PARTS))
-def test_harmonics_hold(part, count):
+def test_harmonics_hold(part, count, without_openings):
     numbers = (n for n in range(part * PART, (part + 1) * PART) if foreign.is_centred(3, n))
     summed([c for c in (foreign.answer(3, n, "auto") for n in numbers) if c], count)
 

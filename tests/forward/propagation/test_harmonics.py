@@ -35,6 +35,7 @@ HEXAGONAL = {
     "lenslet_array__lattice": "hexagonal",
 }
 ISOLATED = {"superpixels": (1, 1), "coherent_ring": 0}
+pytestmark = pytest.mark.usefixtures("without_openings")
 
 
 def round_camera(f_number=2.5, pitch=18e-6, pixels=9, **changes):

@@ -58,9 +58,15 @@ def changed(code, copy, file, old, new):
         ),
         (f"{PROPAGATION}/fresnel/shaped.py", "PIECES = 6", "PIECES = 7", NAMES[2:3]),
         (f"{PROPAGATION}/exact/lenslets.py", "GAPS = 3.0", "GAPS = 4.0", NAMES[3:4]),
-        (f"{PROPAGATION}/exact/prolate.py", "return ", "return 2 * ", NAMES[3:4]),
+        (
+            f"{PROPAGATION}/exact/prolate.py",
+            "return ",
+            "return 2 * ",
+            [NAMES[3], NAMES[5]],
+        ),
         (f"{PROPAGATION}/exact/debye.py", "return ", "return 2 * ", NAMES[3:]),
-        (f"{PROPAGATION}/harmonics/pixels.py", "return ", "return 2 * ", NAMES[4:]),
+        (f"{PROPAGATION}/harmonics/pixels.py", "return ", "return 2 * ", NAMES[4:5]),
+        (f"{PROPAGATION}/exact/openings.py", "KERNEL_CUT = 0.1", "KERNEL_CUT = 0.2", NAMES[5:]),
         (f"{PROPAGATION}/ray/rays.py", "FOCUSED = 1e-9", "FOCUSED = 1e-8", NAMES[:1]),
         ("plenocli/forward/camera/quadrature.py", "return ", "return 2 * ", NAMES),
     ],
@@ -86,7 +92,10 @@ def test_what_does_not_compute_changes_nothing(code, copy, file, old, new):
 
 def test_a_model_is_computed_by_its_own_modules_and_what_they_share(code):
     found = {name: code.modules_of(name, ROOT) for name in NAMES}
-    names = "ray.rays", "fresnel.square", "fresnel.shaped", "exact.lenslets", "harmonics.lenslets"
+    names = [
+        *("ray.rays", "fresnel.square", "fresnel.shaped"),
+        *("exact.lenslets", "harmonics.lenslets", "exact.openings"),
+    ]
     for name, own in zip(NAMES, names, strict=True):
         of = [n for n in NAMES if f"plenocli.forward.propagation.{own}" in found[n]]
         assert of == [name]

@@ -16,6 +16,8 @@ from tests.forward.propagation.test_exact import errors, image_points
 from tests.reference.oblique import cut_pupil, oblique_columns
 from tests.reference.rayleigh import column_energies
 
+pytestmark = pytest.mark.usefixtures("without_openings")
+
 
 def wide_camera(f_number=8.0, pitch=40e-6, half=10.0, **changes):
     """An array whose edge is `half` degrees from the axis, 10x10 pixels and 5x5 points each."""

@@ -120,7 +120,7 @@ def features(
     oblique = geometry.chief != (0.0, 0.0)
     even, item = is_symmetric(camera) and not oblique, 16 if double else 8
     sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), n)
-    written, columns = math.prod(shape[1:]), _columns(camera, geometry, shape)
+    written, count = math.prod(shape[1:]), columns(camera, geometry, shape)
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
     mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
     # terms that go with the point, too
@@ -129,19 +129,17 @@ def features(
     operations = {
         "interval_values": 4 * rows * sizes.across,
         "interval_terms": 8 * rows * terms,
-        "sensor": 8.0 * fine * mean * columns,
+        "sensor": 8.0 * fine * mean * count,
     }
     wide = item / 8  # what is twice as long takes twice the time
     seconds = {
         "process": 1.0,
-        "field_cubed": wide
-        * band.psf_nodes**3
-        * (1 + OBLIQUE_NODES * band.psf_nodes if oblique else 1 / 8 if even else 1),
+        "field_cubed": wide * field_cubed(camera, geometry, band),
         "spread_values": wide
         * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * terms)
         * (ORDERS if oblique else 1),
-        "columns": columns,
-        "sensor_values_double" if double else "sensor_values_single": columns * fine,
+        "columns": count,
+        "sensor_values_double" if double else "sensor_values_single": count * fine,
         "written_double" if double else "written_single": written,
     }
     # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from
@@ -182,7 +180,7 @@ def _parabolic(camera: Camera) -> bool:
     return camera.lenslet_array.profile == "parabolic"
 
 
-def _columns(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> int:
+def columns(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> int:
     """Pairs of a superpixel and a point that symmetry leaves to compute: a lenslet off the axis has
     one mirror at the most.
     """
@@ -190,6 +188,15 @@ def _columns(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> int:
         return distinct(camera, geometry, (shape[0], shape[1], shape[2], shape[3]))[1]
     mirror = 0.0 in geometry.chief or geometry.chief[0] == geometry.chief[1]
     return math.ceil(shape[1] * shape[3] / (2 if mirror and is_symmetric(camera) else 1))
+
+
+def field_cubed(camera: Camera, geometry: Geometry, band: BandPlan) -> float:
+    """What bringing the main lens's field into terms goes with: the cube of its nodes, off the axis
+    the fourth power, too.
+    """
+    if geometry.chief != (0.0, 0.0):
+        return band.psf_nodes**3 * (1 + OBLIQUE_NODES * band.psf_nodes)
+    return band.psf_nodes**3 / (8 if is_symmetric(camera) else 1)
 
 
 def _pupil_share(camera: Camera, n: TermLaw) -> float:

@@ -17,6 +17,7 @@ profile leaves an ell(y, x) of the same form. Their product on all displacements
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -128,7 +129,8 @@ class Residual:
     tolerance: root mean square of what may be left out;
     symmetric: one set of functions for both axes, which takes a centre on the diagonal;
     come: the main lens's wave off the axis, whose axes do something together too; None on it.
-    core: C.
+    core: C;
+    lost: root mean square that is left out.
     """
 
     def __init__(
@@ -149,12 +151,10 @@ class Residual:
         # nodes weigh alike, which favours the edges of the lenslet, where a point's
         # column is most sensitive
         t, s = (gauss(_nodes(slope))[0] for slope in slopes)
-        left, core, right = split(
-            kappa(centre[0] + reach * t[:, None], centre[1] + reach * s, z, k, centre)
-            / np.sqrt(len(t) * len(s)),
-            tolerance / 4,
-            symmetric,
-        )
+        whole = kappa(centre[0] + reach * t[:, None], centre[1] + reach * s, z, k, centre)
+        whole /= np.sqrt(whole.size)
+        left, core, right = split(whole, tolerance / 4, symmetric)
+        lost = np.linalg.norm(whole - left @ core @ right.T)
         lens_left, lens_core, lens_right, lens_slope = _lens_terms(
             reach_x, f, k, tolerance / 4, come, symmetric
         )
@@ -180,9 +180,9 @@ class Residual:
             q, r = np.linalg.qr(values.reshape(len(gu) * len(gx), -1) / np.sqrt(len(gu) * len(gx)))
             products.append(q)
             roots.append(r)
-        left, self.core, right = split(
-            roots[0] @ np.kron(lens_core, core) @ roots[1].T, tolerance, symmetric
-        )
+        both = roots[0] @ np.kron(lens_core, core) @ roots[1].T
+        left, self.core, right = split(both, tolerance, symmetric)
+        self.lost = math.hypot(lost, np.linalg.norm(both - left @ self.core @ right.T))
         self._values = []
         for axis, basis in ((0, left), (1, right)):
             gu, gx = self._grids[axis]

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
 from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_cubed
@@ -51,6 +52,8 @@ Place = tuple[float, float]
 """(row, column), in pitches where it is said."""
 NEAREST = 10
 """Wavelengths from lenslets to sensor within which evanescent waves reach it."""
+MOST_PAIRS = 4000
+"""Pairs of a lenslet and a superpixel beyond which a sum over openings is no plan."""
 KERNEL_CUT = 0.1
 """Root mean square that may be left out of the kernel, over the accuracy asked for."""
 TOGETHER = 1 << 22
@@ -85,8 +88,20 @@ def opening_band(
     accuracy: float,
     tolerance: float,
 ) -> OpeningBand:
-    """As Model.size."""
+    """As Model.size.
+
+    Raises NumericsError as size_band, and for more than MOST_PAIRS.
+    """
     base = size_band(camera, geometry, superpixels, ring, accuracy, tolerance)
+    count = math.prod(superpixels)
+    if base.window is not None:
+        count *= len(_lenslets(geometry, superpixels, base.window))
+    if count > MOST_PAIRS:
+        raise NumericsError(
+            f"{count} pairs of a lenslet and a superpixel are too many to sum over openings",
+            "superpixels",
+            "take fewer superpixels or coherent neighbours",
+        )
     # off the axis there is more to cut
     aside = geometry.chief != (0.0, 0.0)
     moved = aside * FOUND_CUT_EFFECT[1] * base.spread_cut / base.faintest

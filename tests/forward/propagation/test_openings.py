@@ -39,7 +39,7 @@ def missed(found, truth):
 @pytest.mark.parametrize(
     "shape, lattice, request_",
     [
-        ("square", "square", {"superpixels": (3, 3), "coherent_ring": 1}),
+        ("square", "square", {"superpixels": (1, 1), "coherent_ring": 1, "lenslet": (300, 300)}),
         ("square", "square", ISOLATED | {"lenslet": (400, 300)}),
         ("circle", "square", ISOLATED),
         ("hexagon", "hexagonal", ISOLATED),

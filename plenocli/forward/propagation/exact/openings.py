@@ -74,7 +74,10 @@ class OpeningBand(BandPlan):
 
 
 def valid_for(camera: Camera, geometry: Geometry) -> str | None:
-    """As Model.valid_for: no evanescent waves on the sensor."""
+    """As Model.valid_for: no evanescent waves on the sensor, nor lenslets whose terms separate."""
+    shape, lattice = camera.lenslet_array.aperture_shape, camera.lenslet_array.lattice
+    if (shape, lattice, geometry.chief) == ("square", "square", (0.0, 0.0)):
+        return "square lenslets on the axis are left to separable terms"
     if geometry.z3 < NEAREST * geometry.wavelength:
         return "the sensor lies within ten wavelengths of the lenslets"
     return None

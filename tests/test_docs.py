@@ -323,7 +323,7 @@ def test_the_plan_that_the_page_shows_is_the_plan(monkeypatch, capsys):
         [re.sub(r"[\d.]+ s |\s+", " ", line).split() for line in text.splitlines()]
         for text in (printed, shown)
     )
-    assert len(page) == 8 and found[:8] == page
+    assert len(page) == 10 and found[:10] == page
 
 
 def test_the_sweep_that_the_tutorial_writes_is_read(tmp_path):

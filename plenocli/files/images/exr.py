@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from plenocli.files.seal import SEAL, put_seal, require_seal
 
 Name = str | os.PathLike[str]
 SEALED = "plenocli:seal"
+_CLOCK = re.compile(r"\d{4}(:\d\d){2} \d\d(:\d\d){2}")
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
 
@@ -168,7 +170,7 @@ def _spec(
     for name, value in attrs.items():
         spec.attribute(name, value)
     spec.attribute("compression", compression)
-    if "DateTime" not in attrs:
+    if not _CLOCK.fullmatch(attrs.get("DateTime", "")):
         spec.attribute("DateTime", "2000:01:01 00:00:00")  # left out, OpenImageIO writes the clock
     spec.attribute("Software", f"plenocli {__version__}")
     return spec

@@ -1,6 +1,15 @@
 """A plane of pixels or object points as blocks, one a lenslet, and back; lenslets tile the plane
-from its first corner.
+from its first corner. And planes that are worked on in bands of rows or in tiles, and never all in
+memory.
 """
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -46,3 +55,129 @@ def to_plane(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         .swapaxes(1, 2)
         .reshape(rows * shape[0], columns * shape[1])
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InParts:
+    """An array that comes in bands of rows while it is written or read.
+
+    shape, dtype: of all of it.
+    parts: gives rows of its last two axes that follow each other, (row, column), of one plane after
+        the other; a part does not reach into the next plane.
+    """
+
+    shape: tuple[int, ...]
+    dtype: Any
+    parts: Callable[[], Iterable[np.ndarray]]
+
+    def whole(self) -> np.ndarray:
+        """All of it, in memory."""
+        return np.concatenate(list(self.parts())).reshape(self.shape).astype(self.dtype, copy=False)
+
+
+def bands(count: int, most: int) -> list[slice]:
+    """Rows 0 to `count` in bands of `most` (at least one), the last of what is left."""
+    most = max(1, most)
+    return [slice(start, min(start + most, count)) for start in range(0, count, most)]
+
+
+def mirrored(rows: slice, reach: int, count: int) -> np.ndarray:
+    """Numbers of the rows of a band and of `reach` more on either side of it; beyond the first and
+    the last of `count` rows they go back, each of these twice.
+    """
+    return np.pad(np.arange(count), reach, mode="symmetric")[rows.start : rows.stop + 2 * reach]
+
+
+_Value = TypeVar("_Value")
+
+
+@dataclass
+class Whole:
+    """What holds for all tiles of a whole, in the order in which it is asked for: known before, or
+    worked out on a piece that stands for the whole.
+
+    found: name -> values.
+    """
+
+    found: dict[str, list[Any]] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def worked_out(self) -> Iterator[None]:
+        """While the block lasts, `common` works out what is not known, and keeps it here."""
+        known = {name: list(values) for name, values in self.found.items()}
+        with _during(_Run(known, self.found)):
+            yield
+
+    @contextlib.contextmanager
+    def taken_over(self) -> Iterator[None]:
+        """While the block lasts, `common` gives what is kept here."""
+        with _during(_Run(self.found)):
+            yield
+
+    @contextlib.contextmanager
+    def compared(self, others: dict[str, list[Any]]) -> Iterator[None]:
+        """The same; what the piece would have for means by itself is kept in `others`."""
+        with _during(_Run(self.found, others)):
+            yield
+
+    def averaged(self, others: Sequence[dict[str, list[Any]]]) -> Whole:
+        """With means over the piece that it was worked out on and `others`, of what there are."""
+        found = {name: list(values) for name, values in self.found.items()}
+        for name, values in found.items():
+            for place, value in enumerate(values):
+                beside = [o[name][place] for o in others if len(o.get(name, ())) > place]
+                if beside:
+                    values[place] = np.mean([value, *beside], axis=0)
+        return Whole(found)
+
+
+@dataclass
+class _Run:
+    """One piece that is worked on: what is known of the whole, where what it has by itself is kept,
+    and how many values of each name were asked for.
+    """
+
+    known: dict[str, list[Any]]
+    kept: dict[str, list[Any]] | None = None
+    asked: dict[str, int] = field(default_factory=dict)
+
+    def value(self, name: str, work: Callable[[], _Value], mean: bool) -> _Value:
+        place = self.asked.get(name, 0)
+        self.asked[name] = place + 1
+        known = self.known.get(name, [])
+        # a piece may ask more often than that which stands for the whole did
+        told: Any = known[min(place, len(known) - 1)] if known else None
+        if known and (self.kept is None or not mean):
+            return told
+        with _during(None):
+            made = work()
+        if self.kept is not None:
+            self.kept.setdefault(name, []).append(made)
+        return told if known else made
+
+
+_run: ContextVar[_Run | None] = ContextVar("whole", default=None)
+
+
+@contextlib.contextmanager
+def _during(run: _Run | None) -> Iterator[None]:
+    token = _run.set(run)
+    try:
+        yield
+    finally:
+        _run.reset(token)
+
+
+def common(name: str, work: Callable[[], _Value], *, mean: bool = False) -> _Value:
+    """What `work` gives; of a tile, what it gave on the piece that stands for the whole.
+
+    name: of the value. Where it is asked for several times, the order counts.
+    mean: whether it is a number, or numbers, whose means over pieces stand for the whole better.
+    """
+    run = _run.get()
+    return work() if run is None else run.value(name, work, mean)
+
+
+def is_piece() -> bool:
+    """Whether what is worked on is a piece of a whole."""
+    return _run.get() is not None

@@ -48,11 +48,17 @@ def kept(
     if place is None:
         return tuple(map(np.ascontiguousarray, make()))
     path = place / (_digest(name, inputs) + _SUFFIX)
-    found = _read(path)
+    found = read_arrays(path)
     if found is None:
         found = tuple(map(np.ascontiguousarray, make()))
         _write(path, found)
     return found
+
+
+def write_arrays(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
+    """Put float64 arrays, in C order, into a file, whole or not at all. Raises OutputError."""
+    head = json.dumps([_sum(arrays), [values.shape for values in arrays]]) + "\n"
+    publish(path, [head.encode(), *arrays], overwrite=True)
 
 
 def _digest(name: str, inputs: list[np.ndarray]) -> str:
@@ -77,8 +83,10 @@ def _sum(arrays: tuple[np.ndarray, ...]) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> tuple[np.ndarray, ...] | None:
-    """The arrays of a file, None where it is missing or damaged."""
+def read_arrays(path: Path) -> tuple[np.ndarray, ...] | None:
+    """The float64 arrays that `write_arrays` put into a file, None where it is missing or
+    damaged.
+    """
     try:
         with open(path, "rb") as file:
             total, shapes = json.loads(file.readline(4096))
@@ -103,7 +111,6 @@ def _write(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
     size = sum(values.nbytes for values in arrays)
     if size > LARGEST:
         return
-    head = json.dumps([_sum(arrays), [values.shape for values in arrays]]) + "\n"
     with contextlib.suppress(OSError, PlenoError):
         path.parent.mkdir(parents=True, exist_ok=True)
         held = [(f.stat().st_mtime, f.stat().st_size, f) for f in path.parent.glob(f"*{_SUFFIX}")]
@@ -112,4 +119,4 @@ def _write(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
             room -= bytes_of
             if room < 0:
                 file.unlink(missing_ok=True)
-        publish(path, [head.encode(), *arrays], overwrite=True)
+        write_arrays(path, arrays)

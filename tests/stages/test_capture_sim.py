@@ -572,6 +572,6 @@ def test_light_below_zero_is_refused_by_a_sensor(camera, tmp_path, capsys):
 def test_more_memory_than_granted_is_refused_before_it_is_taken(camera, tmp_path, capsys):
     camera.write_text(camera.read_text().replace("count = [3, 4]", "count = [4096, 4096]"))
     assert (
-        run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.h5")]) == 5
+        run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.exr")]) == 5
     )
     assert "--mem-limit" in capsys.readouterr().err

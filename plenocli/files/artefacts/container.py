@@ -9,14 +9,15 @@ digest, structure, declared sizes, and only then values, parsed from those bytes
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import itertools
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.text import utf8
+from plenocli.base.tiling import InParts
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, require_file
-from plenocli.files.artefacts.sparse import SparseFile
+from plenocli.files.artefacts.sparse import Behind, SparseFile
 from plenocli.files.artefacts.structure import (
     EMPTY_AXIS,
     READING,
@@ -39,6 +41,7 @@ from plenocli.files.artefacts.structure import (
     no_hdf5,
     read_attribute,
     survey,
+    window,
 )
 from plenocli.files.atomic import replacement, reserve, write_at
 from plenocli.files.outside import outside
@@ -62,7 +65,7 @@ class Artefact:
     """What a file holds.
 
     kind: the table that it follows.
-    data: dataset path ("pif/A") -> array.
+    data: dataset path ("pif/A") -> array, or InParts to be written.
     attrs: group or dataset path -> name -> number, list, text, bool or JSON-able value.
     provenance: where it came from.
 
@@ -96,8 +99,10 @@ def write_artefact(path: str | os.PathLike, artefact: Artefact, *, overwrite: bo
     Raises ValueError listing every broken rule of the table (a bug of the caller), UsageError where
     the file exists, OutputError where it cannot be written.
     """
-    frame = Frame(artefact)
+    large = any(isinstance(values, InParts) for values in artefact.data.values())
+    frame = None if large else Frame(artefact)
     with replacement(path, overwrite=overwrite) as (_, descriptor):
+        frame = frame or Frame(artefact, descriptor=descriptor)
         frame.write(descriptor)
         for name, values in frame.raw.items():
             write_at(descriptor, frame.offset(name), values)
@@ -149,7 +154,7 @@ def _parsed(
     skip: Collection[str],
 ) -> Artefact:
     """What the HDF5 part of a file, its `image`, holds; errors as read_artefact."""
-    try:
+    with _as_input_error(path):
         content = image(path)
         seconds = _LOOK_S + len(content) // _SLOWEST
         values = outside(compressed_values, path, sorted(skip), seconds=seconds)
@@ -158,10 +163,6 @@ def _parsed(
         del content
         with h5py.File(opened, "r") as file:
             return _parse(path, file, kind, skip, values)
-    except (PlenoError, MemoryError):
-        raise
-    except Exception as error:  # h5py raises half a dozen types for a malformed file
-        raise no_hdf5(path, error) from error
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -174,17 +175,26 @@ class Frame:
     raw: dataset path -> values to write;
     size: bytes of the HDF5 file.
     `streamed`: dataset path -> (shape, dtype) of raw datasets that come by themselves.
+    `descriptor`: of the file that is to be, which takes InParts as they come.
     ValueError listing every broken rule of the table.
     """
 
-    def __init__(self, artefact: Artefact, streamed: tables.Declared | None = None) -> None:
+    def __init__(
+        self,
+        artefact: Artefact,
+        streamed: tables.Declared | None = None,
+        *,
+        descriptor: int | None = None,
+    ) -> None:
         schema, data, declared, attrs = _checked(artefact, streamed or {})
         stored = _stored_attributes(schema, artefact, declared, attrs)
         apart = [path for path, (shape, dtype) in declared.items() if is_raw(schema, path, shape)]
         self.raw = {path: data.pop(path) for path in apart if path in data}
         self._file, self._offsets = _frame(
-            schema, data, {path: declared[path] for path in sorted(apart)}, stored
+            schema, data, {path: declared[path] for path in sorted(apart)}, stored, descriptor
         )
+        if self._file.failed is not None:
+            raise self._file.failed
         self._taken = {
             path: (start, int(np.prod(declared[path][0])) * np.dtype(declared[path][1]).itemsize)
             for path, start in self._offsets.items()
@@ -246,7 +256,7 @@ def _checked(artefact, streamed):
         raise ValueError(f"no artefact kind '{artefact.kind}' (kinds: {', '.join(SCHEMAS)})")
     schema = SCHEMAS[artefact.kind]
     data = {
-        path: _plain_array(path, value)
+        path: value if isinstance(value, InParts) else _plain_array(path, value)
         for path, value in artefact.data.items()
         if value is not None
     }
@@ -258,7 +268,8 @@ def _checked(artefact, streamed):
         streamed
     )
     problems = tables.declared_problems(schema, declared) + tables.attribute_problems(schema, attrs)
-    problems += tables.value_problems(schema, data)
+    known = {path: v for path, v in data.items() if not isinstance(v, InParts)}
+    problems += tables.value_problems(schema, known)
     groups = {
         path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)
     }
@@ -320,7 +331,7 @@ def _storable(value):
     return values.astype({"i": "i8", "u": "u8", "f": "f8", "b": "?"}[values.dtype.kind])
 
 
-def _frame(schema, data, apart, stored):
+def _frame(schema, data, apart, stored, descriptor=None):
     """(SparseFile, raw dataset path -> offset in it).
 
     Raw datasets come first, so that their place depends on their sizes only.
@@ -330,12 +341,15 @@ def _frame(schema, data, apart, stored):
         default=0,
     )
     layout = "v108" if apart or longest >= _LONG_TEXT else "earliest"
-    memory, offsets = SparseFile(), {}
+    memory, offsets = SparseFile(descriptor, HEADER_BYTES), {}
     with h5py.File(memory, "w", libver=(layout, "v110"), track_times=False) as file:
         for path, (shape, dtype) in apart.items():
             offsets[path] = _reserve_dataset(file, path, shape, dtype)
         for path in sorted(data):
-            file.create_dataset(path, data=data[path], **_storage(data[path]))
+            if isinstance(data[path], InParts):
+                _write_parts(file, schema, path, data[path])
+            else:
+                file.create_dataset(path, data=data[path], **_storage(data[path]))
         for where in sorted(stored):
             target = file[where or "/"]
             for name, value in stored[where].items():
@@ -343,6 +357,35 @@ def _frame(schema, data, apart, stored):
         declared = apart | {path: (values.shape, values.dtype) for path, values in data.items()}
         _name_axes(file, tables.axis_names(schema, declared))
     return memory, offsets
+
+
+def _write_parts(file, schema, path, values):
+    """Write a dataset part by part, whole chunks at a time."""
+    made = file.create_dataset(path, shape=values.shape, dtype=values.dtype, **_storage(values))
+    rows = values.shape[-2]
+    step, at, held = made.chunks[-2], 0, []
+    fields = replace(schema, rules=())
+
+    def put(block):
+        plane, row = divmod(at, rows)
+        index = () if len(values.shape) == 2 else np.unravel_index(plane, values.shape[:-2])
+        made[(*index, slice(row, row + len(block)))] = block
+
+    for part in values.parts():
+        part = np.ascontiguousarray(part, values.dtype)
+        problems = tables.value_problems(fields, {path: part})
+        if problems:
+            raise ValueError("; ".join(problems))
+        held.append(part)
+        waiting = sum(map(len, held))
+        end = at + waiting
+        ready = waiting if end % rows == 0 else end % rows // step * step - at % rows
+        if ready > 0:
+            block = held[0] if len(held) == 1 else np.concatenate(held)
+            put(block[:ready])
+            at, held = at + ready, [block[ready:]] if ready < waiting else []
+    if at != np.prod(values.shape[:-1]):
+        raise ValueError(f"'{path}' lacks rows")
 
 
 def _name_axes(file, names):
@@ -392,12 +435,12 @@ def _put_attribute(target, name, value):
         target.attrs.create(name, value)
 
 
-def _storage(values: np.ndarray) -> dict[str, Any]:
+def _storage(values: np.ndarray | InParts) -> dict[str, Any]:
     """Storage options: 1 MiB chunks with a checksum each, gzip."""
-    if values.ndim == 0 or values.size == 0:
+    if len(values.shape) == 0 or 0 in values.shape:
         return {"track_times": False}
     chunks: list[int] = []
-    room = max(_CHUNK_BYTES // values.itemsize, 1)
+    room = max(_CHUNK_BYTES // np.dtype(values.dtype).itemsize, 1)
     for size in reversed(values.shape):
         chunks.insert(0, max(min(size, room), 1))
         room //= chunks[0]
@@ -429,10 +472,91 @@ def _verified_bytes(path: Path) -> memoryview:
     digest = _require_whole(path, content[:4096], len(content))
     image = memoryview(content)[HEADER_BYTES:]
     if hashlib.sha256(image).hexdigest() != digest:
-        raise InputError(
-            "is damaged: its SHA-256 is not the one it was written with", path, "make it again"
-        )
+        raise _damaged(path)
     return image
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A dataset that stays in its file, from which windows are read; its values are for the caller
+    to look at.
+
+    path: of the file.
+    dataset: what h5py reads slices of.
+    """
+
+    path: Path
+    dataset: Any
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the dataset."""
+        return self.dataset.shape
+
+    def window(self, rows: slice, columns: slice = slice(None)) -> np.ndarray:
+        """Part of the last two axes; InputError where it cannot be read."""
+        seconds = _LOOK_S + self.path.stat().st_size // _SLOWEST
+        return outside(window, self.path, self.dataset.name, rows, columns, seconds=seconds)
+
+
+@contextlib.contextmanager
+def opened_artefact(
+    path: str | os.PathLike,
+    kind: str | tuple[str, ...],
+    apart: Collection[str],
+    *,
+    verify: bool = True,
+) -> Iterator[tuple[Artefact, Mapping[str, Stored]]]:
+    """As read_artefact, but for large datasets whose values are read bit by bit.
+
+    path, kind: as of read_artefact.
+    apart: the datasets that stay in the file, whose bytes are verified before.
+    verify: whether the digest is looked at; not where this run has done so before.
+
+    Yields (the Artefact without them, those of them that there are). Raises as read_artefact.
+    """
+    path = Path(path)
+    size = require_file(path)
+    with contextlib.ExitStack() as stack:
+        with _as_input_error(path):
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            stack.callback(os.close, descriptor)
+            digest = _require_whole(path, os.pread(descriptor, HEADER_BYTES, 0), size)
+            if verify:
+                if _digest_behind(descriptor) != digest:
+                    raise _damaged(path)
+            seconds = _LOOK_S + size // _SLOWEST
+            values = outside(compressed_values, path, sorted(apart), seconds=seconds)
+            file = stack.enter_context(h5py.File(Behind(descriptor, HEADER_BYTES), "r"))
+            artefact = _parse(path, file, kind, apart, values)
+            found = {name: Stored(path, file[name]) for name in apart if name in file}
+        yield artefact, found
+
+
+@contextlib.contextmanager
+def _as_input_error(path: Path) -> Iterator[None]:
+    """InputError for the half a dozen types that h5py raises for a file that cannot be read."""
+    try:
+        yield
+    except (PlenoError, MemoryError):
+        raise
+    except Exception as error:
+        raise no_hdf5(path, error) from error
+
+
+def _damaged(path: Path) -> InputError:
+    return InputError(
+        "is damaged: its SHA-256 is not the one it was written with", path, "make it again"
+    )
+
+
+def _digest_behind(descriptor: int) -> str:
+    """SHA-256 of an open file but for its digest block."""
+    digest, at = hashlib.sha256(), HEADER_BYTES
+    while part := os.pread(descriptor, _READ_BYTES, at):
+        digest.update(part)
+        at += len(part)
+    return digest.hexdigest()
 
 
 def _require_whole(path: Path, head: bytes, size: int) -> str:
@@ -483,7 +607,7 @@ def _parse(
     compressed: dict[str, np.ndarray],
 ) -> Artefact:
     """What an open file holds; `compressed`: the values that were read outside."""
-    declared = survey(path, file)
+    declared = survey(path, file, skip)
     root = {
         name: read_attribute(path, file, name)
         for name in tables.ROOT_ATTRIBUTES

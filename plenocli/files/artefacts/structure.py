@@ -5,6 +5,7 @@ the rest declares.
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from typing import Any, TypeAlias
 
 import h5py
@@ -31,13 +32,16 @@ _MAX_OBJECTS = 10_000
 _MAX_DEPTH = 8
 
 
-def survey(path: Name, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def survey(
+    path: Name, file: h5py.File, apart: Collection[str] = ()
+) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
     Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
     object linked twice, external or virtual storage, unknown filters, any type but plain integers,
     floats, true/false and fixed-length text, and what does not fit the
-    memory of this process, as Budget.require_declared. Reads no dataset.
+    memory of this process, as Budget.require_declared, but for the datasets `apart`. Reads no
+    dataset.
     """
     declared: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     seen: set[int] = set()
@@ -68,6 +72,8 @@ def survey(path: Name, file: h5py.File) -> dict[str, tuple[tuple[int, ...], np.d
                 if _is_empty_axis(dataset):
                     continue
                 declared[child] = shape, dtype
+                if child in apart:
+                    continue
                 total += int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
@@ -85,11 +91,20 @@ def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:
     """
     try:
         with h5py.File(path, "r", locking=False) as file:
-            wanted = [name for name in survey(path, file) if name not in skip]
+            wanted = [name for name in survey(path, file, skip) if name not in skip]
             return {name: file[name][()] for name in wanted if file[name].chunks is not None}
     except (PlenoError, MemoryError):
         raise
     except Exception as error:  # h5py raises half a dozen types for a malformed file
+        raise no_hdf5(path, error) from error
+
+
+def window(path: str, name: str, rows: slice, columns: slice) -> np.ndarray:
+    """Part of the last two axes of a dataset; runs outside, as compressed_values."""
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return file[name][..., rows, columns]
+    except Exception as error:
         raise no_hdf5(path, error) from error
 
 

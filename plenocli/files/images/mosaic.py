@@ -8,13 +8,14 @@ import contextlib
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import InParts
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
 from plenocli.files.images.containers import (
     BIO,
@@ -31,6 +32,9 @@ from plenocli.files.images.raw import RawFile, read_raw
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
 from plenocli.forward.sensor.cfa import ColourProfile
 from plenocli.forward.sensor.noise import Noise
+
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact, Stored
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 FURTHEST = 1e100
@@ -78,20 +82,70 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
             path,
             "leave the option out; the file knows it",
         )
-    if found.mosaic.dtype.kind == "f" and not np.isfinite(found.mosaic).all():
+    _require_sound(path, found.mosaic)
+    return found
+
+
+def _require_sound(path: Path, mosaic: np.ndarray) -> None:
+    """InputError for values that no sensor reports."""
+    if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
         raise InputError(
-            f"holds {int((~np.isfinite(found.mosaic)).sum())} values that are NaN or infinite",
+            f"holds {int((~np.isfinite(mosaic)).sum())} values that are NaN or infinite",
             path,
             "make it again",
         )
-    loudest = max(abs(float(found.mosaic.max())), abs(float(found.mosaic.min())))
+    loudest = max(abs(float(mosaic.max())), abs(float(mosaic.min())))
     if loudest and not 1 / FURTHEST < loudest < FURTHEST:
         raise InputError(
             f"has values up to {loudest:.3g}, whose squares no number holds",
             path,
             "divide it by its white level; a unit changes nothing else",
         )
-    return found
+
+
+@dataclass(frozen=True)
+class StoredCapture:
+    """A capture whose mosaic stays in its file.
+
+    about: the capture, its mosaic without values.
+    mosaic: of its file.
+    """
+
+    about: Capture
+    mosaic: Stored
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the sensor."""
+        rows, columns = self.mosaic.shape
+        return rows, columns
+
+    def window(self, rows: slice, columns: slice) -> Capture:
+        """The capture of a part of the sensor. Raises InputError."""
+        values = self.mosaic.window(rows, columns)
+        _require_sound(self.mosaic.path, values)
+        levels = self.about.levels
+        black = np.roll(levels.black, (-rows.start, -columns.start), axis=(0, 1))
+        return replace(self.about, mosaic=values, levels=replace(levels, black=black))
+
+
+@contextlib.contextmanager
+def stored_capture(path: str | Path, *, verify: bool = True) -> Iterator[StoredCapture | None]:
+    """The capture of an artefact, None for another file; verify: as of opened_artefact.
+
+    Raises InputError.
+    """
+    from plenocli.files.artefacts.container import opened_artefact
+
+    path = Path(path)
+    if not is_hdf5(path):
+        yield None
+        return
+    apart = ("capture/mosaic", "capture/scene")
+    with opened_artefact(path, "capture", apart, verify=verify) as (artefact, stored):
+        mosaic = stored["capture/mosaic"]
+        blank = np.empty((0, 0), mosaic.dataset.dtype)
+        yield StoredCapture(_capture_of(path, artefact, blank), mosaic)
 
 
 def is_hdf5(path: str | Path) -> bool:
@@ -106,11 +160,17 @@ def is_hdf5(path: str | Path) -> bool:
 
 
 def _from_artefact(path: Path) -> Capture:
-    from plenocli.files.artefacts.container import cfa_text, read_artefact
+    from plenocli.files.artefacts.container import read_artefact
 
     artefact = read_artefact(path, "capture")
+    return _capture_of(path, artefact, artefact.data["capture/mosaic"])
+
+
+def _capture_of(path: Path, artefact: Artefact, mosaic: np.ndarray) -> Capture:
+    from plenocli.files.artefacts.container import cfa_text
+
     said = {**artefact.attrs.get("capture", {}), "cfa": cfa_text(artefact.data["capture/cfa"])}
-    found = _described(path, artefact.data["capture/mosaic"], said, "capture")
+    found = _described(path, mosaic, said, "capture")
     origin = artefact.provenance
     metadata = replace(
         found.metadata,
@@ -290,7 +350,7 @@ def write_capture(
     capture: Capture,
     provenance: Provenance,
     *,
-    scene: np.ndarray | None = None,
+    scene: np.ndarray | InParts | None = None,
     wavelengths: np.ndarray | None = None,
     degree: np.ndarray | None = None,
     overwrite: bool = False,
@@ -299,7 +359,7 @@ def write_capture(
 
     An EXR keeps float32, whole numbers up to 2^24 exactly; a DNG whole numbers below 65536.
     path: its suffix says what is written.
-    capture: what the sensor reports.
+    capture: what the sensor reports; only an .h5 takes a mosaic InParts.
     provenance: where it came from.
     scene: (band, scene_row, scene_column) the object as sampled, which an .h5 keeps.
     wavelengths: (band,) of the scene, m.

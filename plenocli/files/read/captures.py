@@ -4,15 +4,19 @@ system matrix.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from plenocli.base.errors import InputError
-from plenocli.files.images.mosaic import read_capture
+from plenocli.base.progress import collected_notes
+from plenocli.files.images.mosaic import StoredCapture, read_capture, stored_capture
 from plenocli.files.read.calibrations import read_calibration
 from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.superpixels import superpixels
+from plenocli.inverse.picture.tiles import EVERY, Area, Source
 
 SUFFIXES = tuple(
     ".h5 .exr .dng .png .tif .tiff .3fr .arw .cr2 .cr3 .crw .erf .fff .iiq .kdc .mef .mos .mrw "
@@ -101,3 +105,72 @@ def read_superpixels(
 def read_white(path: str | Path) -> Calibration:
     """What a calibration artefact knows of lenslets, white and dark."""
     return read_calibration(path, needs=("windows", "white", "dark"), response=False)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Superpixels in memory."""
+
+    data: Superpixels
+
+    @property
+    def count(self) -> tuple[int, int]:
+        """Lenslets (rows, columns)."""
+        return self.data.y.shape[0], self.data.y.shape[1]
+
+    def cut(self, rows: slice, columns: slice, own: Area = EVERY) -> Superpixels:
+        """As of Source."""
+        return self.data.cut(rows, columns, own)
+
+
+class _Stored:
+    """Superpixels that stay in the file of a capture, tiled as it says."""
+
+    def __init__(self, capture: StoredCapture, system: LensletMatrix) -> None:
+        self.capture, self.system = capture, system
+        shape = system.pixel_shape
+        self.count = (capture.shape[0] // shape[0], capture.shape[1] // shape[1])
+        self._said = False
+
+    def cut(self, rows: slice, columns: slice, own: Area = EVERY) -> Superpixels:
+        """As of Source."""
+        lenslets = (slice(*part.indices(n)[:2]) for part, n in zip((rows, columns), self.count))
+        pixels = (
+            slice(part.start * n, part.stop * n)
+            for part, n in zip(lenslets, self.system.pixel_shape)
+        )
+        part = self.capture.window(*pixels)
+        # what there is to say of all of it is said once
+        with collected_notes() if self._said else nullcontext():
+            found = superpixels(part, self.system)
+        self._said = True
+        return replace(found, own=own)
+
+
+@contextmanager
+def superpixel_source(
+    path: str | Path,
+    system: LensletMatrix,
+    calibration: str | Path | None = None,
+    *,
+    each_pixel: bool = False,
+    verify: bool = True,
+) -> Iterator[Source]:
+    """As read_superpixels, but that those of a simulated capture stay in its file until they are
+    asked for.
+
+    verify: as of plenocli.files.artefacts.container.opened_artefact.
+    """
+    if calibration is None:
+        with stored_capture(path, verify=verify) as stored:
+            if stored is not None and _divides(system.pixel_shape, stored):
+                yield _Stored(stored, system)
+                return
+    yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
+
+
+def _divides(shape: tuple[int, int], capture: StoredCapture) -> bool:
+    """Whether superpixels tile a sensor; where they do not, the reader says why."""
+    said = capture.about.grid.shape if capture.about.grid else None
+    whole = not any(pixels % n for pixels, n in zip(capture.shape, shape))
+    return whole and said in (None, shape) and capture.about.cfa == "mono"

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plenocli.forward.scene.chart import patch_of
+from plenocli.forward.scene.sample import ALL
 
 MOST_PATCHES = 48
 """Patches of a chart; of more spectra every class shows some, evenly taken."""
@@ -48,10 +49,12 @@ class SpectraChart:
         self.rows = max(1, round(np.sqrt(len(chosen) * 2 / 3)))
         self.columns = -(-len(chosen) // self.rows)
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
-        """Reflectance (row, column) at a wavelength (m) on rows x columns object points."""
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m) on rows x columns object points, of the
+        rows `part`.
+        """
         values = self.spectra.at(wavelength)[:, 0]
-        return values[self._numbers(rows, columns, whole=False)].astype(np.float32)
+        return values[self._numbers(rows, columns, whole=False)[part]].astype(np.float32)
 
     def whole(self, rows: int, columns: int) -> np.ndarray:
         """(row, column) bool, which cells of a grid see one patch alone."""

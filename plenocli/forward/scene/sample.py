@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from plenocli.base.errors import InputError
 
+ALL = slice(None)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709 / sRGB primaries, linear
 
 
@@ -33,7 +34,12 @@ def luminance(picture: ArrayLike) -> np.ndarray:
 
 
 def area_average(
-    values: ArrayLike, count: int, axis: int = 0, start: float = 0.0, stop: float | None = None
+    values: ArrayLike,
+    count: int,
+    axis: int = 0,
+    start: float = 0.0,
+    stop: float | None = None,
+    part: slice = ALL,
 ) -> np.ndarray:
     """Means over equal cells that tile a part of one axis, in input samples.
 
@@ -45,8 +51,9 @@ def area_average(
     count: number of cells.
     axis: along which they lie.
     start, stop: ends of what they tile, in samples; by default the whole axis.
+    part: the cells that are wanted, a slice without a step.
 
-    Returns float64, as values with `count` along the axis.
+    Returns float64, as values with `count` along the axis, or as many as are wanted.
     Raises ValueError where the cells do not fit.
     """
     values = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
@@ -54,7 +61,8 @@ def area_average(
     stop = float(length) if stop is None else float(stop)
     if not (0 <= start < stop <= length + 1e-9 * length) or count < 1:
         raise ValueError(f"cells over [{start}, {stop}) do not fit {length} samples")
-    edges = np.minimum(start + (stop - start) * np.arange(count + 1) / count, length)
+    first, last, _ = part.indices(count)
+    edges = np.minimum(start + (stop - start) * np.arange(first, last + 1) / count, length)
     whole = np.minimum(edges.astype(np.intp), length - 1)
     part = (edges - whole).reshape((-1,) + (1,) * (values.ndim - 1))
     integral = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
@@ -62,13 +70,16 @@ def area_average(
     return np.moveaxis(np.diff(at_edges, axis=0) / ((stop - start) / count), 0, axis)
 
 
-def sample_picture(picture: ArrayLike, rows: int, cols: int, how: str = "fit") -> np.ndarray:
+def sample_picture(
+    picture: ArrayLike, rows: int, cols: int, how: str = "fit", part: slice = ALL
+) -> np.ndarray:
     """A picture on a grid of object points, centred.
 
     picture: (height, width[, channels]).
     rows, cols: object points.
     how: "fit" averages the largest centred part with the grid's aspect ratio over equal cells
         (edges may cut pixels); "crop" takes the central rows x cols pixels as they are.
+    part: rows that are wanted, a slice without a step.
 
     Returns (rows, cols[, channels]) float32.
     Raises InputError where the picture is empty, or too small to crop.
@@ -87,12 +98,13 @@ def sample_picture(picture: ArrayLike, rows: int, cols: int, how: str = "fit") -
                 fix='use a larger picture, or sample it with "fit" instead of "crop"',
             )
         top, left = (height - rows) // 2, (width - cols) // 2
-        return np.ascontiguousarray(picture[top : top + rows, left : left + cols], dtype=np.float32)
+        picture = picture[top : top + rows, left : left + cols][part]
+        return np.ascontiguousarray(picture, dtype=np.float32)
     if how != "fit":
         raise ValueError(f'how is "fit" or "crop", not {how!r}')
     scale = min(height / rows, width / cols)
     top, left = (height - scale * rows) / 2, (width - scale * cols) / 2
-    averaged = area_average(picture, rows, 0, max(top, 0.0), min(height - top, height))
+    averaged = area_average(picture, rows, 0, max(top, 0.0), min(height - top, height), part)
     averaged = area_average(averaged, cols, 1, max(left, 0.0), min(width - left, width))
     return averaged.astype(np.float32)
 

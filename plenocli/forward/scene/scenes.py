@@ -10,6 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
+from plenocli.forward.scene.sample import ALL
+
 _RGB_CENTRES = np.array([450e-9, 545e-9, 630e-9])
 """Where the blue, green and red channels of a photograph stand in the spectrum; linear in
 between, constant outside.
@@ -24,8 +26,10 @@ class Scene(Protocol):
 
     spectral: bool
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
-        """Reflectance (row, column) at a wavelength (m) on rows x columns object points."""
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
+        """Reflectance (row, column) at a wavelength (m) on rows x columns object points, of the
+        rows `part`, a slice without a step.
+        """
         ...
 
 
@@ -37,9 +41,10 @@ class Uniform:
     def __init__(self, level: float) -> None:
         self.level = level
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column), the level everywhere."""
-        return np.full((rows, columns), self.level, dtype=np.float32)
+        first, last, _ = part.indices(rows)
+        return np.full((last - first, columns), self.level, dtype=np.float32)
 
 
 class Photograph:
@@ -51,15 +56,15 @@ class Photograph:
         self.values, self.sampling = values, sampling
         self.spectral = spectral and values.shape[2] >= 3
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column) at a wavelength (m), of a grey picture its luminance."""
         from plenocli.forward.scene.sample import luminance, sample_picture
 
         if not self.spectral:
-            return sample_picture(luminance(self.values), rows, columns, self.sampling)
+            return sample_picture(luminance(self.values), rows, columns, self.sampling, part)
         weights = [np.interp(wavelength, _RGB_CENTRES, one) for one in np.eye(3)]
         picture = sum(w * self.values[:, :, 2 - band] for band, w in enumerate(weights) if w)
-        return sample_picture(picture, rows, columns, self.sampling)
+        return sample_picture(picture, rows, columns, self.sampling, part)
 
 
 class Cube:
@@ -70,17 +75,16 @@ class Cube:
     def __init__(self, wavelengths: np.ndarray, values: np.ndarray, sampling: str) -> None:
         self.wavelengths, self.values, self.sampling = np.asarray(wavelengths), values, sampling
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column) at a wavelength (m), linear between the bands."""
         from plenocli.forward.scene.sample import sample_picture
 
         position = np.interp(wavelength, self.wavelengths, np.arange(len(self.wavelengths)))
         low = min(int(position), len(self.wavelengths) - 1)
         high = min(low + 1, len(self.wavelengths) - 1)
-        part = position - low
-        return sample_picture(
-            (1 - part) * self.values[low] + part * self.values[high], rows, columns, self.sampling
-        )
+        share = position - low
+        picture = (1 - share) * self.values[low] + share * self.values[high]
+        return sample_picture(picture, rows, columns, self.sampling, part)
 
 
 class Polarised:
@@ -95,9 +99,9 @@ class Polarised:
         self.scene, self.degree, self.sampling = scene, degree, sampling
         self.spectral = scene.spectral
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column) at a wavelength (m), of both states together."""
-        return self.scene.at(wavelength, rows, columns)
+        return self.scene.at(wavelength, rows, columns, part)
 
     def degree_at(self, rows: int, columns: int) -> np.ndarray:
         """Degree of polarisation (row, column)."""
@@ -113,8 +117,8 @@ class Chart:
 
     spectral = True
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column) of the chart at a wavelength (m)."""
         from plenocli.forward.scene.chart import chart_scene
 
-        return chart_scene(rows, columns, np.array([wavelength]))[0][0]
+        return chart_scene(rows, columns, np.array([wavelength]))[0][0][part]

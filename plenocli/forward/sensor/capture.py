@@ -89,7 +89,8 @@ class CaptureMetadata:
 class Capture:
     """One exposure of a plenoptic camera, measured or simulated, never demosaiced.
 
-    mosaic: (row, column) values as the sensor reports them.
+    mosaic: (row, column) values as the sensor reports them; InParts only of a simulation whose
+        values are worked out while they are written.
     units: of the values: "DN", "electron", or "relative": 1 is the light of a white object point
         through the clear pupil.
     cfa: colour filter array, "mono" or the four letters of the top left 2x2 pixels, row by row.

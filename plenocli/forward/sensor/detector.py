@@ -134,12 +134,13 @@ class SensorModel:
             min(2**self.bits - 1, np.floor(self.black_level + self.gain * self.full_well + 0.5))
         )
 
-    def pattern(self, shape: tuple[int, ...]) -> PixelPattern:
+    def pattern(self, shape: tuple[int, ...], band: int = 0) -> PixelPattern:
         """What is fixed about the pixels of the sensor `serial`, the same in every frame.
 
         shape: (rows, columns).
+        band: number of the band of rows, where a sensor is worked on in several.
         """
-        rng = stream(self.serial, "sensor")
+        rng = stream(self.serial, "sensor", band)
         response = 1 + self.prnu * rng.standard_normal(shape)
         offset = self.dsnu * rng.standard_normal(shape)
         hot = rng.random(shape) < self.hot_pixels
@@ -151,7 +152,11 @@ class SensorModel:
         )
 
     def expose(
-        self, electrons: np.ndarray, rng: np.random.Generator, seconds: float = 0.0
+        self,
+        electrons: np.ndarray,
+        rng: np.random.Generator,
+        seconds: float = 0.0,
+        band: int = 0,
     ) -> np.ndarray:
         """Digital numbers of one exposure.
 
@@ -164,6 +169,7 @@ class SensorModel:
             of the peak), which counts as zero.
         rng: source of the noise.
         seconds: of the exposure, for the dark current.
+        band: as of `pattern`; the rows of other bands are not looked at.
 
         Returns uint16 of the same shape, DN.
         Raises ValueError where a mean is not finite, or below zero.
@@ -177,7 +183,7 @@ class SensorModel:
         if self.crosstalk:
             mean = spread_to_neighbours(mean, self.crosstalk)
         if self.dark_current or self.dsnu or self.prnu or self.hot_pixels:
-            pattern = self.pattern(mean.shape)
+            pattern = self.pattern(mean.shape, band)
             mean = mean * pattern.response + pattern.dark_current * seconds
             offset = pattern.offset
         charge = np.minimum(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,10 +13,13 @@ import numpy as np
 from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.random_streams import stream
+from plenocli.base.tiling import InParts, bands, mirrored
 from plenocli.forward.camera.pupil import polarisations
+from plenocli.forward.scene.sample import ALL
 from plenocli.forward.scene.scenes import Polarised, Uniform
 from plenocli.forward.scene.white_reference import WHITE_LEVEL
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
+from plenocli.forward.sensor.noise import Noise, white_noise
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.field_nodes import FieldNodes
@@ -24,7 +27,12 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.accuracy_record import AccuracyRecord
     from plenocli.forward.scene.light import Quadrature
     from plenocli.forward.scene.scenes import Scene
+    from plenocli.forward.sensor.detector import SensorModel
 
+BAND = 5 << 19
+"""Pixels that are exposed together, as whole rows of lenslets, at most: what a larger sensor
+records is worked out, and its noise drawn, in bands of rows. Noise depends on it.
+"""
 _MOST = 8 << 30
 """Bytes of memory above which parts of a matrix grow no further: the order of sums, and with it
 the last digits, are the same on all larger machines.
@@ -67,16 +75,56 @@ class SimulatedCapture:
     capture: what it records.
     scene: (band, row, column) reflectance of the object on the points of reconstruction.
     wavelengths: (band,) m, of the scene's bands.
-    saturated: share of the pixels over full well, None in relative units.
+    tally: of the pixels; of a mosaic InParts it grows with the parts.
     degree: (row, column) degree of polarisation on the points of reconstruction, None where light
         is not polarised.
     """
 
     capture: Capture
-    scene: np.ndarray
+    scene: np.ndarray | InParts
     wavelengths: np.ndarray
-    saturated: float | None
+    tally: Tally
     degree: np.ndarray | None = None
+
+    @property
+    def saturated(self) -> float | None:
+        """Share of the pixels over full well, None in relative units."""
+        return self.tally.saturated if self.tally.counted else None
+
+    def in_memory(self) -> SimulatedCapture:
+        """The same without InParts."""
+        mosaic = self.capture.mosaic
+        if not isinstance(mosaic, InParts):
+            return self
+        assert isinstance(self.scene, InParts)
+        capture = replace(self.capture, mosaic=mosaic.whole())
+        return replace(self, capture=capture, scene=self.scene.whole())
+
+
+@dataclass
+class Tally:
+    """Pixels of a capture as far as they were recorded.
+
+    counted: whether full well means something.
+    peak: the largest value.
+    full: pixels over full well, of `pixels`.
+    """
+
+    counted: bool
+    peak: float = -np.inf
+    full: int = 0
+    pixels: int = 0
+
+    @property
+    def saturated(self) -> float:
+        """Share of the pixels over full well."""
+        return self.full / max(1, self.pixels)
+
+    def add(self, values: np.ndarray, full: int = 0) -> None:
+        """Count the pixels of a band, `full` of them over full well."""
+        self.peak = max(self.peak, float(values.max()))
+        self.full += full
+        self.pixels += values.size
 
 
 def simulate_capture(
@@ -88,6 +136,7 @@ def simulate_capture(
     matrices: Mapping[float, MatrixByPoints | StoredField] | None = None,
     name: str = "scene",
     band_m: float | None = None,
+    in_parts: bool = False,
 ) -> SimulatedCapture:
     """One exposure of a scene.
 
@@ -97,55 +146,130 @@ def simulate_capture(
     matrices: system matrices by wavelength (m); None: computed as the options ask.
     name: of the scene, for later stages and messages.
     band_m: centre of the narrow band that lights the scene, m, where there is one.
+    in_parts: whether mosaic and scene of a sensor of more than BAND pixels are InParts, worked out
+        while they are written.
 
     Raises ConfigError where superpixels do not tile the sensor or no light reaches it,
-    NumericsError where memory or accuracy do not suffice, InputError for a scene below zero.
+    NumericsError where memory or accuracy do not suffice, InputError for a scene below zero, which
+    a mosaic InParts raises when it is worked out.
     Berkner et al. 2013, section 2.
     """
-    light = carry_light(camera, source, scene, options, matrices)
-    capture, saturated = detect(camera, source, light, options, name, lamp=band_m is not None)
-    return SimulatedCapture(
-        capture=_described(capture, camera, light.scene, name, band_m),
-        scene=light.scene,
-        wavelengths=np.array(camera.light.wavelengths[: len(light.scene)]),
-        saturated=saturated,
-        degree=light.degree,
+    # shares of polarised light are those of the whole
+    rows = [slice(0, camera.lenslet_array.count[0])]
+    rows = rows if isinstance(scene, Polarised) else _bands(camera)
+    if len(rows) > 1 and matrices is None:
+        matrices = {w: _held(camera, w, options) for w in source.wavelengths}
+
+    def lit(part: slice) -> SensorLight:
+        return carry_light(camera, source, scene, options, matrices, part)
+
+    first = lit(rows[0])
+    if not float(first.white.max()) > 0:
+        raise ConfigError(
+            "no light of this source reaches the sensor",
+            "camera",
+            "check filters, wavelengths and illuminant",
+        )
+    recorder = _recorder(camera, source, first.white, options, name, lamp=band_m is not None)
+    truth = _truth(camera, scene, options.refine, rows)
+    if len(rows) == 1:
+        recorder.measure([first.mosaic])
+        mosaic: np.ndarray | InParts = recorder.band(0, first.mosaic)
+    else:
+        recorder.measure(lit(part).mosaic for part in rows)
+        mosaic = _in_bands(camera, rows, lit, recorder)
+    found = SimulatedCapture(
+        capture=_described(recorder.capture(mosaic), camera, truth.shape, name, band_m),
+        scene=truth if len(rows) > 1 else truth.whole(),
+        wavelengths=np.array(camera.light.wavelengths[: truth.shape[0]]),
+        tally=recorder.tally,
+        degree=_degree(camera, scene, options.refine),
     )
+    return found if in_parts else found.in_memory()
+
+
+def _degree(camera: Camera, scene: Scene, refine: int) -> np.ndarray | None:
+    """Degree of polarisation (row, column) on the points of reconstruction, or None."""
+    if not isinstance(scene, Polarised):
+        return None
+    count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
+    grid = (count[0] * samples[0] * refine, count[1] * samples[1] * refine)
+    return _coarser(scene.degree_at(*grid), refine)
+
+
+def _bands(camera: Camera) -> list[slice]:
+    """Rows of lenslets that are exposed together."""
+    (rows, columns), pixels = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
+    return bands(rows, BAND // (columns * pixels[0] * pixels[1]))
+
+
+def _in_bands(
+    camera: Camera,
+    rows: Sequence[slice],
+    lit: Callable[[slice], SensorLight],
+    recorder: _Recorder,
+) -> InParts:
+    """The mosaic of a sensor that is exposed band by band."""
+    count, pixels = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
+    # what pixels of the next lenslets pass on
+    near = 1 if recorder.spreads else 0
+
+    def parts() -> Iterator[np.ndarray]:
+        recorder.begin(len(rows))
+        for number, part in enumerate(bar(rows, len(rows), "bands of lenslets")):
+            around = slice(max(0, part.start - near), min(count[0], part.stop + near))
+            own = slice(
+                (part.start - around.start) * pixels[0], (part.stop - around.start) * pixels[0]
+            )
+            yield recorder.band(number, lit(around).mosaic, own)
+        recorder.tell()
+
+    shape = (count[0] * pixels[0], count[1] * pixels[1])
+    return InParts(shape=shape, dtype=recorder.dtype, parts=parts)
 
 
 def dark_capture(
-    camera: Camera, options: ExposureOptions, name: str = "dark"
+    camera: Camera, options: ExposureOptions, name: str = "dark", *, in_parts: bool = False
 ) -> SimulatedCapture | None:
     """The exposure without light, for which no optics are needed.
 
     options: the noise, the exposure.
     name: of the scene, for later stages and messages.
+    in_parts: as of simulate_capture.
 
     Returns None where light of known strength and no exposure are given: how long a perfect white
     may shine decides, and the optics say that. The capture does not tell electrons_per_unit.
     Raises NumericsError where the noise is to be in proportion to the light.
     """
     count, pixels = camera.lenslet_array.count, camera.sensor.pixels_per_lenslet
-    mosaic = np.zeros((count[0] * pixels[0], count[1] * pixels[1]))
-    rng, saturated = _noise_source(options), None
-    if options.snr_db is not None or options.noise == "none":
-        capture = relative_capture(camera.sensor, mosaic, options, rng)
-    else:
+    rows, exposure = _bands(camera), None
+    if options.snr_db is None and options.noise != "none":
         seconds = options.exposure or camera.sensor.exposure
         if seconds is None and camera.light.strength is not None:
             return None
         exposure = ExposureScale(1.0, seconds or camera.light.white_exposure)
-        capture, saturated = exposed_capture(camera.sensor, mosaic, exposure, name, rng)
-        capture = replace(capture, metadata=replace(capture.metadata, electrons_per_unit=None))
-    samples = camera.object.samples_per_lenslet
-    grid = (count[0] * samples[0] * options.refine, count[1] * samples[1] * options.refine)
-    scene = _truth(camera, Uniform(0.0), grid, options.refine)
-    return SimulatedCapture(
-        capture=_described(capture, camera, scene, name, None),
+    recorder = _Recorder(camera.sensor, options, name, exposure)
+
+    def dark(part: slice) -> np.ndarray:
+        return np.zeros(((part.stop - part.start) * pixels[0], count[1] * pixels[1]))
+
+    def parts() -> Iterator[np.ndarray]:
+        recorder.begin(len(rows))
+        for number, part in enumerate(rows):
+            yield recorder.band(number, dark(part))
+
+    recorder.measure(map(dark, rows))
+    shape = (count[0] * pixels[0], count[1] * pixels[1])
+    capture = recorder.capture(InParts(shape=shape, dtype=recorder.dtype, parts=parts))
+    capture = replace(capture, metadata=replace(capture.metadata, electrons_per_unit=None))
+    scene = _truth(camera, Uniform(0.0), options.refine, rows)
+    found = SimulatedCapture(
+        capture=_described(capture, camera, scene.shape, name, None),
         scene=scene,
         wavelengths=np.array(camera.light.wavelengths[:1]),
-        saturated=saturated,
+        tally=recorder.tally,
     )
+    return found if in_parts and len(rows) > 1 else found.in_memory()
 
 
 class MatrixByPoints(Protocol):
@@ -175,6 +299,18 @@ class StoredMatrix:
     def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """All points at once: they are in memory."""
         yield np.arange(self.matrix.shape[2]), self.matrix
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A system matrix at one wavelength whose blocks were worked out; see MatrixByPoints."""
+
+    parts: list[tuple[np.ndarray, np.ndarray]]
+    offsets: np.ndarray
+
+    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The blocks that there are."""
+        yield from self.parts
 
 
 @dataclass(frozen=True)
@@ -209,20 +345,18 @@ class StoredField:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorLight:
-    """Relative light on a sensor tiled with superpixels, before detection.
+    """Relative light on rows of a sensor tiled with superpixels, before detection.
 
     colours: letters of the colour filters.
     superpixels: (colour, lenslet_row, lenslet_column, pixel) of the scene.
     white: (colour, pixel) a superpixel of a uniform white object.
-    scene: (band, row, column) reflectance of the object as sampled.
-    degree: (row, column) its degree of polarisation, or None.
+    mosaic: (row, column) light that the sensor's colour filters leave.
     """
 
     colours: tuple[str, ...]
     superpixels: np.ndarray
     white: np.ndarray
-    scene: np.ndarray
-    degree: np.ndarray | None
+    mosaic: np.ndarray
 
 
 def require_tiling(camera: Camera, where: str | Path) -> None:
@@ -250,22 +384,33 @@ def require_tiling(camera: Camera, where: str | Path) -> None:
         )
 
 
-def require_memory_for(camera: Camera, options: ExposureOptions, where: str | Path) -> None:
-    """Refuse, before any work, a sensor or an object larger than the memory granted: light,
-    white and mosaic, float64, by colour.
+def require_memory_for(
+    camera: Camera,
+    options: ExposureOptions,
+    where: str | Path,
+    *,
+    in_parts: bool = False,
+    polarised: bool = False,
+) -> None:
+    """Refuse, before any work, a sensor or an object larger than the memory granted: light, white
+    and mosaic, float64, by colour, of what is exposed together.
+
+    in_parts: whether mosaic and scene are written as they come, and never all in memory.
+    polarised: whether the scene is.
     """
     from plenocli.base.budget import budget
 
-    lenslets, pixels, points = (
+    rows = [slice(0, camera.lenslet_array.count[0])] if polarised else _bands(camera)
+    count, lenslets = camera.lenslet_array.count, int(np.prod(camera.lenslet_array.count))
+    pixels, points = (
         int(np.prod(n, dtype=object))
-        for n in (
-            camera.lenslet_array.count,
-            camera.sensor.pixels_per_lenslet,
-            camera.object.samples_per_lenslet,
-        )
+        for n in (camera.sensor.pixels_per_lenslet, camera.object.samples_per_lenslet)
     )
     colours = 1 if camera.sensor.cfa == "mono" else 3
-    needed = 8 * lenslets * (pixels * (2 * colours + 3) + 2 * points * options.refine**2)
+    together = (rows[0].stop - rows[0].start) * count[1]
+    needed = 8 * together * (pixels * (2 * colours + 3) + 2 * points * options.refine**2)
+    if len(rows) > 1 and not in_parts:
+        needed += 8 * lenslets * (2 * pixels + points)
     budget().require(
         needed,
         "the capture",
@@ -326,89 +471,156 @@ def carry_light(
     scene: Scene,
     options: ExposureOptions,
     matrix: Mapping[float, MatrixByPoints | StoredField] | None,
+    rows: slice = ALL,
 ) -> SensorLight:
-    """Light of the scene on every superpixel, band by band through the system matrix."""
+    """Light of the scene on the superpixels of some rows of lenslets, band by band through the
+    system matrix.
+    """
+    from plenocli.base.budget import budget
     from plenocli.forward.sensor.cfa import sensitivity
+    from plenocli.forward.sensor.irradiance import reach_of, superpixel_light
 
     letters, efficiency = sensitivity(camera, source.wavelengths)
     count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
     fine = (samples[0] * options.refine, samples[1] * options.refine)
     grid = (count[0] * fine[0], count[1] * fine[1])
-    finer = camera.replace(**{"object.samples_per_lenslet": fine}) if options.refine > 1 else camera
-    light, whites, picture = np.zeros(()), np.zeros(()), None
-    degree = scene.degree_at(*grid) if isinstance(scene, Polarised) else None
-    states: list[tuple[Camera, np.ndarray | float]] = [(finer, 1.0)]
-    if degree is not None and len(polarisations(finer)) > 1:
-        if matrix is not None:
-            raise UsageError(
-                "the system matrices are those of light that is not polarised",
-                "--pif",
-                "leave --pif out: each polarisation has matrices of its own",
-            )
-        # each state has half of the light of a white that is not polarised
-        states = list(zip(polarisations(finer), ((1 + degree) / 2, (1 - degree) / 2)))
+    rows = slice(*rows.indices(count[0])[:2])
+    some = (rows.stop - rows.start, count[1])
+    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
+    states = _states(camera, scene, grid, matrix is None)
+    light, whites = np.zeros(()), np.zeros(())
+    around: dict[tuple[int, int], np.ndarray] = {}
     for index, wavelength in enumerate(
         bar(source.wavelengths, len(source.wavelengths), "wavelengths")
     ):
-        if not isinstance(scene, Uniform) and (picture is None or scene.spectral):
-            picture = scene.at(wavelength, *grid)
         weight = (source.photons[index] * efficiency[:, index]).reshape(-1, 1) / options.refine**2
+        if scene.spectral:
+            around.clear()
         for seen, share in states:
             system = matrix[wavelength] if matrix else _build(seen, wavelength, options)
-            part = (
-                scene.level
-                if isinstance(scene, Uniform)
-                else share * np.asarray(picture, np.float32)
-            )
-            carried, white = _carried(system, camera, part, fine)
+            reach, picture = reach_of(system.offsets), None
+            if not isinstance(scene, Uniform) or isinstance(system, StoredField):
+                if reach not in around:
+                    at = partial(_strip, scene, wavelength, grid)
+                    around[reach] = _around(at, reach, rows, count, fine)
+                picture = around[reach]
+            if share is not None and picture is not None:
+                picture = picture * _around(share.__getitem__, reach, rows, count, fine)
+            if isinstance(system, StoredField):
+                assert picture is not None
+                carried, white = _carried_over_the_field(system, camera, picture, rows, fine)
+            else:
+                room = min(budget().memory, _MOST) // 16
+                size = max(8, room // (8 * len(system.offsets) * pixels))
+                blocks = system.blocks(size)
+                carried, white = superpixel_light(blocks, system.offsets, picture, fine)
+                if isinstance(scene, Uniform):
+                    carried = np.broadcast_to(scene.level * white, (*some, pixels))
             light = light + weight[:, :, None, None] * carried[None]
             whites = whites + weight * white[None] / len(states)
     return SensorLight(
         colours=letters,
         superpixels=light,
         white=whites,
-        scene=_truth(camera, scene, grid, options.refine),
-        degree=None if degree is None else _coarser(degree, options.refine),
+        mosaic=_through_the_filters(camera, letters, light, rows.start),
     )
 
 
-def _carried(
-    system: MatrixByPoints | StoredField,
-    camera: Camera,
-    scene: np.ndarray | float,
-    samples: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """As superpixel_light, of a picture or of an even object by its level."""
-    from plenocli.base.budget import budget
-    from plenocli.forward.sensor.irradiance import superpixel_light
+def _states(
+    camera: Camera, scene: Scene, grid: tuple[int, int], built: bool
+) -> list[tuple[Camera, np.ndarray | None]]:
+    """The camera for each polarisation of light, and its share (row, column) of the light on `grid`
+    points of the array; None for all.
 
-    count, pixels = camera.lenslet_array.count, math.prod(camera.sensor.pixels_per_lenslet)
-    picture = scene if isinstance(scene, np.ndarray) else None
-    if isinstance(system, StoredField):
-        grid = (count[0] * samples[0], count[1] * samples[1])
-        whole = np.full(grid, scene) if picture is None else picture
-        return _carried_over_the_field(system, camera, whole, samples)
-    size = max(8, min(budget().memory, _MOST) // 16 // (8 * len(system.offsets) * pixels))
-    carried, white = superpixel_light(system.blocks(size), system.offsets, picture, samples)
-    if picture is None:
-        carried = np.broadcast_to(scene * white, (*count, pixels))
-    return carried, white
+    built: whether matrices are worked out; UsageError where they are not, and each state needs its
+        own.
+    """
+    if not isinstance(scene, Polarised) or len(polarisations(camera)) == 1:
+        return [(camera, None)]
+    if not built:
+        raise UsageError(
+            "the system matrices are those of light that is not polarised",
+            "--pif",
+            "leave --pif out: each polarisation has matrices of its own",
+        )
+    degree = scene.degree_at(*grid)
+    # each state has half of the light of a white that is not polarised
+    return list(zip(polarisations(camera), ((1 + degree) / 2, (1 - degree) / 2)))
+
+
+def _strip(scene: Scene, wavelength: float, grid: tuple[int, int], part: slice) -> np.ndarray:
+    """Rows of a scene on `grid` points."""
+    if isinstance(scene, Uniform):
+        return np.full((part.stop - part.start, grid[1]), scene.level)
+    some = () if part == slice(0, grid[0]) else (part,)
+    return np.asarray(scene.at(wavelength, *grid, *some), np.float32)
+
+
+def _around(
+    at: Callable[[slice], np.ndarray],
+    reach: tuple[int, int],
+    rows: slice,
+    count: tuple[int, int],
+    samples: tuple[int, int],
+) -> np.ndarray:
+    """Values (row, column) at the objects of some rows of lenslets, and of `reach` lenslets more on
+    every side of them; beyond the array they go on mirrored.
+
+    at: gives rows of points of the whole array.
+    count: lenslets (rows, columns) of the array.
+    samples: object points (rows, columns) of a lenslet.
+    """
+    down, across = (r * n for r, n in zip(reach, samples))
+    wanted = mirrored(
+        slice(rows.start * samples[0], rows.stop * samples[0]), down, count[0] * samples[0]
+    )
+    first = int(wanted.min())
+    picture = at(slice(first, int(wanted.max()) + 1))
+    return np.pad(picture[wanted - first], ((0, 0), (across, across)), mode="symmetric")
 
 
 def _carried_over_the_field(
-    system: StoredField, camera: Camera, picture: np.ndarray, samples: tuple[int, int]
+    system: StoredField,
+    camera: Camera,
+    around: np.ndarray,
+    rows: slice,
+    samples: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
     """As superpixel_light, every object through the matrix of its own lenslet; white is that of the
     axis.
     """
-    from plenocli.forward.sensor.irradiance import superpixel_light
+    from plenocli.forward.sensor.irradiance import reach_of, superpixel_light
 
-    light: np.ndarray = np.zeros(())
+    count, reach, light = camera.lenslet_array.count, reach_of(system.offsets), np.zeros(())
+    down, across = mirrored(rows, reach[0], count[0]), np.arange(count[1])
+    across = np.pad(across, reach[1], mode="symmetric")
     for matrix, weight in system.parts(camera):
-        share = picture * np.kron(weight, np.ones(samples))
+        share = around * np.kron(weight[np.ix_(down, across)], np.ones(samples))
         light = light + superpixel_light(matrix.blocks(), matrix.offsets, share, samples)[0]
     axis = system.on_axis
     return light, superpixel_light(axis.blocks(), axis.offsets, None, samples)[1]
+
+
+def _held(
+    camera: Camera, wavelength: float, options: ExposureOptions
+) -> MatrixByPoints | StoredField:
+    """The matrix of one wavelength, worked out once for all bands; NumericsError where there is no
+    room for it.
+    """
+    from plenocli.base.budget import budget
+
+    made = _build(camera, wavelength, options)
+    if isinstance(made, StoredField):
+        return made
+    pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
+    points = int(np.prod(camera.object.samples_per_lenslet)) * options.refine**2
+    budget().require(
+        8 * len(made.offsets) * pixels * points,
+        "the system matrix of a sensor that is exposed in bands",
+        "capture-sim",
+        "take a smaller --refine",
+    )
+    return _Held(list(made.blocks(None)), made.offsets)
 
 
 def _build(
@@ -418,6 +630,9 @@ def _build(
     from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, lay_nodes
     from plenocli.forward.propagation.system_matrix import build_pif
 
+    if options.refine > 1:
+        points = (n * options.refine for n in camera.object.samples_per_lenslet)
+        camera = camera.replace(**{"object.samples_per_lenslet": tuple(points)})
     if options.field_nodes is None:
         return pif_builder(camera, wavelength, **_request(options))
     plan_at = PlansOfPlaces(camera, wavelengths=(wavelength,), **_request(options))
@@ -444,12 +659,22 @@ def stored_field(
     return StoredField(nodes, found, offsets)
 
 
-def _truth(camera: Camera, scene: Scene, grid: tuple[int, int], refine: int) -> np.ndarray:
-    """The object (band, row, column) on the grid that reconstruction uses: area
-    averages of the finer one.
+def _truth(camera: Camera, scene: Scene, refine: int, rows: Sequence[slice]) -> InParts:
+    """The object (band, row, column) on the grid that reconstruction uses: area averages of the
+    finer one, in bands of `rows` of lenslets.
     """
-    bands = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
-    return np.stack([_coarser(scene.at(w, *grid), refine) for w in bands])
+    count, samples = camera.lenslet_array.count, camera.object.samples_per_lenslet
+    fine = (count[0] * samples[0] * refine, count[1] * samples[1] * refine)
+    wavelengths = camera.light.wavelengths if scene.spectral else camera.light.wavelengths[:1]
+
+    def parts() -> Iterator[np.ndarray]:
+        for wavelength in wavelengths:
+            for part in rows:
+                cut = slice(part.start * samples[0] * refine, part.stop * samples[0] * refine)
+                yield _coarser(_strip(scene, wavelength, fine, cut), refine)
+
+    shape = (len(wavelengths), count[0] * samples[0], count[1] * samples[1])
+    return InParts(shape=shape, dtype=np.float32, parts=parts)
 
 
 def _coarser(picture: np.ndarray, refine: int) -> np.ndarray:
@@ -459,75 +684,186 @@ def _coarser(picture: np.ndarray, refine: int) -> np.ndarray:
     return block_mean(picture, (refine, refine)).astype(np.float32)
 
 
-def detect(
-    camera: Camera,
-    source: Quadrature,
-    light: SensorLight,
-    options: ExposureOptions,
-    scene: str,
-    *,
-    lamp: bool = False,
-) -> tuple[Capture, float | None]:
-    """What the sensor reports of relative light, and the share of pixels over full well (None in
-    relative units).
+def _through_the_filters(
+    camera: Camera, colours: Sequence[str], superpixels: np.ndarray, row: int
+) -> np.ndarray:
+    """(row, column) light that the sensor's colour filters leave, relative.
 
-    source: the light.
-    scene: its name, for messages.
-    lamp: whether the light is not the camera's [light], but a lamp as bright as is needed.
+    superpixels: (colour, lenslet_row, lenslet_column, pixel).
+    row: of lenslets, that of the first of them on the sensor.
     """
-    mosaic = _through_the_filters(camera, light)
-    if not float(light.white.max()) > 0:
-        raise ConfigError(
-            "no light of this source reaches the sensor",
-            "camera",
-            "check filters, wavelengths and illuminant",
-        )
-    rng = _noise_source(options)
-    if options.snr_db is not None or options.noise == "none":
-        return relative_capture(camera.sensor, mosaic, options, rng), None
-    brightest = float(light.white.max())
-    electrons = exposure_scale(camera, source, brightest, options.exposure, lamp=lamp)
-    return exposed_capture(camera.sensor, mosaic, electrons, scene, rng)
-
-
-def _noise_source(options: ExposureOptions) -> np.random.Generator:
-    return stream(options.seed, "capture-sim")
-
-
-def _through_the_filters(camera: Camera, light: SensorLight) -> np.ndarray:
-    """(row, column) light that the sensor's colour filters leave, relative."""
     from plenocli.base.tiling import to_plane
     from plenocli.forward.sensor.cfa import cfa_map
 
     shape = camera.sensor.pixels_per_lenslet
-    planes = {c: to_plane(plane, shape) for c, plane in zip(light.colours, light.superpixels)}
+    planes = {c: to_plane(plane, shape) for c, plane in zip(colours, superpixels)}
     mosaic = next(iter(planes.values()))
     if camera.sensor.cfa == "mono":
         return mosaic
-    where = cfa_map(mosaic.shape, camera.sensor.cfa)
+    where = cfa_map(mosaic.shape, camera.sensor.cfa, (row * shape[0], 0))
     filtered = (np.where(where == colour, plane, 0.0) for colour, plane in planes.items())
     return sum(filtered, start=np.zeros(()))
 
 
-def relative_capture(
-    sensor: Sensor, mosaic: np.ndarray, options: ExposureOptions, rng: np.random.Generator
-) -> Capture:
-    """A capture in relative units, with white noise or none: with one wavelength and no colour
-    the mosaic is A x itself.
-    """
-    from plenocli.forward.sensor.noise import Noise, add_white_noise
+def _recorder(
+    camera: Camera,
+    source: Quadrature,
+    white: np.ndarray,
+    options: ExposureOptions,
+    scene: str,
+    *,
+    lamp: bool,
+) -> _Recorder:
+    """What records relative light whose white is (colour, pixel) `white`.
 
-    noise = Noise()
-    mosaic = mosaic / (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0)
-    if options.snr_db is not None:
-        mosaic, noise = add_white_noise(mosaic, options.snr_db, rng)
-    return Capture(
-        mosaic=mosaic.astype(np.float64),
-        units="relative",
-        cfa=sensor.cfa,
-        noise=noise,
-        metadata=CaptureMetadata(snr_db=options.snr_db, noise_from="--snr and --noise"),
-    )
+    scene: its name, for messages.
+    lamp: whether the light is not the camera's [light], but a lamp as bright as is needed.
+    """
+    exposure = None
+    if options.snr_db is None and options.noise != "none":
+        brightest = float(white.max())
+        exposure = exposure_scale(camera, source, brightest, options.exposure, lamp=lamp)
+    return _Recorder(camera.sensor, options, scene, exposure)
+
+
+class _Recorder:
+    """What a sensor reports of relative light, band of rows by band of rows.
+
+    tally: of the pixels.
+    dtype: of what it reports.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        options: ExposureOptions,
+        scene: str,
+        exposure: ExposureScale | None,
+        stage: str = "capture-sim",
+    ) -> None:
+        """scene: its name, for messages.
+
+        exposure: None for relative units.
+        stage: whose random numbers the noise is.
+        """
+        from plenocli.forward.sensor.detector import SensorModel
+
+        self.sensor, self.options, self.scene, self.exposure = sensor, options, scene, exposure
+        self.model = SensorModel.of(sensor)
+        self.tally = Tally(counted=exposure is not None)
+        self.dtype = np.float64 if exposure is None else np.uint16
+        self.spreads = exposure is not None and bool(self.model.crosstalk)
+        self._noise, self._count, self._stage = Noise(), 1, stage
+
+    def measure(self, mosaics: Iterable[np.ndarray]) -> None:
+        """Look at the light of all bands before they are recorded, where noise is in proportion to
+        it.
+        """
+        if self.exposure is None and self.options.snr_db is not None:
+            self._noise = white_noise(map(self._relative, mosaics), self.options.snr_db)
+
+    def begin(self, count: int) -> None:
+        """Record `count` bands from the first one on."""
+        self._count, self.tally.peak, self.tally.full, self.tally.pixels = count, -np.inf, 0, 0
+
+    def _relative(self, mosaic: np.ndarray) -> np.ndarray:
+        return mosaic / (self.sensor.quantum_efficiency if self.sensor.cfa == "mono" else 1.0)
+
+    def band(self, number: int, mosaic: np.ndarray, own: slice = ALL) -> np.ndarray:
+        """What is reported of a band.
+
+        mosaic: (row, column) relative light of it and of rows beside it.
+        own: its rows of them.
+        """
+        rng = stream(self.options.seed, self._stage, number)
+        if self.exposure is None:
+            values = self._relative(mosaic[own]).astype(np.float64, copy=False)
+            if self._noise.sigma:
+                values = values + rng.normal(0.0, self._noise.sigma, values.shape)
+            self.tally.add(values)
+            return values
+        if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
+            raise InputError(
+                "holds values below 0 or beyond all numbers, which no light has",
+                self.scene,
+                "clip it (reconstruct --clip), or use --noise none",
+            )
+        electrons, model = mosaic * self.exposure.electrons, self.model
+        full = int(np.count_nonzero(electrons[own] >= self.sensor.full_well))
+        if self._count > 1:
+            electrons, model = self._apart(electrons, own)
+        values = model.expose(electrons, rng, self.exposure.seconds, number)
+        self.tally.add(values, full)
+        return values
+
+    def _apart(self, electrons: np.ndarray, own: slice) -> tuple[np.ndarray, SensorModel]:
+        """(electrons of the band's own rows, the model of what is left to be done to them): of what
+        concerns more than one band.
+        """
+        from plenocli.forward.sensor.detector import spread_to_neighbours
+
+        if self.spreads:
+            electrons = spread_to_neighbours(electrons, self.model.crosstalk)
+        drift = stream(self.options.seed, self._stage, self._count).normal()
+        black = self.model.black_level + drift * self.model.black_drift
+        model = replace(self.model, crosstalk=0.0, black_drift=0.0, black_level=black)
+        return electrons[own], model
+
+    def tell(self) -> None:
+        """A note where many pixels are over full well."""
+        if self.tally.counted and self.tally.saturated > 0.001:
+            note(
+                f"{self.tally.saturated:.1%} of the pixels are over full well; a shorter "
+                "--exposure would keep them"
+            )
+
+    def capture(self, mosaic: Any) -> Capture:
+        """The capture with what the recorder knows of it; mosaic: an array, or InParts."""
+        if not isinstance(mosaic, InParts):
+            self.tell()
+        if self.exposure is None:
+            return Capture(
+                mosaic=mosaic,
+                units="relative",
+                cfa=self.sensor.cfa,
+                noise=self._noise,
+                metadata=CaptureMetadata(
+                    snr_db=self.options.snr_db, noise_from="--snr and --noise"
+                ),
+            )
+        seconds, mono = self.exposure.seconds, self.sensor.cfa == "mono"
+        electrons = self.exposure.electrons * (self.sensor.quantum_efficiency if mono else 1.0)
+        return Capture(
+            mosaic=mosaic,
+            cfa=self.sensor.cfa,
+            levels=Levels(
+                black=np.full((2, 2), float(self.sensor.black_level)),
+                white=float(self.model.white_level),
+                gain=self.sensor.gain,
+            ),
+            exposure_s=seconds,
+            noise=self.model.noise(seconds),
+            metadata=CaptureMetadata(noise_from="camera", electrons_per_unit=electrons),
+        )
+
+
+def recorded(
+    sensor: Sensor,
+    mosaic: np.ndarray,
+    options: ExposureOptions,
+    scene: str,
+    exposure: ExposureScale | None,
+    stage: str,
+) -> tuple[Capture, float | None]:
+    """What a sensor reports of relative light (row, column), all at once, and the share of its
+    pixels over full well, None in relative units.
+
+    scene, exposure, stage: as of _Recorder.
+    """
+    recorder = _Recorder(sensor, options, scene, exposure, stage)
+    recorder.measure([mosaic])
+    capture = recorder.capture(recorder.band(0, mosaic))
+    return capture, recorder.tally.saturated if recorder.tally.counted else None
 
 
 @dataclass(frozen=True)
@@ -584,58 +920,22 @@ def exposure_scale(
     return ExposureScale(rate * taken, taken)
 
 
-def exposed_capture(
-    sensor: Sensor,
-    mosaic: np.ndarray,
-    exposure: ExposureScale,
-    scene: str,
-    rng: np.random.Generator,
-) -> tuple[Capture, float]:
-    """A capture in digital numbers, and the share of its pixels over full well."""
-    from plenocli.forward.sensor.detector import SensorModel
-
-    scale = exposure.electrons
-    model = SensorModel.of(sensor)
-    if not (mosaic.min() >= 0 and np.isfinite(mosaic).all()):
-        raise InputError(
-            "holds values below 0 or beyond all numbers, which no light has",
-            scene,
-            "clip it (reconstruct --clip), or use --noise none",
-        )
-    values = model.expose(mosaic * scale, rng, exposure.seconds)
-    saturated = float(np.mean(mosaic * scale >= sensor.full_well))
-    if saturated > 0.001:
-        note(
-            f"{saturated:.1%} of the pixels are over full well; a shorter "
-            "--exposure would keep them"
-        )
-    capture = Capture(
-        mosaic=values,
-        cfa=sensor.cfa,
-        levels=Levels(
-            black=np.full((2, 2), float(sensor.black_level)),
-            white=float(model.white_level),
-            gain=sensor.gain,
-        ),
-        exposure_s=exposure.seconds,
-        noise=model.noise(exposure.seconds),
-        metadata=CaptureMetadata(
-            noise_from="camera",
-            electrons_per_unit=scale * (sensor.quantum_efficiency if sensor.cfa == "mono" else 1.0),
-        ),
-    )
-    return capture, saturated
-
-
 def _described(
-    capture: Capture, camera: Camera, truth: np.ndarray, name: str, band_m: float | None
+    capture: Capture,
+    camera: Camera,
+    truth: tuple[int, ...],
+    name: str,
+    band_m: float | None,
 ) -> Capture:
-    """The capture with what later stages need to know beside the mosaic."""
+    """The capture with what later stages need to know beside the mosaic.
+
+    truth: shape (band, row, column) of the object as sampled.
+    """
     from plenocli.forward.sensor.cfa import colour_profile
 
     metadata = replace(
         capture.metadata,
-        scene_shape=tuple(truth.shape[1:]),
+        scene_shape=tuple(truth[1:]),
         target=Path(name).name,
         illuminant=camera.light.illuminant,
         band_m=band_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,26 +64,22 @@ class Noise:
         )
 
 
-def add_white_noise(
-    signal: np.ndarray, snr_db: float, rng: np.random.Generator
-) -> tuple[np.ndarray, Noise]:
-    """Add white Gaussian noise of one sigma to the whole of `signal`; nothing is clipped.
+def white_noise(signals: Iterable[np.ndarray], snr_db: float) -> Noise:
+    """White Gaussian noise of one sigma for the whole of a signal.
 
     sigma^2 = mean(signal^2) 10^(-snr_db/10): the mean of the squares, not the variance, is the
     signal.
-    signal: all superpixels of a capture.
+    signals: all superpixels of a capture, in one part or several.
     snr_db: decibel.
-    rng: source of the noise.
 
-    Returns the noisy signal and its noise.
     Raises NumericsError for a signal that is zero everywhere.
     """
-    signal = np.asarray(signal, float)
-    power = float(np.mean(signal**2))
+    squares = [(float(np.mean(part**2)), part.size) for part in signals]
+    power = sum(mean * size for mean, size in squares) / sum(size for _, size in squares)
+    power = squares[0][0] if len(squares) == 1 else power
     if not power > 0:
         raise NumericsError(
             "a signal-to-noise ratio means nothing for a dark image",
             fix="give more light or no SNR",
         )
-    sigma = float(np.sqrt(power * 10 ** (-snr_db / 10)))
-    return signal + rng.normal(0.0, sigma, signal.shape), Noise.of_sigma(sigma)
+    return Noise.of_sigma(float(np.sqrt(power * 10 ** (-snr_db / 10))))

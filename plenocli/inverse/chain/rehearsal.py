@@ -23,6 +23,7 @@ from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.plan import PifPlan
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.forward.scene.light import Quadrature
+from plenocli.forward.scene.sample import ALL
 from plenocli.forward.scene.scenes import Scene
 from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
 from plenocli.inverse.chain.chains import Inversion, MatrixOption
@@ -49,12 +50,12 @@ class Middle:
         self.scene, self.whole, self.part = scene, whole, part
         self.spectral = scene.spectral
 
-    def at(self, wavelength: float, rows: int, columns: int) -> np.ndarray:
+    def at(self, wavelength: float, rows: int, columns: int, part: slice = ALL) -> np.ndarray:
         """Reflectance (row, column), as it is there in a capture of the whole."""
         fine = (rows // self.part[0], columns // self.part[1])
         picture = self.scene.at(wavelength, self.whole[0] * fine[0], self.whole[1] * fine[1])
         row, column = ((w - p) // 2 * n for w, p, n in zip(self.whole, self.part, fine))
-        return picture[row : row + rows, column : column + columns]
+        return picture[row : row + rows, column : column + columns][part]
 
 
 class Rehearsal:
@@ -107,7 +108,9 @@ class Rehearsal:
             name=name,
         )
         self.data = superpixels(made.capture, self.pilot)
-        self.truth = to_blocks(np.asarray(made.scene[0], float), self.pilot.object_shape)
+        seen = made.in_memory().scene
+        assert isinstance(seen, np.ndarray)
+        self.truth = to_blocks(np.asarray(seen[0], float), self.pilot.object_shape)
         loud = float(np.sqrt(np.mean(np.square(self.data.y))))
         self.noise = self.data.known_sigma / loud
         self._reference = self._isolated("exact", max(finest.accuracy / FINER, FINEST))

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from plenocli.base.tiling import to_plane
+from plenocli.base.tiling import common, to_plane
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse
@@ -79,10 +79,13 @@ def posterior(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> tuple[np.n
         found.T.reshape(rows, columns, -1)
         for found in (lmmse.apply(signals, scale), spread(lmmse, signals, contrast))
     )
-    border = disagreement(x, sigma, shape)
-    return x, sigma * np.exp(
-        BY_WEAK * weak_power(lmmse, signals, scale) + BY_BORDER * (border - USUAL_BORDER)
-    )
+
+    def wider() -> float:
+        border = disagreement(x, sigma, shape)
+        weak = weak_power(lmmse, signals, scale)
+        return float(np.exp(BY_WEAK * weak + BY_BORDER * (border - USUAL_BORDER)))
+
+    return x, sigma * common("wider", wider, mean=True)
 
 
 def spread(lmmse: Lmmse, y: np.ndarray, contrast: np.ndarray) -> np.ndarray:

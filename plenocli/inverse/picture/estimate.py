@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
+from plenocli.base.tiling import common, is_piece
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
 from plenocli.inverse.picture.error_bars import of_picture, posterior
 from plenocli.inverse.picture.estimators import INNER, Estimators
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
-from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.nuisances.clean import Cleaned, clean
 from plenocli.inverse.picture.nuisances.veil import VeilFound
@@ -114,17 +115,18 @@ def estimate(
     """
     if method.sees is Sees.LENSLET_AS_IS:
         bare = clean(estimators, data, look=False)
-        bare.tell()
+        _tell_of(bare)
         data = bare.data
         if data.noise is not None:
             data = replace(data, noise=replace(data.noise, model=model_error))
         found = method.reconstruct(estimators, data, truth)
         return replace(found, trace=(*bare.findings, *found.trace)), None
-    unit = _unit(estimators, data.y)
+    unit = common("unit", lambda: unit_of(estimators.system, data.y))
     estimators, data = _at_unit(estimators, data, unit)
     bare = _cleaned(estimators, data)
-    bare.tell()
-    data, bright = bare.data, _unit(estimators, bare.data.y)
+    _tell_of(bare)
+    data = bare.data
+    bright = common("bright", lambda: unit_of(estimators.system, bare.data.y))
     if abs(bright - 1) > DEFECTIVE:
         estimators, data = _at_unit(estimators, data, bright)
         unit *= bright
@@ -133,9 +135,14 @@ def estimate(
     data = replace(data, noise=Noise.of_sigma(belief.level.sigma))
     looked_through = estimators
     if not belief.right:
-        cause = None if explain is None else explain(settled.own, belief.level.sigma, data.scene)
-        taken_away = estimators.coupled and estimators.overlap == 3
-        _tell(belief, model_error, cause, coupled=taken_away)
+
+        def said() -> None:
+            sigma = belief.level.sigma
+            cause = None if explain is None else explain(settled.own, sigma, data.scene)
+            taken_away = estimators.coupled and estimators.overlap == 3
+            _tell(belief, model_error, cause, coupled=taken_away)
+
+        common("said of the matrix", said)
         rows = belief.lmmse.whitening()
         looked_through, joint = estimators.seen_through(rows), None
         data = replace(data, y=belief.cleared(data.y) @ rows.T)
@@ -155,11 +162,12 @@ def estimate(
         sigma = of_picture(estimators, data, settled.own, found.value)
         found = replace(found, sigma=sigma)
     if kept < 1:
-        note(
+        said_of = (
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
             "lenslet: more of it would not go on across the lenslets' borders"
         )
-    seen = what_is_seen(looked_through, settled.own, belief.lmmse)
+        common("said of the detail", lambda: note(said_of))
+    seen = common("seen", lambda: what_is_seen(looked_through, settled.own, belief.lmmse))
     found = replace(found, trace=(*bare.findings, *found.trace))
     return _in_unit(found, Trusted.of(belief, kept, unit), unit), seen
 
@@ -169,23 +177,39 @@ def _cleaned(estimators: Estimators, data: Superpixels) -> Cleaned:
     like a veil: where the matrix knows it, a veil is believed only if LMMSE over 3x3 lenslets
     leaves less over without it.
     """
-    bare = clean(estimators, data)
-    veiled = any(isinstance(f, VeilFound) and f.removed for f in bare.findings)
-    if not (veiled and estimators.coupled and estimators.overlap == 3):
-        return bare
-    other = clean(estimators, data, veil=False)
-    if data.noise is None:
-        return other
+    tried: list[Cleaned] = []
 
     def left(found: Cleaned) -> float:
         return left_over(estimators, found.data.y, estimate_jointly(estimators, found.data).value)
 
-    return bare if left(bare) < left(other) else other
+    def veil_believed() -> bool:
+        bare = clean(estimators, data)
+        tried.append(bare)
+        veiled = any(isinstance(f, VeilFound) and f.removed for f in bare.findings)
+        if not (veiled and estimators.coupled and estimators.overlap == 3):
+            return True
+        other = clean(estimators, data, veil=False)
+        if data.noise is not None and left(bare) < left(other):
+            return True
+        tried.append(other)
+        return False
+
+    believed = common("veil believed", veil_believed)
+    # of a piece, what is common to all pieces is asked for again
+    return clean(estimators, data, veil=believed) if is_piece() else tried[-1]
 
 
-def _unit(estimators: Estimators, y: np.ndarray) -> float:
-    """What a capture is divided by to have the brightness of photographs; 1 for an empty one."""
-    levels = estimators.system.levels(np.where(np.isfinite(y), y, 0))
+def _tell_of(bare: Cleaned) -> None:
+    """What was found of nuisances; of pieces, whoever puts them together says it."""
+    if not is_piece():
+        bare.tell()
+
+
+def unit_of(system: LensletMatrix, y: np.ndarray) -> float:
+    """What a capture y (lenslet_row, lenslet_column, pixel) is divided by to have the brightness of
+    photographs; 1 for an empty one.
+    """
+    levels = system.levels(np.where(np.isfinite(y), y, 0))
     found = float(np.sqrt(np.mean(levels**2))) / BRIGHTNESS
     return found if found > 0 else 1.0
 
@@ -227,20 +251,26 @@ def _settle(
     given, svd = estimators.options.noise_sigma, estimators.svd
     takes_away = estimators.coupled and estimators.overlap == 3
     plain = estimators.without_stray(data.y) if takes_away else data.y
-    level = noise_level(data.y, given, data.sigma, svd, plain)
+    level = common("noise", lambda: noise_level(data.y, given, data.sigma, svd, plain))
     told = replace(data, noise=Noise.of_sigma(level.sigma))
     if not takes_away:
         jointly = method.makes_joint_estimate(estimators)
         joint = estimate_jointly(estimators, told) if jointly else None
-        belief = believe(estimators, plain, level, data.scene, model_error=model_error)
+        belief = common(
+            "belief",
+            lambda: believe(estimators, plain, level, data.scene, model_error=model_error),
+        )
         return _Settled(belief=belief, own=plain, joint=joint)
     joint = estimate_jointly(estimators, told)
-    left = left_over(estimators, data.y, joint.value)
-    level = replace(level, found=left)
     own = own_light(estimators, data.y, joint.value)
-    inner = own[INNER] if min(own.shape[:2]) > 3 else own
-    belief = believe(estimators, inner, level, data.scene, model_error=model_error, coupled=True)
-    return _Settled(belief=belief, own=own, joint=joint)
+
+    def believed() -> Belief:
+        found = replace(level, found=left_over(estimators, data.y, joint.value))
+        inner = own[INNER] if min(own.shape[:2]) > 3 else own
+        scene = data.scene
+        return believe(estimators, inner, found, scene, model_error=model_error, coupled=True)
+
+    return _Settled(belief=common("belief", believed), own=own, joint=joint)
 
 
 def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: bool) -> None:

@@ -64,11 +64,11 @@ class Estimators:
 
     elsewhere: set to send batches of lenslets to other processes, see `in_batches`.
     trials: PSNR (dB) of each method that was tried, kept for captures to come.
-    through: (rows, what `seen_through` made of them last), for batches to come.
+    through: (rows, what `seen_through` made of them last), for batches and tiles to come.
     """
 
     elsewhere: Elsewhere | None = None
-    through: tuple[np.ndarray, Estimators] | None = None
+    through: list[tuple[np.ndarray, Estimators]]
 
     def __init__(
         self,
@@ -88,6 +88,7 @@ class Estimators:
         self.system, self.options, self.threads = system, options, threads
         self.keep = keep
         self.read_pictures, self.read_dictionary = read_pictures, read_dictionary
+        self.through = []
         self.trials: dict[TrialKey, dict[str, float]] = {}
         self.coupled = len(system.offsets) > 1
         self.overlap = options.overlap or (3 if self.coupled else 1)
@@ -152,12 +153,16 @@ class Estimators:
 
     def seen_through(self, rows: np.ndarray) -> Estimators:
         """The same for superpixels of which only `rows` (row, pixel) are looked at: their noise is
-        white then.
+        white then. What was made last is kept.
         """
+        for known, made in self.through:
+            if np.array_equal(known, rows) and made.options == self.options:
+                return made
         blocks = np.stack([rows @ block for block in self.system.blocks])
         other = self.with_matrix(replace(self.system, blocks=blocks, pixel_shape=(len(rows), 1)))
         if self.elsewhere is not None:
             other.elsewhere = partial(_elsewhere_through, self.elsewhere, rows)
+        self.through[:] = [(rows, other)]
         return other
 
     def sensor(self, count: tuple[int, int]) -> BlockToeplitz:
@@ -214,12 +219,9 @@ def solve_through(
     *options: Any,
 ) -> _Solved:
     """What `solve` gives for a batch of superpixels that are looked at through `rows` (row,
-    pixel); what that takes is kept for the next batch.
+    pixel).
     """
-    known = estimators.through
-    if known is None or not np.array_equal(known[0], rows):
-        known = estimators.through = rows, estimators.seen_through(rows)
-    return solve(known[1], batch, *options)
+    return solve(estimators.seen_through(rows), batch, *options)
 
 
 def root_mean_square(values: np.ndarray) -> float:

@@ -2,7 +2,9 @@
 units.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -115,6 +117,7 @@ class Superpixels:
         does not say.
     variance: like y, of every pixel, inf where it counts for nothing; None where all are alike or
         nothing is known.
+    own: (rows, columns) of a tile, the lenslets that are not there for their neighbours' sake.
     """
 
     y: np.ndarray
@@ -124,6 +127,16 @@ class Superpixels:
     pif_digest: str | None = None
     saturated: np.ndarray | None = None
     variance: np.ndarray | None = None
+    own: tuple[slice, slice] = (slice(None), slice(None))
+
+    def cut(self, rows: slice, columns: slice, own: tuple[slice, slice]) -> Superpixels:
+        """Those of some lenslets, of which `own` count."""
+        saturated, variance = (
+            None if values is None else values[rows, columns]
+            for values in (self.saturated, self.variance)
+        )
+        y = self.y[rows, columns]
+        return replace(self, y=y, saturated=saturated, variance=variance, own=own)
 
     @property
     def sigma(self) -> float | None:

@@ -130,7 +130,7 @@ class Reconstruction(Account):
     """A picture, and how it came about.
 
     value: (lenslet_row, lenslet_column, point); after `as_picture` (row, column) or (band, row,
-        column). Relative to white.
+        column), and InParts of a picture that is put together of tiles. Relative to white.
     sigma: predicted standard deviation, like value, or None.
     """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import note
+from plenocli.base.tiling import InParts
 from plenocli.files.read.scenes import read_polarised, read_scene
 from plenocli.forward.camera.model import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
@@ -88,16 +90,27 @@ def run_capture_sim(
     camera = read_camera(camera_path)
     options = settings.options
     require_tiling(camera, camera_path)
-    require_memory_for(camera, options, camera_path)
+    in_parts = output.suffix == ".h5" and Path(scene_out or "").suffix != ".exr"
+    polarised = settings.polarisation is not None
+    require_memory_for(camera, options, camera_path, in_parts=in_parts, polarised=polarised)
     source, what = _source(camera, settings, scene)
-    found = dark_capture(camera, options) if settings.target == "dark" and not pif else None
+    found = None
+    if settings.target == "dark" and not pif:
+        found = dark_capture(camera, options, in_parts=in_parts)
     accuracy: dict[str, Any] = {}
     if found is None:
         matrices, accuracy = _matrices(pif, camera, settings, source.wavelengths, camera_path)
         _tell_of_the_field(AccuracyRecord.from_json(accuracy))
         name, band = settings.target or str(scene), _band(settings.target)
         found = simulate_capture(
-            camera, source, what, options, matrices=matrices, name=name, band_m=band
+            camera,
+            source,
+            what,
+            options,
+            matrices=matrices,
+            name=name,
+            band_m=band,
+            in_parts=in_parts,
         )
     provenance = Provenance(
         command=command,
@@ -207,7 +220,7 @@ def _check_outputs(
 
 def _summary(output: Path, found: SimulatedCapture, wavelengths: int) -> CaptureSummary:
     capture, relative = found.capture, found.saturated is None
-    peak = capture.mosaic.max()
+    peak = found.tally.peak
     return CaptureSummary(
         output=output,
         rows=capture.shape[0],
@@ -383,7 +396,7 @@ def _read_pif(
 
 def _write_scene(
     path: str | Path,
-    truth: np.ndarray,
+    truth: np.ndarray | InParts,
     wavelengths: np.ndarray,
     provenance: Provenance,
     overwrite: bool,
@@ -397,16 +410,21 @@ def _write_scene(
     from plenocli.files.images.spectral_exr import write_spectral_exr
 
     texts, path = provenance_texts(provenance), Path(path)
-    if path.suffix == ".exr" and len(truth) == 1:
+    count = truth.shape[0]
+    if path.suffix == ".exr" and not isinstance(truth, InParts) and count == 1:
         write_exr(path, {"Y": truth[0]}, texts, overwrite=overwrite)
-    elif path.suffix == ".exr":
+    elif path.suffix == ".exr" and not isinstance(truth, InParts):
         write_spectral_exr(
             path, wavelengths, truth, "reflectance", attrs=texts, overwrite=overwrite
         )
     else:
+        if isinstance(truth, InParts):
+            one: Any = replace(truth, shape=truth.shape[-2:])
+        else:
+            one = truth[0]
         data = (
-            {"image/value": truth[0]}
-            if len(truth) == 1
+            {"image/value": one}
+            if count == 1
             else {"image/value": truth, "image/wavelength": wavelengths}
         )
         attrs = {"image": {"method": "object as sampled"}}

@@ -345,15 +345,9 @@ def _detected(
     camera: Microscope | Camera, light: np.ndarray, settings: Settings, name: str
 ) -> tuple[Capture, float | None]:
     """What the sensor reports, and the share of its pixels over full well."""
-    from plenocli.base.random_streams import stream
     from plenocli.base.tiling import to_plane
     from plenocli.forward.sensor.capture import SuperpixelGrid
-    from plenocli.forward.sensor.exposure import (
-        WHITE_LEVEL,
-        ExposureScale,
-        exposed_capture,
-        relative_capture,
-    )
+    from plenocli.forward.sensor.exposure import WHITE_LEVEL, ExposureScale, recorded
 
     sensor = camera.sensor
     if not light.any():
@@ -362,16 +356,14 @@ def _detected(
         )
     # rounding of transforms leaves dark pixels below zero
     mosaic = to_plane(np.maximum(light, 0), sensor.pixels_per_lenslet) * sensor.quantum_efficiency
-    rng = stream(settings.seed, "capture-sim of a volume")
-    saturated = None
-    if settings.snr_db is not None or settings.noise == "none":
-        capture = relative_capture(sensor, mosaic, settings.options, rng)
-    else:
+    scale = None
+    if settings.snr_db is None and settings.noise != "none":
         usual = camera.light.white_exposure
         seconds = settings.exposure or sensor.exposure or usual
         full = WHITE_LEVEL * sensor.full_well / float(mosaic.max())
         scale = ExposureScale(full * seconds / usual, seconds)
-        capture, saturated = exposed_capture(sensor, mosaic, scale, name, rng)
+    stage = "capture-sim of a volume"
+    capture, saturated = recorded(sensor, mosaic, settings.options, name, scale, stage)
     grid = SuperpixelGrid.tiled(camera.lenslet_array.count, sensor.pixels_per_lenslet)
     about = replace(capture.metadata, target=Path(name).name)
     return replace(capture, grid=grid, metadata=about), saturated

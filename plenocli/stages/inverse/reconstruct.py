@@ -4,7 +4,7 @@ neighbours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -14,15 +14,16 @@ import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import bar, collected_notes, note
-from plenocli.base.tiling import to_blocks
+from plenocli.base.tiling import InParts, Whole, to_blocks
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
-from plenocli.execution.pool import InProcess, absolute, open_pool, run_all
+from plenocli.execution.pool import InProcess, Pool, absolute, open_pool, run_all
+from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.kept import kept
 from plenocli.files.read.captures import (
     describe_capture,
     named_captures,
-    read_superpixels,
     read_white,
+    superpixel_source,
 )
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import (
@@ -41,8 +42,20 @@ from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
+from plenocli.inverse.picture.tiles import (
+    EVERY,
+    NUISANCES,
+    Source,
+    Tile,
+    joined,
+    side_of,
+    spread_over,
+    survey,
+    tiles_of,
+)
 from plenocli.stages.inverse.field_classes import estimate_by_class
 from plenocli.stages.inverse.fitted_matrix import likely_cause, with_fitted_camera
+from plenocli.stages.inverse.tiles import Bench, SolvedTile, picture, solve_all
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -122,6 +135,7 @@ class Solved:
     seen: what of an object the sensor tells apart, None where the noise is not known.
     limits: what limits it, None where that is not known.
     negative_share: of the values, before they are clipped.
+    bench: of the tiles that it consists of, None where it is in memory.
     block: points (rows, columns) of an object, None without a system matrix.
     bands: wavelengths (m) of the bands, () for one picture.
     rgb: (3, row, column) linear sRGB of a capture whose pixels have colours; None of others.
@@ -134,6 +148,7 @@ class Solved:
     block: tuple[int, int] | None = None
     bands: tuple[float, ...] = ()
     rgb: np.ndarray | None = None
+    bench: Bench | None = None
 
     def summary(self, output: Path, *, clipped: bool) -> PictureSummary:
         """What there is to tell of it once it is written to `output`."""
@@ -268,7 +283,8 @@ def run_reconstruct(
     batch = plan_batch(captures, output, suffix, "a picture is", overwrite=overwrite, inputs=inputs)
     if not batch.todo:
         return _summary(summarise(batch, ()))
-    split = not batch.several and METHODS[settings.method].in_batches
+    method = METHODS[settings.method]
+    split = not batch.several and (method.in_batches or method.in_tiles)
     workers = settings.workers if split else min(settings.workers, len(batch.todo))
     pooled = scheduler is not None or workers > 1
     recipe = _recipe(settings, pif, calibration, pooled, elsewhere=scheduler is not None)
@@ -281,9 +297,13 @@ def run_reconstruct(
         if pif:  # a broken one ends the run here, before any capture
             _estimators(recipe) if split or not pooled else _system(recipe)
         with open_pool(workers, scheduler) as pool:
-            if split and pooled:
+            if split and pooled and pif:
                 _estimators(recipe).elsewhere = partial(_solve_in_pool, recipe, pool)
-            work = partial(reconstruct_capture, recipe)
+            tasks = pool if split else InProcess()
+            targets = dict(batch.todo)
+            work = partial(reconstruct_capture, recipe, pool=tasks, targets=targets)
+            if not split and pooled:  # whose tasks hold no pool
+                work = partial(reconstruct_capture, recipe, targets=targets, far=pool.far)
             done = outcomes(batch, InProcess() if split else pool, work, write)
             return _summary(summarise(batch, done))
     finally:
@@ -449,8 +469,20 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
             )
 
 
-def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
-    """The picture of one capture; what many captures need is made once a process."""
+def reconstruct_capture(
+    recipe: Recipe,
+    capture: Path,
+    *,
+    targets: Mapping[Path, Path],
+    pool: Pool | None = None,
+    far: bool = False,
+) -> Solved:
+    """The picture of one capture; what many captures need is made once a process.
+
+    targets: by the captures, the files beside which tiles may lie.
+    pool: for tiles, None for this process.
+    far: whether what lies there is not found by who writes the result.
+    """
     settings = recipe.settings
     if recipe.pif is None and recipe.calibration is not None:
         choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
@@ -459,7 +491,15 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
         return _solved(found, settings, rgb=rgb)
     estimators, method = _estimators(recipe), METHODS[settings.method]
     system = estimators.system
-    data = read_superpixels(capture, system, recipe.calibration, each_pixel=method.each_pixel)
+    with superpixel_source(
+        capture, system, recipe.calibration, each_pixel=method.each_pixel
+    ) as source:
+        tiles = tiles_of(estimators, method, source.count)
+        apart = len(tiles) > 1 and not settings.fit and settings.truth is None
+        if apart and _field(recipe) is None and capture in targets and not far:
+            target = targets[capture]
+            return _in_tiles(recipe, capture, source, tiles, pool or InProcess(), target)
+        data = source.cut(*EVERY)
     look = method.sees is not Sees.LENSLET_AS_IS
     require_reconstruction(
         estimators,
@@ -496,6 +536,111 @@ def reconstruct_capture(recipe: Recipe, capture: Path) -> Solved:
     )
 
 
+def _in_tiles(
+    recipe: Recipe,
+    capture: Path,
+    source: Source,
+    tiles: Sequence[Tile],
+    pool: Pool,
+    target: Path,
+) -> Solved:
+    """The picture of a capture that is larger than a tile."""
+    settings, estimators = recipe.settings, _estimators(recipe)
+    method, system = METHODS[settings.method], estimators.system
+    look = method.sees is not Sees.LENSLET_AS_IS
+    whole, middle = survey(system, source, side_of(system))
+    data = source.cut(*middle.own)
+    most = max(tiles, key=lambda t: np.prod([p.stop - p.start for p in t.around]))
+    require_reconstruction(
+        estimators,
+        source.cut(*most.around),
+        capture,
+        cleaned(method.phases) if look else method.phases,
+        joint=method.makes_joint_estimate(estimators),
+    )
+    limits, finer = _limits(estimators, data), False
+    if look and limits is not None and limits.limited_by == "model":
+        better = _finer(recipe)
+        finer, estimators = better is not None, better or estimators
+        limits = _limits(estimators, data)
+    task = _TileTask(
+        recipe=recipe, capture=capture, finer=finer, model_error=_off(limits), whole=whole
+    )
+    others = spread_over(source.count, side_of(system))
+    sample, seen, task = task.sample(estimators, source, middle, others)
+    depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
+    bench = Bench.beside(target, depends)
+    clip = partial(np.maximum, 0) if settings.clip else np.asarray
+    solve_all(pool, task, tiles, bench, clip)
+    value, sigma, counted = picture(bench, tiles, system.object_shape, max(1, len(system.bands)))
+    size = source.count[0] * source.count[1] * system.own.shape[0]
+    declared = data.saturated is not None
+    parts: dict[str, Any] = {"value": value, "sigma": sigma}
+    trace = joined(sample, counted[1:], size, declared=declared)
+    for entry in trace:
+        if isinstance(entry, NUISANCES) and entry.found:
+            note(entry.sentence)
+    return Solved(
+        found=replace(sample, trace=trace, **parts),
+        seen=seen,
+        limits=limits,
+        negative_share=float(counted[0]) / np.prod(value.shape),
+        block=system.object_shape,
+        bands=system.bands,
+        bench=bench,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TileTask:
+    """The task of a tile, in any process; what they share is made once a process.
+
+    finer: whether by a finer matrix of the camera.
+    model_error: of the matrix, see estimate.
+    whole: what is known of the capture.
+    """
+
+    recipe: Recipe
+    capture: Path
+    finer: bool
+    model_error: float
+    whole: Whole
+
+    def sample(
+        self, estimators: Estimators, source: Source, like: Tile, others: Sequence[Tile]
+    ) -> tuple[Reconstruction, Seen | None, _TileTask]:
+        """(the picture of `like`, the piece that stands for the whole, what is seen in it, the task
+        that knows the whole): numbers are means over `others`, too.
+        """
+        method = METHODS[self.recipe.settings.method]
+        cause = partial(likely_cause, estimators)
+        off, whole = self.model_error, self.whole
+        with whole.worked_out():
+            data = source.cut(*like.around)
+            found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
+        beside: list[dict[str, list[Any]]] = []
+        for piece in others:
+            beside.append({})
+            with whole.compared(beside[-1]), collected_notes():
+                estimate(estimators, method, source.cut(*piece.around), model_error=off)
+        return found, seen, replace(self, whole=whole.averaged(beside))
+
+    def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
+        """A tile; what there is to say was said of the whole."""
+        tile, recipe = job[1], self.recipe
+        estimators = (_finer(recipe) if self.finer else None) or _estimators(recipe)
+        method = METHODS[recipe.settings.method]
+        with collected_notes():
+            with superpixel_source(
+                self.capture, estimators.system, recipe.calibration, verify=False
+            ) as source:
+                data = source.cut(*tile.around, tile.within)
+            with self.whole.taken_over():
+                found, _ = estimate(estimators, method, data, model_error=self.model_error)
+        sigma = None if found.sigma is None else found.sigma[tile.within]
+        return SolvedTile(value=found.value[tile.within], sigma=sigma, trace=found.trace)
+
+
 def _estimate(
     field: FieldMatrix | None,
     estimators: Estimators,
@@ -505,7 +650,7 @@ def _estimate(
     limits: Limits | None,
 ) -> tuple[Reconstruction, Seen | None]:
     """The picture by one matrix, or by those of a whole array."""
-    off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+    off = _off(limits)
     if field is None:
         cause = partial(likely_cause, estimators)
         return estimate(estimators, method, data, truth, model_error=off, explain=cause)
@@ -521,6 +666,11 @@ def _estimate(
     )
 
 
+def _off(limits: Limits | None) -> float:
+    """Error of the matrix that counts beside the noise."""
+    return 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+
+
 def _solved(found: Reconstruction, settings: Settings, **more: Any) -> Solved:
     picture = found.value
     return Solved(
@@ -534,7 +684,6 @@ def _limits(estimators: Estimators, data: Superpixels) -> Limits | None:
     """Whether the capture's noise or the error of the matrix decides, by their records; None where
     that is not known.
     """
-    from plenocli.files.artefacts.provenance import file_digest
     from plenocli.forward.accuracy.limiting_error import what_limits
 
     system, sigma = estimators.system, estimators.options.noise_sigma or data.sigma
@@ -654,6 +803,8 @@ def _write(
     summary = solved.summary(target, clipped=settings.clip)
     write = _write_exr if target.suffix == ".exr" else _write_artefact
     write(target, solved, summary, provenance, overwrite)
+    if solved.bench is not None:
+        solved.bench.remove()
     return summary
 
 
@@ -664,7 +815,7 @@ def _write_exr(
     from plenocli.files.images.exr import write_exr
     from plenocli.files.images.spectral_exr import write_spectral_exr
 
-    picture, sigma = solved.found.value, solved.found.sigma
+    picture, sigma = _in_memory(solved.found.value), _in_memory(solved.found.sigma)
     attrs = {"method": solved.found.method} | provenance_texts(provenance)
     if picture.ndim == 3:
         write_spectral_exr(
@@ -677,6 +828,10 @@ def _write_exr(
         write_exr(target, channels, attrs, overwrite=overwrite)
 
 
+def _in_memory(values: Any) -> Any:
+    return values.whole() if isinstance(values, InParts) else values
+
+
 def _write_artefact(
     target: Path, solved: Solved, summary: PictureSummary, provenance: Provenance, overwrite: bool
 ) -> None:
@@ -686,7 +841,7 @@ def _write_artefact(
     data = {"image/value": picture}
     data |= {} if sigma is None else {"image/sigma": sigma}
     data |= {} if solved.seen is None else {"image/seen": solved.seen.by_point}
-    data |= {"image/wavelength": np.array(solved.bands)} if picture.ndim == 3 else {}
+    data |= {"image/wavelength": np.array(solved.bands)} if len(picture.shape) == 3 else {}
     data |= {} if solved.rgb is None else {"image/rgb": solved.rgb}
     attrs: dict[str, Any] = {
         "method": solved.found.method,

@@ -84,6 +84,8 @@ class Method(ABC):
     hindsight: whether the truth may choose its weight.
     each_pixel: whether every pixel counts by its own noise.
     in_batches: whether its lenslets are solved in batches, which processes may share.
+    in_tiles: whether large captures may be estimated tile by tile.
+    points_around: of a method that sees the whole picture, how far a point looks.
     """
 
     name: str
@@ -95,6 +97,8 @@ class Method(ABC):
     hindsight: bool = False
     each_pixel: bool = False
     in_batches: bool = False
+    in_tiles: bool = True
+    points_around: int = 0
 
     def makes_joint_estimate(self, estimators: Estimators) -> bool:
         """Whether LMMSE over 3x3 lenslets is made, before the method or instead of it."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
+from plenocli.base.tiling import common
 from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
@@ -131,7 +132,8 @@ def tikhonov(
     if alpha is None and truth is not None:
         alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
     elif alpha is None:
-        alpha, rule = least_squares.discrepancy_alpha(svd, z, sigma), "discrepancy"
+        alpha = common("alpha", lambda: least_squares.discrepancy_alpha(svd, z, sigma), mean=True)
+        rule = "discrepancy"
     return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
 
@@ -144,7 +146,8 @@ def tsvd(
     if rank is None and truth is not None:
         rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
     elif rank is None:
-        rank, rule = least_squares.best_rank(svd, z, sigma), "least estimated error"
+        rank = common("rank", lambda: least_squares.best_rank(svd, z, sigma))
+        rule = "least estimated error"
     rank = min(rank, svd.rank())
     return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
 

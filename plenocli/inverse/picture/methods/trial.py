@@ -17,7 +17,7 @@ import numpy as np
 
 from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
-from plenocli.base.tiling import to_blocks
+from plenocli.base.tiling import common, to_blocks
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, TrialKey
@@ -62,8 +62,17 @@ class Trial(Method):
         joint: JointEstimate | None = None,
     ) -> Reconstruction:
         """As in Method, by the method that does best in the trial."""
-        method, choice = self.choose(estimators, data)
+        name, choice = common("method", lambda: self._chosen(estimators, data))
+        method = self._by_name[name]
         return method.reconstruct(estimators, data, truth, choice, joint)
+
+    @property
+    def _by_name(self) -> dict[str, Method]:
+        return {m.name: m for m in (self.fallback, *self.others, self.with_dictionary)}
+
+    def _chosen(self, estimators: Estimators, data: Superpixels) -> tuple[str, Choice]:
+        method, choice = self.choose(estimators, data)
+        return method.name, choice
 
     def choose(self, estimators: Estimators, data: Superpixels) -> tuple[Method, Choice]:
         """The best method for a capture, and why; trials are kept for captures to come."""
@@ -79,8 +88,7 @@ class Trial(Method):
                 method=self.fallback.name,
                 reason="the training pictures are too small for a trial of others",
             )
-        methods = {m.name: m for m in (self.fallback, *self.others, self.with_dictionary)}
-        best = methods[max(quality, key=lambda name: quality[name])]
+        best = self._by_name[max(quality, key=lambda name: quality[name])]
         rule = "best"
         if best is self.fallback:
             close = max(self.others, key=lambda m: quality[m.name])
@@ -197,6 +205,7 @@ AUTO = Trial(
     phases=_phases,
     needs_pif=False,
     options=("dictionary",),
+    points_around=PNP.points_around,
     fallback=LMMSE,
     others=(PNP,),
     with_dictionary=DICTIONARY,

@@ -179,5 +179,6 @@ WEIGHTED = Estimator(
     phases=weighted_phases,
     options=("hold_out",),
     each_pixel=True,
+    in_tiles=False,
     estimate=weighted,
 )

@@ -5,12 +5,14 @@ veil, and what was found. All methods see the same data, so all profit.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import note
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.joint import own_light
 from plenocli.inverse.picture.lenslet_model import Superpixels
@@ -93,20 +95,25 @@ def clean(
     y = data.y.reshape(-1, data.y.shape[2])
     unknown = ~np.isfinite(y)
     blind = unknown.mean(axis=1) > BLIND
-    known = int(np.count_nonzero(unknown & ~blind[:, None]))
+    counted = np.zeros(data.y.shape[:2], bool)
+    counted[data.own] = True
+    own = counted.ravel()
+    known = int(np.count_nonzero((unknown & ~blind[:, None])[own]))
     filled = replace(data, y=_filled(estimators, y, unknown, blind).reshape(data.y.shape))
     declared = data.saturated is not None
     clipped = data.saturated if data.saturated is not None else piled_up(data.y)
     clipped = np.zeros(y.shape, bool) if clipped is None else clipped.reshape(y.shape)
-    bare = Cleaned(filled, (*_known_before(known, y.size), *saturation(clipped, declared=declared)))
+    before = _known_before(known, own.sum() * y.shape[1])
+    bare = Cleaned(filled, (*before, *saturation(clipped[own], declared=declared)))
     if not look or blind.all() or not filled.y.any():
         return bare
     try:
-        sigma = _noise(estimators, filled)
+        sigma = common("pixel noise", lambda: _noise(estimators, filled))
         lmmse = estimators.prior.lmmse(sigma, data.scene)
     except PlenoError:  # the method itself will say so, where it needs them
         return bare
-    model = PixelModel.of(lmmse, max(sigma, LEAST_NOISE * root_mean_square(filled.y)))
+    loud = common("signal", lambda: root_mean_square(filled.y))
+    model = PixelModel.of(lmmse, max(sigma, LEAST_NOISE * loud))
     task = _Task(
         estimators=estimators,
         lmmse=lmmse,
@@ -114,6 +121,7 @@ def clean(
         unknown=unknown,
         blind=blind,
         inner=_inner(data.y.shape[:2]),
+        counted=own,
         clipped=clipped & ~unknown,
         declared=declared,
         veil=veil,
@@ -189,7 +197,8 @@ class _Task:
     """What is looked for, and with what.
 
     unknown, clipped: (lenslet, pixel).
-    blind, inner: (lenslet,), those given up, and those that have all their neighbours.
+    blind, inner, counted: (lenslet,), those given up, those that have all their neighbours, and
+        those that findings count.
     declared: whether the capture says where its sensor saturates.
     veil: whether one is looked for.
     """
@@ -200,6 +209,7 @@ class _Task:
     unknown: np.ndarray
     blind: np.ndarray
     inner: np.ndarray
+    counted: np.ndarray
     clipped: np.ndarray
     declared: bool
     veil: bool = True
@@ -232,17 +242,21 @@ class _Task:
         out = y.reshape(-1, shape[2]) - 0.0
         out[seen] += (better - own).T
         out[self.blind] = 0.0
+        counted = self.counted[seen]
+        sign, clipped = sign[:, counted], clipped[:, counted]
         findings: list[Finding] = [
             DefectsFound(
                 dark=int(np.count_nonzero(sign < 0)),
                 bright=int(np.count_nonzero(sign > 0)),
-                known=int(np.count_nonzero(unknown)),
-                pixels=self.unknown.size,
+                known=int(np.count_nonzero(unknown[:, counted])),
+                pixels=int(self.counted.sum()) * self.unknown.shape[1],
             )
         ]
         findings += [] if veil is None else [veil]
         if clipped.any():
-            raised = np.mean((better - own + light)[clipped]) / np.mean(np.abs(own[clipped]))
+            own = own[:, counted]
+            rise = (better[:, counted] - own + light[counted])[clipped]
+            raised = np.mean(rise) / np.mean(np.abs(own[clipped]))
             findings += saturation(clipped.T, declared=self.declared, raised=float(raised))
         return _Found(out.reshape(shape), tuple(findings))
 
@@ -256,12 +270,15 @@ class _Task:
             return own
         for _ in range(STRAY_ROUNDS):
             stacked = own.reshape(-1, own.shape[2]).T
-            misfit = np.median(by_lenslet(np.abs(deviation(self.model, stacked))))
+            misfit = common("misfit", partial(self._misfit, stacked))
             # with the noise that is left the estimate does not amplify it
-            lmmse = replace(self.lmmse, sigma=self.model.sigma * max(1.0, float(misfit)))
+            lmmse = replace(self.lmmse, sigma=self.model.sigma * max(1.0, misfit))
             x = lmmse.apply(stacked, lmmse.scales(stacked))
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
+
+    def _misfit(self, stacked: np.ndarray) -> float:
+        return float(np.median(by_lenslet(np.abs(deviation(self.model, stacked)))))
 
     def _veil(
         self, y: np.ndarray, guessed: np.ndarray, stray: float
@@ -288,8 +305,11 @@ def _uncensored(
     """y (pixel, signal) with lost and clipped pixels imputed; a brightness that nothing else tells
     is about that of the other lenslets.
     """
-    brightness = model.free.T @ np.where(lost, 0.0, y)
-    model = replace(model, free_variance=float(np.mean(brightness**2)))
+
+    def variance() -> float:
+        return float(np.mean((model.free.T @ np.where(lost, 0.0, y)) ** 2))
+
+    model = replace(model, free_variance=common("brightness", variance))
     y = y.copy()
     for column in np.flatnonzero((lost | clipped).any(axis=0)):
         y[:, column] = censored(model, y[:, column], clipped[:, column], lost[:, column])

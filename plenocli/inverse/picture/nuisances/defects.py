@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
 FAR = 7.0
@@ -87,13 +88,17 @@ class Spread:
         from scipy.ndimage import median_filter
 
         count = y.shape[1]
-        some = np.unique(np.linspace(0, count - 1, min(count, TYPICAL)).round().astype(int))
-        far = np.concatenate(
-            [np.abs(deviation(model, y[:, some[part]])) for part in chunks(len(some))], axis=1
-        )
-        far /= by_lenslet(far)
-        middle = NORMAL * np.median(far, axis=1).reshape(shape)
-        return cls(median_filter(middle, AROUND, mode="nearest").ravel())
+
+        def measured() -> np.ndarray:
+            some = np.unique(np.linspace(0, count - 1, min(count, TYPICAL)).round().astype(int))
+            far = np.concatenate(
+                [np.abs(deviation(model, y[:, some[part]])) for part in chunks(len(some))], axis=1
+            )
+            far /= by_lenslet(far)
+            middle = NORMAL * np.median(far, axis=1).reshape(shape)
+            return median_filter(middle, AROUND, mode="nearest").ravel()
+
+        return cls(common("spread", measured))
 
     def over(self, far: np.ndarray) -> np.ndarray:
         """Deviations (pixel, signal) over those of good pixels."""

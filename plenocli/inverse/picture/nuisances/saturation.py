@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.nuisances.pixel_model import AtContrast, PixelModel
 
 ROUNDS = 30
@@ -88,6 +89,12 @@ def piled_up(y: np.ndarray) -> np.ndarray | None:
     """Which pixels of y (any shape) were clipped although nobody says so, or None: those at the
     largest value, where it is that of far more pixels than the next one.
     """
+    level = common("clipped", lambda: _piled_up(y))
+    return None if level is None else y == level
+
+
+def _piled_up(y: np.ndarray) -> float | None:
+    """The level at which y was clipped, None where it was not."""
     known = y[np.isfinite(y)]
     if not known.size:
         return None
@@ -97,7 +104,7 @@ def piled_up(y: np.ndarray) -> np.ndarray | None:
         return None
     lower = known[known < largest]
     at_next = int(np.count_nonzero(lower == lower.max())) if lower.size else known.size
-    return y == largest if at_largest >= PILE * at_next else None
+    return float(largest) if at_largest >= PILE * at_next else None
 
 
 def censored(model: PixelModel, y: np.ndarray, clipped: np.ndarray, lost: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
@@ -106,9 +107,23 @@ def find_veil(
     take away, (signal,)).
     """
     found, nothing = _offsets(model, y), np.zeros(y.shape[1])
+    veil, extra = common("veil", lambda: _common_veil(model, y, found, unsure))
+    if veil is None or not veil.removed:
+        return veil, nothing
+    told = np.isfinite(found.variance)
+    own = np.full(y.shape[1], veil.level)
+    value, variance = found.value[told], found.variance[told]
+    own[told] += extra / (extra + variance) * (value - veil.level)
+    return veil, own
+
+
+def _common_veil(
+    model: PixelModel, y: np.ndarray, found: _Offsets, unsure: float
+) -> tuple[VeilFound | None, float]:
+    """(the even light, None where it cannot be told; variance of the lenslets' own about it)."""
     told = np.isfinite(found.variance)
     if not told.any():
-        return None, nothing
+        return None, 0.0
     value, variance = found.value[told], found.variance[told]
     line, extra = _straight_line(value, found.brightness[told]), 0.0
     if np.median(found.misfit) > EXPLAINED or line.falls:
@@ -125,11 +140,7 @@ def find_veil(
         mean=float(np.mean(y)) - level,
         removed=bool(removed),
     )
-    if not removed:
-        return told_of, nothing
-    own = np.full(y.shape[1], level)
-    own[told] += extra / (extra + variance) * (value - level)
-    return told_of, own
+    return told_of, extra
 
 
 def _possible(level: float, y: np.ndarray, sigma: float) -> bool:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import require_noise
 
@@ -77,7 +78,7 @@ class JointLmmse:
             for k, scale in enumerate(CONTRASTS):
                 expected = scale * power + 1
                 likelihood[k][group.at] = -0.5 * (np.log(expected).sum() + (1 / expected) @ seen**2)
-        share = _posterior(likelihood)
+        share = _posterior(likelihood, f"joint contrast {float(np.trace(self.data))!r}")
         x, sigma = np.empty((2, *y.shape[:2], len(self.variance)))
         for group, (power, gain, seen) in zip(groups, turned):
             shares = share[:, group.at[0], group.at[1]]
@@ -144,22 +145,29 @@ class _Alike:
     z: np.ndarray
 
 
-def _posterior(likelihood: np.ndarray) -> np.ndarray:
+def _posterior(likelihood: np.ndarray, name: str) -> np.ndarray:
     """Share of each of CONTRASTS at each lenslet, (scale, lenslet_row, lenslet_column).
 
     likelihood: its logarithm, alike.
+    name: of what is common to all lenslets.
     """
-    logs = np.log(CONTRASTS)
     likelihood = np.exp(likelihood - likelihood.max(axis=0))
-    prior = np.full(len(logs), 1 / len(logs))
-    for _ in range(ROUNDS):
+
+    def given(prior: np.ndarray) -> np.ndarray:
         share = likelihood * prior[:, None, None]
         share /= share.sum(axis=0)
-        prior = share.mean(axis=(1, 2))
-        middle = prior @ logs
-        deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
-        prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-    return share
+        return share
+
+    def fitted() -> np.ndarray:
+        logs, prior = np.log(CONTRASTS), np.full(len(CONTRASTS), 1 / len(CONTRASTS))
+        for _ in range(ROUNDS - 1):
+            prior = given(prior).mean(axis=(1, 2))
+            middle = prior @ logs
+            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
+            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+        return prior
+
+    return given(common(name, fitted, mean=True))
 
 
 def prepare_joint(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.solvers.least_squares import Svd
 
 SCALES = np.geomspace(1e-3, 30, 60)
@@ -139,15 +140,23 @@ class Lmmse:
         """
         likelihood = self._likelihood(self.coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
-        logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
-        for _ in range(ROUNDS):
+
+        def given(prior: np.ndarray) -> np.ndarray:
             posterior = likelihood * prior[:, None]
             posterior /= posterior.sum(axis=0)
-            prior = posterior.mean(axis=1)
-            middle = prior @ logs
-            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
-            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-        return posterior
+            return posterior
+
+        def fitted() -> np.ndarray:
+            logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
+            for _ in range(ROUNDS - 1):
+                prior = given(prior).mean(axis=1)
+                middle = prior @ logs
+                deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
+                prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+            return prior
+
+        name = f"contrast {self.sigma!r} {float(self.noise.sum())!r}"
+        return given(common(name, fitted, mean=True))
 
     def degrees(self, y: np.ndarray) -> float:
         """Degrees of freedom that the estimate has of an object, the mean over the signals: the

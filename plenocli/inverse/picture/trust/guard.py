@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from plenocli.base.tiling import common
 from plenocli.inverse.picture.error_bars import about
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.trust.believe import CHANCE, CONTINUOUS, Belief
@@ -47,7 +48,7 @@ def guarded(
     """
     lmmse, stacked = belief.lmmse, y.reshape(-1, y.shape[-1]).T
     mean = (lmmse.even @ (lmmse.levels @ stacked)).T.reshape(found.value.shape)
-    kept = detail_kept(found.value, mean, belief, shape)
+    kept = common("kept", lambda: detail_kept(found.value, mean, belief, shape))
     if kept == 1:
         return found, kept
     drawn = mean + kept * (found.value - mean)

@@ -1,0 +1,165 @@
+"""reconstruct, tile by tile: finished tiles lie beside the result until that is written, so that a
+run that was killed goes on from them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plenocli import __version__
+from plenocli.base.errors import OutputError, PlenoError
+from plenocli.base.progress import bar
+from plenocli.base.tiling import InParts, to_plane
+from plenocli.execution.pool import Pool, run_all
+from plenocli.files.kept import read_arrays, write_arrays
+from plenocli.inverse.picture.reconstruction import Entry
+from plenocli.inverse.picture.tiles import Tile, counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolvedTile:
+    """What a tile's own lenslets show.
+
+    value, sigma: (lenslet_row, lenslet_column, point), sigma None where the method knows none.
+    trace: what was found in it.
+    """
+
+    value: np.ndarray
+    sigma: np.ndarray | None
+    trace: tuple[Entry, ...]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A folder of finished tiles, which lies beside the result and has a name of all that they
+    depend on.
+    """
+
+    folder: Path
+
+    @classmethod
+    def beside(cls, target: Path, depends: Any) -> Bench:
+        """That of the result `target`; those of other runs towards it go.
+
+        depends: all that tiles depend on, beside the code; its repr counts.
+
+        Raises OutputError where it cannot be made.
+        """
+        digest = hashlib.sha256(f"{__version__} {depends!r}".encode()).hexdigest()[:16]
+        folder = target.with_name(f".{target.name}.{digest}.tiles")
+        for other in target.parent.glob(f".{target.name}.*.tiles"):
+            if other != folder:
+                shutil.rmtree(other, ignore_errors=True)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"the folder of its tiles cannot be made ({error.strerror})", target
+            ) from error
+        return cls(folder)
+
+    def path(self, number: int) -> Path:
+        """Of a tile's file."""
+        return self.folder / f"{number:06d}"
+
+    def has(self, number: int) -> bool:
+        """Whether a tile is finished."""
+        return read_arrays(self.path(number)) is not None
+
+    def put(self, number: int, arrays: Sequence[np.ndarray]) -> None:
+        """Keep a finished tile."""
+        write_arrays(self.path(number), tuple(np.ascontiguousarray(a, float) for a in arrays))
+
+    def remove(self) -> None:
+        """Its tiles are no longer needed."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class PlaneOfTiles:
+    """The rows of a picture whose tiles are finished; see InParts.
+
+    bench: where they are.
+    tiles: all of them, row by row.
+    which: of the arrays of a tile.
+    shape: points (rows, columns) of an object in one band.
+    bands: of the picture.
+    """
+
+    bench: Bench
+    tiles: tuple[Tile, ...]
+    which: int
+    shape: tuple[int, int]
+    bands: int
+
+    def __call__(self) -> Iterator[np.ndarray]:
+        rows: dict[int, list[int]] = {}
+        for number, tile in enumerate(self.tiles):
+            rows.setdefault(tile.own[0].start, []).append(number)
+        size = self.shape[0] * self.shape[1]
+        for band in range(self.bands):
+            part = slice(band * size, (band + 1) * size)
+            for numbers in rows.values():
+                planes = [to_plane(self._read(n)[:, :, part], self.shape) for n in numbers]
+                yield np.concatenate(planes, axis=1)
+
+    def _read(self, number: int) -> np.ndarray:
+        arrays = read_arrays(self.bench.path(number))
+        if arrays is None:
+            raise OutputError("a finished tile is gone or damaged", self.bench.folder, "run again")
+        return arrays[self.which]
+
+
+def solve_all(
+    pool: Pool,
+    task: Callable[[tuple[int, Tile]], SolvedTile],
+    tiles: Sequence[Tile],
+    bench: Bench,
+    finish: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """Solve the tiles that are not finished; the first PlenoError is raised.
+
+    task: found by its name in a module, for other processes.
+    finish: what becomes of a value before it is kept.
+    """
+    todo = [(n, tile) for n, tile in enumerate(tiles) if not bench.has(n)]
+    with bar(None, len(tiles), "tiles of lenslets") as progress:
+        progress.update(len(tiles) - len(todo))
+        for number, found in run_all(pool, ((job[0], task, job) for job in todo)):
+            if isinstance(found, PlenoError):
+                raise found
+            values = [finish(found.value), *([] if found.sigma is None else [found.sigma])]
+            # what is negative is counted before it is clipped
+            counted = [np.count_nonzero(found.value < 0), *counts(found.trace)]
+            bench.put(number, [*values, np.array(counted, float)])
+            progress.update()
+
+
+def picture(
+    bench: Bench, tiles: Sequence[Tile], shape: tuple[int, int], bands: int
+) -> tuple[InParts, InParts | None, np.ndarray]:
+    """(value, sigma or None, how many values are negative and the sum of the tiles' `counts`) of a
+    picture whose tiles are finished.
+    """
+    first = read_arrays(bench.path(0))
+    assert first is not None
+    rows, columns = (n * max(tile.own[axis].stop for tile in tiles) for axis, n in enumerate(shape))
+    size = (rows, columns) if bands == 1 else (bands, rows, columns)
+    found = [
+        InParts(
+            shape=size,
+            dtype=np.float64,
+            parts=PlaneOfTiles(bench, tuple(tiles), which, shape, bands),
+        )
+        for which in range(len(first) - 1)
+    ]
+    read = (read_arrays(bench.path(number)) for number in range(len(tiles)))
+    counted = sum(arrays[-1] for arrays in read if arrays is not None)
+    return found[0], found[1] if len(found) > 1 else None, np.asarray(counted)

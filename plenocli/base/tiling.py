@@ -116,19 +116,26 @@ class Whole:
 
     @contextlib.contextmanager
     def compared(self, others: dict[str, list[Any]]) -> Iterator[None]:
-        """The same; what the piece would have for means by itself is kept in `others`."""
+        """The same; what the piece has by itself of what is put together is kept in `others`."""
         with _during(_Run(self.found, others)):
             yield
 
-    def averaged(self, others: Sequence[dict[str, list[Any]]]) -> Whole:
-        """With means over the piece that it was worked out on and `others`, of what there are."""
+    def together(self, others: Sequence[dict[str, list[Any]]]) -> Whole:
+        """With what `common` puts together of the piece that it was worked out on and `others`."""
         found = {name: list(values) for name, values in self.found.items()}
         for name, values in found.items():
             for place, value in enumerate(values):
                 beside = [o[name][place] for o in others if len(o.get(name, ())) > place]
                 if beside:
-                    values[place] = np.mean([value, *beside], axis=0)
+                    values[place] = _joined([value, *beside])
         return Whole(found)
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    """The mean of numbers; arrays of several axes one after the other, along a last one."""
+    if np.ndim(values[0]) < 2:
+        return np.mean(values, axis=0)
+    return np.concatenate([value.reshape(len(value), -1) for value in values], axis=1)
 
 
 @dataclass
@@ -141,13 +148,13 @@ class _Run:
     kept: dict[str, list[Any]] | None = None
     asked: dict[str, int] = field(default_factory=dict)
 
-    def value(self, name: str, work: Callable[[], _Value], mean: bool) -> _Value:
+    def value(self, name: str, work: Callable[[], _Value], together: bool) -> _Value:
         place = self.asked.get(name, 0)
         self.asked[name] = place + 1
         known = self.known.get(name, [])
         # a piece may ask more often than that which stands for the whole did
         told: Any = known[min(place, len(known) - 1)] if known else None
-        if known and (self.kept is None or not mean):
+        if known and (self.kept is None or not together):
             return told
         with _during(None):
             made = work()
@@ -168,14 +175,15 @@ def _during(run: _Run | None) -> Iterator[None]:
         _run.reset(token)
 
 
-def common(name: str, work: Callable[[], _Value], *, mean: bool = False) -> _Value:
+def common(name: str, work: Callable[[], _Value], *, together: bool = False) -> _Value:
     """What `work` gives; of a tile, what it gave on the piece that stands for the whole.
 
     name: of the value. Where it is asked for several times, the order counts.
-    mean: whether it is a number, or numbers, whose means over pieces stand for the whole better.
+    together: whether several pieces stand for the whole better than one: the means of numbers
+        (any,), or samples (kind, ..) of all of them.
     """
     run = _run.get()
-    return work() if run is None else run.value(name, work, mean)
+    return work() if run is None else run.value(name, work, together)
 
 
 def is_piece() -> bool:

@@ -155,6 +155,16 @@ class Whole(click.IntRange):
         return super().convert(value, param, ctx)
 
 
+class Workers(Whole):
+    """How many work at the same time; auto: one for each core that this process may use."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """An int."""
+        if value == "auto":
+            return len(os.sched_getaffinity(0))
+        return super().convert(value, param, ctx)
+
+
 class Grid(click.ParamType):
     """Two whole numbers such as 3x3, or one of the given words."""
 
@@ -313,10 +323,12 @@ seed = click.option(
 )
 workers = click.option(
     "--workers",
-    type=Whole(1, 1024),
+    type=Workers(1, 1024),
     default=1,
     show_default=True,
-    help="Processes or threads to use; the results do not depend on it.",
+    help=(
+        "Processes or threads to use, or auto: one for each core. The results do not depend on it."
+    ),
 )
 scheduler = click.option(
     "--scheduler",

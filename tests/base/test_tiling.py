@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.base.tiling import InParts, Whole, bands, common, mirrored, to_blocks, to_plane
 
 
 def test_blocks_are_what_stands_in_the_plane_and_go_back():
@@ -24,3 +24,43 @@ def test_bands_stand_one_after_the_other():
     blocks = to_blocks(cube, (2, 5))
     assert blocks.shape == (3, 4, 30) and (blocks[..., 10:20] == to_blocks(cube[1], (2, 5))).all()
     assert (to_plane(blocks, (2, 5)) == cube).all()
+
+
+def test_bands_cover_all_rows_once_and_mirrored_rows_are_those_of_a_padded_plane():
+    for count, most, reach in ((11, 4, 2), (6, 6, 1), (3, 1, 3), (5, 0, 0)):
+        found = bands(count, most)
+        assert [n for part in found for n in range(count)[part]] == list(range(count))
+        padded = np.pad(np.arange(count), reach, mode="symmetric")
+        for part in found:
+            around = padded[part.start : part.stop + 2 * reach]
+            assert mirrored(part, reach, count).tolist() == around.tolist()
+
+
+def test_an_array_in_parts_is_put_together_plane_by_plane():
+    cube = np.random.default_rng(1).random((2, 7, 3))
+    parts = [plane[part] for plane in cube for part in bands(7, 3)]
+    whole = InParts(shape=cube.shape, dtype=np.float32, parts=lambda: parts).whole()
+    assert whole.dtype == np.float32 and (whole == cube.astype(np.float32)).all()
+
+
+def test_a_tile_takes_over_what_its_whole_knows():
+    def piece(values):
+        level = common("level", lambda: float(np.mean(values)), together=True)
+        most = common("most", lambda: common("inner", lambda: max(values)))
+        return level, most, common("level", lambda: level + len(values), together=True)
+
+    whole = Whole({"given": [7]})
+    assert piece([1, 3]) == (2, 3, 4)  # of no whole
+    with whole.worked_out():
+        assert common("given", lambda: 1) == 7
+        assert piece([1, 3]) == (2, 3, 4)
+    with whole.taken_over():
+        assert piece([5, 5, 5]) == (2, 3, 4)
+        # asked more often than there, and not asked there
+        assert common("level", lambda: 0) == 4 and common("other", lambda: 9) == 9
+    beside = {}
+    with whole.compared(beside):
+        assert piece([5, 5, 8]) == (2, 3, 4)
+    with whole.together([beside]).taken_over():
+        assert piece([0]) == (4, 3, 4.5)
+    assert "other" not in whole.found and "inner" not in whole.found

@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 
 from plenocli.base.budget import Budget, within
-from plenocli.base.errors import InputError, NumericsError, UsageError
+from plenocli.base.errors import InputError, NumericsError, OutputError, UsageError
+from plenocli.base.tiling import InParts
 from plenocli.files import atomic
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts import sparse
+from plenocli.files.artefacts.container import (
+    Artefact,
+    opened_artefact,
+    read_artefact,
+    write_artefact,
+)
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.shards import pif_parts, read_pif, shard_path, writing_pif
 from plenocli.files.artefacts.sparse import PAGE, SparseFile
@@ -233,3 +240,87 @@ def test_streaming_holds_one_piece_in_memory(tmp_path):
         check=True,
     )
     assert os.path.getsize(tmp_path / "a.h5") > 160_000_000 and int(done.stdout) < 40_000  # KiB
+
+
+def capture(step=None, rows=900, columns=1301):
+    """A capture whose mosaic and scene are held in memory, or come in parts of `step` rows."""
+    rng = np.random.default_rng(5)
+    mosaic = rng.integers(0, 4096, (rows, columns)).astype(np.uint16)
+    scene = rng.random((2, rows, columns)).astype(np.float32)
+    large = {"capture/mosaic": mosaic, "capture/scene": scene}
+    if step is not None:
+        large = {
+            name: InParts(
+                shape=values.shape,
+                dtype=values.dtype,
+                parts=lambda v=values: (
+                    plane[start : start + step]
+                    for plane in v.reshape(-1, rows, columns)
+                    for start in range(0, rows, step)
+                ),
+            )
+            for name, values in large.items()
+        }
+    small = {"capture/cfa": "mono", "capture/wavelength": [5e-7, 6e-7]}
+    return Artefact("capture", small | large, {"capture": {"units": "DN"}})
+
+
+@pytest.mark.parametrize("step", [1, 77, 900])
+def test_compressed_datasets_in_parts_give_the_same_bytes_as_whole_ones(tmp_path, step):
+    write_artefact(tmp_path / "whole.h5", capture())
+    write_artefact(tmp_path / "parts.h5", capture(step))
+    assert (tmp_path / "whole.h5").read_bytes() == (tmp_path / "parts.h5").read_bytes()
+
+
+def test_windows_of_a_stored_dataset_are_those_of_the_whole(tmp_path):
+    write_artefact(tmp_path / "c.h5", capture(50))
+    whole = read_artefact(tmp_path / "c.h5").data
+    apart = ("capture/mosaic", "capture/scene", "capture/lenslet_centre")
+    with opened_artefact(tmp_path / "c.h5", "capture", apart) as (artefact, stored):
+        assert set(artefact.data) == {"capture/cfa", "capture/wavelength"}
+        assert set(stored) == {"capture/mosaic", "capture/scene"}
+        for name, values in stored.items():
+            part = values.window(slice(100, 333), slice(7, 1200))
+            assert values.shape == whole[name].shape
+            np.testing.assert_array_equal(part, whole[name][..., 100:333, 7:1200])
+    content = bytearray((tmp_path / "c.h5").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "c.h5").write_bytes(content)
+    with (
+        pytest.raises(InputError, match="damaged"),
+        opened_artefact(tmp_path / "c.h5", "capture", apart),
+    ):
+        pass
+
+
+def test_a_disk_that_is_full_amid_the_parts_leaves_the_old_file(tmp_path, monkeypatch):
+    (tmp_path / "c.h5").write_bytes(b"old")
+
+    def full(descriptor, offset, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sparse, "write_at", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_artefact(tmp_path / "c.h5", capture(100), overwrite=True)
+    assert (tmp_path / "c.h5").read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["c.h5"]
+
+
+def test_parts_that_break_the_table_or_do_not_fill_it_are_refused(tmp_path):
+    def mosaic(parts):
+        return Artefact(
+            "capture",
+            {
+                "capture/cfa": "mono",
+                "capture/mosaic": InParts(shape=(6, 4), dtype=np.float64, parts=lambda: parts),
+            },
+            {"capture": {"units": "DN"}},
+        )
+
+    for parts, said in (
+        ([np.ones((3, 4)), np.full((3, 4), np.nan)], "NaN"),
+        ([np.ones((3, 4))], "lacks rows"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            write_artefact(tmp_path / "c.h5", mosaic(parts))
+    assert not list(tmp_path.iterdir())

@@ -13,6 +13,7 @@ from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.config.camera_file import load_camera, parse_camera
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.accuracy.dial import system_matrix
+from plenocli.forward.sensor import exposure
 from plenocli.stages.forward import capture_sim
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
@@ -575,3 +576,66 @@ def test_more_memory_than_granted_is_refused_before_it_is_taken(camera, tmp_path
         run(["capture-sim", str(camera), "--target", "white", "-o", str(tmp_path / "out.exr")]) == 5
     )
     assert "--mem-limit" in capsys.readouterr().err
+
+
+def in_bands(monkeypatch, rows, columns=4, pixels=81):
+    """From now on sensors are exposed in bands of so many rows of lenslets."""
+    monkeypatch.setattr(exposure, "BAND", rows * columns * pixels)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_light_does_not_depend_on_bands(camera, scene, tmp_path, monkeypatch, rows):
+    options = [camera, "--scene", scene[0], "--noise", "none", "--refine", 2]
+    whole = capture(*options, "-o", tmp_path / "whole.h5")
+    in_bands(monkeypatch, rows)
+    bands = capture(*options, "-o", tmp_path / "bands.h5")
+    light = whole.data["capture/mosaic"]
+    np.testing.assert_allclose(bands.data["capture/mosaic"], light, atol=2e-6 * light.max())
+    np.testing.assert_array_equal(bands.data["capture/scene"], whole.data["capture/scene"])
+    assert bands.attrs["capture"].keys() == whole.attrs["capture"].keys()
+    # of an EXR all is in memory
+    assert run(["capture-sim", *map(str, options), "-o", str(tmp_path / "bands.exr")]) == 0
+    np.testing.assert_allclose(
+        read_capture(tmp_path / "bands.exr").mosaic, light, atol=2e-6 * light.max()
+    )
+
+
+def test_colour_filters_crosstalk_and_the_black_level_do_not_see_bands(
+    camera, tmp_path, monkeypatch
+):
+    """Bands of an odd number of pixels, and noise so small that it does not show."""
+    text = camera.read_text()
+    text = text.replace("[sensor]", '[sensor]\ncfa = "RGGB"\ncrosstalk = "20 %"')
+    camera.write_text(text)
+    assert "crosstalk" in text
+    options = [camera, "--target", "colorchecker", "--seed", 4]
+    whole = capture(*options, "-o", tmp_path / "whole.h5").data["capture/mosaic"].astype(float)
+    in_bands(monkeypatch, 1)
+    bands = capture(*options, "-o", tmp_path / "bands.h5").data["capture/mosaic"].astype(float)
+    frames = [bands]
+    for seed in (5, 6):
+        frame = capture(*options[:-1], seed, "-o", tmp_path / f"{seed}.h5")
+        frames.append(frame.data["capture/mosaic"].astype(float))
+    # what differs is noise, as much at the borders of bands (9 pixels) as elsewhere
+    difference, noise = bands - whole, frames[1] - frames[2]
+    at = np.zeros(len(bands), bool)
+    at[[8, 9, 17, 18]] = True
+    for where in (at, ~at):
+        ratio = difference[where].std() / noise[where].std()
+        assert 0.75 < ratio < 1.33
+        assert abs(difference[where].mean()) < 5 * noise[where].std() / np.sqrt(
+            difference[where].size
+        )
+
+
+def test_noise_of_bands_is_that_of_the_whole(camera, tmp_path, monkeypatch):
+    in_bands(monkeypatch, 1)
+    clear = capture(camera, "--target", "white", "--noise", "none", "-o", tmp_path / "a.h5")
+    noisy = capture(camera, "--target", "white", "--snr", "20dB", "-o", tmp_path / "b.h5")
+    rest = noisy.data["capture/mosaic"] - clear.data["capture/mosaic"]
+    power = np.mean(clear.data["capture/mosaic"] ** 2)
+    sigma = noisy.attrs["capture"]["noise_sigma"]
+    assert sigma == pytest.approx(0.1 * np.sqrt(power), rel=1e-6)
+    assert rest.std() == pytest.approx(sigma, rel=0.1)
+    bands = rest.reshape(3, -1)
+    assert np.abs(np.corrcoef(bands) - np.eye(3)).max() < 0.2  # no band has another's noise

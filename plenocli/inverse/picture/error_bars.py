@@ -85,7 +85,7 @@ def posterior(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> tuple[np.n
         weak = weak_power(lmmse, signals, scale)
         return float(np.exp(BY_WEAK * weak + BY_BORDER * (border - USUAL_BORDER)))
 
-    return x, sigma * common("wider", wider, mean=True)
+    return x, sigma * common("wider", wider, together=True)
 
 
 def spread(lmmse: Lmmse, y: np.ndarray, contrast: np.ndarray) -> np.ndarray:

@@ -571,11 +571,11 @@ def _in_tiles(
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray
-    solve_all(pool, task, tiles, bench, clip)
+    stats = solve_all(pool, task, tiles, bench, clip)
     value, sigma, counted = picture(bench, tiles, system.object_shape, max(1, len(system.bands)))
     size = source.count[0] * source.count[1] * system.own.shape[0]
     declared = data.saturated is not None
-    parts: dict[str, Any] = {"value": value, "sigma": sigma}
+    parts: dict[str, Any] = {"value": value, "sigma": sigma, "stats": stats or sample.stats}
     trace = joined(sample, counted[1:], size, declared=declared)
     for entry in trace:
         if isinstance(entry, NUISANCES) and entry.found:
@@ -610,7 +610,7 @@ class _TileTask:
         self, estimators: Estimators, source: Source, like: Tile, others: Sequence[Tile]
     ) -> tuple[Reconstruction, Seen | None, _TileTask]:
         """(the picture of `like`, the piece that stands for the whole, what is seen in it, the task
-        that knows the whole): numbers are means over `others`, too.
+        that knows the whole): `others` stand beside it.
         """
         method = METHODS[self.recipe.settings.method]
         cause = partial(likely_cause, estimators)
@@ -623,7 +623,7 @@ class _TileTask:
             beside.append({})
             with whole.compared(beside[-1]), collected_notes():
                 estimate(estimators, method, source.cut(*piece.around), model_error=off)
-        return found, seen, replace(self, whole=whole.averaged(beside))
+        return found, seen, replace(self, whole=whole.together(beside))
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile; what there is to say was said of the whole."""
@@ -638,7 +638,8 @@ class _TileTask:
             with self.whole.taken_over():
                 found, _ = estimate(estimators, method, data, model_error=self.model_error)
         sigma = None if found.sigma is None else found.sigma[tile.within]
-        return SolvedTile(value=found.value[tile.within], sigma=sigma, trace=found.trace)
+        value, trace = found.value[tile.within], found.trace
+        return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)
 
 
 def _estimate(

@@ -19,7 +19,7 @@ from plenocli.base.progress import bar
 from plenocli.base.tiling import InParts, to_plane
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.kept import read_arrays, write_arrays
-from plenocli.inverse.picture.reconstruction import Entry
+from plenocli.inverse.picture.reconstruction import Entry, Stats
 from plenocli.inverse.picture.tiles import Tile, counts
 
 
@@ -29,11 +29,13 @@ class SolvedTile:
 
     value, sigma: (lenslet_row, lenslet_column, point), sigma None where the method knows none.
     trace: what was found in it.
+    stats: of the method.
     """
 
     value: np.ndarray
     sigma: np.ndarray | None
     trace: tuple[Entry, ...]
+    stats: Stats | None
 
 
 @dataclass(frozen=True)
@@ -123,12 +125,15 @@ def solve_all(
     tiles: Sequence[Tile],
     bench: Bench,
     finish: Callable[[np.ndarray], np.ndarray],
-) -> None:
+) -> Stats | None:
     """Solve the tiles that are not finished; the first PlenoError is raised.
 
     task: found by its name in a module, for other processes.
     finish: what becomes of a value before it is kept.
+
+    Returns what the method tells of one of them, None where none was left to be solved.
     """
+    stats: Stats | None = None
     todo = [(n, tile) for n, tile in enumerate(tiles) if not bench.has(n)]
     with bar(None, len(tiles), "tiles of lenslets") as progress:
         progress.update(len(tiles) - len(todo))
@@ -139,7 +144,9 @@ def solve_all(
             # what is negative is counted before it is clipped
             counted = [np.count_nonzero(found.value < 0), *counts(found.trace)]
             bench.put(number, [*values, np.array(counted, float)])
+            stats = found.stats
             progress.update()
+    return stats
 
 
 def picture(

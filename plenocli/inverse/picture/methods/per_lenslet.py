@@ -132,7 +132,8 @@ def tikhonov(
     if alpha is None and truth is not None:
         alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
     elif alpha is None:
-        alpha = common("alpha", lambda: least_squares.discrepancy_alpha(svd, z, sigma), mean=True)
+        power = common("power", lambda: least_squares.power_of(z), together=True)
+        alpha = least_squares.discrepancy_alpha(svd, power, sigma)
         rule = "discrepancy"
     return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
@@ -146,7 +147,8 @@ def tsvd(
     if rank is None and truth is not None:
         rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
     elif rank is None:
-        rank = common("rank", lambda: least_squares.best_rank(svd, z, sigma))
+        power = common("power", lambda: least_squares.power_of(z), together=True)
+        rank = least_squares.best_rank(svd, power, sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())
     return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)

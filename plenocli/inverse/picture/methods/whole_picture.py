@@ -101,7 +101,7 @@ def _from_lmmse(
         x[inner], sigma[inner] = around[0][inner], around[1][inner]
     else:
         x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
-    error = common("start", lambda: root_mean_square(sigma[inner]), mean=True)
+    error = common("start", lambda: root_mean_square(sigma[inner]), together=True)
     held = None
     if joint is not None:
         edge = np.ones(y.shape[:2], bool)

@@ -4,12 +4,12 @@ own, by generalised least squares under the model of LMMSE.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from plenocli.base.tiling import common
+from plenocli.base.tiling import common, is_piece
 from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
@@ -110,6 +110,16 @@ def find_veil(
     veil, extra = common("veil", lambda: _common_veil(model, y, found, unsure))
     if veil is None or not veil.removed:
         return veil, nothing
+
+    def of_this_piece() -> float:
+        own = _common_veil(model, y, found, unsure)[0]
+        return own.level if own is not None and own.removed else 0.0
+
+    veil = (
+        replace(veil, level=common("veil level", of_this_piece, together=True))
+        if is_piece()
+        else veil
+    )
     told = np.isfinite(found.variance)
     own = np.full(y.shape[1], veil.level)
     value, variance = found.value[told], found.variance[told]

@@ -152,22 +152,22 @@ def _posterior(likelihood: np.ndarray, name: str) -> np.ndarray:
     name: of what is common to all lenslets.
     """
     likelihood = np.exp(likelihood - likelihood.max(axis=0))
+    all_of_them = common(name, lambda: likelihood, together=True)
+    if all_of_them.ndim == 2:
+        all_of_them = all_of_them[:, None]
+    logs, prior = np.log(CONTRASTS), np.full(len(CONTRASTS), 1 / len(CONTRASTS))
+    for _ in range(ROUNDS - 1):
+        prior = _given(prior, all_of_them).mean(axis=(1, 2))
+        middle = prior @ logs
+        deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
+        prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+    return _given(prior, likelihood)
 
-    def given(prior: np.ndarray) -> np.ndarray:
-        share = likelihood * prior[:, None, None]
-        share /= share.sum(axis=0)
-        return share
 
-    def fitted() -> np.ndarray:
-        logs, prior = np.log(CONTRASTS), np.full(len(CONTRASTS), 1 / len(CONTRASTS))
-        for _ in range(ROUNDS - 1):
-            prior = given(prior).mean(axis=(1, 2))
-            middle = prior @ logs
-            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
-            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-        return prior
-
-    return given(common(name, fitted, mean=True))
+def _given(prior: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
+    share = likelihood * prior[:, None, None]
+    share /= share.sum(axis=0)
+    return share
 
 
 def prepare_joint(

@@ -129,7 +129,12 @@ def truncated(svd: Svd, z: np.ndarray, rank: int) -> np.ndarray:
     return svd.vt[:rank].T @ (z[:rank] / svd.s[:rank, None])
 
 
-def discrepancy_alpha(svd: Svd, z: np.ndarray, sigma: float) -> float:
+def power_of(z: np.ndarray) -> np.ndarray:
+    """Mean square (k,) of each direction over signals z (k, signal)."""
+    return np.mean(z**2, axis=1)
+
+
+def discrepancy_alpha(svd: Svd, power: np.ndarray, sigma: float) -> float:
     """alpha for which the residual of all signals together is what noise leaves in z.
 
     Morozov's rule: sum |z - S V^T x|^2 = (number of entries of z) sigma^2; it rises with alpha, and
@@ -137,10 +142,10 @@ def discrepancy_alpha(svd: Svd, z: np.ndarray, sigma: float) -> float:
     the rule cannot be met).
 
     svd: of A.
-    z: U^T y (k, signal).
+    power: (k,) `power_of` z = U^T y.
     sigma: standard deviation of the noise.
     """
-    power, target = np.sum(z**2, axis=1), z.size * sigma**2
+    target = len(power) * sigma**2
 
     def residual(alpha: float) -> float:
         return np.sum((alpha / (svd.s**2 + alpha)) ** 2 * power)
@@ -156,7 +161,7 @@ def discrepancy_alpha(svd: Svd, z: np.ndarray, sigma: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def best_rank(svd: Svd, z: np.ndarray, sigma: float) -> int:
+def best_rank(svd: Svd, power: np.ndarray, sigma: float) -> int:
     """The truncation with the least estimated mean square error of x, all signals together.
 
     An unbiased estimate in the manner of Stein and Mallows: direction k costs 2 sigma^2 / s_k^2 of
@@ -164,13 +169,13 @@ def best_rank(svd: Svd, z: np.ndarray, sigma: float) -> int:
     directions here: it asks the cut to explain the weak ones too.)
 
     svd: of A.
-    z: (k, signal) U^T y.
+    power: (k,) `power_of` z = U^T y.
     sigma: standard deviation of the noise in y.
 
     Returns how many directions are kept.
     """
     top = svd.rank()
-    change = np.sum(2 * sigma**2 - z[:top] ** 2, axis=1) / svd.s[:top] ** 2
+    change = (2 * sigma**2 - power[:top]) / svd.s[:top] ** 2
     return int(np.argmin(np.cumsum(change))) + 1
 
 

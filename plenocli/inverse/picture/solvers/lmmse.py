@@ -141,22 +141,15 @@ class Lmmse:
         likelihood = self._likelihood(self.coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
 
-        def given(prior: np.ndarray) -> np.ndarray:
-            posterior = likelihood * prior[:, None]
-            posterior /= posterior.sum(axis=0)
-            return posterior
-
-        def fitted() -> np.ndarray:
-            logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
-            for _ in range(ROUNDS - 1):
-                prior = given(prior).mean(axis=1)
-                middle = prior @ logs
-                deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
-                prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-            return prior
-
         name = f"contrast {self.sigma!r} {float(self.noise.sum())!r}"
-        return given(common(name, fitted, mean=True))
+        all_of_them = common(name, lambda: likelihood, together=True)
+        logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
+        for _ in range(ROUNDS - 1):
+            prior = _given(prior, all_of_them).mean(axis=1)
+            middle = prior @ logs
+            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
+            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+        return _given(prior, likelihood)
 
     def degrees(self, y: np.ndarray) -> float:
         """Degrees of freedom that the estimate has of an object, the mean over the signals: the
@@ -168,6 +161,13 @@ class Lmmse:
         return len(self.levels) + float(
             np.mean(np.sum(stronger / (stronger + self.noise[:, None]), axis=0))
         )
+
+
+def _given(prior: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
+    """Probabilities (scale, signal), from those beforehand (scale,)."""
+    posterior = likelihood * prior[:, None]
+    posterior /= posterior.sum(axis=0)
+    return posterior
 
 
 def require_noise(sigma: float) -> None:

@@ -1,0 +1,137 @@
+"""Captures larger than a tile: the same pictures as in one piece, whatever works on them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from plenocli.base.errors import NumericsError
+from plenocli.cli.main import run
+from plenocli.evaluation.metrics.quality import psnr
+from plenocli.files.artefacts.container import read_artefact
+from plenocli.inverse.picture import tiles
+from plenocli.stages.inverse import reconstruct
+from tests.stages import test_reconstruct
+from tests.stages.test_reconstruct import N, make_files
+
+COUNT, SIDE = 24, 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Captures of 24 x 24 lenslets, alone and with neighbours' light, and their truths."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(test_reconstruct, "COUNT", COUNT)
+        made = tmp_path_factory.mktemp("tiles")
+        truths = {}
+        for name, coupled in (("alone", False), ("coupled", True)):
+            (made / name).mkdir()
+            truths[name] = make_files(made / name, coupled=coupled, noise=40.0)
+    return made, truths
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    """Tiles of 12 x 12 lenslets, for these captures."""
+    monkeypatch.setattr(tiles, "AT_ONCE", SIDE**2 * (81 + 36 + tiles.FURTHER))
+
+
+def picture(folder, output, *options, method):
+    command = ["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "pif.h5")]
+    assert run([*command, "--method", method, "-o", str(output), "--overwrite", *options]) == 0
+    return read_artefact(output, "image")
+
+
+def jumps(error, at):
+    """Mean difference of the error across the borders of lenslets `at`, rows and columns."""
+    across = [np.abs(e[at] - e[at - 1]).mean(axis=1) for e in (error, error.T)]
+    return float(np.mean(across))
+
+
+@pytest.mark.parametrize(
+    "name, method",
+    [
+        ("alone", "block-mean"),
+        ("alone", "tikhonov"),
+        ("alone", "lmmse"),
+        ("coupled", "tsvd"),
+        ("coupled", "lmmse"),
+        pytest.param("alone", "pnp", marks=pytest.mark.slow),
+        pytest.param("coupled", "tv", marks=pytest.mark.slow),
+        pytest.param("coupled", "pnp", marks=pytest.mark.slow),
+        pytest.param("alone", "auto", marks=pytest.mark.slow),
+    ],
+)
+def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name, method):
+    made, truths = folder
+    whole = picture(made / name, tmp_path / "whole.h5", method=method)
+    monkeypatch.setattr(tiles, "AT_ONCE", SIDE**2 * (81 + 36 + tiles.FURTHER))
+    tiled = picture(made / name, tmp_path / "tiled.h5", method=method)
+    one, two = (found.data["image/value"] for found in (whole, tiled))
+    truth = truths[name]
+    assert two.shape == one.shape == truth.shape
+    assert psnr(two, truth) == pytest.approx(psnr(one, truth), abs=0.1)
+    borders = np.arange(1, COUNT) * N
+    at = borders[borders % (SIDE * N) == 0]
+    near = np.array([b for b in borders if b not in at and min(abs(b - at)) <= 3 * N])
+    seam = [jumps(p - truth, at) / jumps(p - truth, near) for p in (one, two)]
+    assert seam[1] < 1.1 * seam[0]
+    if "image/sigma" in whole.data:
+        ratio = np.mean(tiled.data["image/sigma"]) / np.mean(whole.data["image/sigma"])
+        assert 0.8 < ratio < 1.25
+    told = tiled.attrs["image"]["parameters"]
+    veil = {"veil"}  # of this camera it is a matter of chance
+    assert told.keys() - veil == whole.attrs["image"]["parameters"].keys() - veil
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["tiled.h5", "whole.h5"]
+
+
+def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles):
+    made, _ = folder
+    for workers in ("1", "2"):
+        found = picture(
+            made / "coupled", tmp_path / f"{workers}.h5", "--workers", workers, method="lmmse"
+        )
+        assert found.data["image/value"].shape == (COUNT * N, COUNT * N)
+    assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
+
+
+def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, monkeypatch):
+    made, _ = folder
+    picture(made / "alone", tmp_path / "right.h5", method="lmmse")
+    solved, solve = [], reconstruct._TileTask.__call__
+
+    def counted(self, job):
+        if len(solved) == 3 and not resumed:
+            raise NumericsError("the power went off")
+        solved.append(job[0])
+        return solve(self, job)
+
+    monkeypatch.setattr(reconstruct._TileTask, "__call__", counted)
+    command = ["reconstruct", str(made / "alone/capture.h5"), "--pif", str(made / "alone/pif.h5")]
+    command += ["--method", "lmmse", "-o", str(tmp_path / "out.h5")]
+    resumed = False
+    assert run(command) == 5
+    assert not (tmp_path / "out.h5").exists()
+    assert len(list(tmp_path.glob(".out.h5.*.tiles/*"))) == 3
+    damaged = next(tmp_path.glob(".out.h5.*.tiles/000001"))
+    damaged.write_bytes(damaged.read_bytes()[:-8])
+    resumed = True
+    assert run(command) == 0
+    assert solved == [0, 1, 2, 1, 3]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.h5", "right.h5"]
+    one, two = (read_artefact(tmp_path / name, "image") for name in ("right.h5", "out.h5"))
+    for name, values in one.data.items():
+        np.testing.assert_array_equal(two.data[name], values)
+
+
+def test_other_outputs_of_tiles(folder, tmp_path, small_tiles, capsys):
+    made, truths = folder
+    command = ["reconstruct", str(made / "alone/capture.h5"), "--pif", str(made / "alone/pif.h5")]
+    command += ["--method", "tikhonov", "--clip"]
+    assert run([*command, "-o", str(tmp_path / "p.exr"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["captures"][0]
+    assert (said["rows"], said["columns"]) == truths["alone"].shape
+    assert run([*command, "-o", str(tmp_path / "p.h5")]) == 0
+    value = read_artefact(tmp_path / "p.h5", "image").data["image/value"]
+    assert value.min() == 0 and 0 < said["negative_share"] < 1
+    assert run([*command, str(made / "coupled/capture.h5"), "-o", str(tmp_path / "many")]) in (0, 2)

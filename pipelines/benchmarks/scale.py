@@ -1,0 +1,151 @@
+"""Time, memory and bytes of whole sensors: capture-sim and reconstruct against lenslets, points and
+workers.
+
+Cameras are seed_spatial with more lenslets (`seed`: 52x52 pixels and 40x40 points a lenslet, or
+`small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB. Every
+command is a process of its own, of one thread; its CPU seconds (user and system, workers
+included), seconds by the clock, its highest resident memory and the bytes of its file are lines
+of RUN/scale.jsonl. What stands there is not measured again. RUN/scale.md has the table, with the
+exponents of time and memory by least squares of their logarithms from the second size on, and
+what they say of 130,000 lenslets where that was not run. With an --old tree of the sources, that
+is measured, too, in turn.
+
+Run from the project's root:
+python pipelines/benchmarks/scale.py RUN --kind small --lenslets 1024 4096 16384 65536 129960
+"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = {
+    "samples_per_lenslet = [40, 40]": "samples_per_lenslet = [12, 12]",
+    "pixels_per_lenslet = [52, 52]": "pixels_per_lenslet = [15, 15]",
+    '"104 um"': '"30 um"',
+    '"832 um"': '"240 um"',
+}
+WHOLE = 130_000
+
+
+def described(kind, lenslets):
+    """The camera's description, TOML, and how many lenslets it has: as square as can be."""
+    text = (ROOT / "sample_configs/seed_spatial.toml").read_text()
+    for old, new in SMALL.items() if kind == "small" else ():
+        text = text.replace(old, new)
+    rows = int(lenslets**0.5)
+    columns = max(1, round(lenslets / rows))
+    return text.replace("count = [11, 11]", f"count = [{rows}, {columns}]"), rows * columns
+
+
+def measured(tree, command):
+    """(CPU s, clock s, KiB) of a command of the sources in `tree`; RuntimeError where it fails."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    environment = os.environ | threads | {"PYTHONPATH": str(tree)}
+    program = [sys.executable, "-m", "plenocli", "--quiet", *map(str, command)]
+    start = time.perf_counter()
+    process = subprocess.Popen(program, env=environment, cwd="/", stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise RuntimeError(f"{' '.join(map(str, command))} ended with {status}")
+    return used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss
+
+
+def commands(run, kind, lenslets, chosen):
+    """(name, command, its file) of one size; the matrix serves all sizes of a kind."""
+    text, count = described(kind, lenslets)
+    superpixels, limit = chosen.superpixels, chosen.mem_limit
+    kind = f"{kind}-{superpixels}"
+    camera, pif = run / f"{kind}-{count}.toml", run / f"{kind}-pif.h5"
+    camera.write_text(text)
+    if not pif.exists():
+        measured(ROOT, ["simulate-pif", camera, "--superpixels", superpixels, "-o", pif])
+    shot, limits = run / f"{kind}-{count}.h5", ["--mem-limit", limit, "--overwrite"]
+    scene = ["--scene", "skimage:astronaut", "--pif", pif, "--snr", "50dB"]
+    yield count, "capture-sim", ["capture-sim", camera, *scene, "-o", shot, *limits], shot
+    for method in chosen.methods:
+        out = run / f"{kind}-{count}-{method}.h5"
+        options = ["--pif", pif, "--method", method, "-o", out, *limits]
+        yield count, method, ["reconstruct", shot, *options], out
+
+
+def exponents(lines):
+    """(of time, of memory) of lines of one command by lenslets, None for less than two sizes."""
+    import numpy as np
+
+    sizes = sorted({line["lenslets"] for line in lines})[1:]
+    points = [line for line in lines if line["lenslets"] in sizes]
+    if len(sizes) < 2:
+        return None
+    logs = np.log([line["lenslets"] for line in points])
+    return [np.polyfit(logs, np.log([line[n] for line in points]), 1) for n in ("cpu", "kib")]
+
+
+def table(lines):
+    """Markdown of all lines."""
+    names = "camera, code, command, lenslets, CPU s, clock s, peak MiB, file MiB".split(", ")
+    rows = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
+    groups = {}
+    for line in lines:
+        groups.setdefault((line["kind"], line["code"], line["command"]), []).append(line)
+    for key, group in sorted(groups.items()):
+        for line in sorted(group, key=lambda one: one["lenslets"]):
+            figures = line["cpu"], line["clock"], line["kib"] / 1024, line["bytes"] / 2**20
+            told = " | ".join(f"{figure:.3g}" for figure in figures)
+            rows.append(f"| {' | '.join(key)} | {line['lenslets']} | {told} |")
+        fitted = exponents(group)
+        if fitted is None:
+            continue
+        law = "CPU seconds grow as n^{:.2f}, memory as n^{:.2f}".format(*(e for e, _ in fitted))
+        if max(line["lenslets"] for line in group) < 0.9 * WHOLE:
+            seconds, kib = (math.exp(c) * WHOLE**e for e, c in fitted)
+            law += f"; by that {WHOLE} lenslets take {seconds:.3g} s and {kib / 1024:.3g} MiB"
+        rows.append(f"| {' | '.join(key)} | | {law} | | | |")
+    return "\n".join(rows) + "\n"
+
+
+def main():
+    """Measure what is not measured yet, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--kind", choices=["seed", "small"], default="small")
+    parser.add_argument("--lenslets", type=int, nargs="+", default=[121, 1024, 4096])
+    parser.add_argument("--methods", nargs="+", default=["lmmse"])
+    parser.add_argument("--workers", type=int, nargs="+", default=[1])
+    parser.add_argument("--superpixels", default="1x1", help="that the matrix knows")
+    parser.add_argument("--mem-limit", default="2GiB")
+    parser.add_argument("--old", type=Path, help="sources to compare with")
+    chosen = parser.parse_args()
+    chosen.run.mkdir(parents=True, exist_ok=True)
+    run = chosen.run.resolve()
+    log = run / "scale.jsonl"
+    lines = [json.loads(text) for text in log.read_text().splitlines()] if log.exists() else []
+    trees = {"new": ROOT} | ({"old": chosen.old.resolve()} if chosen.old else {})
+    kind = f"{chosen.kind} {chosen.superpixels}"
+    for lenslets in chosen.lenslets:
+        jobs = commands(run, chosen.kind, lenslets, chosen)
+        for count, name, command, file in jobs:
+            for workers in chosen.workers if name != "capture-sim" else [1]:
+                shared = [] if workers == 1 else ["--workers", workers]
+                told = f"{name}, {workers} workers" if shared else name
+                for code, tree in trees.items():
+                    about = dict(kind=kind, code=code, command=told, lenslets=count)
+                    if any(about.items() <= line.items() for line in lines) and file.exists():
+                        continue
+                    cpu, clock, kib = measured(tree, [*command, *shared])
+                    size = file.stat().st_size
+                    line = about | dict(cpu=cpu, clock=clock, kib=kib, bytes=size)
+                    lines.append(line)
+                    with log.open("a") as stream:
+                        stream.write(json.dumps(line) + "\n")
+                    print(line, flush=True)
+    (run / "scale.md").write_text(table(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -12,6 +12,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 PATCH, STEP, SEARCH, STACK = 8, 4, 9, 16
 """Side of a patch, distance of reference patches, how far similar ones are searched, how many
@@ -19,7 +20,7 @@ are stacked (a power of two).
 """
 THRESHOLD = 2.7
 """Coefficients below so many standard deviations of the noise vanish; the paper's value."""
-TOGETHER = 8192
+TOGETHER = 4096
 """Stacks that are filtered together."""
 
 
@@ -80,12 +81,10 @@ def _match(
     columns, these first.
     """
     height, width = guide.shape
-    sum_rows, sum_columns = (
-        np.zeros((len(at), n), np.float32) for at, n in ((rows, height), (columns, width))
-    )
-    for sums, at in ((sum_rows, rows), (sum_columns, columns)):
-        for k, first in enumerate(at):
-            sums[k, first : first + patch] = 1
+    sum_rows = np.zeros((len(rows), height), np.float32)
+    for k, first in enumerate(rows):
+        sum_rows[k, first : first + patch] = 1
+    up_to = np.zeros((len(rows), width + 1))
     offsets = np.array(
         [(r, c) for r in range(-SEARCH, SEARCH + 1) for c in range(-SEARCH, SEARCH + 1)]
     )
@@ -107,9 +106,11 @@ def _match(
         change = (
             guide[r, c] - guide[r.start + down : r.stop + down, c.start + right : c.stop + right]
         )
-        distance[k, at_r, at_c] = (
-            sum_rows[at_r, r] @ np.square(change, out=change) @ sum_columns[at_c, c].T
-        )
+        down_patches = sum_rows[at_r, r] @ np.square(change, out=change)
+        sums = up_to[: len(down_patches), : down_patches.shape[1] + 1]
+        np.cumsum(down_patches, axis=1, out=sums[:, 1:])
+        first = columns[at_c] - c.start
+        distance[k, at_r, at_c] = sums[:, first + patch] - sums[:, first]
     distance[len(offsets) // 2] = -1
     by_patch = distance.reshape(len(offsets), -1).T
     best = np.argpartition(by_patch, stack - 1, axis=1)[:, :stack]
@@ -123,36 +124,49 @@ def _filter(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(weighted sum, weights), each like source, of the filtered patches.
 
+    Every patch of the plane is transformed once, and what stacks make of it is summed before it is
+    transformed back.
     guide: None, or the pilot.
     """
+    from scipy.sparse import csr_array
+
     shape = source.shape
+    corners = (shape[0] - patch + 1, shape[1] - patch + 1)
     cosine, across, taper = _transforms(patch, stacks.shape[1])
-    index = stacks[:, :, None] + (np.arange(patch)[:, None] * shape[1] + np.arange(patch)).ravel()
+    rows, columns = np.divmod(stacks.T.ravel(), shape[1])
+    at = rows * corners[1] + columns
 
     def forward(plane: np.ndarray) -> np.ndarray:
-        return across @ (plane.ravel()[index].reshape(-1, patch * patch) @ cosine.T).reshape(
-            index.shape
-        )
+        """(place in its stack, stack times coefficient)."""
+        patches = sliding_window_view(plane, (patch, patch)).reshape(-1, patch * patch)
+        return across @ (patches @ cosine.T)[at].reshape(stacks.shape[1], -1)
 
-    spectrum = forward(source)
+    spectrum = forward(source).reshape(stacks.shape[1], len(stacks), -1)
     if guide is None:
         keep = np.abs(spectrum) > THRESHOLD * sigma
-        keep[:, 0, 0] = True
+        keep[0, :, 0] = True
         spectrum *= keep
-        weight = 1 / keep.sum(axis=(1, 2), dtype=np.float32)
+        weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
     else:
-        wiener = np.square(forward(guide))
+        wiener = np.square(forward(guide)).reshape(spectrum.shape)
         wiener /= wiener + np.float32(max(sigma, 1e-12) ** 2)
-        wiener[:, 0, 0] = 1
+        wiener[0, :, 0] = 1
         spectrum *= wiener
-        weight = 1 / np.maximum(np.square(wiener).sum(axis=(1, 2)), 1)
-    weight = weight[:, None, None] * taper
-    back = ((across @ spectrum).reshape(-1, patch * patch) @ cosine).reshape(index.shape) * weight
-    index, size = index.ravel(), source.size
-    weights = np.broadcast_to(weight, back.shape)
-    return np.bincount(index, back.ravel(), size).reshape(shape), np.bincount(
-        index, weights.ravel(), size
-    ).reshape(shape)
+        weight = 1 / np.maximum(np.square(wiener).sum(axis=(0, 2)), 1)
+    spectrum *= weight[:, None]
+    back = (across @ spectrum.reshape(stacks.shape[1], -1)).reshape(len(at), -1)
+    # which stacks each patch is in
+    order = np.argsort(at, kind="stable")
+    starts = np.searchsorted(at[order], np.arange(corners[0] * corners[1] + 1))
+    member = csr_array((np.ones(len(at), np.float32), order, starts), (len(starts) - 1, len(at)))
+    planes = (cosine.T @ (member @ back).T).reshape(patch, patch, *corners)
+    counted = (member @ np.tile(weight, stacks.shape[1])).reshape(corners)
+    total, weights = np.zeros(shape), np.zeros(shape)
+    for r, c in np.ndindex(patch, patch):
+        here = np.s_[r : r + corners[0], c : c + corners[1]]
+        total[here] += taper[r * patch + c] * planes[r, c]
+        weights[here] += taper[r * patch + c] * counted
+    return total, weights
 
 
 @lru_cache(maxsize=8)

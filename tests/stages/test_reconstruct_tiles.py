@@ -70,7 +70,8 @@ def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name
     one, two = (found.data["image/value"] for found in (whole, tiled))
     truth = truths[name]
     assert two.shape == one.shape == truth.shape
-    assert psnr(two, truth) == pytest.approx(psnr(one, truth), abs=0.1)
+    # 144 lenslets tell the veil that this camera seems to have less surely than 576
+    assert psnr(two, truth) == pytest.approx(psnr(one, truth), abs=0.2)
     borders = np.arange(1, COUNT) * N
     at = borders[borders % (SIDE * N) == 0]
     near = np.array([b for b in borders if b not in at and min(abs(b - at)) <= 3 * N])

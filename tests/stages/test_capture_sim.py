@@ -605,7 +605,7 @@ def test_colour_filters_crosstalk_and_the_black_level_do_not_see_bands(
 ):
     """Bands of an odd number of pixels, and noise so small that it does not show."""
     text = camera.read_text()
-    text = text.replace("[sensor]", '[sensor]\ncfa = "RGGB"\ncrosstalk = "20 %"')
+    text = text.replace("[sensor]", '[sensor]\ncfa = "RGGB"\ncrosstalk = 0.2')
     camera.write_text(text)
     assert "crosstalk" in text
     options = [camera, "--target", "colorchecker", "--seed", 4]

@@ -121,13 +121,13 @@ class Whole:
             yield
 
     def together(self, others: Sequence[dict[str, list[Any]]]) -> Whole:
-        """With what `common` puts together of the piece that it was worked out on and `others`."""
+        """With what `common` puts together of `others`, in place of the one piece's own."""
         found = {name: list(values) for name, values in self.found.items()}
         for name, values in found.items():
-            for place, value in enumerate(values):
+            for place in range(len(values)):
                 beside = [o[name][place] for o in others if len(o.get(name, ())) > place]
                 if beside:
-                    values[place] = _joined([value, *beside])
+                    values[place] = _joined(beside)
         return Whole(found)
 
 

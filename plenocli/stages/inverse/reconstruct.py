@@ -568,6 +568,8 @@ def _in_tiles(
     )
     others = spread_over(source.count, side_of(system))
     sample, seen, task = task.sample(estimators, source, middle, others)
+    if method.weighs_all:
+        task = task.weighed(estimators, source, tiles)
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray
@@ -624,6 +626,16 @@ class _TileTask:
             with whole.compared(beside[-1]), collected_notes():
                 estimate(estimators, method, source.cut(*piece.around), model_error=off)
         return found, seen, replace(self, whole=whole.together(beside))
+
+    def weighed(self, estimators: Estimators, source: Source, tiles: Sequence[Tile]) -> _TileTask:
+        """The task that knows the power of all lenslets."""
+        method, off, power = METHODS[self.recipe.settings.method], self.model_error, []
+        for tile in bar(tiles, len(tiles), "power of tiles"):
+            own: dict[str, list[Any]] = {}
+            with self.whole.compared(own), collected_notes():
+                estimate(estimators, method, source.cut(*tile.around), model_error=off)
+            power.append({name: own[name] for name in ("power",) if name in own})
+        return replace(self, whole=self.whole.together(power))
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile; what there is to say was said of the whole."""

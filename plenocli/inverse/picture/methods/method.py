@@ -85,6 +85,7 @@ class Method(ABC):
     each_pixel: whether every pixel counts by its own noise.
     in_batches: whether its lenslets are solved in batches, which processes may share.
     in_tiles: whether large captures may be estimated tile by tile.
+    weighs_all: whether one weight goes by the power of all lenslets, which some do not tell.
     points_around: of a method that sees the whole picture, how far a point looks.
     """
 
@@ -98,6 +99,7 @@ class Method(ABC):
     each_pixel: bool = False
     in_batches: bool = False
     in_tiles: bool = True
+    weighs_all: bool = False
     points_around: int = 0
 
     def makes_joint_estimate(self, estimators: Estimators) -> bool:

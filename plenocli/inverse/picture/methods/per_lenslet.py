@@ -311,6 +311,7 @@ TIKHONOV = Estimator(
     sees=Sees.LENSLET,
     phases=footprint.lmmse_phases,
     options=("alpha",),
+    weighs_all=True,
     hindsight=True,
     estimate=partial(_by_lenslet, tikhonov, True, True),
 )
@@ -319,6 +320,7 @@ TSVD = Estimator(
     sees=Sees.LENSLET,
     phases=footprint.lmmse_phases,
     options=("rank",),
+    weighs_all=True,
     hindsight=True,
     estimate=partial(_by_lenslet, tsvd, True, True),
 )

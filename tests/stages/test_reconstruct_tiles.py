@@ -70,8 +70,9 @@ def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name
     one, two = (found.data["image/value"] for found in (whole, tiled))
     truth = truths[name]
     assert two.shape == one.shape == truth.shape
-    # 144 lenslets tell the veil that this camera seems to have less surely than 576
-    assert psnr(two, truth) == pytest.approx(psnr(one, truth), abs=0.2)
+    # the veil that this camera seems to have, by chance, may be told less of by 144 lenslets
+    assert psnr(two, truth) > psnr(one, truth) - 0.1
+    assert np.mean((two - one) ** 2) < 0.25 * np.mean((one - truth) ** 2)
     borders = np.arange(1, COUNT) * N
     at = borders[borders % (SIDE * N) == 0]
     near = np.array([b for b in borders if b not in at and min(abs(b - at)) <= 3 * N])

@@ -94,24 +94,8 @@ def run_capture_sim(
     polarised = settings.polarisation is not None
     require_memory_for(camera, options, camera_path, in_parts=in_parts, polarised=polarised)
     source, what = _source(camera, settings, scene)
-    found = None
-    if settings.target == "dark" and not pif:
-        found = dark_capture(camera, options, in_parts=in_parts)
-    accuracy: dict[str, Any] = {}
-    if found is None:
-        matrices, accuracy = _matrices(pif, camera, settings, source.wavelengths, camera_path)
-        _tell_of_the_field(AccuracyRecord.from_json(accuracy))
-        name, band = settings.target or str(scene), _band(settings.target)
-        found = simulate_capture(
-            camera,
-            source,
-            what,
-            options,
-            matrices=matrices,
-            name=name,
-            band_m=band,
-            in_parts=in_parts,
-        )
+    name = settings.target or str(scene)
+    found, accuracy = _exposed(camera, camera_path, settings, source, what, pif, name, in_parts)
     provenance = Provenance(
         command=command,
         inputs=describe_inputs(camera_files(camera_path, camera) | others),
@@ -133,6 +117,37 @@ def run_capture_sim(
         if scene_out:
             _write_scene(scene_out, truth, bands, provenance, overwrite)
     return _summary(output, found, len(source.wavelengths))
+
+
+def _exposed(
+    camera: Camera,
+    camera_path: str | Path,
+    settings: Settings,
+    source: Quadrature,
+    scene: Scene,
+    pif: str | Path | None,
+    name: str,
+    in_parts: bool,
+) -> tuple[SimulatedCapture, dict[str, Any]]:
+    """(the exposure, the accuracy record of its matrices)."""
+    options = settings.options
+    if settings.target == "dark" and not pif:
+        found = dark_capture(camera, options, in_parts=in_parts)
+        if found is not None:
+            return found, {}
+    matrices, accuracy = _matrices(pif, camera, settings, source.wavelengths, camera_path)
+    _tell_of_the_field(AccuracyRecord.from_json(accuracy))
+    found = simulate_capture(
+        camera,
+        source,
+        scene,
+        options,
+        matrices=matrices,
+        name=name,
+        band_m=_band(settings.target),
+        in_parts=in_parts,
+    )
+    return found, accuracy
 
 
 def _file(name: str | Path | None) -> str | Path | None:

@@ -84,7 +84,7 @@ class Bench:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlaneOfTiles:
     """The rows of a picture whose tiles are finished; see InParts.
 
@@ -163,7 +163,9 @@ def picture(
         InParts(
             shape=size,
             dtype=np.float64,
-            parts=PlaneOfTiles(bench, tuple(tiles), which, shape, bands),
+            parts=PlaneOfTiles(
+                bench=bench, tiles=tuple(tiles), which=which, shape=shape, bands=bands
+            ),
         )
         for which in range(len(first) - 1)
     ]

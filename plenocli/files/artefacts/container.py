@@ -496,7 +496,9 @@ class Stored:
     def window(self, rows: slice, columns: slice = slice(None)) -> np.ndarray:
         """Part of the last two axes; InputError where it cannot be read."""
         seconds = _LOOK_S + self.path.stat().st_size // _SLOWEST
-        return outside(window, self.path, self.dataset.name, rows, columns, seconds=seconds)
+        name, shape = self.dataset.name, self.shape
+        part = [*rows.indices(shape[-2])[:2], *columns.indices(shape[-1])[:2]]
+        return outside(window, self.path, name, part, seconds=seconds)[name]
 
 
 @contextlib.contextmanager

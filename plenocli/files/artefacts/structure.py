@@ -99,11 +99,14 @@ def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:
         raise no_hdf5(path, error) from error
 
 
-def window(path: str, name: str, rows: slice, columns: slice) -> np.ndarray:
-    """Part of the last two axes of a dataset; runs outside, as compressed_values."""
+def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:
+    """Rows and columns, first and last but one each, of a dataset's last two axes, by its name;
+    runs outside, as compressed_values.
+    """
+    top, bottom, left, right = part
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return file[name][..., rows, columns]
+            return {name: file[name][..., top:bottom, left:right]}
     except Exception as error:
         raise no_hdf5(path, error) from error
 

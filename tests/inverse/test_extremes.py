@@ -77,7 +77,7 @@ def test_data_times_s_give_results_times_s(scale):
     assert scaled == pytest.approx(alpha, rel=1e-9)
     assert linear.best_rank(
         svd, linear.power_of(svd.compress(scale * y)), scale * 1e-3
-    ) == linear.best_rank(svd, svd.compress(y), 1e-3)
+    ) == linear.best_rank(svd, linear.power_of(svd.compress(y)), 1e-3)
     assert linear.estimate_noise(svd, scale * y) == pytest.approx(
         scale * linear.estimate_noise(svd, y), rel=1e-9
     )

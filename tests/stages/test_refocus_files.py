@@ -126,7 +126,8 @@ def test_a_folder_of_captures_is_refocused_once_and_bad_ones_do_not_stop_it(fold
     assert run([*words, "-o", str(out), "--json"]) == 3
     told = json.loads(capsys.readouterr().out)
     assert told["done"] == 2 and [one["capture"][-4:] for one in told["failed"]] == ["c.h5"]
-    assert sorted(path.name for path in out.iterdir()) == ["a.tif", "b.tif"]
+    names = ["a.tif", "b.tif", "summary.csv", "summary.json"]
+    assert sorted(path.name for path in out.iterdir()) == names
     before = (out / "a.tif").stat().st_mtime_ns
     (folder / "shots/c.h5").unlink()
     assert run([*words, "-o", str(out)]) == 0

@@ -22,6 +22,7 @@ from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
+from plenocli.stages.inverse.refocus import Settings as Refocus
 from plenocli.stages.inverse.refocus import run_refocus
 from plenocli.stages.inverse.volume import run_volume
 from plenocli.stages.sweep.sweep import run_sweep
@@ -209,7 +210,8 @@ def test_a_volume_for_fiji_has_its_errors_beside_it(seen, tmp_path):
     stored, stack = read_volume(tmp_path / "v.h5"), read_tiff_volume(tmp_path / "v.ome.tif")
     assert np.array_equal(stack.value, stored.value) and stack.step == pytest.approx(4e-6)
     with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
-        assert np.array_equal(file.asarray()[1], stored.sigma)
+        assert file.series[0].axes == "ZCYX"
+        assert np.array_equal(file.asarray()[:, 1], stored.sigma)
 
 
 def test_a_capture_of_another_camera_is_refused(seen, tmp_path):
@@ -252,7 +254,10 @@ def test_ome_tiff_is_what_another_reader_reads(tmp_path):
             pixels = tree.fromstring(description).find(".//{*}Pixels")
         number += 1
         source.close()
-    assert np.array_equal(np.array(planes).reshape(2, 4, 9, 7), np.stack([value, sigma]))
+    # channels vary before planes do, and the XML says so
+    assert pixels.attrib["DimensionOrder"] == "XYCZT"
+    both = np.stack([value, sigma], axis=1)
+    assert np.array_equal(np.array(planes).reshape(4, 2, 9, 7), both)
     sizes = {k: float(v) for k, v in pixels.attrib.items() if k in ("SizeZ", "SizeC")}
     assert sizes == {"SizeZ": 4, "SizeC": 2}
     found = [float(pixels.attrib[f"PhysicalSize{axis}"]) for axis in "XYZ"]
@@ -366,7 +371,9 @@ def test_the_depth_of_two_opaque_layers_is_found_and_their_volume_shows_both(she
     assert np.allclose(truth.depth, [0.48, 0.64]) and truth.opacity.shape == (2, 48, 44)
     assert truth.opacity[0, :, :20].min() == 1 and truth.opacity[0, :, 24:].max() == 0
     assert not truth.value[1, :, :18].any() and truth.value[1, :, 26:].any()
-    run_refocus(tmp_path / "capture.h5", tmp_path / "planes.h5", camera=sheets / "camera.toml")
+    run_refocus(
+        [tmp_path / "capture.h5"], tmp_path / "planes.h5", Refocus(camera=sheets / "camera.toml")
+    )
     figures = (
         run_score([tmp_path / "planes.h5"], tmp_path / "d.json", truth=tmp_path / "truth.h5")
         .results[0]

@@ -33,7 +33,7 @@ DEFINITIONS = {
     "bead_width_m": (
         "full width at half maximum across the axis at the truth's beads, the median: its "
         "brightest places from which it falls to half in all directions, at most three times as "
-        "far in one as in another"
+        "far in one as in another; NaN where it falls to half at none of them"
     ),
     "bead_depth_m": "the same along the axis",
     "volume_z_rms": "root mean square of error over stated standard deviation",
@@ -142,8 +142,11 @@ def _beads(
             widths.append(_widths(found, place, spacing))
     if not widths:
         return None
-    depth, rows, columns = np.nanmedian(np.where(np.isfinite(widths), widths, np.nan), axis=0)
-    return BeadsScore(bead_width_m=float(np.sqrt(rows * columns)), bead_depth_m=float(depth))
+    depth, rows, columns = (
+        float(np.median(axis[np.isfinite(axis)])) if np.isfinite(axis).any() else float("nan")
+        for axis in np.array(widths).T
+    )
+    return BeadsScore(bead_width_m=float(np.sqrt(rows * columns)), bead_depth_m=depth)
 
 
 def _widths(

@@ -113,15 +113,6 @@ _PIF_ATTRS = (
 )
 
 
-def _shapes_of_matrix(data: Mapping[str, np.ndarray]) -> str | None:
-    if "pif/A" not in data:
-        return None
-    for name, length in zip(("pif/pixel_shape", "pif/object_shape"), data["pif/A"].shape[2:]):
-        if np.prod(data[name], dtype=object) != length:
-            return f"'{name}' is {data[name].tolist()}, but 'pif/A' has {length}"
-    return None
-
-
 PIF = Schema(
     kind="pif",
     version=1,
@@ -143,7 +134,6 @@ PIF = Schema(
     ),
     attrs={"pif": _PIF_ATTRS},
     plots={"pif": ("A", ())},
-    rules=(_shapes_of_matrix,),
     default=("pif",),
 )
 

@@ -13,7 +13,7 @@ import numpy as np
 from h5py import h5d, h5ds, h5l, h5t, h5z
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.errors import InputError
 from plenocli.base.memory import can_have
 
 Name: TypeAlias = str | os.PathLike[str]
@@ -81,27 +81,9 @@ def survey(
     return dict(sorted(declared.items()))
 
 
-def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:
-    """Dataset path -> values of those that are stored in pieces, which a damaged index of pieces
-    may lead HDF5 astray in; runs outside.
-
-    skip: datasets that are not wanted.
-
-    Raises as survey; InputError and MemoryError for what HDF5 cannot read.
-    """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            wanted = [name for name in survey(path, file, skip) if name not in skip]
-            return {name: file[name][()] for name in wanted if file[name].chunks is not None}
-    except (PlenoError, MemoryError):
-        raise
-    except Exception as error:  # h5py raises half a dozen types for a malformed file
-        raise no_hdf5(path, error) from error
-
-
 def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:
     """Rows and columns, first and last but one each, of a dataset's last two axes, by its name;
-    runs outside, as compressed_values.
+    runs outside, as `container.compressed_values`.
     """
     top, bottom, left, right = part
     try:

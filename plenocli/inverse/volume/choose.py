@@ -12,13 +12,13 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.progress import bar
-from plenocli.inverse.volume.lmmse import lmmse
+from plenocli.inverse.volume.lmmse import is_uneven, lmmse
 from plenocli.inverse.volume.measurement import Problem
 from plenocli.inverse.volume.richardson_lucy import iterate, richardson_lucy
 from plenocli.inverse.volume.total_variation import total_variation
 from plenocli.inverse.volume.volume import Trial, Volume
 
-SOLVERS: dict[str, Callable[[Problem], Volume]] = {
+SOLVERS: dict[str, Callable[..., Volume]] = {
     "rl": richardson_lucy,
     "lmmse": lmmse,
     "tv": total_variation,
@@ -56,6 +56,14 @@ def volume_of(problem: Problem, method: str = "auto") -> Volume:
             best = found
     assert best is not None
     return replace(best, trace=(*tried, *best.trace))
+
+
+def volume_like(problem: Problem, other: Volume) -> Volume:
+    """The volume behind another part of the same specimen, by the method of `other`; its error bars
+    follow the specimen where those of `other` do, else they would jump from part to part.
+    """
+    linear = {} if other.sigma is None else {"uneven": is_uneven(other.value)}
+    return SOLVERS[other.method](problem, **linear)
 
 
 def _misfit(problem: Problem, volume: Volume) -> float:

@@ -33,15 +33,18 @@ GAUSSIAN = 5.0
 """Kurtosis up to which a volume passes for Gaussian, which has 3."""
 
 
-def lmmse(problem: Problem, white: bool = False, rounds: int = ROUNDS) -> Volume:
+def lmmse(
+    problem: Problem, white: bool = False, rounds: int = ROUNDS, *, uneven: bool | None = None
+) -> Volume:
     """The linear estimate of the least mean square error, and its standard deviation.
 
     problem: pixels that do not count, and the border, are filled with what is predicted of them.
     white: take voxels for independent (Tikhonov), instead of correlated as exp(-r/l).
     rounds: of filling, at most.
+    uneven: whether the errors follow the specimen; None: where the volume is no Gaussian.
 
-    Returns a volume whose sigma is that of a Gaussian specimen of the same statistics; where the
-    volume is none, it follows the specimen: sigma^2 (0.1 + 0.9 e/mean e), e its local mean square.
+    Returns a volume whose sigma is that of a Gaussian specimen of the same statistics; where they
+    are uneven, it follows the specimen: sigma^2 (0.1 + 0.9 e/mean e), e its local mean square.
     Raises NumericsError where memory is lacking.
     docs/model.md, "Volumes inverted".
     """
@@ -67,7 +70,7 @@ def lmmse(problem: Problem, white: bool = False, rounds: int = ROUNDS) -> Volume
     method = "tikhonov" if white else "lmmse"
     return Volume(
         value=value,
-        sigma=_sigma(problem, gain, value),
+        sigma=_sigma(problem, gain, value, is_uneven(value) if uneven is None else uneven),
         method=method,
         trace=(Trial(method, problem.misfit(light)),),
         background=float(problem.measurement.offset.mean()),
@@ -161,15 +164,20 @@ def _weights(problem: Problem, gain: Gain, own: np.ndarray) -> np.ndarray:
     return np.where(problem.counts, weight, 0)
 
 
-def _sigma(problem: Problem, gain: Gain, value: np.ndarray) -> np.ndarray:
-    """Like value: by voxel of the lenslet, and where the specimen is."""
+def is_uneven(value: np.ndarray) -> bool:
+    """Whether a volume is further from a Gaussian than passes for one."""
+    rest = value - value.mean()
+    return bool(np.mean(rest**4) > GAUSSIAN * np.mean(rest**2) ** 2)
+
+
+def _sigma(problem: Problem, gain: Gain, value: np.ndarray, uneven: bool) -> np.ndarray:
+    """Like value: by voxel of the lenslet, and where uneven by where the specimen is."""
     from scipy.ndimage import gaussian_filter
 
     rows, columns = problem.op.range.shape[:2]
     even = np.broadcast_to(gain.variance, (rows, columns, len(gain.variance)))
     variance = problem.voxels.picture(even)
-    rest = value - value.mean()
-    if np.mean(rest**4) > GAUSSIAN * np.mean(rest**2) ** 2:
+    if uneven:
         local = gaussian_filter(value.astype(float) ** 2, WIDTH)
         variance = variance * (EVEN + (1 - EVEN) * local / local.mean())
     return np.sqrt(variance).astype(value.dtype)

@@ -14,7 +14,7 @@ from plenocli.base.budget import budget
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
 from plenocli.forward.volume.stack import Stack
-from plenocli.inverse.volume.choose import volume_of
+from plenocli.inverse.volume.choose import volume_like, volume_of
 from plenocli.inverse.volume.haze import haze, without_haze
 from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, Voxels, lots
 from plenocli.inverse.volume.volume import HeldOut, Prior, Trial, Volume, predictive_sigma
@@ -155,7 +155,8 @@ class Tiles:
         return taken / float(self.measurement.signal.mean()) if taken else 0.0
 
     def volume(self) -> Volume:
-        """The volume of all windows; "auto" chooses by the brightest one.
+        """The volume of all windows; the brightest one decides what "auto" takes and
+        whether error bars follow the specimen.
 
         Raises as volume_of.
         """
@@ -163,7 +164,7 @@ class Tiles:
             return volume_of(self.problem(self.windows[0]), self.method)
         first = volume_of(self.problem(self.brightest), self.method)
         found = [
-            first if w is self.brightest else volume_of(self.problem(w), first.method)
+            first if w is self.brightest else volume_like(self.problem(w), first)
             for w in bar(self.windows, len(self.windows), "windows")
         ]
         return self._joined(found)

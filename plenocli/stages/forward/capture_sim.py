@@ -391,6 +391,13 @@ def _read_pif(
         )
     known, offsets = (artefact.data[f"pif/{part}"] for part in ("wavelength", "lenslet_offset"))
     shapes = artefact.data["pif/pixel_shape"], artefact.data["pif/object_shape"]
+    for shape, length in zip(shapes, artefact.data["pif/A"].shape[2:]):
+        if np.prod(shape, dtype=object) != length:
+            raise InputError(
+                f"says {' x '.join(map(str, shape))} of what its matrix has {length}",
+                path,
+                "make it again with simulate-pif",
+            )
     stored: dict[float, StoredMatrix | StoredField] = {}
     for wavelength in wavelengths:
         band = int(np.argmin(np.abs(known - wavelength)))

@@ -36,12 +36,12 @@ class Mosaic:
         size = (len(self.bands), COUNT[0] + 1, COUNT[1] + 1)
         self.values = np.random.default_rng(seed).uniform(0.05, 0.9, size)
 
-    def at(self, wavelength, rows, columns):
+    def at(self, wavelength, rows, columns, part=slice(None)):
         i, j = (
             np.floor((np.arange(n) + 0.5) / n * count + self.offset).astype(int)
             for n, count in zip((rows, columns), COUNT)
         )
-        return self.values[self.bands.index(wavelength)][i][:, j].astype(np.float32)
+        return self.values[self.bands.index(wavelength)][i[part]][:, j].astype(np.float32)
 
     def truth(self):
         fine = 30

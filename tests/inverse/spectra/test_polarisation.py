@@ -28,8 +28,8 @@ class Grey:
 
     spectral = False
 
-    def at(self, wavelength, rows, columns):
-        return np.full((rows, columns), LEVEL, np.float32)
+    def at(self, wavelength, rows, columns, part=slice(None)):
+        return np.full((rows, columns), LEVEL, np.float32)[part]
 
 
 @pytest.fixture(scope="module")

@@ -68,7 +68,7 @@ extremes: $(READY) ## errors of the solvers against the condition of the matrix;
 honesty: $(READY) ## 2,000 random cameras of all shapes at random accuracies, and 300 lenslets off the axis, against sums that share no code with the models (an hour or two)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "" tests/forward/propagation/test_foreign_cameras.py
 
-faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, lack of memory, bombs (some 40 minutes on 2 cores)
+faults: $(READY) ## the fault campaigns in full: 13,000 damaged files, 3,200 kills, full disks, power cuts, lack of memory, bombs (an hour or so on 2 cores)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "" --campaign tests/faults
 
 kills: $(READY) ## 400 kills at random times of each kind: every stage, make, and client, workers and scheduler of a sweep on Dask (hours)

@@ -15,6 +15,7 @@ import errno
 import fcntl
 import importlib
 import json
+import mmap
 import os
 import pkgutil
 import resource
@@ -48,7 +49,7 @@ def _import_everything():
 
 def _serve(request):
     # a pipe takes the messages: a limit of file sizes does not hold for it
-    (heard, said), (noticed, fired) = os.pipe(), os.pipe()
+    (heard, said), fired = os.pipe(), _Notes()
     fcntl.fcntl(said, fcntl.F_SETPIPE_SZ, 1 << 20)
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     child = os.fork()
@@ -70,8 +71,39 @@ def _serve(request):
         "hung": not ended and request["kill_after"] is None,
     }
     os.close(handle)
-    notes = _drain(noticed, fired).decode()
+    notes = fired.text()
     return answer | {"fired": bool(notes), "notes": notes}
+
+
+class _Notes:
+    """What the command and its own children write down, in memory that all of them share: a child
+    that decodes files closes what it inherits and may not write.
+    """
+
+    def __init__(self):
+        self._memory = mmap.mmap(-1, 1 << 20)
+
+    def add(self, text):
+        """Append; what has no room is lost."""
+        at, data = self._number(0), text.encode()
+        if 16 + at + len(data) <= len(self._memory):
+            self._memory[16 + at : 16 + at + len(data)] = data
+            self._memory[0:8] = (at + len(data)).to_bytes(8, "little")
+
+    def count(self):
+        """How often this was called, by any of them."""
+        number = self._number(8) + 1
+        self._memory[8:16] = number.to_bytes(8, "little")
+        return number
+
+    def text(self):
+        """All that was added; closes it."""
+        text = self._memory[16 : 16 + self._number(0)].decode()
+        self._memory.close()
+        return text
+
+    def _number(self, at):
+        return int.from_bytes(self._memory[at : at + 8], "little")
 
 
 def _drain(reader, writer):
@@ -114,7 +146,7 @@ def _arm(fault, fired):
     if fault.get("places"):
         from tests.messages import listen
 
-        listen(lambda place: _real_write(fired, f"{place} ".encode()))
+        listen(lambda place: fired.add(f"{place} "))
     if "call" not in fault:
         return None
     number = getattr(errno, fault.get("error", "ENOSPC"), None)
@@ -125,7 +157,7 @@ def _arm(fault, fired):
     if fault["call"] == "filesize":
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (fault["nth"], resource.RLIM_INFINITY))
-        return _real_write(fired, b"x ")
+        return fired.add("x ")
     if fault["call"] == "memory":
         with open("/proc/self/status") as table:
             used = next(int(line.split()[1]) << 10 for line in table if line.startswith("VmData"))
@@ -147,16 +179,13 @@ def _arm(fault, fired):
             return real(*arguments, **named)
         seen += 1
         if seen == fault["nth"] or (fault.get("lasting") and seen > fault["nth"]):
-            _real_write(fired, b"x ")
+            fired.add("x ")
             if number is None:
                 return False
             raise OSError(number, os.strerror(number))
         return real(*arguments, **named)
 
     setattr(home, fault["call"], failing)
-
-
-_real_write = os.write
 
 
 def _is_console(descriptor):
@@ -174,7 +203,7 @@ def _arm_bytes(room, number, fired):
             if _is_console(descriptor):
                 return real(descriptor, view, *rest)
             if left <= 0 and len(view):
-                _real_write(fired, b"x ")
+                fired.add("x ")
                 raise OSError(number, os.strerror(number))
             written = real(descriptor, memoryview(view).cast("B")[:left], *rest)
             left -= written
@@ -184,24 +213,23 @@ def _arm_bytes(room, number, fired):
 
 
 def _arm_arrays(nth, lasting, fired):
-    """numpy's memory comes from functions of ours; the nth piece, and perhaps all that
-    follow, is refused.
+    """numpy's memory comes from functions of ours; the nth piece, here or in a child that
+    decodes, and perhaps all that follow, is refused.
     """
     import ctypes
 
     import numpy
 
     size, address = ctypes.c_size_t, ctypes.c_void_p
-    libc, seen = ctypes.CDLL(None), 0
+    libc = ctypes.CDLL(None)
     for name in ("malloc", "calloc", "realloc"):
         getattr(libc, name).restype = address
 
     def granted():
-        nonlocal seen
-        seen += 1
+        seen = fired.count()
         refused = seen == nth or (lasting and seen > nth)
         if seen == nth:
-            _real_write(fired, b"x ")
+            fired.add("x ")
         return not refused
 
     kinds = {
@@ -267,7 +295,7 @@ def _arm_short(fired):
             count[0] += 1
             if _is_console(descriptor):
                 return real(descriptor, view, *rest)
-            _real_write(fired, b"x ")
+            fired.add("x ")
             return real(descriptor, memoryview(view).cast("B")[: 1 + count[0] * 997 % 7000], *rest)
 
         setattr(os, name, short)

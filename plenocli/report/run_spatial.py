@@ -196,7 +196,7 @@ FACTS = (
 def _add_matrix(page: Page, file: RunFile) -> None:
     from plenocli.report.figures import matrix_figures
 
-    matrix = matrix_of(file.artefact())
+    matrix = matrix_of(file.artefact(), file.path)
     page.heading(f"System matrix {file.name.removesuffix('.h5')}", file.made_by)
     facts = [
         (
@@ -260,5 +260,5 @@ def _add_dictionary(page: Page, run: RunFolder, file: RunFile) -> None:
             f"{notes.get('lmmse_psnr_db', 0):.2f} dB): reconstruct with LMMSE instead."
         )
     source = run.source_of_kind(file, "pif")
-    matrix = None if source is None else matrix_of(source.artefact())
+    matrix = None if source is None else matrix_of(source.artefact(), source.path)
     page.figures(dictionary_figures(result_of(artefact, file.path), file.name, matrix))

@@ -120,6 +120,7 @@ IMPOSSIBLE = [
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "lambda", -1.0)),
     ("image.h5", SCORE, values("image/value", lambda v: v * 0 + 1e300)),
     ("pif.h5", SIMULATE, values("pif/pixel_shape", lambda v: v * 0 + 1)),
+    ("pif.h5", "show X -o o.png", values("pif/pixel_shape", lambda v: v * 0 + 1)),
     ("dictionary.h5", RESUME, other("dictionary/state/atoms", lambda v: v[:, :1])),
     ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
 ]

@@ -18,6 +18,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
+from plenocli.base.text import by
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
 from plenocli.files.artefacts.provenance import Provenance, file_digest
 from plenocli.files.artefacts.stream import streamed_artefact
@@ -299,6 +300,28 @@ def read_field(
                 "make all again",
             )
     return nodes, parts
+
+
+def shapes_of(
+    artefact: Artefact, path: str | os.PathLike | None = None
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(rows, columns) of a superpixel's pixels and of an object's points, of the kind pif.
+
+    Raises InputError where its matrices have others.
+    """
+    pixels, points = (
+        (int(rows), int(columns))
+        for rows, columns in (artefact.data[f"pif/{name}_shape"] for name in ("pixel", "object"))
+    )
+    sizes = artefact.data["pif/A"].shape[2:]
+    if sizes != (math.prod(pixels), math.prod(points)):
+        raise InputError(
+            f"has matrices of {by(sizes)} for superpixels of {by(pixels)} pixels and blocks of "
+            f"{by(points)} points",
+            path,
+            "run simulate-pif again",
+        )
+    return pixels, points
 
 
 def turned_part(part: Artefact, how: Turn) -> np.ndarray:

@@ -10,7 +10,6 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.progress import collected_notes, note
-from plenocli.base.text import by
 from plenocli.forward.accuracy.field_nodes import FieldNodes, Place
 from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
@@ -86,6 +85,8 @@ def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | Non
 
 def _lenslet_matrix(artefact: "Artefact", path: Path, *, by_band: bool) -> LensletMatrix:
     """As read_lenslet_matrix, of an artefact of kind pif."""
+    from plenocli.files.artefacts.shards import shapes_of
+
     if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError(
             (
@@ -100,20 +101,8 @@ def _lenslet_matrix(artefact: "Artefact", path: Path, *, by_band: bool) -> Lensl
         raise InputError(
             "lacks the object's own superpixel, offset (0, 0)", path, "run simulate-pif again"
         )
-    shapes = []
-    for name in ("pixel", "object"):
-        rows, columns = artefact.data[f"pif/{name}_shape"]
-        shapes.append((int(rows), int(columns)))
+    shapes = shapes_of(artefact, path)
     matrices = artefact.data["pif/A"]
-    if matrices.shape[2:] != (np.prod(shapes[0]), np.prod(shapes[1])):
-        raise InputError(
-            (
-                f"has matrices of {by(matrices.shape[2:])} for superpixels of {by(shapes[0])} "
-                f"pixels and blocks of {by(shapes[1])} points"
-            ),
-            path,
-            "run simulate-pif again",
-        )
     camera = _camera(artefact, path)
     bands, weights, illuminant = _bands(artefact, camera) if by_band else ((), None, None)
     if weights is None and len(matrices) > 1:

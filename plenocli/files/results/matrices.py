@@ -1,5 +1,6 @@
 """System matrices as they are looked at: with what simulate-pif says of them."""
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -66,21 +67,19 @@ def _numbers(value: object, bands: int) -> np.ndarray | None:
     return None if value is None else np.broadcast_to(np.ravel(np.asarray(value, float)), bands)
 
 
-def _pair(values: np.ndarray) -> tuple[int, int]:
-    rows, columns = (int(n) for n in values)
-    return rows, columns
+def matrix_of(artefact: "Artefact", path: str | os.PathLike | None = None) -> StoredMatrix:
+    """The matrix that a pif artefact holds, of the file `path`. Raises InputError as shapes_of."""
+    from plenocli.files.artefacts.shards import shapes_of
 
-
-def matrix_of(artefact: "Artefact") -> StoredMatrix:
-    """The matrix that a pif artefact holds."""
+    pixel_shape, object_shape = shapes_of(artefact, path)
     data, attrs = artefact.data, artefact.attrs.get("pif", {})
     bands = len(data["pif/wavelength"])
     return StoredMatrix(
         blocks=data["pif/A"],
         offsets=data["pif/lenslet_offset"],
         wavelengths=data["pif/wavelength"],
-        pixel_shape=_pair(data["pif/pixel_shape"]),
-        object_shape=_pair(data["pif/object_shape"]),
+        pixel_shape=pixel_shape,
+        object_shape=object_shape,
         column_energy=data["pif/column_energy"],
         singular_values=data.get("pif/singular_values"),
         rank=_numbers(attrs.get("rank"), bands),

@@ -90,12 +90,12 @@ def run_show(
             )
         figures = _compared(files, truth)
     else:
-        matrix = next((file.artefact for file in found if file.kind == "pif"), None)
+        matrix = next((file for file in found if file.kind == "pif"), None)
         choice = _Choice(
             centres=centres,
             points=points or None,
             lenslets=lenslets or None,
-            matrix=None if matrix is None else matrix_of(matrix),
+            matrix=None if matrix is None else matrix_of(matrix.stored(), matrix.path),
         )
         figures = [figure for file in found for figure in _FIGURES[file.kind](file, choice)]
     publish(output, stacked(figures), overwrite=overwrite)
@@ -117,7 +117,7 @@ def _pif(file: OpenedFile, choice: _Choice) -> Figures:
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.figures import matrix_figures
 
-    matrix = matrix_of(file.stored())
+    matrix = matrix_of(file.stored(), file.path)
     _require_inside(choice.points, matrix.object_shape, "--point", "object points")
     return matrix_figures(matrix, choice.points)
 

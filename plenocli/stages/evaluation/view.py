@@ -198,7 +198,7 @@ def _matrix(file: OpenedFile, choice: _Choice) -> list[Panel]:
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.viewer.panels import matrix_panels
 
-    return matrix_panels(matrix_of(file.stored()), file.path.name, choice.most)
+    return matrix_panels(matrix_of(file.stored(), file.path), file.path.name, choice.most)
 
 
 def _dictionary(file: OpenedFile, choice: _Choice) -> list[Panel]:

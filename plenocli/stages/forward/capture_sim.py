@@ -358,7 +358,7 @@ def _read_pif(
     belongs to another camera or lacks a wavelength.
     """
     from plenocli.files.artefacts.container import read_artefact
-    from plenocli.files.artefacts.shards import PIF_KINDS, read_field, read_pif
+    from plenocli.files.artefacts.shards import PIF_KINDS, read_field, read_pif, shapes_of
     from plenocli.files.config.camera_file import parse_camera
     from plenocli.files.read.cameras import require_same_files
 
@@ -390,14 +390,7 @@ def _read_pif(
             "was made for light of another polarisation", path, "run simulate-pif on this camera"
         )
     known, offsets = (artefact.data[f"pif/{part}"] for part in ("wavelength", "lenslet_offset"))
-    shapes = artefact.data["pif/pixel_shape"], artefact.data["pif/object_shape"]
-    for shape, length in zip(shapes, artefact.data["pif/A"].shape[2:]):
-        if np.prod(shape, dtype=object) != length:
-            raise InputError(
-                f"says {' x '.join(map(str, shape))} of what its matrix has {length}",
-                path,
-                "make it again with simulate-pif",
-            )
+    shapes = shapes_of(artefact, path)
     stored: dict[float, StoredMatrix | StoredField] = {}
     for wavelength in wavelengths:
         band = int(np.argmin(np.abs(known - wavelength)))

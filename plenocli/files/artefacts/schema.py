@@ -1,6 +1,6 @@
 """What a schema is: a table of datasets and attributes from which the writer's checks, the reader's
 checks, the plotting attributes, `plenocli inspect` and the documentation all come. The tables
-themselves stand in `kinds`.
+themselves stand in kinds.toml.
 
 `python -m plenocli.files.artefacts` prints them as a Markdown page.
 """
@@ -121,16 +121,6 @@ class Schema:
     def attr_for(self, where: str, name: str) -> Attr | None:
         """The Attr `name` of group or dataset `where`, or None."""
         return next((attr for attr in self.attrs.get(where, ()) if attr.name == name), None)
-
-
-def dataset(path: str, dims: str | None, dtype: str, unit: str, doc: str, **options: Any) -> Field:
-    """A Field, as the tables write it: its columns in this order, what is rare by name."""
-    return Field(path=path, dims=dims, dtype=dtype, unit=unit, doc=doc, **options)
-
-
-def attribute(name: str, type: str, unit: str, doc: str, **options: Any) -> Attr:
-    """An Attr, as the tables write it: its columns in this order, what is rare by name."""
-    return Attr(name=name, type=type, unit=unit, doc=doc, **options)
 
 
 def _dtype_fits(dtype: Any, spec: str) -> bool:

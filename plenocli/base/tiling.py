@@ -5,11 +5,9 @@ memory.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextvars import ContextVar
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -86,106 +84,3 @@ def mirrored(rows: slice, reach: int, count: int) -> np.ndarray:
     the last of `count` rows they go back, each of these twice.
     """
     return np.pad(np.arange(count), reach, mode="symmetric")[rows.start : rows.stop + 2 * reach]
-
-
-_Value = TypeVar("_Value")
-
-
-@dataclass
-class Whole:
-    """What holds for all tiles of a whole, in the order in which it is asked for: known before, or
-    worked out on a piece that stands for the whole.
-
-    found: name -> values.
-    """
-
-    found: dict[str, list[Any]] = field(default_factory=dict)
-
-    @contextlib.contextmanager
-    def worked_out(self) -> Iterator[None]:
-        """While the block lasts, `common` works out what is not known, and keeps it here."""
-        known = {name: list(values) for name, values in self.found.items()}
-        with _during(_Run(known, self.found)):
-            yield
-
-    @contextlib.contextmanager
-    def taken_over(self) -> Iterator[None]:
-        """While the block lasts, `common` gives what is kept here."""
-        with _during(_Run(self.found)):
-            yield
-
-    @contextlib.contextmanager
-    def compared(self, others: dict[str, list[Any]]) -> Iterator[None]:
-        """The same; what the piece has by itself of what is put together is kept in `others`."""
-        with _during(_Run(self.found, others)):
-            yield
-
-    def together(self, others: Sequence[dict[str, list[Any]]]) -> Whole:
-        """With what `common` puts together of `others`, in place of the one piece's own."""
-        found = {name: list(values) for name, values in self.found.items()}
-        for name, values in found.items():
-            for place in range(len(values)):
-                beside = [o[name][place] for o in others if len(o.get(name, ())) > place]
-                if beside:
-                    values[place] = _joined(beside)
-        return Whole(found)
-
-
-def _joined(values: Sequence[Any]) -> Any:
-    """The mean of numbers; arrays of several axes one after the other, along a last one."""
-    if np.ndim(values[0]) < 2:
-        return np.mean(values, axis=0)
-    return np.concatenate([value.reshape(len(value), -1) for value in values], axis=1)
-
-
-@dataclass
-class _Run:
-    """One piece that is worked on: what is known of the whole, where what it has by itself is kept,
-    and how many values of each name were asked for.
-    """
-
-    known: dict[str, list[Any]]
-    kept: dict[str, list[Any]] | None = None
-    asked: dict[str, int] = field(default_factory=dict)
-
-    def value(self, name: str, work: Callable[[], _Value], together: bool) -> _Value:
-        place = self.asked.get(name, 0)
-        self.asked[name] = place + 1
-        known = self.known.get(name, [])
-        # a piece may ask more often than that which stands for the whole did
-        told: Any = known[min(place, len(known) - 1)] if known else None
-        if known and (self.kept is None or not together):
-            return told
-        with _during(None):
-            made = work()
-        if self.kept is not None:
-            self.kept.setdefault(name, []).append(made)
-        return told if known else made
-
-
-_run: ContextVar[_Run | None] = ContextVar("whole", default=None)
-
-
-@contextlib.contextmanager
-def _during(run: _Run | None) -> Iterator[None]:
-    token = _run.set(run)
-    try:
-        yield
-    finally:
-        _run.reset(token)
-
-
-def common(name: str, work: Callable[[], _Value], *, together: bool = False) -> _Value:
-    """What `work` gives; of a tile, what it gave on the piece that stands for the whole.
-
-    name: of the value. Where it is asked for several times, the order counts.
-    together: whether several pieces stand for the whole better than one: the means of numbers
-        (any,), or samples (kind, ..) of all of them.
-    """
-    run = _run.get()
-    return work() if run is None else run.value(name, work, together)
-
-
-def is_piece() -> bool:
-    """Whether what is worked on is a piece of a whole."""
-    return _run.get() is not None

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plenocli.base.tiling import InParts, Whole, bands, common, mirrored, to_blocks, to_plane
+from plenocli.base.tiling import InParts, bands, mirrored, to_blocks, to_plane
 
 
 def test_blocks_are_what_stands_in_the_plane_and_go_back():
@@ -41,26 +41,3 @@ def test_an_array_in_parts_is_put_together_plane_by_plane():
     parts = [plane[part] for plane in cube for part in bands(7, 3)]
     whole = InParts(shape=cube.shape, dtype=np.float32, parts=lambda: parts).whole()
     assert whole.dtype == np.float32 and (whole == cube.astype(np.float32)).all()
-
-
-def test_a_tile_takes_over_what_its_whole_knows():
-    def piece(values):
-        level = common("level", lambda: float(np.mean(values)), together=True)
-        most = common("most", lambda: common("inner", lambda: max(values)))
-        return level, most, common("level", lambda: level + len(values), together=True)
-
-    whole = Whole({"given": [7]})
-    assert piece([1, 3]) == (2, 3, 4)  # of no whole
-    with whole.worked_out():
-        assert common("given", lambda: 1) == 7
-        assert piece([1, 3]) == (2, 3, 4)
-    with whole.taken_over():
-        assert piece([5, 5, 5]) == (2, 3, 4)
-        # asked more often than there, and not asked there
-        assert common("level", lambda: 0) == 4 and common("other", lambda: 9) == 9
-    beside = {}
-    with whole.compared(beside):
-        assert piece([5, 5, 8]) == (2, 3, 4)
-    with whole.together([beside]).taken_over():
-        assert piece([0]) == (6, 3, 5)
-    assert "other" not in whole.found and "inner" not in whole.found

@@ -16,9 +16,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from plenocli.base.tiling import common, to_plane
+from plenocli.base.tiling import to_plane
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.lenslet_model import Common, Superpixels
 from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse
 
 INTERVAL, INSIDE = 1.96, 0.95
@@ -58,22 +58,25 @@ def of_picture(
     factor: of its method.
     """
     lmmse = estimators.prior.lmmse(data.known_sigma, data.scene)
-    x, left = posterior(lmmse, y, estimators.system.object_shape)
+    x, left = posterior(lmmse, y, estimators.system.object_shape, data.common)
     return factor * about(value - x, left)
 
 
-def posterior(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def posterior(
+    lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int], common: Common
+) -> tuple[np.ndarray, np.ndarray]:
     """LMMSE of each lenslet by itself, and its standard deviation in this capture.
 
     y: (lenslet_row, lenslet_column, pixel) own light.
     shape: points (rows, columns) of a block in one band.
+    common: gives what lenslets that are a part have in common.
 
     Returns (x, sigma), (lenslet_row, lenslet_column, point) each.
     docs/model.md, "Spatial reconstruction".
     """
     rows, columns = y.shape[:2]
     signals = y.reshape(rows * columns, -1).T
-    contrast = lmmse.contrast(signals)
+    contrast = lmmse.contrast(signals, common)
     scale = np.exp(np.log(SCALES) @ contrast)
     x, sigma = (
         found.T.reshape(rows, columns, -1)
@@ -85,7 +88,7 @@ def posterior(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> tuple[np.n
         weak = weak_power(lmmse, signals, scale)
         return float(np.exp(BY_WEAK * weak + BY_BORDER * (border - USUAL_BORDER)))
 
-    return x, sigma * common("wider", wider, together=True)
+    return x, sigma * common("wider", wider, (lmmse.sigma, float(lmmse.noise.sum())))
 
 
 def spread(lmmse: Lmmse, y: np.ndarray, contrast: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.base.tiling import common, is_piece
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
 from plenocli.inverse.picture.error_bars import of_picture, posterior
@@ -121,12 +120,12 @@ def estimate(
             data = replace(data, noise=replace(data.noise, model=model_error))
         found = method.reconstruct(estimators, data, truth)
         return replace(found, trace=(*bare.findings, *found.trace)), None
-    unit = common("unit", lambda: unit_of(estimators.system, data.y))
+    unit = data.common("unit", lambda: unit_of(estimators.system, data.y))
     estimators, data = _at_unit(estimators, data, unit)
     bare = _cleaned(estimators, data)
     _tell_of(bare)
     data = bare.data
-    bright = common("bright", lambda: unit_of(estimators.system, bare.data.y))
+    bright = data.common("bright", lambda: unit_of(estimators.system, bare.data.y))
     if abs(bright - 1) > DEFECTIVE:
         estimators, data = _at_unit(estimators, data, bright)
         unit *= bright
@@ -135,14 +134,10 @@ def estimate(
     data = replace(data, noise=Noise.of_sigma(belief.level.sigma))
     looked_through = estimators
     if not belief.right:
-
-        def said() -> None:
-            sigma = belief.level.sigma
-            cause = None if explain is None else explain(settled.own, sigma, data.scene)
-            taken_away = estimators.coupled and estimators.overlap == 3
-            _tell(belief, model_error, cause, coupled=taken_away)
-
-        common("said of the matrix", said)
+        noise = belief.level.sigma
+        cause = None if explain is None else explain(settled.own, noise, data.scene)
+        taken_away = estimators.coupled and estimators.overlap == 3
+        _tell(belief, model_error, cause, coupled=taken_away)
         rows = belief.lmmse.whitening()
         looked_through, joint = estimators.seen_through(rows), None
         data = replace(data, y=belief.cleared(data.y) @ rows.T)
@@ -152,27 +147,27 @@ def estimate(
     if found.sigma is not None and not belief.right:
         # noise that was raised swallows contrast: the bars are no shorter than with the noise told
         told = estimators.prior.lmmse(belief.level.sigma, data.scene)
-        _, left = posterior(told, settled.own, estimators.system.object_shape)
+        _, left = posterior(told, settled.own, estimators.system.object_shape, data.common)
         found = replace(found, sigma=np.maximum(found.sigma, left))
     kept = 1.0
     if guard:
-        found, kept = guarded(found, settled.own, belief, estimators.system.object_shape)
+        shape = estimators.system.object_shape
+        found, kept = guarded(found, settled.own, belief, shape, data.common)
     if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
         # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found
         sigma = of_picture(estimators, data, settled.own, found.value)
         found = replace(found, sigma=sigma)
     if kept < 1:
-        said_of = (
+        note(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
             "lenslet: more of it would not go on across the lenslets' borders"
         )
-        common("said of the detail", lambda: note(said_of))
-    seen = common("seen", lambda: what_is_seen(looked_through, settled.own, belief.lmmse))
+    seen = data.common("seen", lambda: what_is_seen(looked_through, settled.own, belief.lmmse))
     found = replace(found, trace=(*bare.findings, *found.trace))
     return _in_unit(found, Trusted.of(belief, kept, unit), unit), seen
 
 
-def _cleaned(estimators: Estimators, data: Superpixels) -> Cleaned:
+def _cleaned(estimators: Estimators, piece: Superpixels) -> Cleaned:
     """The capture without its nuisances. Neighbours' light that block means take away badly looks
     like a veil: where the matrix knows it, a veil is believed only if LMMSE over 3x3 lenslets
     leaves less over without it.
@@ -183,6 +178,7 @@ def _cleaned(estimators: Estimators, data: Superpixels) -> Cleaned:
         return left_over(estimators, found.data.y, estimate_jointly(estimators, found.data).value)
 
     def veil_believed() -> bool:
+        data = replace(piece, whole=None)
         bare = clean(estimators, data)
         tried.append(bare)
         veiled = any(isinstance(f, VeilFound) and f.removed for f in bare.findings)
@@ -194,14 +190,14 @@ def _cleaned(estimators: Estimators, data: Superpixels) -> Cleaned:
         tried.append(other)
         return False
 
-    believed = common("veil believed", veil_believed)
+    believed = piece.common("veil believed", veil_believed)
     # of a piece, what is common to all pieces is asked for again
-    return clean(estimators, data, veil=believed) if is_piece() else tried[-1]
+    return tried[-1] if piece.whole is None else clean(estimators, piece, veil=believed)
 
 
 def _tell_of(bare: Cleaned) -> None:
     """What was found of nuisances; of pieces, whoever puts them together says it."""
-    if not is_piece():
+    if bare.data.whole is None:
         bare.tell()
 
 
@@ -251,12 +247,12 @@ def _settle(
     given, svd = estimators.options.noise_sigma, estimators.svd
     takes_away = estimators.coupled and estimators.overlap == 3
     plain = estimators.without_stray(data.y) if takes_away else data.y
-    level = common("noise", lambda: noise_level(data.y, given, data.sigma, svd, plain))
+    level = data.common("noise", lambda: noise_level(data.y, given, data.sigma, svd, plain))
     told = replace(data, noise=Noise.of_sigma(level.sigma))
     if not takes_away:
         jointly = method.makes_joint_estimate(estimators)
         joint = estimate_jointly(estimators, told) if jointly else None
-        belief = common(
+        belief = data.common(
             "belief",
             lambda: believe(estimators, plain, level, data.scene, model_error=model_error),
         )
@@ -270,7 +266,7 @@ def _settle(
         scene = data.scene
         return believe(estimators, inner, found, scene, model_error=model_error, coupled=True)
 
-    return _Settled(belief=common("belief", believed), own=own, joint=joint)
+    return _Settled(belief=data.common("belief", believed), own=own, joint=joint)
 
 
 def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: bool) -> None:

@@ -30,9 +30,9 @@ def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate
     leaves open (docs/model.md, "Spatial reconstruction").
     """
     own = estimators.prior.lmmse(data.known_sigma, data.scene)
-    x, _, scale = estimators.prior.joint(data.known_sigma, data.scene).apply(data.y)
+    x, _, scale = estimators.prior.joint(data.known_sigma, data.scene).apply(data.y, data.common)
     y = own_light(estimators, data.y, x) if estimators.coupled else data.y
-    apart, left = error_bars.posterior(own, y, estimators.system.object_shape)
+    apart, left = error_bars.posterior(own, y, estimators.system.object_shape, data.common)
     return JointEstimate(
         value=x,
         sigma=error_bars.JOINTLY * error_bars.about(x - apart, left),

@@ -4,9 +4,11 @@ units.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -104,6 +106,76 @@ def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
     )
 
 
+Shared = Literal[
+    "unit",  # of brightness, what a capture is divided by
+    "bright",  # the same again, without defective pixels
+    "clipped",  # level at which pixels were
+    "pixel noise",  # and
+    "signal",  # by which defective pixels are told
+    "misfit",  # noise found over it, round by round
+    "spread",  # of pixels about what their neighbours tell, defects.Spread
+    "brightness",  # variance of lenslets', where a lenslet does not tell its own
+    "veil",  # VeilFound, and how far lenslets differ
+    "veil believed",
+    "noise",  # NoiseLevel
+    "belief",  # Belief
+    "method",  # that the trial chose, and why
+    "kept",  # share of detail
+    "seen",  # Seen
+    "contrasts",  # probability of each contrast, by estimator
+    "power",  # of directions, by which weights go
+    "start",  # error expected of what methods of the picture start from
+    "veil level",
+    "wider",  # factor of standard deviations, by estimator
+]
+"""What the pieces of a capture have in common."""
+MEANS: tuple[Shared, ...] = ("contrasts", "power", "start", "veil level", "wider")
+"""What is a mean over pieces from all over; the others are those of the one piece."""
+Common = Callable[..., Any]
+"""(name, what works it out, which of that name): the value, see Superpixels.common."""
+
+
+def alone(name: Shared, work: Callable[[], Any], which: Any = None) -> Any:
+    """A Common of no piece."""
+    return work()
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What holds for all of a capture, whichever piece of it is looked at.
+
+    found: name -> which of that name -> value.
+    closed: whether nothing is added: a tile works out by itself what was not found.
+    """
+
+    found: dict[Shared, dict[Any, Any]]
+    closed: bool = False
+
+    def value(self, name: Shared, work: Callable[[], Any], which: Any) -> Any:
+        """As Superpixels.common; the last of a name where this one was not found."""
+        known = self.found.get(name, {})
+        if which in known or (known and self.closed):
+            return known.get(which, [*known.values()][-1])
+        made = work()
+        if not self.closed:
+            self.found.setdefault(name, {})[which] = made
+        return made
+
+    def without_means(self) -> Whole:
+        """For another piece, which finds its own."""
+        return Whole({name: dict(of) for name, of in self.found.items() if name not in MEANS})
+
+    def closed_with(self, others: Sequence[Whole]) -> Whole:
+        """With the means over other pieces in place of what the one piece found."""
+        found = {name: dict(of) for name, of in self.found.items()}
+        for name in MEANS:
+            for which in found.get(name, {}):
+                of_others = [o.found[name][which] for o in others if which in o.found.get(name, {})]
+                if of_others:
+                    found[name][which] = np.mean(of_others, axis=0)
+        return Whole(found, closed=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Superpixels:
     """A capture as the estimators take it.
@@ -118,6 +190,7 @@ class Superpixels:
     variance: like y, of every pixel, inf where it counts for nothing; None where all are alike or
         nothing is known.
     own: (rows, columns) of a tile, the lenslets that are not there for their neighbours' sake.
+    whole: of a piece of a capture, what is common to all of it.
     """
 
     y: np.ndarray
@@ -128,6 +201,11 @@ class Superpixels:
     saturated: np.ndarray | None = None
     variance: np.ndarray | None = None
     own: tuple[slice, slice] = (slice(None), slice(None))
+    whole: Whole | None = None
+
+    def common(self, name: Shared, work: Callable[[], Any], which: Any = None) -> Any:
+        """What `work` gives; of a piece, what the whole has under this name."""
+        return work() if self.whole is None else self.whole.value(name, work, which)
 
     def cut(self, rows: slice, columns: slice, own: tuple[slice, slice]) -> Superpixels:
         """Those of some lenslets, of which `own` count."""

@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from plenocli.base.tiling import Whole, bands
+from plenocli.base.tiling import bands
 from plenocli.inverse.picture.estimate import BRIGHTNESS
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.nuisances.defects import DefectsFound
 from plenocli.inverse.picture.nuisances.saturation import SaturationFound
@@ -135,7 +135,7 @@ def survey(system: LensletMatrix, source: Source, tile: int) -> tuple[Whole, Til
         levels[rows] = found.mean(axis=2)
         detail[rows] = np.sqrt(np.mean((y - found @ system.even.T) ** 2, axis=2))
     unit = math.sqrt(power / values) / BRIGHTNESS
-    return Whole({"unit": [unit if unit > 0 else 1.0]}), _typical(levels, detail, tile)
+    return Whole({"unit": {None: unit if unit > 0 else 1.0}}), _typical(levels, detail, tile)
 
 
 def _typical(levels: np.ndarray, detail: np.ndarray, side: int) -> Tile:

@@ -14,7 +14,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import bar, collected_notes, note
-from plenocli.base.tiling import InParts, Whole, to_blocks
+from plenocli.base.tiling import InParts, to_blocks
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, Pool, absolute, open_pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
@@ -37,7 +37,7 @@ from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Account, Choice, Reconstruction
@@ -566,10 +566,8 @@ def _in_tiles(
     task = _TileTask(
         recipe=recipe, capture=capture, finer=finer, model_error=_off(limits), whole=whole
     )
-    others = spread_over(source.count, side_of(system))
+    others = tiles if method.weighs_all else spread_over(source.count, side_of(system))
     sample, seen, task = task.sample(estimators, source, middle, others)
-    if method.weighs_all:
-        task = task.weighed(estimators, source, tiles)
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray
@@ -617,25 +615,14 @@ class _TileTask:
         method = METHODS[self.recipe.settings.method]
         cause = partial(likely_cause, estimators)
         off, whole = self.model_error, self.whole
-        with whole.worked_out():
-            data = source.cut(*like.around)
-            found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
-        beside: list[dict[str, list[Any]]] = []
-        for piece in others:
-            beside.append({})
-            with whole.compared(beside[-1]), collected_notes():
-                estimate(estimators, method, source.cut(*piece.around), model_error=off)
-        return found, seen, replace(self, whole=whole.together(beside))
-
-    def weighed(self, estimators: Estimators, source: Source, tiles: Sequence[Tile]) -> _TileTask:
-        """The task that knows the power of all lenslets."""
-        method, off, power = METHODS[self.recipe.settings.method], self.model_error, []
-        for tile in bar(tiles, len(tiles), "power of tiles"):
-            own: dict[str, list[Any]] = {}
-            with self.whole.compared(own), collected_notes():
-                estimate(estimators, method, source.cut(*tile.around), model_error=off)
-            power.append({name: own[name] for name in ("power",) if name in own})
-        return replace(self, whole=self.whole.together(power))
+        data = replace(source.cut(*like.around), whole=whole)
+        found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
+        beside = [whole.without_means() for _ in others]
+        for piece, own in bar(list(zip(others, beside)), len(others), "what tiles share"):
+            with collected_notes():
+                data = replace(source.cut(*piece.around), whole=own)
+                estimate(estimators, method, data, model_error=off)
+        return found, seen, replace(self, whole=whole.closed_with(beside))
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile; what there is to say was said of the whole."""
@@ -646,9 +633,8 @@ class _TileTask:
             with superpixel_source(
                 self.capture, estimators.system, recipe.calibration, verify=False
             ) as source:
-                data = source.cut(*tile.around, tile.within)
-            with self.whole.taken_over():
-                found, _ = estimate(estimators, method, data, model_error=self.model_error)
+                data = replace(source.cut(*tile.around, tile.within), whole=self.whole)
+            found, _ = estimate(estimators, method, data, model_error=self.model_error)
         sigma = None if found.sigma is None else found.sigma[tile.within]
         value, trace = found.value[tile.within], found.trace
         return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)

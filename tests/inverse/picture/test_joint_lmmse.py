@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance
-from plenocli.inverse.picture.solvers import joint_lmmse
+from plenocli.inverse.picture.solvers import joint_lmmse, lmmse
 from plenocli.inverse.picture.solvers import least_squares as linear
 from plenocli.inverse.prior import natural_images as natural
 
@@ -144,7 +144,7 @@ def test_a_mean_over_contrasts_is_that_of_dense_mixtures():
                 - cross @ np.linalg.solve(data, cross.T)
             )
     logs, prior = np.log(scales), np.full(len(scales), 1 / len(scales))
-    for _ in range(joint_lmmse.ROUNDS):
+    for _ in range(lmmse.ROUNDS):
         share = np.exp(log - log.max(axis=0)) * prior[:, None]
         share /= share.sum(axis=0)
         middle = (weight := share.mean(axis=1)) @ logs

@@ -11,7 +11,7 @@ import pytest
 from plenocli.cli.inverse.reconstruct import METHODS as OFFERED
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, Options
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Choice, ContrastScale, Reconstruction
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
@@ -95,3 +95,21 @@ def test_later_findings_overrule_earlier_ones():
     told = found.as_json()
     assert told["noise_sigma"] == 2.0 and told["excess"] == 0.75 and told["scale"] == 0.5
     assert found.as_picture(POINTS).value.shape == POINTS and found.sigma is None
+
+
+def test_a_tile_takes_over_what_its_whole_knows():
+    def piece(values, whole):
+        common = Superpixels(y=np.zeros((1, 1, 1)), whole=whole).common
+        level = common("power", lambda: np.mean(values), "a")
+        return level, common("noise", lambda: max(values)), common("power", lambda: len(values))
+
+    whole = Whole({"unit": {None: 7}})
+    assert piece([1, 3], None) == piece([1, 3], whole) == (2, 3, 2)
+    beside = whole.without_means()
+    assert piece([5, 5, 8], beside) == (6, 3, 3)
+    assert whole.closed_with([]).found == whole.found
+    tile = whole.closed_with([beside, Whole({})])
+    assert piece([0], tile) == (6, 3, 3) and whole.found["power"] == {"a": 2, None: 2}
+    # asked more often than there, and not asked there
+    assert tile.value("noise", lambda: 0, "again") == 3 and tile.value("kept", lambda: 9, None) == 9
+    assert "kept" not in tile.found

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.base.tiling import common
 from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
 from plenocli.inverse.picture.reconstruction import Stats
 from plenocli.inverse.picture.solvers import least_squares
@@ -35,10 +35,10 @@ TOO_LOUD = 50
 """Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
 Solve = Callable[
-    [Estimators, np.ndarray, float, np.ndarray | None], tuple[np.ndarray, Stats | None]
+    [Estimators, np.ndarray, Superpixels, np.ndarray | None], tuple[np.ndarray, Stats | None]
 ]
-"""(estimators, y (pixel, signal), noise, truth (point, signal) or None) -> (x (point, signal), what
-there is to tell).
+"""(estimators, y (pixel, signal), the capture they are of, truth (point, signal) or None) ->
+(x (point, signal), what there is to tell).
 """
 
 
@@ -116,7 +116,7 @@ class DictionaryStats:
 
 
 def block_mean(
-    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
 ) -> tuple[np.ndarray, None]:
     """One value a lenslet and band."""
     system = estimators.system
@@ -124,7 +124,7 @@ def block_mean(
 
 
 def tikhonov(
-    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TikhonovStats]:
     """Weight given, by the discrepancy principle, or with hindsight."""
     svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
@@ -132,14 +132,14 @@ def tikhonov(
     if alpha is None and truth is not None:
         alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
     elif alpha is None:
-        power = common("power", lambda: least_squares.power_of(z), together=True)
-        alpha = least_squares.discrepancy_alpha(svd, power, sigma)
+        power = data.common("power", lambda: least_squares.power_of(z))
+        alpha = least_squares.discrepancy_alpha(svd, power, data.known_sigma)
         rule = "discrepancy"
     return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
 
 def tsvd(
-    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TsvdStats]:
     """Rank given, by the least estimated error, or with hindsight."""
     svd, rank, rule = estimators.svd, estimators.options.rank, "given"
@@ -147,15 +147,15 @@ def tsvd(
     if rank is None and truth is not None:
         rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
     elif rank is None:
-        power = common("power", lambda: least_squares.power_of(z), together=True)
-        rank = least_squares.best_rank(svd, power, sigma)
+        power = data.common("power", lambda: least_squares.power_of(z))
+        rank = least_squares.best_rank(svd, power, data.known_sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())
     return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
 
 
 def nnls(
-    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
 ) -> tuple[np.ndarray, NnlsStats]:
     """Converged, or stopped after so many iterations as the options say."""
     svd, steps = estimators.svd, estimators.options.nnls_iterations
@@ -193,11 +193,11 @@ def nnls_batch(estimators: Estimators, z: np.ndarray) -> tuple[np.ndarray, float
 
 
 def dictionary(
-    estimators: Estimators, y: np.ndarray, sigma: float, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
 ) -> tuple[np.ndarray, DictionaryStats]:
     """The mean over the mirror images of a learnt dictionary."""
     learnt, svd, asked = estimators.learnt, estimators.svd, estimators.options.lam
-    scale = float(svd.s[0])
+    sigma, scale = data.known_sigma, float(svd.s[0])
     louder = max(1.0, sigma / scale / learnt.sigma) if learnt.sigma > 0 else 1.0
     lam = asked if asked is not None else learnt.lam * louder**LOUDER_POWER
     if louder > TOO_LOUD:
@@ -244,44 +244,39 @@ def dictionary_batch(estimators: Estimators, z: np.ndarray, lam: float) -> Avera
 
 
 def adaptive_lmmse(
-    estimators: Estimators, sigma: float, scene: str | None, y: np.ndarray
+    estimators: Estimators, data: Superpixels, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """LMMSE of each lenslet by itself, each with its own contrast.
 
-    sigma: noise of a pixel.
-    scene: that training leaves out.
+    data: the capture, its noise known.
     y: (lenslet_row, lenslet_column, pixel).
 
     Returns (x, its standard deviation), (lenslet_row, lenslet_column, point).
     """
     rows, columns = y.shape[:2]
-    lmmse = estimators.prior.lmmse(sigma, scene)
-    x, sigma_of_x, _ = lmmse.adaptive(y.reshape(rows * columns, -1).T)
+    lmmse = estimators.prior.lmmse(data.known_sigma, data.scene)
+    x, sigma_of_x, _ = lmmse.adaptive(y.reshape(rows * columns, -1).T, data.common)
     return x.T.reshape(rows, columns, -1), sigma_of_x.T.reshape(rows, columns, -1)
 
 
 def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:
     y = light.y[light.inner]
-    x, _ = adaptive_lmmse(estimators, light.data.known_sigma, light.data.scene, y)
+    x, _ = adaptive_lmmse(estimators, light.data, y)
     return Estimate(
         value=x, sigma=error_bars.of_picture(estimators, light.data, y, x), from_lmmse=0.0
     )
 
 
-def _by_lenslet(
-    solve: Solve, noisy: bool, bars: bool, estimators: Estimators, light: OwnLight
-) -> Estimate:
+def _by_lenslet(solve: Solve, bars: bool, estimators: Estimators, light: OwnLight) -> Estimate:
     """The Estimate of `solve`, on all superpixels at once.
 
-    noisy: whether it has a use for the noise.
-    bars: whether it has a standard deviation, which needs the noise too.
+    bars: whether it has a standard deviation, which needs the noise.
     """
     y, truth = light.y[light.inner], light.truth
     rows, columns = y.shape[:2]
     if truth is not None:
         truth = truth[light.inner].reshape(-1, truth.shape[2]).T
-    sigma = light.data.known_sigma if noisy else 0.0
-    found, stats = solve(estimators, y.reshape(rows * columns, -1).T, sigma, truth)
+    found, stats = solve(estimators, y.reshape(rows * columns, -1).T, light.data, truth)
     value = found.T.reshape(rows, columns, -1)
     left = error_bars.of_picture(estimators, light.data, y, value) if bars else None
     if light.joint is not None:
@@ -304,7 +299,7 @@ BLOCK_MEAN = Estimator(
     sees=Sees.LENSLET_AS_IS,
     phases=footprint.no_more,
     needs_pif=False,
-    estimate=partial(_by_lenslet, block_mean, False, False),
+    estimate=partial(_by_lenslet, block_mean, False),
 )
 TIKHONOV = Estimator(
     name="tikhonov",
@@ -313,7 +308,7 @@ TIKHONOV = Estimator(
     options=("alpha",),
     weighs_all=True,
     hindsight=True,
-    estimate=partial(_by_lenslet, tikhonov, True, True),
+    estimate=partial(_by_lenslet, tikhonov, True),
 )
 TSVD = Estimator(
     name="tsvd",
@@ -322,7 +317,7 @@ TSVD = Estimator(
     options=("rank",),
     weighs_all=True,
     hindsight=True,
-    estimate=partial(_by_lenslet, tsvd, True, True),
+    estimate=partial(_by_lenslet, tsvd, True),
 )
 NNLS = Estimator(
     name="nnls",
@@ -330,7 +325,7 @@ NNLS = Estimator(
     phases=footprint.nnls_phases,
     options=("nnls_iterations",),
     in_batches=True,
-    estimate=partial(_by_lenslet, nnls, False, True),
+    estimate=partial(_by_lenslet, nnls, True),
 )
 LMMSE = Estimator(name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse)
 DICTIONARY = Estimator(
@@ -340,5 +335,5 @@ DICTIONARY = Estimator(
     needs_dictionary=True,
     options=("lam", "dictionary"),
     in_batches=True,
-    estimate=partial(_by_lenslet, dictionary, True, True),
+    estimate=partial(_by_lenslet, dictionary, True),
 )

@@ -17,7 +17,7 @@ import numpy as np
 
 from plenocli.base.progress import note
 from plenocli.base.random_streams import stream
-from plenocli.base.tiling import common, to_blocks
+from plenocli.base.tiling import to_blocks
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture import footprint
 from plenocli.inverse.picture.estimators import Estimators, TrialKey
@@ -62,7 +62,7 @@ class Trial(Method):
         joint: JointEstimate | None = None,
     ) -> Reconstruction:
         """As in Method, by the method that does best in the trial."""
-        name, choice = common("method", lambda: self._chosen(estimators, data))
+        name, choice = data.common("method", lambda: self._chosen(estimators, data))
         method = self._by_name[name]
         return method.reconstruct(estimators, data, truth, choice, joint)
 

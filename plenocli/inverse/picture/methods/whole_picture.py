@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import bar
-from plenocli.base.tiling import common, to_blocks, to_plane
+from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
@@ -97,11 +97,11 @@ def _from_lmmse(
     prior, scene = estimators.prior, light.data.scene
     wide = wide and estimators.options.overlap != 1 and prior.heard(noise, scene).shape[1] <= LOUD
     if wide:
-        around = prior.joint(noise, scene).apply(light.data.y)
+        around = prior.joint(noise, scene).apply(light.data.y, light.data.common)
         x[inner], sigma[inner] = around[0][inner], around[1][inner]
     else:
-        x[inner], sigma[inner] = adaptive_lmmse(estimators, noise, light.data.scene, y[inner])
-    error = common("start", lambda: root_mean_square(sigma[inner]), together=True)
+        x[inner], sigma[inner] = adaptive_lmmse(estimators, light.data, y[inner])
+    error = light.data.common("start", lambda: root_mean_square(sigma[inner]))
     held = None
     if joint is not None:
         edge = np.ones(y.shape[:2], bool)

@@ -4,6 +4,7 @@ veil, and what was found. All methods see the same data, so all profit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
@@ -12,10 +13,9 @@ import numpy as np
 
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import note
-from plenocli.base.tiling import common
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.joint import own_light
-from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.lenslet_model import Common, Shared, Superpixels
 from plenocli.inverse.picture.nuisances.defects import (
     NORMAL,
     DefectsFound,
@@ -101,21 +101,25 @@ def clean(
     known = int(np.count_nonzero((unknown & ~blind[:, None])[own]))
     filled = replace(data, y=_filled(estimators, y, unknown, blind).reshape(data.y.shape))
     declared = data.saturated is not None
-    clipped = data.saturated if data.saturated is not None else piled_up(data.y)
-    clipped = np.zeros(y.shape, bool) if clipped is None else clipped.reshape(y.shape)
+    if data.saturated is not None:
+        clipped = data.saturated.reshape(y.shape)
+    else:
+        level = data.common("clipped", lambda: piled_up(y))
+        clipped = np.zeros(y.shape, bool) if level is None else y == level
     before = _known_before(known, own.sum() * y.shape[1])
     bare = Cleaned(filled, (*before, *saturation(clipped[own], declared=declared)))
     if not look or blind.all() or not filled.y.any():
         return bare
     try:
-        sigma = common("pixel noise", lambda: _noise(estimators, filled))
+        sigma = data.common("pixel noise", lambda: _noise(estimators, filled))
         lmmse = estimators.prior.lmmse(sigma, data.scene)
     except PlenoError:  # the method itself will say so, where it needs them
         return bare
-    loud = common("signal", lambda: root_mean_square(filled.y))
+    loud = data.common("signal", lambda: root_mean_square(filled.y))
     model = PixelModel.of(lmmse, max(sigma, LEAST_NOISE * loud))
     task = _Task(
         estimators=estimators,
+        common=data.common,
         lmmse=lmmse,
         model=model,
         unknown=unknown,
@@ -128,8 +132,13 @@ def clean(
     )
     found = task.solve(filled.y, filled.y)
     if estimators.coupled and any(finding.found for finding in found.findings):
-        found = task.solve(filled.y, found.data)
+        found = replace(task, common=partial(_again, data.common)).solve(filled.y, found.data)
     return Cleaned(replace(data, y=found.data, saturated=None), found.findings)
+
+
+def _again(common: Common, name: Shared, work: Callable[[], Any], which: Any = 0) -> Any:
+    """A Common of what is worked out a second time."""
+    return common(name, work, ("again", which))
 
 
 def _inner(count: tuple[int, ...]) -> np.ndarray:
@@ -196,6 +205,7 @@ class _Found:
 class _Task:
     """What is looked for, and with what.
 
+    common: gives what superpixels that are a part have in common.
     unknown, clipped: (lenslet, pixel).
     blind, inner, counted: (lenslet,), those given up, those that have all their neighbours, and
         those that findings count.
@@ -204,6 +214,7 @@ class _Task:
     """
 
     estimators: Estimators
+    common: Common
     lmmse: Lmmse
     model: PixelModel
     unknown: np.ndarray
@@ -225,7 +236,7 @@ class _Task:
         own = (y - stray).reshape(-1, shape[2])[seen].T
         unknown, clipped = self.unknown[seen].T, self.clipped[seen].T
         sign, clean = find_defects(
-            self.model, own, unknown | clipped, self.estimators.system.pixel_shape
+            self.model, own, unknown | clipped, self.estimators.system.pixel_shape, self.common
         )
         hot = defects_among(self.model, own, clipped, (sign != 0) | unknown)
         sign[hot], clipped = 1, clipped & ~hot
@@ -238,7 +249,7 @@ class _Task:
         if lost.any():
             better = bare.impute(better, lost)
         if clipped.any():
-            better = _uncensored(bare, own - light, lost, clipped)
+            better = _uncensored(bare, own - light, lost, clipped, self.common)
         out = y.reshape(-1, shape[2]) - 0.0
         out[seen] += (better - own).T
         out[self.blind] = 0.0
@@ -268,12 +279,12 @@ class _Task:
         own = self.estimators.without_stray(y)
         if not self.estimators.coupled:
             return own
-        for _ in range(STRAY_ROUNDS):
+        for k in range(STRAY_ROUNDS):
             stacked = own.reshape(-1, own.shape[2]).T
-            misfit = common("misfit", partial(self._misfit, stacked))
+            misfit = self.common("misfit", partial(self._misfit, stacked), k)
             # with the noise that is left the estimate does not amplify it
             lmmse = replace(self.lmmse, sigma=self.model.sigma * max(1.0, misfit))
-            x = lmmse.apply(stacked, lmmse.scales(stacked))
+            x = lmmse.apply(stacked, lmmse.scales(stacked, self.common))
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
 
@@ -292,15 +303,15 @@ class _Task:
             sure = np.ones(len(sure), bool)
         if not self.veil:
             return None, np.zeros(y.shape[1])
-        veil, light = find_veil(self.model, y[:, sure], unsure=STRAY_UNSURE * stray)
-        common = veil.level if veil is not None and veil.removed else 0.0
-        every = np.full(y.shape[1], common)
+        unsure = STRAY_UNSURE * stray
+        veil, light = find_veil(self.model, y[:, sure], unsure=unsure, common=self.common)
+        every = np.full(y.shape[1], veil.level if veil is not None and veil.removed else 0.0)
         every[sure] = light
         return veil, every
 
 
 def _uncensored(
-    model: PixelModel, y: np.ndarray, lost: np.ndarray, clipped: np.ndarray
+    model: PixelModel, y: np.ndarray, lost: np.ndarray, clipped: np.ndarray, common: Common
 ) -> np.ndarray:
     """y (pixel, signal) with lost and clipped pixels imputed; a brightness that nothing else tells
     is about that of the other lenslets.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.base.tiling import common
+from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
 FAR = 7.0
@@ -88,17 +88,13 @@ class Spread:
         from scipy.ndimage import median_filter
 
         count = y.shape[1]
-
-        def measured() -> np.ndarray:
-            some = np.unique(np.linspace(0, count - 1, min(count, TYPICAL)).round().astype(int))
-            far = np.concatenate(
-                [np.abs(deviation(model, y[:, some[part]])) for part in chunks(len(some))], axis=1
-            )
-            far /= by_lenslet(far)
-            middle = NORMAL * np.median(far, axis=1).reshape(shape)
-            return median_filter(middle, AROUND, mode="nearest").ravel()
-
-        return cls(common("spread", measured))
+        some = np.unique(np.linspace(0, count - 1, min(count, TYPICAL)).round().astype(int))
+        far = np.concatenate(
+            [np.abs(deviation(model, y[:, some[part]])) for part in chunks(len(some))], axis=1
+        )
+        far /= by_lenslet(far)
+        middle = NORMAL * np.median(far, axis=1).reshape(shape)
+        return cls(median_filter(middle, AROUND, mode="nearest").ravel())
 
     def over(self, far: np.ndarray) -> np.ndarray:
         """Deviations (pixel, signal) over those of good pixels."""
@@ -119,7 +115,11 @@ def deviation(model: PixelModel, y: np.ndarray) -> np.ndarray:
 
 
 def find_defects(
-    model: PixelModel, y: np.ndarray, unknown: np.ndarray, shape: tuple[int, int]
+    model: PixelModel,
+    y: np.ndarray,
+    unknown: np.ndarray,
+    shape: tuple[int, int],
+    common: Common = alone,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Search for defective pixels, the largest deviations first, those found imputed before the
     next round.
@@ -127,12 +127,13 @@ def find_defects(
     y: (pixel, signal), unknown ones with any value.
     unknown: (pixel, signal), True where there is nothing to judge.
     shape: (rows, columns) of a superpixel.
+    common: gives the Spread, of superpixels that are a part.
 
     Returns (sign (pixel, signal) int8, -1 of a dark and 1 of a bright one, 0 of all others; y with
     unknown and defective pixels imputed).
     """
     clean, sign = model.impute(y, unknown), np.zeros(y.shape, np.int8)
-    spread = Spread.of(model, clean, shape)
+    spread = common("spread", lambda: Spread.of(model, clean, shape))
     for part in chunks(y.shape[1]):
         clean[:, part], sign[:, part] = _search(
             model, spread, y[:, part], clean[:, part], unknown[:, part]

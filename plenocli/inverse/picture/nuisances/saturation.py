@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.base.tiling import common
 from plenocli.inverse.picture.nuisances.pixel_model import AtContrast, PixelModel
 
 ROUNDS = 30
@@ -85,16 +84,10 @@ def saturation(
     )
 
 
-def piled_up(y: np.ndarray) -> np.ndarray | None:
-    """Which pixels of y (any shape) were clipped although nobody says so, or None: those at the
-    largest value, where it is that of far more pixels than the next one.
+def piled_up(y: np.ndarray) -> float | None:
+    """The level at which y (any shape) was clipped although nobody says so, None where it was not:
+    the largest value, where it is that of far more pixels than the next one.
     """
-    level = common("clipped", lambda: _piled_up(y))
-    return None if level is None else y == level
-
-
-def _piled_up(y: np.ndarray) -> float | None:
-    """The level at which y was clipped, None where it was not."""
     known = y[np.isfinite(y)]
     if not known.size:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.base.tiling import common, is_piece
+from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
@@ -87,7 +87,7 @@ class _Offsets:
 
 
 def find_veil(
-    model: PixelModel, y: np.ndarray, *, unsure: float = 0.0
+    model: PixelModel, y: np.ndarray, *, unsure: float = 0.0, common: Common = alone
 ) -> tuple[VeilFound | None, np.ndarray]:
     """The even light over superpixels.
 
@@ -102,6 +102,7 @@ def find_veil(
     y: (pixel, signal) without defects.
     unsure: what all offsets may be wrong by, as light of neighbours was taken away that is not
         known exactly; then lenslets have no offsets of their own.
+    common: gives the common one, of superpixels that are a part.
 
     Returns (what was found, None where an even object and an even light look alike; the light to
     take away, (signal,)).
@@ -111,15 +112,11 @@ def find_veil(
     if veil is None or not veil.removed:
         return veil, nothing
 
-    def of_this_piece() -> float:
+    def level() -> float:
         own = _common_veil(model, y, found, unsure)[0]
         return own.level if own is not None and own.removed else 0.0
 
-    veil = (
-        replace(veil, level=common("veil level", of_this_piece, together=True))
-        if is_piece()
-        else veil
-    )
+    veil = replace(veil, level=common("veil level", level))
     told = np.isfinite(found.variance)
     own = np.full(y.shape[1], veil.level)
     value, variance = found.value[told], found.variance[told]

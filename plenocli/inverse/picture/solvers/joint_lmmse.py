@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.base.tiling import common
+from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.solvers.least_squares import Svd
-from plenocli.inverse.picture.solvers.lmmse import require_noise
+from plenocli.inverse.picture.solvers.lmmse import given, require_noise, usual
 
 RING = 1
 MOST = 96
@@ -32,8 +32,6 @@ LOUD = 0.005
 """Power of a direction of a superpixel over that of the noise, from which on it is worth a look:
 photographs of sixteen times the usual variance then add a twelfth to the noise.
 """
-ROUNDS = 10
-"""Rounds of expectation and maximisation for the distribution of the scale over the lenslets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +52,9 @@ class JointLmmse:
     data: np.ndarray
     variance: np.ndarray
 
-    def apply(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def apply(
+        self, y: np.ndarray, common: Common = alone
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The picture behind superpixels whose contrast differs from place to place.
 
         The covariance about each lenslet is that of photographs times an unknown scale, the same
@@ -67,6 +67,7 @@ class JointLmmse:
         exist. Light from outside the array is taken to have the scene's mean and covariance.
 
         y: (lenslet_row, lenslet_column, pixel).
+        common: gives that distribution, of lenslets that are a part.
 
         Returns (x, its standard deviation, scale), (lenslet_row, lenslet_column, point) and
         (lenslet_row, lenslet_column), the scale the mean of its logarithm.
@@ -78,7 +79,10 @@ class JointLmmse:
             for k, scale in enumerate(CONTRASTS):
                 expected = scale * power + 1
                 likelihood[k][group.at] = -0.5 * (np.log(expected).sum() + (1 / expected) @ seen**2)
-        share = _posterior(likelihood, f"joint contrast {float(np.trace(self.data))!r}")
+        likelihood = np.exp(likelihood - likelihood.max(axis=0)).reshape(len(CONTRASTS), -1)
+        which = ("joint", float(np.trace(self.data)))
+        prior = common("contrasts", lambda: usual(likelihood, CONTRASTS, 0.5), which)
+        share = given(prior, likelihood).reshape(-1, *y.shape[:2])
         x, sigma = np.empty((2, *y.shape[:2], len(self.variance)))
         for group, (power, gain, seen) in zip(groups, turned):
             shares = share[:, group.at[0], group.at[1]]
@@ -143,31 +147,6 @@ class _Alike:
     at: tuple[np.ndarray, np.ndarray]
     kept: np.ndarray
     z: np.ndarray
-
-
-def _posterior(likelihood: np.ndarray, name: str) -> np.ndarray:
-    """Share of each of CONTRASTS at each lenslet, (scale, lenslet_row, lenslet_column).
-
-    likelihood: its logarithm, alike.
-    name: of what is common to all lenslets.
-    """
-    likelihood = np.exp(likelihood - likelihood.max(axis=0))
-    all_of_them = common(name, lambda: likelihood, together=True)
-    if all_of_them.ndim == 2:
-        all_of_them = all_of_them[:, None]
-    logs, prior = np.log(CONTRASTS), np.full(len(CONTRASTS), 1 / len(CONTRASTS))
-    for _ in range(ROUNDS - 1):
-        prior = _given(prior, all_of_them).mean(axis=(1, 2))
-        middle = prior @ logs
-        deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.5)
-        prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-    return _given(prior, likelihood)
-
-
-def _given(prior: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
-    share = likelihood * prior[:, None, None]
-    share /= share.sum(axis=0)
-    return share
 
 
 def prepare_joint(

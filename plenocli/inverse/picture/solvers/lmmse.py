@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.base.tiling import common
+from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.solvers.least_squares import Svd
 
 SCALES = np.geomspace(1e-3, 30, 60)
@@ -72,11 +72,13 @@ class Lmmse:
         noise = self.noise[:, None] / np.broadcast_to(scale, w.shape[1:])
         return w / (self.power[:, None] + noise)
 
-    def adaptive(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def adaptive(
+        self, y: np.ndarray, common: Common = alone
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the
         estimates and their predicted standard deviations (point, signal), the scales (signal,).
         """
-        scale = self.scales(y)
+        scale = self.scales(y, common)
         left = self.gain**2 @ (1 / (self.power[:, None] + self.noise[:, None] / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
         # the patterns are orthogonal
@@ -120,16 +122,16 @@ class Lmmse:
         """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
         return self.analysis @ y - self.offset[:, None]
 
-    def scales(self, y: np.ndarray) -> np.ndarray:
+    def scales(self, y: np.ndarray, common: Common = alone) -> np.ndarray:
         """The scale of each signal: the posterior mean of its logarithm (see `contrast`).
 
         y: (pixel, signal).
 
         Returns (signal,).
         """
-        return np.exp(np.log(SCALES) @ self.contrast(y))
+        return np.exp(np.log(SCALES) @ self.contrast(y, common))
 
-    def contrast(self, y: np.ndarray) -> np.ndarray:
+    def contrast(self, y: np.ndarray, common: Common = alone) -> np.ndarray:
         """Probability of each of SCALES, (scale, signal), for each signal.
 
         Coordinates have variance scale power + noise. The prior of log scale is normal, with the
@@ -137,19 +139,13 @@ class Lmmse:
         alone says little where noise is strong.
 
         y: (pixel, signal).
+        common: gives that prior, of signals that are a part.
         """
         likelihood = self._likelihood(self.coordinates(y))
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
-
-        name = f"contrast {self.sigma!r} {float(self.noise.sum())!r}"
-        all_of_them = common(name, lambda: likelihood, together=True)
-        logs, prior = np.log(SCALES), np.full(len(SCALES), 1 / len(SCALES))
-        for _ in range(ROUNDS - 1):
-            prior = _given(prior, all_of_them).mean(axis=1)
-            middle = prior @ logs
-            deviation = max(np.sqrt(prior @ (logs - middle) ** 2), 0.2)
-            prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
-        return _given(prior, likelihood)
+        which = (self.sigma, float(self.noise.sum()))
+        prior = common("contrasts", lambda: usual(likelihood, SCALES, 0.2), which)
+        return given(prior, likelihood)
 
     def degrees(self, y: np.ndarray) -> float:
         """Degrees of freedom that the estimate has of an object, the mean over the signals: the
@@ -163,7 +159,22 @@ class Lmmse:
         )
 
 
-def _given(prior: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
+def usual(likelihood: np.ndarray, scales: np.ndarray, least: float) -> np.ndarray:
+    """Probabilities of scales beforehand, (scale,): their logarithm normal, with the mean and the
+    deviation (at least `least`) that make all signals together most likely.
+
+    likelihood: (scale, signal).
+    """
+    logs, prior = np.log(scales), np.full(len(scales), 1 / len(scales))
+    for _ in range(ROUNDS - 1):
+        prior = given(prior, likelihood).mean(axis=1)
+        middle = prior @ logs
+        deviation = max(np.sqrt(prior @ (logs - middle) ** 2), least)
+        prior = np.maximum(np.exp(-((logs - middle) ** 2) / (2 * deviation**2)), 1e-30)
+    return prior
+
+
+def given(prior: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
     """Probabilities (scale, signal), from those beforehand (scale,)."""
     posterior = likelihood * prior[:, None]
     posterior /= posterior.sum(axis=0)

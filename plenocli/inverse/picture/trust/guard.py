@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from plenocli.base.tiling import common
 from plenocli.inverse.picture.error_bars import about
+from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.trust.believe import CHANCE, CONTINUOUS, Belief
 from plenocli.inverse.picture.trust.continuity import LEAST_REFERENCE, Jumps, jumps
@@ -38,13 +38,18 @@ def detail_kept(
 
 
 def guarded(
-    found: Reconstruction, y: np.ndarray, belief: Belief, shape: tuple[int, int]
+    found: Reconstruction,
+    y: np.ndarray,
+    belief: Belief,
+    shape: tuple[int, int],
+    common: Common = alone,
 ) -> tuple[Reconstruction, float]:
     """(the picture with as much of its detail as `detail_kept` says, that share).
 
     Its standard deviation grows by the detail that is given up, see error_bars.about.
 
     y: (lenslet_row, lenslet_column, pixel) own light.
+    common: gives that share, of lenslets that are a part.
     """
     lmmse, stacked = belief.lmmse, y.reshape(-1, y.shape[-1]).T
     mean = (lmmse.even @ (lmmse.levels @ stacked)).T.reshape(found.value.shape)

@@ -179,33 +179,28 @@ def _stationary(capture: LatticeCapture, radiance: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(capture.response).all(axis=-1), variance, np.inf)
 
 
-def _left(
-    system: LatticeSystem, capture: LatticeCapture, padded: np.ndarray, points: np.ndarray
-) -> np.ndarray:
-    """What unknowns do not explain of the superpixels, 0 where nothing is known."""
-    left = capture.values - system.forward(padded)
-    if capture.own is not None:
-        left -= capture.own(_mean(system, points))
-    return np.where(np.isfinite(left) & capture.known, left, 0)
-
-
 def _solved(
     system: LatticeSystem, capture: LatticeCapture, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(unknowns, what they leave of the superpixels): steps from `points` until they are small
-    beside the noise.
+    """(unknowns, what they leave of the superpixels, 0 where nothing is known): steps from `points`
+    until they are small beside the noise.
     """
     scale = np.sqrt(system.impulse[2]).min()
-    padded = system.mirrored(points)
-    left = _left(system, capture, padded, points)
+    values = np.where(np.isfinite(capture.response).all(axis=-1), capture.values, 0)
+    seen, told = values, system.directions(np.nan_to_num(values))
     for _ in range(STEPS):
-        step = system.step(left, padded)
-        points = points + step
+        if capture.own is not None:
+            seen = values - capture.own(_mean(system, points))
+            told = system.directions(np.nan_to_num(seen))
         padded = system.mirrored(points)
-        left = _left(system, capture, padded, points)
+        step = system.step(system.left(told, padded, seen), padded)
+        points = points + step
         if np.abs(_mean(system, step)).max() < ENOUGH * scale:
             break
-    return points, left
+    left = capture.values - system.forward(system.mirrored(points))
+    if capture.own is not None:
+        left -= capture.own(_mean(system, points))
+    return points, np.where(np.isfinite(left) & capture.known, left, 0)
 
 
 def _mean(system: LatticeSystem, points: np.ndarray) -> np.ndarray:
@@ -310,14 +305,16 @@ def _directions(
     """
     padded, variance = system.mirrored(points), _stationary(capture, points)
     seen, lines = np.ones(len(variance)), []
+    weight = (capture.known / np.sqrt(variance)).astype(np.float32)
     for blocks in directions:
         change = LatticeSystem(blocks, offsets, seen, system.shape).forward(padded)
-        change = np.where(capture.known, change, 0)
-        lost = system.forward(system.mirrored(system.step(change, padded)))
-        lines.append((change - lost).ravel())
-    j, w = np.array(lines), (capture.known / variance).ravel()
-    chi = max(1.0, float((left.ravel() ** 2 * w).sum() / max(np.count_nonzero(w), 1)))
-    return (j * w) @ j.T / chi, (j * w) @ left.ravel() / chi
+        change *= capture.known
+        step = system.step(system.directions(change), padded)
+        change -= system.forward(system.mirrored(step))
+        lines.append((change * weight).ravel())
+    j, rest = np.array(lines), (left * weight).ravel()
+    chi = max(1.0, float(rest @ rest) / max(int(np.count_nonzero(weight)), 1))
+    return (j @ j.T / chi).astype(float), (j @ rest / chi).astype(float)
 
 
 def _prior(first: LatticeAnswer) -> PointPrior:

@@ -16,6 +16,8 @@ PAD = 4
 """Mirrored lenslets on each side, at least."""
 IMPULSE = 16
 """Lenslets a side of the lattice on which what one pixel does to the answer is computed."""
+FAINT = 1e-4
+"""Of the strongest direction of a superpixel, over the noise: fainter ones are not looked along."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +97,15 @@ class LatticeSystem:
         self.unknowns = blocks.shape[-1]
         self.points = 1 if prior is None else prior.points
         self.padded = tuple(next_fast_len(n + 2 * PAD, real=True) for n in shape)
-        weighted = blocks / variance[:, None]
-        self._there = np.concatenate(list(blocks.swapaxes(1, 2)), dtype=np.float32)
-        self._back = np.concatenate(list(weighted), axis=1, dtype=np.float32)
-        self._apart, self._products = _stencil(weighted, blocks, offsets)
+        there = np.concatenate(list(blocks.swapaxes(1, 2)))
+        gram = (there / variance) @ there.T
+        self._there = there.astype(np.float32)
+        self._apart, self._products = _stencil(gram, offsets)
+        power, turn = np.linalg.eigh(gram)
+        strong = power > FAINT**2 * power[-1]
+        turn, size = turn[:, strong], np.sqrt(power[strong])
+        self._seen = (turn * size).astype(np.float32)
+        self._look = (there.T / variance[:, None] @ (turn / size)).astype(np.float32)
 
     def mirrored(self, inner: np.ndarray) -> np.ndarray:
         """Unknowns (rows, columns, unknown) as a padded array, object points mirrored."""
@@ -117,17 +124,40 @@ class LatticeSystem:
 
     def forward(self, b: np.ndarray) -> np.ndarray:
         """Superpixels (rows, columns, pixel) float32 of padded unknowns."""
+        return self._gathered(b) @ self._there
+
+    def directions(self, values: np.ndarray) -> np.ndarray:
+        """What superpixels (..., pixel) show along the few directions in which unknowns act on
+        them, of unit noise: (..., direction).
+        """
+        return values.astype(np.float32, copy=False) @ self._look
+
+    def left(self, told: np.ndarray, b: np.ndarray, masked: np.ndarray) -> np.ndarray:
+        """What padded unknowns do not explain of directions (rows, columns, direction).
+
+        masked: (rows, columns, pixel) superpixels, NaN where they are not known; of those that
+            lack none `told` counts.
+        """
+        gathered = self._gathered(b)
+        out = told - gathered @ self._seen
+        some = np.isnan(masked).any(axis=-1)
+        if some.any():
+            out[some] = self.directions(np.nan_to_num(masked[some] - gathered[some] @ self._there))
+        return out
+
+    def _gathered(self, b: np.ndarray) -> np.ndarray:
+        """Padded unknowns that reach each superpixel: (rows, columns, block * unknown) float32."""
         rows, columns = self.shape
-        seen = np.empty((rows, columns, len(self.offsets), self.unknowns), np.float32)
+        out = np.empty((rows, columns, len(self.offsets), self.unknowns), np.float32)
         for k, (down, across) in enumerate(self.offsets):
             top, left = PAD - down, PAD - across
-            seen[:, :, k] = b[top : top + rows, left : left + columns]
-        return seen.reshape(rows, columns, -1) @ self._there
+            out[:, :, k] = b[top : top + rows, left : left + columns]
+        return out.reshape(rows, columns, -1)
 
-    def back(self, values: np.ndarray) -> np.ndarray:
-        """A^T V^-1 of superpixels, padded."""
+    def back(self, told: np.ndarray) -> np.ndarray:
+        """A^T V^-1 of superpixels by their directions, padded."""
         rows, columns = self.shape
-        parts = values.astype(np.float32, copy=False) @ self._back
+        parts = told @ self._seen.T
         parts = parts.reshape(rows, columns, len(self.offsets), self.unknowns)
         out = np.zeros((*self.padded, self.unknowns))
         for k, (down, across) in enumerate(self.offsets):
@@ -170,12 +200,12 @@ class LatticeSystem:
         found = (self._inverse @ spectrum[..., None])[..., 0]
         return irfft2(found, s=self.padded, axes=(0, 1)).astype(float)
 
-    def step(self, residual: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def step(self, left: np.ndarray, b: np.ndarray) -> np.ndarray:
         """What unknowns b, padded, lack: inner.
 
-        residual: of the superpixels, 0 where nothing is known.
+        left: of the superpixels' directions.
         """
-        right = self.back(residual)
+        right = self.back(left)
         if self.prior is not None:
             right = right + self.prior.pull(b)
         return self.inner(self.solve(right))
@@ -213,10 +243,10 @@ class LatticeSystem:
         posterior = np.einsum("dk,rcdk->k", mean, turned).real / IMPULSE**2
         spread = np.fft.ifft2(turned, axes=(0, 1)).real  # (row, column, unknown, band)
         reach = int(np.abs(self.offsets).max()) + 1
-        back = self._back.reshape(len(self._back), len(self.offsets), -1)
+        back = (self._look @ self._seen.T).reshape(len(self._look), len(self.offsets), -1)
         near = range(-reach, reach + 1)
         where = np.array([(i, j) for i in near for j in near])
-        h = np.zeros((len(where), bands, len(self._back)))
+        h = np.zeros((len(where), bands, len(self._look)))
         for d, (i, j) in enumerate(where):
             for k, (down, across) in enumerate(self.offsets):
                 at = spread[(i - down) % IMPULSE, (j - across) % IMPULSE]
@@ -224,14 +254,16 @@ class LatticeSystem:
         return where, h, posterior
 
 
-def _stencil(
-    weighted: np.ndarray, blocks: np.ndarray, offsets: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A^T V^-1 A as a stencil: lenslets apart (n, 2), and (n, unknown, unknown) complex64."""
+def _stencil(gram: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A^T V^-1 A as a stencil: lenslets apart (n, 2), and (n, unknown, unknown) complex64.
+
+    gram: (block * unknown, block * unknown).
+    """
     apart, which = np.unique(
         (offsets[None] - offsets[:, None]).reshape(-1, 2), axis=0, return_inverse=True
     )
-    products = np.einsum("opd,qpe->oqde", weighted, blocks, optimize=True)
+    count = len(offsets)
+    products = gram.reshape(count, len(gram) // count, count, -1).swapaxes(1, 2)
     out = np.zeros((len(apart), *products.shape[2:]), np.complex64)
     np.add.at(out, which.ravel(), products.reshape(-1, *products.shape[2:]))
     return apart, out

@@ -78,7 +78,7 @@ class Demultiplexer:
         calibration = by_state(calibration)
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
-        self.moving = _moving(calibration, camera) if self.neighbours else None
+        self.moving = _moving(calibration, self.neighbours)
         self.prior = light_prior(LensletResponses.of(calibration), known)
         # its superpixels, one for every lenslet, have served
         self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
@@ -252,14 +252,14 @@ class Demultiplexer:
         return replace(found, trace=replace(found.trace, registration=aligned.registration))
 
 
-def _moving(calibration: Calibration, camera: Camera | None) -> MovingResponse | None:
+def _moving(calibration: Calibration, light: NeighbourLight | None) -> MovingResponse | None:
     """The response of all lenslets where it can be displaced by prediction."""
     from plenocli.inverse.spectra.neighbours import MovingResponse
 
-    if camera is None or not LensletResponses.of(calibration).shared:
+    if light is None or not LensletResponses.of(calibration).shared:
         return None
     try:
-        return MovingResponse(camera, calibration)
+        return MovingResponse(light.camera, calibration)
     except ConfigError:
         return None
 

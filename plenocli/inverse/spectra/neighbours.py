@@ -13,6 +13,7 @@ import numpy as np
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.geometry import finely_sampled
 from plenocli.forward.camera.pupil import polarised
+from plenocli.forward.propagation.response import uniform_response, valid_for
 from plenocli.inverse.registration.smooth_response import DEGREE
 
 if TYPE_CHECKING:
@@ -36,7 +37,11 @@ FACTOR_SPREAD = 0.5
 at.
 """
 OPTICS_SPREAD = 0.01
-"""The same of the sensor's distance and the filters' size, relative."""
+"""The same of the sensor's distance and the filters' size, relative, before F is looked at."""
+OPTICS_MOST = 4.0
+"""Of these by which F changes them at most."""
+CLOSED_TO = 0.007
+"""Relative (L2) accuracy of the closed form of F beside a measured one."""
 UNLIKE = 0.5
 """Relative (L2) difference of predicted and measured F from which the description is another's."""
 
@@ -50,11 +55,13 @@ class NeighbourLight:
     light: (superpixel, pixel, point, band), points of the field row by row.
     changes: (change, superpixel, pixel, point, band), what may be wrong with it, by one standard
         deviation.
+    camera: whose light it is.
     """
 
     offsets: np.ndarray
     light: np.ndarray
     changes: np.ndarray
+    camera: Camera
 
     @property
     def own(self) -> int:
@@ -129,13 +136,14 @@ class NeighbourLight:
 def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
     """Predict it by the finest model that a system matrix is made with.
 
-    camera: its description.
+    camera: its description, of which the measured response corrects the sensor's distance and the
+        size of filters or pupil: where it has light, the light of neighbours lies likewise.
     calibration: with windows and a response, whose bands are asked for.
 
     Raises ConfigError where there is no prediction for these lenslets, or it is none of them.
     """
     _check(camera, calibration)
-    measured = _typical(calibration)
+    measured, camera = _typical(calibration), _as_measured(camera, calibration)
     offsets, light = _predicted(camera, calibration)
     total = light.sum(axis=(0, 2))
     apart = np.linalg.norm(np.nan_to_num(measured - total)) / np.linalg.norm(
@@ -152,33 +160,51 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
         for far in [np.minimum(np.abs(offsets).max(axis=1), 2)]
         for ring in (1, 2)
     ]
-    # what other optics change needs no fine picture
-    coarse, *others = (
-        _predicted(one, calibration, fine=False)[1] for one in (camera, *_other_optics(camera))
-    )
-    changes += [other - coarse for other in others]
+    changes += [_predicted(_other_optics(camera, one), calibration)[1] - light for one in np.eye(2)]
     share = light.sum(axis=(1, 2)) / light.sum(axis=(0, 1, 2))
     kept = (share.max(axis=1) >= LEAST_SHARE) | (offsets == 0).all(axis=1)
     return NeighbourLight(
-        offsets=offsets[kept], light=light[kept], changes=np.stack(changes)[:, kept]
+        offsets=offsets[kept],
+        light=light[kept],
+        changes=np.stack(changes)[:, kept],
+        camera=camera,
     )
 
 
-def _predicted(
-    camera: Camera, calibration: Calibration, *, fine: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
-    """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
-    band as the calibrated response.
+def _as_measured(camera: Camera, calibration: Calibration) -> Camera:
+    """The camera whose even response is nearest to the measured one, each other length of the
+    sensor's distance and of the filters against it; as described where there is no closed form.
+    """
+    from scipy.optimize import least_squares
 
-    fine: by as many object points as a field has diffraction cells, since fewer leave fringes, and
-        too little light on neighbours; else by those of the description.
+    if valid_for(camera, "fresnel"):
+        return camera
+    measured, colours = _typical(calibration), _colours(camera, calibration)
+    colours = np.where(np.isfinite(measured), colours, 0)
+    measured = np.nan_to_num(measured)
+
+    def apart(amounts: np.ndarray) -> np.ndarray:
+        even = _even(_by_band(_other_optics(camera, amounts), calibration), np.zeros(2)) * colours
+        even *= (even * measured).sum(axis=0) / (even**2).sum(axis=0)
+        left = (even - measured) / np.linalg.norm(measured)
+        return np.append(left.ravel() / CLOSED_TO, amounts)
+
+    limits = (-OPTICS_MOST, OPTICS_MOST)
+    found = least_squares(apart, np.zeros(2), bounds=limits, diff_step=0.05, x_scale=1.0, xtol=1e-3)
+    return _other_optics(camera, found.x)
+
+
+def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
+    band as the calibrated response: by as many object points as a field has diffraction cells,
+    since fewer leave fringes, and too little light on neighbours.
     """
     from plenocli.forward.accuracy.dial import pif_builder
 
     measured, bands = _typical(calibration), []
     offsets = np.zeros((0, 2), int)
     for wavelength, seen in _by_band(camera, calibration):
-        sampled = _in_thirds(finely_sampled(seen, wavelength) if fine else seen)
+        sampled = _in_thirds(finely_sampled(seen, wavelength))
         builder = pif_builder(sampled, wavelength, superpixels=(REACH, REACH), accuracy=KNOWN_TO)
         offsets = builder.offsets
         matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
@@ -201,18 +227,23 @@ def _by_band(camera: Camera, calibration: Calibration) -> list[tuple[float, Came
     ]
 
 
-def _other_optics(camera: Camera) -> list[Camera]:
-    """The camera with a sensor a little further away, and with a little larger filters or pupil."""
-    filters, lens = camera.filter_array, camera.main_lens
+def _other_optics(camera: Camera, amounts: np.ndarray) -> Camera:
+    """The camera with a sensor further away, and with larger filters or pupil, each by so many
+    standard deviations.
+    """
+    filters, (longer, larger) = camera.filter_array, 1 + OPTICS_SPREAD * amounts
     pupil = (
-        {"main_lens.aperture_diameter": lens.aperture_diameter * (1 + OPTICS_SPREAD)}
+        {"main_lens.aperture_diameter": camera.main_lens.aperture_diameter * larger}
         if filters is None or filters.size is None
-        else {"filter_array.size": filters.size * (1 + OPTICS_SPREAD)}
+        else {"filter_array.size": filters.size * larger}
     )
-    return [
-        camera.replace(**{"sensor.distance": camera.sensor.distance * (1 + OPTICS_SPREAD)}),
-        camera.replace(**pupil),
-    ]
+    return camera.replace(**{"sensor.distance": camera.sensor.distance * longer}, **pupil)
+
+
+def _even(bands: list[tuple[float, Camera]], displacement: np.ndarray) -> np.ndarray:
+    """Closed form of F (pixel, band), not as bright, with the light displaced by (2,) px."""
+    found = [uniform_response(seen, w, "fresnel", [-displacement])[0] for w, seen in bands]
+    return np.stack(found, axis=-1)
 
 
 class MovingResponse:
@@ -227,28 +258,17 @@ class MovingResponse:
 
     def __init__(self, camera: Camera, calibration: Calibration) -> None:
         """Predict the response where it is."""
-        from plenocli.forward.propagation.response import valid_for
-
         why = valid_for(camera, "fresnel")
         if why is not None or calibration.sensor.cfa != "mono":
             raise ConfigError(why or "a colour filter array", "camera", "leave it to splines")
         self.measured, self.bands = _typical(calibration), _by_band(camera, calibration)
-        here = self._even(np.zeros(2))
+        here = _even(self.bands, np.zeros(2))
         self.scale = np.nansum(self.measured, axis=0) / here.sum(axis=0)
         self.here = here * self.scale
 
-    def _even(self, displacement: np.ndarray) -> np.ndarray:
-        from plenocli.forward.propagation.response import uniform_response
-
-        found = [
-            uniform_response(seen, wavelength, "fresnel", [-displacement])[0]
-            for wavelength, seen in self.bands
-        ]
-        return np.stack(found, axis=-1)
-
     def at(self, displacement: np.ndarray) -> np.ndarray:
         """F (pixel, band) with the light displaced by (rows, columns) px."""
-        return self.measured + self._even(displacement) * self.scale - self.here
+        return self.measured + _even(self.bands, displacement) * self.scale - self.here
 
     def slopes(self, displacement: np.ndarray, step: float = 0.02) -> np.ndarray:
         """Derivatives (2, pixel, band) of `at` by rows and columns, per px."""

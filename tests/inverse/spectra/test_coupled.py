@@ -35,7 +35,7 @@ def lattice_light(strength=1.0, seed=0):
                 light[k, :, :, band] = cell[:, None] * rng.uniform(0.8, 1.2, (1, POINTS**2))
     light *= 3000 / POINTS**2
     changes = np.where((OFFSETS != 0).any(axis=1)[:, None, None, None], 0.5 * light, 0)[None]
-    return NeighbourLight(offsets=OFFSETS, light=light, changes=changes)
+    return NeighbourLight(offsets=OFFSETS, light=light, changes=changes, camera=None)
 
 
 def seen(light, points):

@@ -30,12 +30,13 @@ def bar(iterable: Iterable | None, total: int | None = None, label: str = "") ->
     Returns an iterable and context manager with `n` and `update`; it is silent off a terminal, for
     a single step, and while notes are collected.
     """
-    if quiet or total == 1 or _COLLECTED.get() is not None:
+    shown = sys.stderr is not None and sys.stderr.isatty()
+    if quiet or total == 1 or not shown or _COLLECTED.get() is not None:
         return _Silent(iterable)
     from tqdm import tqdm
 
     tqdm.monitor_interval = 0  # no thread that watches the bar
-    return tqdm(iterable, total=total, desc=label, file=sys.stderr, disable=None, leave=False)
+    return tqdm(iterable, total=total, desc=label, file=sys.stderr, leave=False)
 
 
 class _Silent:

@@ -174,7 +174,7 @@ FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 class Section(BaseModel):
     """A table of a description: frozen, without unknown keys or numbers that are not finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 MOST_PLANES = 1000

@@ -2,6 +2,8 @@
 draw the same numbers.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 

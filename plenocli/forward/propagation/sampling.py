@@ -471,12 +471,16 @@ def _fringe_errors(count: int, rule: int, own: float, lenslets: int) -> Iterator
     there are of each frequency) for n from 1 to below `lenslets`, at most MANY of them.
     """
     beside = max(lenslets, 1) - 1
-    some = np.unique(np.linspace(1, beside, min(beside, MANY)).round().astype(int))
-    apart, share, (t, w) = some[:, None], np.linspace(-1, 1, 65)[1:-1], band_rule(count, rule)
+    some = sorted({*np.linspace(1, beside, min(beside, MANY)).round().astype(int).tolist()})
+    apart, share, (t, w) = (
+        np.array(some, int)[:, None],
+        np.linspace(-1, 1, 65)[1:-1],
+        band_rule(count, rule),
+    )
     whole, part = np.pi * own * apart * t, np.pi * own * np.outer(t, share)
     found = (np.cos(whole) * w) @ np.cos(part) - (np.sin(whole) * w) @ np.sin(part)
     errors = (np.abs(found / 2 - np.sinc(own * (apart + share))) * (1 - np.abs(share))).max(axis=1)
-    return zip(some.tolist(), errors.tolist())
+    return zip(some, errors.tolist())
 
 
 def _patch_error(count: int, rule: int, own: float, cells: float, blur: float) -> float:

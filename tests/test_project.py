@@ -10,7 +10,7 @@ from typing import NoReturn
 import pytest
 
 from plenocli import __version__
-from plenocli.base import extras
+from plenocli.base.text import how_to_install
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -62,15 +62,15 @@ def test_what_the_tables_hold_is_in_the_notices() -> None:
 def test_an_extra_is_installed_by_the_names_of_its_packages() -> None:
     for extra in ("plot", "cluster", "optimise", "lens", "ml"):
         packages = [f"'{package}'" for package in PROJECT["optional-dependencies"][extra]]
-        assert extras.how_to_install(extra) == f"pip install {' '.join(packages)}"
+        assert how_to_install(extra) == f"pip install {' '.join(packages)}"
 
 
 def test_without_metadata_the_list_itself_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(name: str) -> NoReturn:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(extras, "requires", none)
-    assert extras.how_to_install("plot") == "install what pyproject.toml lists as plot"
+    monkeypatch.setattr("importlib.metadata.requires", none)
+    assert how_to_install("plot") == "install what pyproject.toml lists as plot"
 
 
 def test_every_hint_is_about_an_extra_that_there_is() -> None:

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from math import prod
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.budget import spread
+from plenocli.base.device import CPU, Device, namespace
 
 CHUNK = 1 << 25
 """Bytes of kernels that are transformed at a time."""
@@ -32,22 +33,6 @@ class Space:
     def size(self) -> int:
         """How many numbers an array of it has."""
         return prod(self.shape)
-
-
-class LinearMap(Protocol):
-    """What every map offers. <forward(x), y> = <x, adjoint(y)> for all x in domain, y in range."""
-
-    domain: Space
-    range: Space
-    dtype: np.dtype
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        """A x, of `range.shape`."""
-        ...
-
-    def adjoint(self, y: np.ndarray) -> np.ndarray:
-        """A* y, of `domain.shape`."""
-        ...
 
 
 class BlockToeplitz:
@@ -123,6 +108,7 @@ class BlockCirculant:
     torus: (rows, columns) of lenslets that have unknowns. No light goes round it as long as it
         has `count` and the farthest offset; what lies outside on the left is what lies outside
         on the right, unless it has that offset twice (see torus_for).
+    device: where it multiplies and transforms; values at frequencies are arrays of it.
 
     `spectrum` (frequency, pixel, unknown) has the frequencies of rfft2, row by row, complex64 for
     single precision and complex128 for double. Arrays are worked on in that precision.
@@ -135,7 +121,9 @@ class BlockCirculant:
         parts: Sequence[tuple[np.ndarray, np.ndarray]],
         count: tuple[int, int],
         torus: tuple[int, int],
+        device: Device = CPU,
     ) -> None:
+        self.device = device
         pairs = [(np.asarray(b), np.asarray(o, dtype=int)) for b, o in parts]
         if not pairs:
             raise ValueError("a map needs at least one part")
@@ -167,6 +155,7 @@ class BlockCirculant:
         for blocks, offsets in pairs:
             self._transform(blocks, offsets, slice(first, first + blocks.shape[2]))
             first += blocks.shape[2]
+        self._spectrum = device.put(self.spectrum)
 
     @staticmethod
     def needed(pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4) -> int:
@@ -220,31 +209,41 @@ class BlockCirculant:
         other.range = Space(self.range.axes, (*self.torus, self.range.shape[2]))
         return other
 
-    def to_frequencies(self, array: np.ndarray) -> np.ndarray:
+    def to_frequencies(self, array: np.ndarray) -> Any:
         """(row, column, n) on the torus -> (frequency, n), neither sum nor root divided out."""
-        from scipy.fft import rfft2
+        there = self.device.put(np.asarray(array, self.dtype))
+        moved = _transforms(there).rfftn(there, axes=(0, 1))
+        return namespace(moved).reshape(moved, (-1, array.shape[2]))
 
-        moved = rfft2(np.asarray(array, self.dtype), axes=(0, 1))
-        return moved.reshape(-1, array.shape[2])
-
-    def from_frequencies(self, array: np.ndarray) -> np.ndarray:
+    def from_frequencies(self, array: Any) -> np.ndarray:
         """(frequency, n) -> (row, column, n) on the torus, the inverse of to_frequencies."""
-        from scipy.fft import irfft2
+        whole = namespace(array).reshape(array, (*self.frequencies, array.shape[1]))
+        return self.device.get(_transforms(whole).irfftn(whole, s=self.torus, axes=(0, 1)))
 
-        whole = array.reshape(*self.frequencies, array.shape[1])
-        return irfft2(whole, s=self.torus, axes=(0, 1))
-
-    def at_frequencies(self, x: np.ndarray) -> np.ndarray:
+    def at_frequencies(self, x: Any) -> Any:
         """(frequency, unknown) -> (frequency, pixel): A_k x_k."""
-        return times(self.spectrum, x)
+        return times(self._spectrum, x)
 
-    def back_at_frequencies(self, y: np.ndarray) -> np.ndarray:
+    def back_at_frequencies(self, y: Any) -> Any:
         """(frequency, pixel) -> (frequency, unknown): A_k^H y_k."""
-        return times_adjoint(self.spectrum, y)
+        return times_adjoint(self._spectrum, y)
 
 
-def times(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Each of (frequency, m, n) times its own of (frequency, n), on the threads of the budget."""
+def _transforms(array: Any) -> Any:
+    """Fourier transforms for an array; SciPy's keep NumPy's single precision."""
+    if not isinstance(array, np.ndarray):
+        return namespace(array).fft
+    import scipy.fft
+
+    return scipy.fft
+
+
+def times(matrices: Any, x: Any) -> Any:
+    """Each of (frequency, m, n) times its own of (frequency, n); NumPy's on the threads of the
+    budget.
+    """
+    if not isinstance(matrices, np.ndarray):
+        return namespace(x).matmul(matrices, x[:, :, None])[:, :, 0]
     y = np.empty(matrices.shape[:2], np.result_type(matrices, x))
 
     def work(part: slice) -> None:
@@ -254,8 +253,11 @@ def times(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
     return y
 
 
-def times_adjoint(matrices: np.ndarray, y: np.ndarray) -> np.ndarray:
+def times_adjoint(matrices: Any, y: Any) -> Any:
     """The conjugate transpose of each of (frequency, m, n) times its own of (frequency, m)."""
+    if not isinstance(matrices, np.ndarray):
+        xp = namespace(y)
+        return xp.conj(xp.matmul(xp.conj(y)[:, None, :], matrices)[:, 0, :])
     x = np.empty((len(matrices), matrices.shape[2]), np.result_type(matrices, y))
 
     def work(part: slice) -> None:

@@ -22,7 +22,13 @@ ROOM = 256 << 20
 """Bytes without which no command starts: HDF5, OpenBLAS and LLVM end the process
 where they get none.
 """
-_SIGNS = ("memory allocation failed", "start new thread", "failed to map segment", "bad_alloc")
+_SIGNS = (
+    "memory allocation failed",
+    "start new thread",
+    "failed to map segment",
+    "bad_alloc",
+    "out of memory",
+)
 
 
 def base_memory() -> int:

@@ -1,7 +1,10 @@
-"""Values as JSON knows them, shapes and values as a person writes them."""
+"""Values as JSON knows them, shapes and values as a person writes them, and commands that install
+what is missing.
+"""
 
 import json
 import math
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -56,3 +59,25 @@ def by(shape: Iterable[int]) -> str:
 def shown(value: object) -> str:
     """A value of a TOML file as it may stand there."""
     return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def how_to_install(extra: str) -> str:
+    """The command that installs the packages of an extra, by their own names and least versions.
+
+    extra: a name of [project.optional-dependencies], such as "plot".
+
+    Returns text such as "pip install 'matplotlib>=3.9'".
+    The name plenocli is never in it: on an index it could be anybody's.
+    """
+    from importlib import metadata
+
+    try:
+        declared = metadata.requires("plenocli") or []
+    except metadata.PackageNotFoundError:  # run from its sources
+        declared = []
+    parted = (line.partition(";") for line in declared)
+    wanted = re.compile(rf"\bextra == ['\"]{re.escape(extra)}['\"]")
+    found = [f"'{package.strip()}'" for package, _, marker in parted if wanted.search(marker)]
+    if not found:
+        return f"install what pyproject.toml lists as {extra}"
+    return f"pip install {' '.join(found)}"

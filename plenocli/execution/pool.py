@@ -33,8 +33,8 @@ from typing import Any, Protocol
 from plenocli import __version__
 from plenocli.base.budget import Budget, budget, set_budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
-from plenocli.base.extras import how_to_install
 from plenocli.base.progress import collected_notes, note
+from plenocli.base.text import how_to_install
 
 Job = tuple[Any, Callable[[Any], Any], Any]
 """(token, function, task): the result of function(task) comes back with its token."""

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plenocli.base.errors import UsageError
-from plenocli.base.extras import how_to_install
-from plenocli.base.text import printable_lines
+from plenocli.base.text import how_to_install, printable_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

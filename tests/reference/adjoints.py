@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plenocli.base.linear_maps import LinearMap, Space
+from plenocli.base.linear_maps import BlockCirculant, BlockToeplitz, Space
 
 
 class Dense:
@@ -23,7 +23,7 @@ class Dense:
         return self.matrix.T @ np.reshape(y, self.range.shape)
 
 
-def adjoint_gap(op: LinearMap, seed: int = 0) -> float:
+def adjoint_gap(op: BlockCirculant | BlockToeplitz, seed: int = 0) -> float:
     """|<Ax, y> - <x, A*y>| in units of eps, for a seeded pair x, y.
 
     op: the map.

@@ -67,6 +67,13 @@ class _Background(click.ParamType):
         "photographic cameras support two or three. Default: all."
     ),
 )
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="Where kernels are multiplied and transformed; cuda is a graphics card, by PyTorch.",
+)
 @options.output
 @options.seed
 @options.mem_limit
@@ -83,6 +90,7 @@ def command(
     hold_out: float,
     background: float | Literal["auto"],
     most_planes: int | None,
+    device: str,
     output: Path,
     seed: int,
     overwrite: bool,
@@ -109,6 +117,7 @@ def command(
         hold_out=hold_out,
         background=background,
         most_planes=most_planes,
+        device=device,
         overwrite=overwrite,
         seed=seed,
         command=options.command_line(ctx),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.base.extras import how_to_install
+from plenocli.base.text import how_to_install
 from plenocli.forward.camera.glass import AIR, GLASSES, Medium, medium
 from plenocli.forward.camera.prescription import Prescription, Surface
 from plenocli.forward.camera.raytrace import entrance_pupil

@@ -242,7 +242,7 @@ def read_bio(path: Path) -> np.ndarray:
 
     Raises InputError where bioio is missing, cannot read it, or finds several pictures.
     """
-    from plenocli.base.extras import how_to_install
+    from plenocli.base.text import how_to_install
 
     try:
         from bioio import BioImage

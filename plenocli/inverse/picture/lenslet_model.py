@@ -124,7 +124,7 @@ Shared = Literal[
     "seen",  # Seen
     "contrasts",  # probability of each contrast, by estimator
     "power",  # of directions, by which weights go
-    "start",  # error expected of what methods of the picture start from
+    "start",  # squared error expected of what methods of the picture start from
     "veil level",
     "wider",  # factor of standard deviations, by estimator
 ]

@@ -127,6 +127,7 @@ def conditional_mean(
     weight[:rows, :columns] = _weights(problem, gain, of_pixels)
     x = point = np.zeros(whole.domain.shape, problem.op.dtype)
     whitening = gain.whitening.astype(problem.op.dtype)
+    matrix = whole.device.put(gain.matrix)
     step, momentum = kind(1 / max(1.0, float(weight.max()))), 1.0
     exact = bool(np.all(weight == 1)) and problem.measurement.gain == 0
     rounds = 1 if exact else rounds
@@ -142,7 +143,7 @@ def conditional_mean(
             weight[:rows, :columns] = _weights(problem, gain, own)
             step = kind(1 / max(1.0, float(weight.max())))
         filled = weight * y + (1 - weight) * (light * whitening)
-        full = whole.from_frequencies(times(gain.matrix, whole.to_frequencies(filled)))
+        full = whole.from_frequencies(times(matrix, whole.to_frequencies(filled)))
         new = point + step * (full - point)
         change, descent = new - x, point - new
         moved = float(np.linalg.norm(change)) / max(float(np.linalg.norm(new)), 1e-30)

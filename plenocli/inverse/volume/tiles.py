@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.budget import budget
+from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
 from plenocli.forward.volume.stack import Stack
@@ -49,6 +50,7 @@ class Tiles:
     hold_out: share of the pixels that are put aside, the same ones in all windows.
     seed: of which ones.
     where: the kernels' file, for messages.
+    device: of their map.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
     All have the same size, and so the same map.
@@ -65,7 +67,9 @@ class Tiles:
         hold_out: float,
         seed: int,
         where: str | Path | None = None,
+        device: Device = CPU,
     ) -> None:
+        self.device = device
         self.stack, self.measurement, self.method = stack, measurement, method
         self._hold_out, self._seed, self._where = hold_out, seed, where
         count = measurement.signal.shape[:2]
@@ -100,7 +104,8 @@ class Tiles:
     def _op(self) -> BlockCirculant:
         window = self.windows[0]
         size = len(window.row_weight), len(window.column_weight)
-        return BlockCirculant(self.stack.parts(), size, torus_for(size, self.stack.reach))
+        torus = torus_for(size, self.stack.reach)
+        return BlockCirculant(self.stack.parts(), size, torus, self.device)
 
     @cached_property
     def _draw(self) -> np.ndarray:
@@ -138,6 +143,7 @@ class Tiles:
             hold_out=self._hold_out,
             seed=self._seed,
             where=self._where,
+            device=self.device,
         )
         other.windows, other._draw = self.windows, self._draw
         return other.problem(self.brightest)

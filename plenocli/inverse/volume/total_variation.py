@@ -98,7 +98,7 @@ class _Descent:
         lattice = lattice_of(op.torus, problem.voxels)
         scale = float(np.sqrt(lattice.mean(power))) or 1.0
         self.scale = (whitening / scale).astype(op.dtype)
-        self.solve = _inverses(problem, lattice, self.scale)
+        self.solve = op.device.put(_inverses(problem, lattice, self.scale))
         rows, columns = op.range.shape[:2]
         self.y = np.zeros(self.whole.range.shape, op.dtype)
         self.counts = np.zeros(self.whole.range.shape, op.dtype)

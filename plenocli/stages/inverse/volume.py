@@ -69,6 +69,7 @@ def run_volume(
     hold_out: float = 0.05,
     background: float | Literal["auto"] = "auto",
     most_planes: int | None = None,
+    device: str = "cpu",
     overwrite: bool = False,
     seed: int = 0,
     command: str = "",
@@ -84,9 +85,11 @@ def run_volume(
     background: signal without any specimen, in units of white; "auto": the haze of the darkest
         lenslets, where that predicts the held-out pixels better.
     most_planes: keep the planes that predict held-out pixels best, no more than this; None: all.
+    device: "cpu" or "cuda", where the kernels' map multiplies and transforms.
 
     Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
     """
+    from plenocli.base.device import device as device_of
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
     from plenocli.files.images.mosaic import read_capture
@@ -98,6 +101,7 @@ def run_volume(
 
     output = Path(output)
     check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
+    there = device_of(device)
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
     shot = read_capture(capture)
@@ -115,10 +119,11 @@ def run_volume(
         f"{stack.point_shape[1]} voxels a lenslet"
     )
     trials: tuple[Trial, ...] = ()
-    tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
+    how: dict[str, Any] = dict(hold_out=hold_out, seed=seed, where=pif, device=there)
+    tiles = Tiles(stack, measurement, method, **how)
     if most_planes is not None:
         stack, trials = _supported(tiles, most_planes)
-        tiles = Tiles(stack, measurement, method, hold_out=hold_out, seed=seed, where=pif)
+        tiles = Tiles(stack, measurement, method, **how)
     if len(tiles.windows) > 1:
         size = by(tiles.windows[0].weight.shape)
         note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
@@ -130,7 +135,7 @@ def run_volume(
     provenance = Provenance(
         command=command, inputs=inputs, seed=seed, accuracy=stack.accuracy.as_json()
     )
-    _write(output, volume, stack, provenance, overwrite)
+    _write(output, volume, stack, provenance, overwrite, there.name)
     held = volume.held_out
     explained = None if held is None else all_known([held.explained_db])
     return VolumeSummary(
@@ -170,7 +175,12 @@ def _take_haze(tiles: Tiles) -> None:
 
 
 def _write(
-    path: Path, volume: Volume, stack: Stack, provenance: Provenance, overwrite: bool
+    path: Path,
+    volume: Volume,
+    stack: Stack,
+    provenance: Provenance,
+    overwrite: bool,
+    device: str | None,
 ) -> None:
     """The volume as artefact or OME-TIFF."""
     from plenocli.files.artefacts.container import write_artefact
@@ -179,6 +189,7 @@ def _write(
 
     if path.suffix == ".h5":
         made = volume_artefact(volume, stack.depth, stack.spacing, stack.point_shape, provenance)
+        made.attrs["volume"] |= {} if device is None else {"device": device}
         write_artefact(path, made, overwrite=overwrite)
         return
     rows, columns = stack.spacing.mean(axis=0).tolist()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import ConfigError, UsageError
-from plenocli.base.extras import how_to_install
+from plenocli.base.text import how_to_install
 from plenocli.execution.pool import open_pool
 from plenocli.stages.sweep.space import DesignPoint, ReadOptions, Space, open_space
 from plenocli.stages.sweep.store import open_store

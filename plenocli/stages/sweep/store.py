@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError, remedy
-from plenocli.base.extras import how_to_install
 from plenocli.base.progress import bar
+from plenocli.base.text import how_to_install
 from plenocli.execution.pool import Lost, Pool
 from plenocli.stages.sweep.point import run_capture, run_matrix, run_point
 from plenocli.stages.sweep.task import (

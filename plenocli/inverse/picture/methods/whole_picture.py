@@ -101,7 +101,7 @@ def _from_lmmse(
         x[inner], sigma[inner] = around[0][inner], around[1][inner]
     else:
         x[inner], sigma[inner] = adaptive_lmmse(estimators, light.data, y[inner])
-    error = light.data.common("start", lambda: root_mean_square(sigma[inner]))
+    error = float(np.sqrt(light.data.common("start", lambda: np.mean(sigma[inner] ** 2))))
     held = None
     if joint is not None:
         edge = np.ones(y.shape[:2], bool)

@@ -1,0 +1,70 @@
+"""Kernels on arrays of other libraries against NumPy's."""
+
+import numpy as np
+import pytest
+
+from plenocli.base.device import CPU, Device, device
+from plenocli.base.errors import UsageError
+from plenocli.base.linear_maps import BlockCirculant, times, times_adjoint
+from plenocli.inverse.volume.lmmse import lmmse
+from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
+from plenocli.inverse.volume.richardson_lucy import richardson_lucy
+from plenocli.inverse.volume.total_variation import total_variation
+from tests.reference import volumes
+
+COUNT, TORUS = (6, 7), (8, 9)
+
+
+@pytest.fixture(scope="module", params=["array_api_strict", "torch"])
+def other(request):
+    """A device that is none of NumPy's, in the processor."""
+    library = pytest.importorskip(request.param)
+    if request.param == "array_api_strict":
+        pytest.importorskip("array_api_compat")
+        return Device("another", library)
+    return Device("another", pytest.importorskip("array_api_compat.torch"), "cpu")
+
+
+@pytest.mark.parametrize("kind, within", [(np.float32, 1e-5), (float, 1e-13)])
+def test_a_map_is_the_same_elsewhere(other, kind, within):
+    parts = [(blocks.astype(kind), offsets) for blocks, offsets in volumes.kernels(2, 4, 9)]
+    here, there = (BlockCirculant(parts, COUNT, TORUS, where) for where in (CPU, other))
+    rng = np.random.default_rng(1)
+    x, y = (rng.standard_normal(space.shape) for space in (here.domain, here.range))
+    for one, two in ((here.forward(x), there.forward(x)), (here.adjoint(y), there.adjoint(y))):
+        assert two.dtype == one.dtype == kind
+        assert np.abs(one - two).max() <= within * np.abs(one).max()
+    matrices = rng.standard_normal((3, 4, 5)) + 1j * rng.standard_normal((3, 4, 5))
+    u, v = rng.standard_normal((3, 5)) + 0j, 1j * rng.standard_normal((3, 4))
+    for product, of in ((times, u), (times_adjoint, v)):
+        found = other.get(product(other.put(matrices), other.put(of)))
+        np.testing.assert_allclose(found, product(matrices, of), atol=1e-13)
+
+
+@pytest.mark.parametrize("method", [richardson_lucy, lmmse, total_variation])
+def test_volumes_are_the_same_elsewhere(other, method):
+    parts = [(b.astype(np.float32), o) for b, o in volumes.kernels(2, 4, 9)]
+    truth = np.random.default_rng(2).gamma(1, 1, (*TORUS, 8)).astype(np.float32)
+    light = BlockCirculant(parts, COUNT, TORUS).forward(truth)
+    noise = 0.01 * np.random.default_rng(3).standard_normal(light.shape).astype(np.float32)
+    measurement = Measurement(signal=light + noise, read_variance=1e-4)
+    voxels = Voxels(point_shape=(2, 2), pitch=1e-6, depths=(0.0, 2e-6))
+    one, two = (
+        method(Problem(BlockCirculant(parts, COUNT, TORUS, where), measurement, voxels, 0.1)).value
+        for where in (CPU, other)
+    )
+    assert np.abs(one - two).max() < 1e-4 * np.abs(one).max()
+
+
+def test_a_graphics_card_that_is_not_there_is_refused():
+    assert device("cpu") is CPU
+    try:
+        import torch
+    except ImportError:
+        said = "PyTorch, which is not installed"
+    else:
+        if torch.cuda.is_available():
+            pytest.skip("there is one")
+        said = "finds no graphics card"
+    with pytest.raises(UsageError, match=said):
+        device("cuda")

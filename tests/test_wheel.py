@@ -66,7 +66,7 @@ def fresh(tmp_path: Path) -> Path:
 
 def samples() -> list[Path]:
     home = ROOT / "sample_configs"
-    return [home / "Makefile", *home.glob("*.toml"), *home.glob("*/*.toml")]
+    return [home / "Makefile", *home.glob("*.toml"), *home.glob("*/*.toml"), *home.glob("*/*.csv")]
 
 
 def require_it_runs(folder: Path, programs: Path) -> None:

@@ -35,7 +35,8 @@ def next_step(folder: str | Path) -> str:
     if "calibration" in first:
         return f"plenocli demux YOUR.nef --calibration {first['calibration']} -o spectra.exr"
     if cameras:
-        return f"plenocli simulate-pif {cameras[0]} -o pif.h5"
+        several = f", or another of {len(cameras)} cameras here" if len(cameras) > 1 else ""
+        return f"plenocli simulate-pif {cameras[-1]} -o pif.h5{several}"
     return (
         "plenocli init && make -C plenocli-start, which takes a sample camera through the chain; "
         "or describe yours (plenocli schema camera), or measure it (plenocli calibrate --help)"

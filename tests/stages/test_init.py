@@ -10,7 +10,7 @@ from plenocli.stages.forward.init import samples
 
 ROOT = Path(__file__).resolve().parents[2]
 HOME = ROOT / "sample_configs"
-FOUND = [*HOME.glob("*.toml"), *HOME.glob("*/*.toml")]
+FOUND = [path for part in ("*.toml", "*/*.toml", "*/*.csv") for path in HOME.glob(part)]
 SAMPLES = {str(p.relative_to(HOME)): p.read_bytes() for p in FOUND}
 
 

@@ -78,9 +78,9 @@ def samples() -> list[Sample]:
 
 
 def _descriptions(home: Traversable, within: str) -> Iterator[Sample]:
-    """Every .toml in `home`, and one folder down: results that lie beside them are deeper."""
+    """Every .toml and .csv in `home`, and one folder down: results beside them are deeper."""
     for entry in sorted(home.iterdir(), key=lambda e: e.name):
-        if entry.name.endswith(".toml"):
+        if entry.name.endswith((".toml", ".csv")):
             yield Sample(name=within + entry.name, content=entry.read_bytes())
         elif not within and entry.is_dir():
             yield from _descriptions(entry, f"{entry.name}/")

@@ -44,15 +44,25 @@ def kept(
 
     Returns them in C order, the same bytes either way.
     """
-    place = folder()
-    if place is None:
+    path = _place(name, inputs)
+    if path is None:
         return tuple(map(np.ascontiguousarray, make()))
-    path = place / (_digest(name, inputs) + _SUFFIX)
     found = read_arrays(path)
     if found is None:
         found = tuple(map(np.ascontiguousarray, make()))
         _write(path, found)
     return found
+
+
+def is_kept(name: str, inputs: list[np.ndarray]) -> bool:
+    """Whether an earlier run kept what `kept` would make."""
+    path = _place(name, inputs)
+    return path is not None and path.exists()
+
+
+def _place(name: str, inputs: list[np.ndarray]) -> Path | None:
+    place = folder()
+    return None if place is None else place / (_digest(name, inputs) + _SUFFIX)
 
 
 def write_arrays(path: Path, arrays: tuple[np.ndarray, ...]) -> None:

@@ -636,3 +636,26 @@ def test_noise_of_bands_is_that_of_the_whole(camera, tmp_path, monkeypatch):
     assert rest.std() == pytest.approx(sigma, rel=0.1)
     bands = rest.reshape(3, -1)
     assert np.abs(np.corrcoef(bands) - np.eye(3)).max() < 0.2  # no band has another's noise
+
+
+def test_targets_before_one_camera_share_its_matrix(camera, scene, tmp_path, monkeypatch, capsys):
+    """Kept by all that it depends on, in the cache folder; bytes are those of no cache."""
+    from plenocli.stages.forward import kept_matrices
+
+    asked = [("--target", "white"), ("--target", "mono:550nm"), ("--scene", str(scene[0]))]
+
+    def shots(folder):
+        (tmp_path / folder).mkdir()
+        for number, words in enumerate(asked):
+            capture(camera, *words, "-o", tmp_path / folder / f"{number}.h5")
+        return [path.read_bytes() for path in sorted((tmp_path / folder).iterdir())]
+
+    alone, made = shots("alone"), []
+    monkeypatch.setenv("PLENOCLI_CACHE", str(tmp_path / "cache"))
+    build = kept_matrices.build_matrix
+    monkeypatch.setattr(kept_matrices, "build_matrix", lambda *a: made.append(a) or build(*a))
+    assert shots("together") == alone and len(made) == 1
+    camera.write_text(camera.read_text().replace('"550 mm"', '"500 mm"'))
+    capture(camera, *asked[0], "-o", tmp_path / "other.h5")
+    capture(camera, *asked[0], "--accuracy", "0.02", "-o", tmp_path / "exact.h5")
+    assert len(made) == 3

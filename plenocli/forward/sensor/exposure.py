@@ -133,7 +133,8 @@ def simulate_capture(
     scene: Scene,
     options: ExposureOptions,
     *,
-    matrices: Mapping[float, MatrixByPoints | StoredField] | None = None,
+    matrices: Mapping[float, AnyMatrix] | None = None,
+    build: Build | None = None,
     name: str = "scene",
     band_m: float | None = None,
     in_parts: bool = False,
@@ -144,6 +145,7 @@ def simulate_capture(
     scene: what is in front of the camera.
     options: how it is computed, the noise, the exposure.
     matrices: system matrices by wavelength (m); None: computed as the options ask.
+    build: computes them, default build_matrix.
     name: of the scene, for later stages and messages.
     band_m: centre of the narrow band that lights the scene, m, where there is one.
     in_parts: whether mosaic and scene of a sensor of more than BAND pixels are InParts, worked out
@@ -158,10 +160,11 @@ def simulate_capture(
     rows = [slice(0, camera.lenslet_array.count[0])]
     rows = rows if isinstance(scene, Polarised) else _bands(camera)
     if len(rows) > 1 and matrices is None:
-        matrices = {w: _held(camera, w, options) for w in source.wavelengths}
+        make = build or build_matrix
+        matrices = {w: _held(camera, options, make(camera, w, options)) for w in source.wavelengths}
 
     def lit(part: slice) -> SensorLight:
-        return carry_light(camera, source, scene, options, matrices, part)
+        return carry_light(camera, source, scene, options, matrices, part, build=build)
 
     first = lit(rows[0])
     if not float(first.white.max()) > 0:
@@ -343,6 +346,11 @@ class StoredField:
         return StoredMatrix(self.matrices[rows, columns], self.offsets)
 
 
+AnyMatrix = MatrixByPoints | StoredField
+Build = Callable[["Camera", float, ExposureOptions], AnyMatrix]
+"""As build_matrix."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SensorLight:
     """Relative light on rows of a sensor tiled with superpixels, before detection.
@@ -420,10 +428,10 @@ def require_memory_for(
 
 
 def planned_accuracy(
-    camera: Camera, options: ExposureOptions, wavelengths: np.ndarray
+    camera: Camera, options: ExposureOptions, wavelengths: np.ndarray, missing: int
 ) -> AccuracyRecord:
     """The accuracy record of a capture that computes its own system matrices: that of the middle
-    wavelength's plan. Says how long all will take.
+    wavelength's plan. Says how long the `missing` ones of them will take.
     """
     from plenocli.forward.accuracy.dial import plan_pif
     from plenocli.forward.accuracy.explain import expectation
@@ -431,7 +439,7 @@ def planned_accuracy(
     from plenocli.forward.camera.geometry import corner_ray
 
     request = _request(options) | {"wavelengths": (wavelengths[len(wavelengths) // 2],)}
-    times = len(wavelengths) * options.refine**2
+    times = missing * options.refine**2
     if options.field_nodes is None:
         plan = plan_pif(camera, **request)
     else:
@@ -440,7 +448,7 @@ def planned_accuracy(
         plan = nodes.told(plan_at(corner_ray(camera)))
         times *= len(nodes.numbers)
     expected = expectation(plan, times=times)
-    if expected:
+    if expected and missing:
         note(expected)
     return plan.accuracy_record()
 
@@ -470,8 +478,10 @@ def carry_light(
     source: Quadrature,
     scene: Scene,
     options: ExposureOptions,
-    matrix: Mapping[float, MatrixByPoints | StoredField] | None,
+    matrix: Mapping[float, AnyMatrix] | None,
     rows: slice = ALL,
+    *,
+    build: Build | None = None,
 ) -> SensorLight:
     """Light of the scene on the superpixels of some rows of lenslets, band by band through the
     system matrix.
@@ -497,7 +507,9 @@ def carry_light(
         if scene.spectral:
             around.clear()
         for seen, share in states:
-            system = matrix[wavelength] if matrix else _build(seen, wavelength, options)
+            system = (
+                matrix[wavelength] if matrix else (build or build_matrix)(seen, wavelength, options)
+            )
             reach, picture = reach_of(system.offsets), None
             if not isinstance(scene, Uniform) or isinstance(system, StoredField):
                 if reach not in around:
@@ -601,16 +613,13 @@ def _carried_over_the_field(
     return light, superpixel_light(axis.blocks(), axis.offsets, None, samples)[1]
 
 
-def _held(
-    camera: Camera, wavelength: float, options: ExposureOptions
-) -> MatrixByPoints | StoredField:
+def _held(camera: Camera, options: ExposureOptions, made: AnyMatrix) -> AnyMatrix:
     """The matrix of one wavelength, worked out once for all bands; NumericsError where there is no
     room for it.
     """
     from plenocli.base.budget import budget
 
-    made = _build(camera, wavelength, options)
-    if isinstance(made, StoredField):
+    if isinstance(made, (StoredField, StoredMatrix)):
         return made
     pixels = camera.sensor.pixels_per_lenslet[0] * camera.sensor.pixels_per_lenslet[1]
     points = int(np.prod(camera.object.samples_per_lenslet)) * options.refine**2
@@ -623,9 +632,8 @@ def _held(
     return _Held(list(made.blocks(None)), made.offsets)
 
 
-def _build(
-    camera: Camera, wavelength: float, options: ExposureOptions
-) -> MatrixByPoints | StoredField:
+def build_matrix(camera: Camera, wavelength: float, options: ExposureOptions) -> AnyMatrix:
+    """The system matrix at a wavelength (m), as the options ask. Raises as build_pif."""
     from plenocli.forward.accuracy.dial import pif_builder
     from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, lay_nodes
     from plenocli.forward.propagation.system_matrix import build_pif

@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.tiling import InParts
+from plenocli.files.read.cameras import camera_files
 from plenocli.files.read.scenes import read_polarised, read_scene
 from plenocli.forward.camera.model import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
@@ -29,6 +30,7 @@ from plenocli.forward.sensor.exposure import (
     stored_field,
 )
 from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
+from plenocli.stages.forward.kept_matrices import KeptMatrices
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
@@ -70,7 +72,7 @@ def run_capture_sim(
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.config.microscope_file import describes_microscope
     from plenocli.files.images.mosaic import write_capture
-    from plenocli.files.read.cameras import camera_files, read_camera
+    from plenocli.files.read.cameras import read_camera
 
     if volume is not None or layers or describes_microscope(camera_path):
         return _of_volume(
@@ -135,7 +137,13 @@ def _exposed(
         found = dark_capture(camera, options, in_parts=in_parts)
         if found is not None:
             return found, {}
-    matrices, accuracy = _matrices(pif, camera, settings, source.wavelengths, camera_path)
+    store = _kept_matrices(camera, camera_path)
+    if pif:
+        matrices, accuracy = _read_pif(pif, camera, settings, source.wavelengths, camera_path)
+    else:
+        missing = store.missing(camera, source.wavelengths, options)
+        planned = planned_accuracy(camera, options, source.wavelengths, missing)
+        matrices, accuracy = None, planned.as_json()
     _tell_of_the_field(AccuracyRecord.from_json(accuracy))
     found = simulate_capture(
         camera,
@@ -143,6 +151,7 @@ def _exposed(
         scene,
         options,
         matrices=matrices,
+        build=store.build,
         name=name,
         band_m=_band(settings.target),
         in_parts=in_parts,
@@ -334,17 +343,13 @@ def _tell_of_the_field(record: AccuracyRecord | None) -> None:
         )
 
 
-def _matrices(
-    pif: str | Path | None,
-    camera: Camera,
-    settings: Settings,
-    wavelengths: np.ndarray,
-    camera_path: str | Path,
-) -> tuple[dict[float, StoredMatrix | StoredField] | None, dict[str, Any]]:
-    """As _read_pif; without a pif None, and the accuracy record of what will be computed."""
-    if pif:
-        return _read_pif(pif, camera, settings, wavelengths, camera_path)
-    return None, planned_accuracy(camera, settings.options, wavelengths).as_json()
+def _kept_matrices(camera: Camera, path: str | Path) -> KeptMatrices:
+    """Where matrices of a camera are kept, by the files that its description at `path` names."""
+    from plenocli.files.artefacts.provenance import describe_inputs
+
+    files = {k: v for k, v in camera_files(path, camera).items() if k != "camera"}
+    told = describe_inputs(files)
+    return KeptMatrices({role: about["sha256"] for role, about in told.items()})
 
 
 def _read_pif(

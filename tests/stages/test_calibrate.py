@@ -339,6 +339,19 @@ def test_white_alone_gives_a_grid(files, tmp_path, capsys):
         run_demux([files["scene"]], tmp_path / "o.h5", calibration=tmp_path / "g.h5")
 
 
+def test_light_that_jumps_from_lenslet_to_lenslet_is_said_to_be_a_scene(tmp_path, capsys):
+    """Folders stand for the captures in them; dim edges and dead lenslets pass for white."""
+    fall = 1 - 0.6 * np.hypot(*np.indices((ROWS, COLUMNS)) / COLUMNS)[..., None]
+    dead = np.where(np.random.default_rng(1).random((ROWS, COLUMNS, 1)) < 0.02, 0.5, fall)
+    printed = 0.4 + 0.6 * (np.random.default_rng(2).random((ROWS, COLUMNS, 1)) < 0.7)
+    for name, gains in (("white", dead), ("scene", printed)):
+        (tmp_path / name).mkdir()
+        save(tmp_path / name / "a.h5", electrons(1.0, gains), 3)
+        words = ["calibrate", "--white", str(tmp_path / name), "-o", str(tmp_path / f"{name}.h5")]
+        assert run(words) == 0
+        assert ("--scene finds the grid" in capsys.readouterr().err) == (name == "scene")
+
+
 def test_the_same_inputs_give_the_same_bytes(files, tmp_path):
     for name in ("a.h5", "b.h5"):
         run_calibrate(

@@ -241,7 +241,7 @@ def test_unknown_noise_is_estimated_and_said(tmp_path, capsys):
     parameters = reconstruct(tmp_path, "--method", "tikhonov").attrs["image"]["parameters"]
     assert (
         "estimated" in parameters["noise_source"]
-        and "does not say its noise" in capsys.readouterr().err
+        and "does not say one noise" in capsys.readouterr().err
     )
     make_files(tmp_path)
     known = reconstruct(tmp_path, "--method", "tikhonov").attrs["image"]["parameters"][

@@ -19,7 +19,7 @@ from plenocli.cli import options
     "whites",
     multiple=True,
     type=options.FILE,
-    help="White image: even light through the main lens. Repeatable: frames are averaged.",
+    help="White image: even light through the main lens. Repeatable, or a folder: averaged.",
 )
 @click.option(
     "--scene",

@@ -112,7 +112,7 @@ def run_calibrate(
 ) -> CalibrateSummary:
     """Calibrate a camera and write `output`.
 
-    whites, scenes, darks: captures; whites or scenes at least.
+    whites, scenes, darks: captures, folders and patterns of them; whites or scenes at least.
     grid_error: px rms, the largest expected error of a grid from scenes that is accepted.
     bands: (wavelength m, capture) pairs, several a band allowed.
     across: the same under light polarised along 90 degrees, where that of `bands` is along 0.
@@ -130,7 +130,13 @@ def run_calibrate(
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.read.calibrations import write_calibration
     from plenocli.files.read.cameras import camera_files, read_camera
+    from plenocli.files.read.captures import named_captures
 
+    whites, scenes, darks = map(named_captures, (whites, scenes, darks))
+    bands, across = (
+        [(w, path) for w, name in pairs for path in named_captures([name])]
+        for pairs in (bands, across)
+    )
     if not whites and not scenes:
         raise UsageError("there is neither --white nor --scene", fix="give one of them")
     if bands and not whites:

@@ -85,5 +85,5 @@ def noise_level(
     if known is not None:
         return NoiseLevel(sigma=max(known, floor), source=TOLD, found=found)
     sigma = max(found or 0.0, floor)
-    note(f"the capture does not say its noise: sigma = {sigma:.3g}, {FOUND}")
+    note(f"the capture does not say one noise of all pixels: sigma = {sigma:.3g}, {FOUND}")
     return NoiseLevel(sigma=sigma, source=FOUND, found=found)

@@ -12,33 +12,19 @@ from plenocli.base.errors import InputError
 from plenocli.evaluation.designs import DesignTable, Parameter
 from plenocli.files.results.measured_seconds import inversion_seconds
 from plenocli.report.drawing import COLOURS, LEVEL_MAP, Figures, colour_bar, drawing
+from plenocli.report.tables import label_and_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LABELS = {
-    "psnr_db": "PSNR (dB)",
-    "psnr_inner_db": "PSNR without the border (dB)",
-    "ssim": "SSIM",
-    "rmse": "root mean square error",
-    "six_patch_rmse": "error over six patches",
-    "spectral_angle_deg": "spectral angle (degrees)",
-    "delta_e_2000": "colour difference ΔE 2000",
-    "snr_predicted_mean_db": "predicted SNR (dB)",
     "matrix_seconds": "time for the matrix (s)",
     "matrix_bytes": "size of the matrix (bytes)",
     "sensor_pixels": "pixels of the sensor",
-    "lenslets": "lenslets",
-    "object_points": "object points",
     "lenslet_field_m": "lenslet's field on the object (m)",
 }
-QUALITY = {
-    "psnr_db": "PSNR (dB)",
-    "ssim": "SSIM",
-    "six_patch_rmse": "spectral RMSE, six patches",
-    "spectral_angle_deg": "spectral angle (degrees)",
-    "depth_slope_error": "depth error (geometric limits)",
-}
+"""Of what designs say themselves, beside those of plenocli.report.tables."""
+QUALITY = ("psnr_db", "ssim", "six_patch_rmse", "spectral_angle_deg", "depth_slope_error")
 """Figures that are drawn over the seconds, where a table has them."""
 MARKERS = "osD^vP*X<>"
 MOST_ROWS = 200
@@ -93,11 +79,14 @@ def _columns(table: DesignTable) -> dict[str, _Column]:
         p.key: (f"{p.key} ({p.unit})" if p.unit else p.key, table.values[:, i])
         for i, p in enumerate(table.parameters)
         if p.choices is None
-    } | {
-        m.name: (LABELS.get(m.name, m.name), table.figures[:, i])
-        for i, m in enumerate(table.metrics)
-    }
+    } | {m.name: (_label(m.name), table.figures[:, i]) for i, m in enumerate(table.metrics)}
     return {name: _handy(*column) for name, column in found.items()}
+
+
+def _label(name: str) -> str:
+    """What people read for a figure, with its unit."""
+    label, unit = label_and_unit(name)
+    return LABELS.get(name) or (f"{label} ({unit})" if unit else label)
 
 
 def _handy(label: str, values: np.ndarray) -> _Column:
@@ -246,7 +235,7 @@ def cost_figures(table: DesignTable, measured: Mapping[str, np.ndarray]) -> Figu
                     )
             axes.set_xscale("log")
             axes.set_xlabel("CPU seconds, measured")
-            axes.set_ylabel(QUALITY[name])
+            axes.set_ylabel(_label(name))
             axes.grid(True)
         handles, labels = axes.get_legend_handles_labels()
         drawn = [k for k, h in enumerate(handles) if len(h.get_offsets())]
@@ -281,7 +270,7 @@ def cost_rows(
         ]
         for i in map(int, order)
     ]
-    heads = [QUALITY.get(name, LABELS.get(name, name)) for name in stated]
+    heads = [_label(name) for name in stated]
     spent = [f"{stage.removesuffix(' cpu_s')} (CPU s, measured)" for stage in measured]
     keys = [p.key for p in table.parameters]
     return ["design", *keys, *heads, *spent, "to the result (CPU s, measured)"], rows

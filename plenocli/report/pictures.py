@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.evaluation.scores import ResultScore
 from plenocli.report.drawing import (
     COLOURS,
     GRID_LINE,
@@ -481,72 +480,6 @@ def seen_map(share: np.ndarray) -> bytes:
             vmax=1,
         )
     return made.png
-
-
-def method_bars(documents: Sequence[tuple[str, Sequence[ResultScore]]]) -> bytes:
-    """PSNR of every method, one colour an experiment.
-
-    documents: (name, results that have a PSNR) each.
-
-    Returns PNG.
-    """
-    methods = list(dict.fromkeys(one.label for _, results in documents for one in results))
-    with drawing(8.2, 0.95 + (0.24 * len(documents) + 0.16) * len(methods)) as made:
-        axes = made.figure.subplots()
-        thick = 0.8 / len(documents)
-        low = high = None
-        for number, (name, results) in enumerate(documents):
-            levels = {
-                one.label: ratio for one in results if (ratio := one.number("psnr_db")) is not None
-            }
-            shift = (number - (len(documents) - 1) / 2) * thick
-            first = next((method for method in methods if method in levels), None)
-            for position, method in enumerate(methods):
-                value = levels.get(method)
-                if value is None:
-                    continue
-                low, high = min(value, low or value), max(value, high or value)
-                axes.barh(
-                    position + shift,
-                    value,
-                    0.88 * thick,
-                    color=COLOURS[number % len(COLOURS)],
-                    label=name if method == first else None,
-                )
-                axes.annotate(
-                    f"{value:.1f}",
-                    (max(value, 0), position + shift),
-                    (3, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=7.5,
-                )
-            if number == 0:
-                _baseline(axes, results)
-        axes.set_yticks(range(len(methods)), methods)
-        axes.invert_yaxis()
-        axes.set(
-            xlabel="PSNR [dB], peak 1.0, whole picture",
-            xlim=(max(min(0, low or 0), -8), max(high or 1, 1) * 1.08),
-        )
-        axes.grid(True, axis="x")
-        axes.tick_params(axis="y", length=0)
-        made.figure.legend(loc="outside lower center", ncols=3)
-    return made.png
-
-
-def _baseline(axes: "Axes", results: Sequence[ResultScore]) -> None:
-    """A line at the PSNR of one value a lenslet, where it is known."""
-    known = {one.label: one.number("block_mean_psnr_db") for one in results}
-    baseline = next((value for value in known.values() if value is not None), None)
-    if baseline is not None:
-        axes.axvline(
-            baseline,
-            color="#777777",
-            linewidth=0.9,
-            linestyle=(0, (4, 3)),
-            label="block mean of the truth",
-        )
 
 
 def dictionary_atoms(

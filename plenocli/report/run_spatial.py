@@ -44,8 +44,6 @@ def add_spatial(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str | 
 
     Returns its name, None where there is nothing to show.
     """
-    from plenocli.report.pictures import method_bars
-
     images = [
         file
         for file in run.of_kind("image")
@@ -63,17 +61,10 @@ def add_spatial(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str | 
             "than there are lenslets."
         ),
     )
-    documents = [(file, file.scores) for file in scores if file.scores is not None]
-    if documents:
-        bars = [
-            (file.path.stem, [o for o in found.results if o.number("psnr_db") is not None])
-            for file, found in documents
-        ]
-        page.figure(
-            method_bars(bars),
-            "Quality of every method; the dashed line is the PSNR of one value a lenslet.",
-        )
-    for file, document in documents:
+    for file in scores:
+        document = file.scores
+        if document is None:
+            continue
         page.heading(file.name.removesuffix(".json"), file.made_by)
         add_table(page, document)
         _add_drawn_results(page, run, file, document)

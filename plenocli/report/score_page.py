@@ -159,12 +159,7 @@ def add_spectra(page: Page, document: ScoreDocument, results: Sequence[tuple[str
     """Bars per band and spectra of patches of a document, and the bands of `results`, (label,
     spectra) each, as pictures.
     """
-    from plenocli.report.spectral_pictures import (
-        accuracy_bars,
-        band_pictures,
-        patch_errors,
-        patch_spectra,
-    )
+    from plenocli.report.spectral_pictures import accuracy_bars, band_pictures, patch_spectra
 
     entries = [
         one for one in document.results if one.wavelengths_nm and "rmse_per_band" in one.figures
@@ -178,13 +173,6 @@ def add_spectra(page: Page, document: ScoreDocument, results: Sequence[tuple[str
         chart = [(one.label, one.patches) for one in same if one.patches][:6]
         if chart:
             bands = same[0].wavelengths_nm
-            page.figure(
-                patch_errors(chart, bands),
-                (
-                    "Error of the six patches of the paper, with one standard deviation "
-                    "of a single lenslet."
-                ),
-            )
             page.figure(
                 patch_spectra(chart, bands),
                 (

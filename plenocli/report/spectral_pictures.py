@@ -12,7 +12,6 @@ from plenocli.report.drawing import (
     COLOURS,
     LEVEL_MAP,
     LIGHT_MAP,
-    SIGN_MAP,
     TRUTH,
     bare,
     colour_bar,
@@ -125,36 +124,6 @@ def response_picture(
             image = axes.imshow(values, cmap=LIGHT_MAP, vmin=0, interpolation="nearest")
             bare(axes, nanometres(wavelengths[band]))
             colour_bar(axes, image, "")
-    return made.png
-
-
-def response_errors(
-    error: np.ndarray, peak: np.ndarray, window: tuple[int, ...], wavelengths: np.ndarray
-) -> bytes:
-    """Which pixels of the superpixel differ between two responses, on one scale.
-
-    error: (pixel, band) difference.
-    peak: (band,) brightest pixel.
-    window: (rows, columns) of pixels.
-    wavelengths: (band,) m.
-
-    Returns PNG.
-    """
-    count = len(wavelengths)
-    shares = 100 * np.asarray(error) / np.asarray(peak)
-    limit = float(np.nanmax(np.abs(shares))) or 1.0
-    with drawing(min(2.5 * count, 10.2), 2.7) as made:
-        panels = made.figure.subplots(1, count, squeeze=False)[0]
-        for band, axes in enumerate(panels):
-            image = axes.imshow(
-                np.nan_to_num(shares[:, band]).reshape(window),
-                cmap=SIGN_MAP,
-                vmin=-limit,
-                vmax=limit,
-                interpolation="nearest",
-            )
-            bare(axes, nanometres(wavelengths[band]))
-        made.figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, label="% of the peak")
     return made.png
 
 
@@ -361,14 +330,12 @@ def lenslet_spectra(
 def patch_spectra(
     entries: Sequence[tuple[str, Sequence[PatchScore]]],
     wavelengths_nm: Sequence[float],
-    only_six: bool = False,
 ) -> bytes:
     """Spectra of the chart's patches: truth as a line, each result as points with +- one standard
     deviation; a colour strip beneath each title shows the patch.
 
     entries: (label, patches) of each result.
     wavelengths_nm: (band,).
-    only_six: leave out all but the paper's six patches.
 
     Returns PNG.
     """
@@ -376,7 +343,7 @@ def patch_spectra(
     from plenocli.forward.scene.tables import colorchecker
 
     bands = np.asarray(wavelengths_nm, dtype=float)
-    wanted = {p.label: p for _, patches in entries for p in patches if p.one_of_six or not only_six}
+    wanted = {p.label: p for _, patches in entries for p in patches}
     order = sorted(wanted)
     columns = 6 if len(order) > 6 else 3
     lines = -(-len(order) // columns)
@@ -468,49 +435,6 @@ def _points(
         color=COLOURS[number % len(COLOURS)],
         label=label,
     )
-
-
-def patch_errors(
-    entries: Sequence[tuple[str, Sequence[PatchScore]]], wavelengths_nm: Sequence[float]
-) -> bytes:
-    """Error (mean - truth) of the six patches by band with +- one standard deviation of a lenslet.
-
-    entries: (label, patches) of each result.
-    wavelengths_nm: (band,).
-
-    Returns PNG, nothing where none of the six is known.
-    """
-    bands = np.asarray(wavelengths_nm, dtype=float)
-    found = {
-        p.label: p.name
-        for _, patches in entries
-        for p in patches
-        if p.one_of_six and p.truth is not None
-    }
-    if not found:
-        return b""
-    apart = 0.02 * max(np.ptp(bands), 1.0)
-    with drawing(10.2, 3.1) as made:
-        panels = made.figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-        for place, (axes, label) in enumerate(zip(panels, sorted(found), strict=True)):
-            axes.axhline(0, color=TRUTH, linewidth=0.9)
-            for number, (name, patches) in enumerate(entries):
-                patch = next((p for p in patches if p.label == label and p.truth is not None), None)
-                if patch is not None and patch.truth is not None:
-                    shift = (number - (len(entries) - 1) / 2) * apart
-                    _points(
-                        axes,
-                        bands + shift,
-                        np.subtract(patch.mean, patch.truth),
-                        patch.std,
-                        number,
-                        name if not place else None,
-                    )
-            axes.set(title=found[label], xlabel="wavelength [nm]")
-            axes.grid(True, axis="y")
-        panels[0].set_ylabel("error in reflectance")
-        made.figure.legend(loc="outside upper center", ncols=min(len(entries), 6))
-    return made.png
 
 
 def accuracy_bars(results: Sequence[ResultScore]) -> bytes:

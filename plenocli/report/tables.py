@@ -83,6 +83,15 @@ def label_of(name: str) -> str:
     return LABELS.get(name, (name,))[0]
 
 
+def label_and_unit(name: str) -> tuple[str, str]:
+    """What people read for a metric, and its unit, which unlisted names end with."""
+    words, _, last = name.replace("_", " ").rpartition(" ")
+    units = {"db": "dB", "m": "m", "s": "s"}
+    return LABELS.get(name) or (
+        (words, units[last]) if last in units else (name.replace("_", " "), "")
+    )
+
+
 def metric_rows(document: ScoreDocument) -> tuple[list[str], list[list[str]]]:
     """The figures of a score document as text.
 
@@ -98,7 +107,7 @@ def metric_rows(document: ScoreDocument) -> tuple[list[str], list[list[str]]]:
     rows = []
     for name in names:
         values = [one.figures.get(name) for one in results]
-        label, unit = LABELS.get(name, (name.replace("_", " "), ""))
+        label, unit = label_and_unit(name)
         unit = f" [{unit}]" if unit else ""
         bands = max((len(v) for v in values if isinstance(v, list)), default=0)
         if not bands:

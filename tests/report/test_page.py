@@ -142,9 +142,6 @@ DRAWN = {
     "close-ups": lambda: pictures.close_ups(
         [("m", rng().random((24, 30)), "")], rng().random((24, 30)), (6, 6)
     ),
-    "methods": lambda: pictures.method_bars(
-        [("a", [entry("x", 20.0), entry("y", -3.0)]), ("b", [entry("x", 21.0)])]
-    ),
     "atoms": lambda: pictures.dictionary_atoms(
         rng().standard_normal((12, 7)), (3, 4), rng().random((20, 12)), (5, 4)
     ),
@@ -162,12 +159,6 @@ DRAWN = {
     ),
     "patches": lambda: spectral_pictures.patch_spectra(
         [("a", patches(0)), ("b", patches(0.1))], BANDS * 1e9
-    ),
-    "six patches": lambda: spectral_pictures.patch_spectra(
-        [("a", patches(0))], BANDS * 1e9, only_six=True
-    ),
-    "patch errors": lambda: spectral_pictures.patch_errors(
-        [("a", patches(0.01)), ("b", patches(0.1))], BANDS * 1e9
     ),
     "bars": lambda: spectral_pictures.accuracy_bars(
         [entry("a", snr=[40, 41, 42, None]), entry("b")]

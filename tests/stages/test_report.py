@@ -190,9 +190,9 @@ def test_the_page_shows_both_chains(folder, tmp_path):
         and summary.unreadable == []
         and summary.scores == 3
     )
-    # bars, results, close-up, capture, PIF, A, matrix, atoms, history; bars, errors, patches, 2 x
-    # bands, grid, response, capture
-    assert page.count("<figure>") == 17
+    # results, close-up, capture, PIF, A, matrix, atoms, history; bars, patches, 2 x bands, grid,
+    # response, capture
+    assert page.count("<figure>") == 15
     for word in (
         "score-same",
         "lmmse",
@@ -304,7 +304,7 @@ def test_score_writes_its_own_page(folder, tmp_path, capsys):
         )
         == 0
     )
-    assert (tmp_path / "c.html").read_text().count("<figure>") == 4
+    assert (tmp_path / "c.html").read_text().count("<figure>") == 3
     pif = ["--pif", str(folder / "spatial" / "pif.h5")]
     assert (
         run(

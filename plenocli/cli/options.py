@@ -254,7 +254,7 @@ class Ring(click.ParamType):
         return int(value)
 
 
-class _File(click.Path):
+class File(click.Path):
     """A path with a name: an empty one, often a shell variable that is not set, would mean
     the current folder, and '-' a stream.
     """
@@ -262,17 +262,18 @@ class _File(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the file name is empty", param, ctx)
-        if value == "-":
+        if value == "-" and not self.allow_dash:
             self.fail(
                 "files are checked and sealed, so that '-' is none of them: name a file (--json "
-                "prints a summary to standard output; ./- is a file of that name)",
+                "prints a summary to standard output, score -o - its JSON; ./- is a file of that "
+                "name)",
                 param,
                 ctx,
             )
         return super().convert(value, param, ctx)
 
 
-FILE = _File(path_type=Path)
+FILE = File(path_type=Path)
 
 
 def input_path(name: str, **settings: Any) -> Callable:

@@ -176,6 +176,17 @@ def test_a_folder_is_the_captures_in_it(folder, tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+def test_pictures_and_pages_take_folders_and_patterns(folder, tmp_path, capsys):
+    shown = tmp_path / "s"
+    shown.mkdir()
+    for path in shots(folder)[:2]:
+        (shown / path.name).write_bytes(path.read_bytes())
+    for command, names, out in (("show", shown, "a.png"), ("view", shown / "shot*.h5", "a.html")):
+        assert run([command, str(names), "-o", str(tmp_path / out), "--json"]) == 0
+        made = json.loads(capsys.readouterr().out)
+        assert [Path(file).name for file in made["files"]] == ["shot00.h5", "shot01.h5"]
+
+
 def test_a_batch_that_fails_in_part_tells_one_document(folder, tmp_path, capsys):
     bad = tmp_path / "bad.h5"
     bad.write_bytes(shots(folder)[0].read_bytes()[:-40])

@@ -64,7 +64,7 @@ def sensible(option):
         found = ("450nm=450nm.dng", "650nm=white.dng")
     elif isinstance(kind, (options.Ring, click.IntRange, click.types.IntParamType)):
         found = ("0", "1", "3")
-    elif isinstance(kind, options._File):
+    elif isinstance(kind, options.File):
         found = FILES
     elif getattr(kind, "name", "") == "angle":
         found = ("0deg", "20deg")

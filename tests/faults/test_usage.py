@@ -94,7 +94,7 @@ def senseless(kind):
         return ("", "abc", "-1", "nan", "inf", "5nm")
     if kind.name == "angle":
         return ("", "abc", "5", "5nm", "nan", "nandeg", "1e999deg")
-    if isinstance(kind, options._File):
+    if isinstance(kind, options.File):
         return ("",)
     return ()
 
@@ -127,7 +127,7 @@ def test_senseless_values_are_refused_by_name_with_an_example(
 
 def gives_an_example(said, kind):
     """Whether a message shows something that may be written, or the range of what may."""
-    if isinstance(kind, options._File):
+    if isinstance(kind, options.File):
         return "empty" in said
     return any(
         word in said

@@ -306,3 +306,15 @@ def test_a_picture_is_no_white_target(tmp_path):
     assert read_result(tmp_path / "grey.exr").kind == "image"
     with pytest.raises(InputError, match="spectra are due"):
         read_result(tmp_path / "grey.exr", ("spectra",))
+
+
+def test_a_dash_prints_the_document_and_writes_nothing(tmp_path, capsys):
+    values = np.random.default_rng(1).random((12, 12)).astype(np.float32)
+    for name in ("a.h5", "b.h5"):
+        made = Artefact("image", {"image/value": values}, {}, Provenance(command="test"))
+        write_artefact(tmp_path / name, made)
+    words = ["score", str(tmp_path / "*.h5"), "--truth", str(tmp_path / "a.h5"), "-o", "-"]
+    assert run(words) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in printed["results"]] == ["a.h5", "b.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]

@@ -37,7 +37,14 @@ METRICS = (
         "skimage:astronaut, colorchecker, or for refocused planes a distance such as 620mm."
     ),
 )
-@options.output
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=options.File(path_type=Path, allow_dash=True),
+    metavar="OUT",
+    help="JSON to write; - prints it instead.",
+)
 @click.option(
     "--report", type=options.FILE, help="Also write a page with pictures, such as report.html."
 )
@@ -154,8 +161,8 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr)
-    with the truth, side by side in one table.
+    """Compare RESULTs (image, spectra, dictionary, calibration or refocused planes; .h5 or .exr,
+    or folders of them) with the truth, side by side in one table.
 
     Pictures: PSNR with peak 1.0, SSIM, the block-mean baseline, the share of points whose 95 %
     interval holds the truth. Spectra: error per band and over the six patches of the paper,
@@ -179,12 +186,14 @@ def command(
       plenocli score dictionary.h5 --pif pif.h5 -o coherence.json
       plenocli score predicted.h5 --truth calibration.h5 -o agreement.json
       plenocli score planes.h5 --truth 620mm -o depth.json
+      plenocli score image.h5 --truth capture.h5 -o -
     """
     from plenocli.stages.evaluation.score import run_score, table
 
+    printed = str(output) == "-"
     document = run_score(
         results,
-        output,
+        None if printed else output,
         command=options.command_line(ctx),
         truth=truth,
         report=report,
@@ -204,4 +213,4 @@ def command(
         learnt=learnt,
         overwrite=overwrite,
     )
-    options.summary(document.as_json(), as_json, table(document))
+    options.summary(document.as_json(), as_json or printed, table(document))

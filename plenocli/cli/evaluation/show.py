@@ -57,8 +57,8 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Draw FILEs into one picture: system matrix, capture (with its lenslet grid), calibration,
-    spectra, dictionary, image, as artefact, EXR or RAW.
+    """Draw FILEs, or folders of them, into one picture: system matrix, capture (with its lenslet
+    grid), calibration, spectra, dictionary, image, as artefact, EXR or RAW.
 
     A dictionary is drawn on the sensor too when its pif is among the FILEs. Needs
     matplotlib: the extra [plot].

@@ -37,8 +37,8 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write one self-contained HTML page in which FILEs are looked at: it asks no network for
-    anything and opens from the file system.
+    """Write one self-contained HTML page in which FILEs, or folders of them, are looked at: it
+    asks no network for anything and opens from the file system.
 
     Captures and light fields are refocused by a slider and turned by dragging; spectra are drawn
     with error bars where one clicks; pictures beside --truth share a wipe of truth, result and

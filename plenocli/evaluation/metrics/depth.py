@@ -16,7 +16,7 @@ SURE = 0.9
 DEFINITIONS = {
     "depth_slope": "slope at which the plane stands, px per px: in units of the geometric limit",
     "depth_slope_found": (
-        "median slope over the lenslets that count, those with a confidence of 0.4 or more"
+        "median slope over the lenslets that count, those with a confidence of 0.9 or more"
     ),
     "depth_slope_error": "median of |slope - truth| over them, in units of the geometric limit",
     "depth_slope_worst": "the same, 95th percentile",

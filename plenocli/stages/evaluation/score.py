@@ -101,7 +101,7 @@ class _Scored:
 
 def run_score(
     results: Sequence[Path | str],
-    output: Path | str,
+    output: Path | str | None,
     *,
     truth: Path | str | None = None,
     report: Path | str | None = None,
@@ -122,9 +122,9 @@ def run_score(
     overwrite: bool = False,
     command: str = "",
 ) -> ScoreDocument:
-    """Score every result, write `output` (JSON) and perhaps `report` (HTML).
+    """Score every result, write `output` (JSON, None: nothing) and perhaps `report` (HTML).
 
-    results: paths.
+    results: paths, folders and patterns of them.
     truth: path or scene name, needed but for dictionaries.
     metrics: names of figures' groups, all without any.
     whites: spectra of a white target, frames.
@@ -146,12 +146,16 @@ def run_score(
     """
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.atomic import check_output, publish, together
+    from plenocli.files.read.captures import named_captures
     from plenocli.files.results.scores import json_pieces
     from plenocli.files.seal import publish_sealed
 
-    inputs = [*results, truth, *whites, patches, pif, capture, camera, classes, prior]
+    others = [truth, *whites, patches, pif, capture, camera, classes, prior]
+    results = named_captures(results, others)
+    inputs = [*results, *others]
     files = [path for path in inputs if _is_file(path)]
-    check_output(output, overwrite=overwrite, inputs=files, suffixes=(".json",))
+    if output is not None:
+        check_output(output, overwrite=overwrite, inputs=files, suffixes=(".json",))
     if report is not None:
         check_output(
             report, overwrite=overwrite, inputs=files, others=[output], suffixes=(".html",)
@@ -179,7 +183,8 @@ def run_score(
     }
     document = _document(results, scored, describe_inputs(roles), command)
     with together():
-        publish_sealed(output, json_pieces(document.as_json()), overwrite=overwrite)
+        if output is not None:
+            publish_sealed(output, json_pieces(document.as_json()), overwrite=overwrite)
         if report is not None:
             publish(report, _page(document, scored), overwrite=overwrite)
     if errors:

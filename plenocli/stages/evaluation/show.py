@@ -60,7 +60,7 @@ def run_show(
     lenslets: Sequence[Place] = (),
     overwrite: bool = False,
 ) -> ShowSummary:
-    """Draw files into one PNG.
+    """Draw files, folders and patterns of them into one PNG.
 
     output: default the first file's name with .png, in the current folder.
     truth: what pictures are compared with, as in score.
@@ -72,10 +72,12 @@ def run_show(
     """
     from plenocli.files.atomic import check_output, publish
     from plenocli.files.opened_file import open_file
+    from plenocli.files.read.captures import named_captures
     from plenocli.files.results.matrices import matrix_of
     from plenocli.report.drawing import stacked
 
-    output = Path(output) if output is not None else Path(f"{Path(files[0]).stem}.png")
+    files = named_captures(files, [truth, calibration])
+    output = Path(output) if output is not None else Path(f"{files[0].stem}.png")
     inputs = [*files, truth, calibration]
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".png",))
     centres = None if calibration is None else _centres(calibration)

@@ -54,7 +54,7 @@ def run_view(
 ) -> ViewSummary:
     """Write one self-contained page in which files are looked at.
 
-    files: artefacts, EXR, RAW, DNG, photographs.
+    files: artefacts, EXR, RAW, DNG, photographs; folders and patterns of them.
     output: .html.
     truth: what pictures and spectra are compared with, as in score.
     calibration: lenslets and white image of captures.
@@ -65,8 +65,10 @@ def run_view(
     """
     from plenocli.files.atomic import check_output, publish
     from plenocli.files.opened_file import open_file
+    from plenocli.files.read.captures import named_captures
     from plenocli.report.viewer.page import view_page
 
+    files = named_captures(files, [truth, calibration])
     inputs = [*files, truth, calibration]
     check_output(output, overwrite=overwrite, inputs=inputs, suffixes=(".html",))
     found = [open_file(file) for file in files]

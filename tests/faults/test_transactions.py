@@ -72,7 +72,9 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
 
 
 @pytest.mark.parametrize("command", SEVERAL.values(), ids=SEVERAL)
-@pytest.mark.parametrize("call", ["fsync", "replace", "unlink"])
+@pytest.mark.parametrize(
+    "call", ["replace", *(pytest.param(c, marks=pytest.mark.slow) for c in ("fsync", "unlink"))]
+)
 def test_a_kill_at_any_call_leaves_all_old_or_all_new(
     runner, folder, campaign, count, command, call
 ):
@@ -81,7 +83,7 @@ def test_a_kill_at_any_call_leaves_all_old_or_all_new(
     assert runner.run(words, folder).code == 0
     whole = _results(folder)
     for old in (dict.fromkeys(whole, OLD), {}):
-        for nth in range(1, campaign(5, 200)):
+        for nth in range(1, campaign(4, 200)):
             empty(folder / "out")
             for name, content in old.items():
                 (folder / "out" / name).write_bytes(content)

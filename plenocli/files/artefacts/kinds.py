@@ -55,14 +55,6 @@ def _even_history(data: Mapping[str, np.ndarray]) -> str | None:
     return None if even else "'dictionary/state' has histories of several lengths"
 
 
-def _in_metres(data: Mapping[str, np.ndarray]) -> str | None:
-    for path, found in data.items():
-        if path.endswith("/wavelength") and found.size:
-            if not (1e-8 < found.min() and found.max() < 1e-3):
-                return f"'{path}' is no light in metres"
-    return None
-
-
 _RULES = {
     "calibration": (_lit_lenslets, _whole_response),
     "pif-stack": (_one_entry_each,),
@@ -98,7 +90,7 @@ def _schema(kind: str, table: dict[str, Any], known: Mapping[str, Schema]) -> Sc
         attrs=attrs,
         plots=plots or like.plots,
         default=tuple(table.get("default", like.default)),
-        rules=(*_RULES.get(kind, ()), _in_metres),
+        rules=_RULES.get(kind, ()),
     )
 
 

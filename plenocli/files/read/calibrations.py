@@ -81,6 +81,9 @@ def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefa
         raise InputError(
             "has another number of pixels in response/F than in its windows", path, "make it again"
         )
+    light = artefact.data.get("response/wavelength", np.array([5e-7]))
+    if not 1e-8 < light.min() <= light.max() < 1e-3:
+        raise InputError("has a response to no light: wavelengths are in metres", path, "mend it")
     return artefact
 
 

@@ -261,10 +261,8 @@ def failed_together(
     """
     worst = max((error for _, error in errors), key=lambda error: error.exit_code)
     return type(worst)(
-        (
-            f"{len(errors)} of {total} {things} failed: "
-            f"{', '.join(Path(path).name for path, _ in errors)}"
-        ),
+        f"{len(errors)} of {total} {things} failed: "
+        f"{', '.join(Path(path).name for path, _ in errors)}",
         where,
         fix,
     )

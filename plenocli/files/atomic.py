@@ -56,10 +56,8 @@ def check_output(
         raise OutputError("is a folder", path, "name a file for the result")
     if suffixes and path.suffix not in suffixes:
         raise UsageError(
-            (
-                f"the result is written as {' or '.join(suffixes)}, not "
-                f"{path.suffix or 'without a suffix'}"
-            ),
+            f"the result is written as {' or '.join(suffixes)}, not "
+            f"{path.suffix or 'without a suffix'}",
             path,
             "change the suffix of OUT",
         )

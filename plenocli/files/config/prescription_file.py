@@ -93,10 +93,8 @@ def _read(path: Path) -> tuple[Any, list[str]]:
 
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
-            (
-                f"is {path.suffix or 'a file without a suffix'}; prescriptions are read as "
-                f"{', '.join(SUFFIXES)}"
-            ),
+            f"is {path.suffix or 'a file without a suffix'}; prescriptions are read as "
+            f"{', '.join(SUFFIXES)}",
             path,
             "convert it to .zmx",
         )

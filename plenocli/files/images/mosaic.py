@@ -327,10 +327,8 @@ def _from_image(path: Path, kind: str, cfa: str) -> Capture:
             details["note"] = f"{values.shape[-1]} identical channels, one taken"
         else:
             raise InputError(
-                (
-                    f"is a picture with {values.shape[-1]} different channels, not a mosaic "
-                    "with one value a pixel"
-                ),
+                f"is a picture with {values.shape[-1]} different channels, not a mosaic "
+                "with one value a pixel",
                 path,
                 "give the sensor's mosaic before demosaicing",
             )

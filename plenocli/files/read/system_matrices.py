@@ -89,10 +89,8 @@ def _lenslet_matrix(artefact: "Artefact", path: Path, *, by_band: bool) -> Lensl
 
     if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError(
-            (
-                "belongs to a hexagonal lattice, whose object blocks do not tile a "
-                "picture in rows and columns"
-            ),
+            "belongs to a hexagonal lattice, whose object blocks do not tile a "
+            "picture in rows and columns",
             path,
             "use the pif of a camera with a square lattice",
         )

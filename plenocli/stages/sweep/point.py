@@ -52,10 +52,8 @@ def _require_files(job: Job) -> None:
             raise OutputError(
                 f"{socket.gethostname()} does not see this file",
                 path,
-                (
-                    "workers need the same files under the same names: put them on a file "
-                    "system that all share"
-                ),
+                "workers need the same files under the same names: put them on a file "
+                "system that all share",
             )
 
 

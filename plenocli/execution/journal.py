@@ -34,9 +34,7 @@ class Journal:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
             raise OutputError(
-                f"cannot be written ({error.strerror})",
-                path,
-                remedy(error),
+                f"cannot be written ({error.strerror})", path, remedy(error)
             ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -108,9 +108,7 @@ def _read(path: Path) -> tuple[Any, list[str]]:
             from optiland import fileio
     except ImportError as error:
         raise UsageError(
-            f"importing a prescription needs optiland ({error})",
-            path,
-            how_to_install("lens"),
+            f"importing a prescription needs optiland ({error})", path, how_to_install("lens")
         ) from None
     load = {
         ".zmx": fileio.load_zemax_file,

@@ -113,11 +113,7 @@ def calibration_of(artefact: Artefact, *, response: bool = True) -> Calibration:
 
 
 def write_calibration(
-    path: str | Path,
-    calibration: Calibration,
-    provenance: Provenance,
-    *,
-    overwrite: bool = False,
+    path: str | Path, calibration: Calibration, provenance: Provenance, *, overwrite: bool = False
 ) -> None:
     """Write a calibration, whole or not at all.
 
@@ -145,11 +141,7 @@ def write_calibration(
             "response/energy": c.response.energy,
         }
         attrs["response"] = _response_attrs(c.response, c.sensor)
-    write_artefact(
-        path,
-        Artefact("calibration", datasets, attrs, provenance),
-        overwrite=overwrite,
-    )
+    write_artefact(path, Artefact("calibration", datasets, attrs, provenance), overwrite=overwrite)
 
 
 # --- reading --------------------------------------------------------------------------------------

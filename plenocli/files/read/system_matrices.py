@@ -75,11 +75,7 @@ def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | Non
     if camera is None:
         raise InputError("does not say for which camera it is", path, "run simulate-pif again")
     return FieldMatrix(
-        path=Path(path),
-        nodes=nodes,
-        parts=parts,
-        pitch=camera.lenslet_array.pitch,
-        by_band=by_band,
+        path=Path(path), nodes=nodes, parts=parts, pitch=camera.lenslet_array.pitch, by_band=by_band
     )
 
 

@@ -239,9 +239,7 @@ def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
 
     start = time.process_time()
     report = run_simulate_pif(
-        folder / "camera.toml",
-        folder / "pif.h5",
-        _settings(Settings, task.options("simulate-pif")),
+        folder / "camera.toml", folder / "pif.h5", _settings(Settings, task.options("simulate-pif"))
     )
     assert isinstance(report, PifSummary | StackSummary)  # nothing was to be explained
     return MatrixCost(
@@ -513,10 +511,7 @@ def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:
     matrix = (
         {}
         if cost is None
-        else {
-            "matrix_seconds": cost.matrix_seconds,
-            "matrix_bytes": float(cost.matrix_bytes),
-        }
+        else {"matrix_seconds": cost.matrix_seconds, "matrix_bytes": float(cost.matrix_bytes)}
     )
     return matrix | {
         "lenslets": float(lenslets),

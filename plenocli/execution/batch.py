@@ -199,8 +199,8 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
 def _write_summary(
     batch: Batch, reports: Mapping[Path, Any], errors: Mapping[Path, PlenoError]
 ) -> None:
-    """Write SUMMARY.json and SUMMARY.csv beside the results: a row for every capture, what an
-    earlier run said of those that were finished before.
+    """Write SUMMARY.json and SUMMARY.csv (without what has parts of its own) beside the results: a
+    row for every capture, what an earlier run said of those that were finished before.
     """
     from plenocli.base.text import json_value
     from plenocli.files.atomic import publish
@@ -223,19 +223,13 @@ def _write_summary(
             row |= known.get(str(capture), {}) | row | {"state": "finished before", "error": None}
         rows.append(json_value(row))
     document = json.dumps({"captures": rows}, indent=1, ensure_ascii=False, allow_nan=False)
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    flat = [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
     table = io.StringIO()
+    names = list(dict.fromkeys(name for row in flat for name in row))
     writer = csv.DictWriter(table, names, lineterminator="\n")
     writer.writeheader()
-    for row in rows:
-        writer.writerow(
-            {
-                name: json.dumps(value, ensure_ascii=False)
-                if isinstance(value, (dict, list))
-                else value
-                for name, value in row.items()
-            }
-        )
+    for row in flat:
+        writer.writerow({k: json.dumps(v) if isinstance(v, list) else v for k, v in row.items()})
     publish(path, document.encode() + b"\n", overwrite=True)
     publish(path.with_suffix(".csv"), table.getvalue().encode(), overwrite=True)
 

@@ -352,6 +352,26 @@ def test_light_that_jumps_from_lenslet_to_lenslet_is_said_to_be_a_scene(tmp_path
         assert ("--scene finds the grid" in capsys.readouterr().err) == (name == "scene")
 
 
+def test_the_time_of_a_capture_goes_into_finished_exr_and_the_summary(tmp_path):
+    import csv
+
+    import OpenEXR
+    import tifffile
+
+    names = [str(tmp_path / name) for name in ("white.tif", "a.tif", "b.tif")]
+    for number, name in enumerate(names):
+        values = SENSOR.expose(electrons(1.0 - 0.2 * number), np.random.default_rng(number))
+        tifffile.imwrite(name, values, datetime=f"2024:05:06 07:08:0{number}")
+    grid, out = str(tmp_path / "g.h5"), tmp_path / "out"
+    assert run(["calibrate", "--white", names[0], "-o", grid]) == 0
+    words = ["reconstruct", *names[1:], "--method", "block-mean", "--calibration", grid]
+    assert run([*words, "--format", "exr", "-o", str(out)]) == 0
+    found = [OpenEXR.File(str(out / f"{name}.exr")).header()["capDate"] for name in "ab"]
+    assert found == ["2024:05:06 07:08:01", "2024:05:06 07:08:02"]
+    rows = list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
+    assert [row["captured"] for row in rows] == ["2024-05-06T07:08:01", "2024-05-06T07:08:02"]
+
+
 def test_the_same_inputs_give_the_same_bytes(files, tmp_path):
     for name in ("a.h5", "b.h5"):
         run_calibrate(

@@ -18,14 +18,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 
-from plenocli.base.linear_maps import BlockCirculant, torus_for  # noqa: E402
 from plenocli.forward.volume.optics import VolumeOptics  # noqa: E402
 from plenocli.forward.volume.phantoms import Region, phantom  # noqa: E402
 from plenocli.forward.volume.plan import plan_volume  # noqa: E402
 from plenocli.forward.volume.recording import finer, record  # noqa: E402
 from plenocli.forward.volume.stack import build_stack  # noqa: E402
 from plenocli.inverse.volume.choose import SOLVERS  # noqa: E402
-from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels  # noqa: E402
+from plenocli.inverse.volume.lattice import map_of, voxels_of  # noqa: E402
+from plenocli.inverse.volume.measurement import Measurement, Problem  # noqa: E402
 
 PHANTOMS = "beads", "shells", "filaments"
 METHODS = "rl", "lmmse", "tv", "tikhonov"
@@ -94,10 +94,10 @@ def rows(options):
     stack = build_stack(camera, plan)
     yield f"kernels within {plan.error:.1e} | | {time.process_time() - clock:.1f} | | | | | |"
     clock = time.process_time()
-    op = BlockCirculant(stack.parts(), count, torus_for(count, stack.reach))
+    op = map_of(stack, count)
     size = f"torus {op.torus[0]}x{op.torus[1]}, {op.spectrum.nbytes / 2**20:.0f} MiB"
     yield f"spectrum, {size} | | {time.process_time() - clock:.1f} | | | | | |"
-    voxels = Voxels((samples, samples), float(stack.spacing[0, 0]), tuple(stack.depth))
+    voxels = voxels_of(stack)
     del stack  # what is left is as much as a reader of its file would keep
     rng = np.random.default_rng(1)
     for name in options.phantom or PHANTOMS:

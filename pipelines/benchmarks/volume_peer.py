@@ -127,21 +127,20 @@ def rows(options):
     sys.path[:0] = [str(ROOT), str(ROOT / "pipelines" / "benchmarks")]
     from volume import PHANTOMS, optics, recorded
 
-    from plenocli.base.linear_maps import BlockCirculant, torus_for
     from plenocli.base.tiling import to_plane
     from plenocli.forward.volume.lenslets import terms_for
     from plenocli.forward.volume.plan import FINEST, plan_volume
     from plenocli.forward.volume.stack import build_stack
     from plenocli.forward.volume.waves import WavePlane, WaveSettings
     from plenocli.inverse.volume.choose import SOLVERS
-    from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
+    from plenocli.inverse.volume.lattice import map_of, voxels_of
+    from plenocli.inverse.volume.measurement import Measurement, Problem
 
     camera = optics(PIXELS, options.planes)
     count = options.lenslets, options.lenslets
     plan = plan_volume(camera, (SAMPLES, SAMPLES), accuracy=options.accuracy, model="fresnel")
     stack = build_stack(camera, plan)
-    op = BlockCirculant(stack.parts(), count, torus_for(count, stack.reach))
-    voxels = Voxels((SAMPLES, SAMPLES), float(stack.spacing[0, 0]), tuple(stack.depth))
+    op, voxels = map_of(stack, count), voxels_of(stack)
     rng, seen, captures = np.random.default_rng(1), {}, {}
     for name in PHANTOMS:
         seen[name] = recorded(camera, name, SAMPLES, options.lenslets, options.accuracy)

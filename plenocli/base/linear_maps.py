@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from typing import Any
 
@@ -155,7 +156,11 @@ class BlockCirculant:
         for blocks, offsets in pairs:
             self._transform(blocks, offsets, slice(first, first + blocks.shape[2]))
             first += blocks.shape[2]
-        self._spectrum = device.put(self.spectrum)
+
+    @cached_property
+    def _there(self) -> Any:
+        """The spectrum on the device, from its first use on."""
+        return self.device.put(self.spectrum)
 
     @staticmethod
     def needed(pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4) -> int:
@@ -206,6 +211,7 @@ class BlockCirculant:
         array would see.
         """
         other = copy(self)
+        other._there = self._there
         other.range = Space(self.range.axes, (*self.torus, self.range.shape[2]))
         return other
 
@@ -222,11 +228,11 @@ class BlockCirculant:
 
     def at_frequencies(self, x: Any) -> Any:
         """(frequency, unknown) -> (frequency, pixel): A_k x_k."""
-        return times(self._spectrum, x)
+        return times(self._there, x)
 
     def back_at_frequencies(self, y: Any) -> Any:
         """(frequency, pixel) -> (frequency, unknown): A_k^H y_k."""
-        return times_adjoint(self._spectrum, y)
+        return times_adjoint(self._there, y)
 
 
 def _transforms(array: Any) -> Any:

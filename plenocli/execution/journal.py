@@ -34,7 +34,9 @@ class Journal:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
             raise OutputError(
-                f"cannot be written ({error.strerror})", path, remedy(error)
+                f"cannot be written ({error.strerror})",
+                path,
+                remedy(error),
             ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -90,6 +92,6 @@ def _read(line: bytes) -> tuple[str, Any] | None:
         return None
     try:
         key, record = json.loads(text)
-        return str(key), record
-    except (ValueError, TypeError, RecursionError):  # sealed, but none of ours
+    except ValueError:
         return None
+    return key, record

@@ -36,6 +36,8 @@ TRIED_BLUR = 4.0
 """Lenslets on each side that the deepest point that is tried lights."""
 DEEPER = 1.6
 """Error of deeper points over that of the deepest that is tried (measured to 17 lenslets)."""
+BOX = 2
+"""Points along each side of a voxel that stand for it, its light being their mean."""
 OVERHEAD = 3.6
 """Time over that of the products."""
 
@@ -100,7 +102,7 @@ def plan_volume(
     *,
     accuracy: float = 5e-3,
     model: str = "auto",
-    box: int = 2,
+    box: int = BOX,
 ) -> VolumePlan:
     """The cheapest plan that meets an accuracy.
 

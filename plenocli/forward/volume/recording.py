@@ -10,7 +10,7 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.forward.volume.optics import VolumeOptics
-from plenocli.forward.volume.plan import VolumePlan, plan_volume
+from plenocli.forward.volume.plan import BOX, VolumePlan, plan_volume
 from plenocli.forward.volume.stack import plane_kernels
 
 Sampler = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
@@ -40,7 +40,7 @@ def finer(
     fine = replace(optics, depths=depths, places=depths, scales=(1.0,) * len(depths))
     many = (samples[0] * refine, samples[1] * refine)
     # a voxel is a box: points of the finer ones stand for it
-    box = max(1, round(2 / refine))
+    box = max(1, round(BOX / refine))
     return fine, plan_volume(fine, many, accuracy=accuracy, model=model, box=box)
 
 

@@ -1,5 +1,5 @@
 """What a lattice of lenslets is to the finer lattice of points: each of its frequencies mixes as
-many frequencies of the finer one as a lenslet has points.
+many frequencies of the finer one as a lenslet has points. Between points a specimen is smooth.
 """
 
 from __future__ import annotations
@@ -8,7 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.device import CPU, Device
+from plenocli.base.linear_maps import BlockCirculant, torus_for
+from plenocli.forward.volume.plan import BOX
+from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume.measurement import Voxels
+
+WITHIN = 1 / 24
+"""x less its mean over a voxel, per second difference of the means."""
+ACROSS = WITHIN + (1 - 1 / BOX**2) / 24
+"""The same along rows and columns, where a kernel is already the mean over BOX points."""
+EVEN = 0.01
+"""Difference of the planes' spacings, relative, up to which they are even."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,3 +121,44 @@ def back_through_prior(matrix: np.ndarray, mixing: np.ndarray, factor: np.ndarra
     points, planes = factor.shape[:2]
     deep = factor @ matrix.reshape(points, planes, -1)
     return np.tensordot(deep, mixing, (0, 1)).transpose(0, 2, 1).reshape(points * planes, -1)
+
+
+def voxels_of(stack: Stack) -> Voxels:
+    """The unknowns of a stack of kernels."""
+    # layers of a photographic camera are told apart by parallax, not by their distance
+    return Voxels(
+        point_shape=stack.point_shape,
+        pitch=float(np.mean(stack.spacing)),
+        depths=tuple((stack.depth - stack.depth[0]).tolist()),
+    )
+
+
+def map_of(stack: Stack, count: tuple[int, int], device: Device = CPU) -> BlockCirculant:
+    """What `count` (rows, columns) lenslets see of a specimen that is smooth, by the means over its
+    voxels, on a torus that all light fits into.
+
+    device: of the map.
+
+    A sum of A x over places is the integral, the mean m over voxels is x + m''/24: light is that
+    of m - m''/24, and where kernels are means of two places too, of m - 7 m''/96. Along the depth
+    planes are lines, and m'' is known where they are even. docs/model.md, "Volumes inverted".
+    """
+    op = BlockCirculant(stack.parts(), count, torus_for(count, stack.reach), device)
+    _smooth(op, voxels_of(stack))
+    return op
+
+
+def _smooth(op: BlockCirculant, voxels: Voxels) -> None:
+    """Turn a map of what is in the voxels' middles into one of their means; see map_of."""
+    lattice, planes = lattice_of(op.torus, voxels), len(voxels.depths)
+    sharper = np.prod(1 + 4 * ACROSS * np.sin(np.pi * lattice.turns) ** 2, axis=-1)
+    across = lattice.mixing * sharper[:, None] @ lattice.mixing.conj().transpose(0, 2, 1)
+    apart = np.diff(voxels.depths)
+    along = np.eye(planes)
+    if planes > 2 and np.ptp(apart) <= EVEN * abs(apart[0]):
+        step = np.diff(np.eye(planes), axis=0)
+        along = along + WITHIN * step.T @ step
+    along = along.astype(op.dtype)
+    for k, matrix in enumerate(op.spectrum):
+        layers = matrix.reshape(len(matrix), planes, -1) @ across[k].astype(matrix.dtype)
+        op.spectrum[k] = np.matmul(along, layers).reshape(len(matrix), -1)

@@ -21,8 +21,8 @@ MOST_WEIGHT = 3.0
 """Of a pixel that is darker than its fellows, whose noise is below theirs."""
 FIRST = 8
 """Rounds after which the pixels' own noise is read off their prediction."""
-EVEN, WIDTH = 0.1, 2.0
-"""Share of the variance that every voxel has, and the voxels over which the rest follows the
+EVEN, WIDTH = 0.3, 1.0
+"""Share of the variance that every voxel has, and the voxels over which what is added follows the
 specimen's mean square.
 """
 UNEXPLAINED = 30.0
@@ -44,7 +44,7 @@ def lmmse(
     uneven: whether the errors follow the specimen; None: where the volume is no Gaussian.
 
     Returns a volume whose sigma is that of a Gaussian specimen of the same statistics; where they
-    are uneven, it follows the specimen: sigma^2 (0.1 + 0.9 e/mean e), e its local mean square.
+    are uneven, it follows the specimen: sigma^2 (0.3 + e/mean e), e its local mean square.
     Raises NumericsError where memory is lacking.
     docs/model.md, "Volumes inverted".
     """
@@ -168,7 +168,6 @@ def _weights(problem: Problem, gain: Gain, own: np.ndarray) -> np.ndarray:
 def is_uneven(value: np.ndarray) -> bool:
     """Whether a volume is further from a Gaussian than passes for one."""
     rest = value - value.mean()
-    rest = rest / (np.abs(rest).max() or 1)  # powers of any unit stay numbers
     return bool(np.mean(rest**4) > GAUSSIAN * np.mean(rest**2) ** 2)
 
 
@@ -181,5 +180,5 @@ def _sigma(problem: Problem, gain: Gain, value: np.ndarray, uneven: bool) -> np.
     variance = problem.voxels.picture(even)
     if uneven:
         local = gaussian_filter(value.astype(float) ** 2, WIDTH)
-        variance = variance * (EVEN + (1 - EVEN) * local / local.mean())
+        variance = variance * (EVEN + local / local.mean())
     return np.sqrt(variance).astype(value.dtype)

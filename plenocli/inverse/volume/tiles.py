@@ -17,7 +17,8 @@ from plenocli.base.progress import bar
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume.choose import volume_like, volume_of
 from plenocli.inverse.volume.haze import haze, without_haze
-from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, Voxels, lots
+from plenocli.inverse.volume.lattice import map_of, voxels_of
+from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, lots
 from plenocli.inverse.volume.volume import HeldOut, Prior, Trial, Volume, predictive_sigma
 
 MOST = 10_000
@@ -104,8 +105,7 @@ class Tiles:
     def _op(self) -> BlockCirculant:
         window = self.windows[0]
         size = len(window.row_weight), len(window.column_weight)
-        torus = torus_for(size, self.stack.reach)
-        return BlockCirculant(self.stack.parts(), size, torus, self.device)
+        return map_of(self.stack, size, self.device)
 
     @cached_property
     def _draw(self) -> np.ndarray:
@@ -120,11 +120,7 @@ class Tiles:
             signal=whole.signal[at],
             usable=None if whole.usable is None else whole.usable[at],
         )
-        # layers of a photographic camera are told apart by parallax, not by their distance
-        depths = tuple((self.stack.depth - self.stack.depth[0]).tolist())
-        pitch = float(np.mean(self.stack.spacing))
-        voxels = Voxels(point_shape=self.stack.point_shape, pitch=pitch, depths=depths)
-        return Problem(self._op, part, voxels, self._hold_out, draw=self._draw[at])
+        return Problem(self._op, part, voxels_of(self.stack), self._hold_out, draw=self._draw[at])
 
     @cached_property
     def brightest(self) -> Window:

@@ -19,11 +19,11 @@ PENALTY, SIGN = 3e-2, 0.5
 """Of differences and of the sign, over the data's, where A' A has a mean diagonal of 1."""
 RELAXED = np.float32(1.6)
 """How far each round goes."""
-STRENGTHS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
+STRENGTHS = (3e-2, 1e-2, 3e-3, 1e-3, 5e-4, 2.5e-4)
 """Of the total variation, over the root mean square of the signal."""
 ROUNDS, LAST = 12, 25
 """At each strength, and more of them at the best."""
-GAIN = 0.1
+GAIN = 0.01
 """Share by which weaker total variation must make the held-out error smaller to be preferred."""
 
 
@@ -41,7 +41,8 @@ def total_variation(
     Returns a volume without sigma.
     Raises NumericsError where memory is lacking.
 
-    TV is isotropic in three dimensions, with differences from voxel to voxel. By the alternating
+    TV is isotropic in space: differences from plane to plane count less the further planes are
+    apart, beside the pitch of voxels. By the alternating
     direction method of multipliers on w = A x, v = D x and u = x >= 0: all maps are invariant
     under shifts by lenslets, so that the step in x is exact, by one matrix a lattice frequency.
     Boyd et al. 2011; Afonso, Bioucas-Dias and Figueiredo 2011.
@@ -98,7 +99,8 @@ class _Descent:
         lattice = lattice_of(op.torus, problem.voxels)
         scale = float(np.sqrt(lattice.mean(power))) or 1.0
         self.scale = (whitening / scale).astype(op.dtype)
-        self.solve = op.device.put(_inverses(problem, lattice, self.scale))
+        self.along = (problem.voxels.pitch / np.diff(problem.voxels.depths)).astype(op.dtype)
+        self.solve = op.device.put(_inverses(problem, lattice, self.scale, self.along))
         rows, columns = op.range.shape[:2]
         self.y = np.zeros(self.whole.range.shape, op.dtype)
         self.counts = np.zeros(self.whole.range.shape, op.dtype)
@@ -112,7 +114,7 @@ class _Descent:
         planes, (rows, columns) = len(self.problem.voxels.depths), self.whole.torus
         s, t = self.problem.voxels.point_shape
         u = np.zeros((planes, rows * s, columns * t), self.whole.dtype)
-        v = differences(u)
+        v = differences(u, self.along)
         return _State(
             w=self.y,
             v=v,
@@ -135,7 +137,7 @@ class _Descent:
     def _round(self, state: _State, strength: np.floating) -> _State:
         whole, voxels = self.whole, self.problem.voxels
         kind = whole.dtype.type
-        pull = back_differences(tuple(v - d for v, d in zip(state.v, state.of_v)))
+        pull = back_differences(tuple(v - d for v, d in zip(state.v, state.of_v)), self.along)
         pull = kind(PENALTY) * pull + kind(SIGN) * (state.u - state.of_u)
         pull = voxels.lenslets(pull)
         data = whole.to_frequencies((state.w - state.of_w) * self.scale)
@@ -144,7 +146,8 @@ class _Descent:
         light = whole.from_frequencies(whole.at_frequencies(of_x)) * self.scale
         aim = _beyond(light, state.w) + state.of_w
         w = (self.counts * self.y + aim) / (self.counts + 1)
-        aims = tuple(_beyond(g, v) + d for g, v, d in zip(differences(x), state.v, state.of_v))
+        steps = zip(differences(x, self.along), state.v, state.of_v)
+        aims = tuple(_beyond(g, v) + d for g, v, d in steps)
         v = shrunk(aims, strength / kind(PENALTY))
         above = _beyond(x, state.u) + state.of_u
         u = np.maximum(above, 0)
@@ -159,14 +162,18 @@ class _Descent:
         )
 
 
-def differences(x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of (plane, row, column) with the next plane, and with the next row, column on the torus."""
-    return np.diff(x, axis=0), np.roll(x, -1, 1) - x, np.roll(x, -1, 2) - x
+def differences(x: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of (plane, row, column) with the next plane, times `along` (plane - 1,), and with the next
+    row, column on the torus.
+    """
+    deep = along[:, None, None] * np.diff(x, axis=0)
+    return deep, np.roll(x, -1, 1) - x, np.roll(x, -1, 2) - x
 
 
-def back_differences(v: tuple[np.ndarray, ...]) -> np.ndarray:
+def back_differences(v: tuple[np.ndarray, ...], along: np.ndarray) -> np.ndarray:
     """The adjoint of `differences`."""
     deep, down, right = v
+    deep = along[:, None, None] * deep
     x = np.roll(down, 1, 1) - down + np.roll(right, 1, 2) - right
     x[1:] += deep
     x[:-1] -= deep
@@ -186,7 +193,9 @@ def _beyond(new: np.ndarray, old: np.ndarray) -> np.ndarray:
     return RELAXED * new + (1 - RELAXED) * old
 
 
-def _inverses(problem: Problem, lattice: Lattice, scale: np.ndarray) -> np.ndarray:
+def _inverses(
+    problem: Problem, lattice: Lattice, scale: np.ndarray, along: np.ndarray
+) -> np.ndarray:
     """(A' A + p D' D + q)^-1 of every frequency, (frequency, unknown, unknown), made in double
     precision and stored as the map is.
     """
@@ -197,7 +206,7 @@ def _inverses(problem: Problem, lattice: Lattice, scale: np.ndarray) -> np.ndarr
     frequencies, _, unknowns = spectrum.shape
     points = unknowns // planes
     inverse = np.empty((frequencies, unknowns, unknowns), spectrum.dtype)
-    step = np.diff(np.eye(planes), axis=0)
+    step = along[:, None] * np.diff(np.eye(planes), axis=0)
     axial = np.kron(np.eye(points), PENALTY * step.T @ step)
     independent = np.broadcast_to(np.eye(planes), (points, planes, planes))
     across = (4 * np.sin(np.pi * lattice.turns) ** 2).sum(axis=-1)

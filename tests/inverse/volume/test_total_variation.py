@@ -16,6 +16,8 @@ from plenocli.inverse.volume.total_variation import (
 from tests.reference import volumes
 
 VOXELS = Voxels((2, 2), 1e-6, (-1e-6, 1e-6))
+ALONG = np.array([0.5])
+"""Pitch of the voxels over the distance of the planes."""
 COUNT, TORUS = (3, 4), (4, 5)
 
 
@@ -37,7 +39,7 @@ def box(count=COUNT, torus=TORUS, noise=0.03, hold_out=0.0, dtype=float, pixels=
 def gradients():
     """(plane, row, column differences) as dense matrices of the map's unknowns."""
     count = int(np.prod(TORUS)) * 8
-    columns = [differences(VOXELS.picture(one.reshape(*TORUS, 8))) for one in np.eye(count)]
+    columns = [differences(VOXELS.picture(one.reshape(*TORUS, 8)), ALONG) for one in np.eye(count)]
     return [np.array([c[axis].ravel() for c in columns]).T for axis in range(3)]
 
 
@@ -96,13 +98,14 @@ def test_it_is_the_least(strength):
 def test_differences_and_their_adjoint():
     rng = np.random.default_rng(1)
     x = rng.standard_normal((3, 6, 8))
-    v = tuple(rng.standard_normal(part.shape) for part in differences(x))
-    forward = sum(np.sum(a * b) for a, b in zip(differences(x), v))
-    assert forward == pytest.approx(np.sum(x * back_differences(v)), rel=1e-12)
+    along = np.array([0.3, 2.0])
+    v = tuple(rng.standard_normal(part.shape) for part in differences(x, along))
+    forward = sum(np.sum(a * b) for a, b in zip(differences(x, along), v))
+    assert forward == pytest.approx(np.sum(x * back_differences(v, along)), rel=1e-12)
 
 
 def test_shrinking_takes_the_same_length_off_everywhere():
-    v = differences(np.random.default_rng(2).standard_normal((3, 6, 8)))
+    v = differences(np.random.default_rng(2).standard_normal((3, 6, 8)), np.ones(2))
     before, after = lengths(v), lengths(shrunk(v, np.float64(0.5)))
     np.testing.assert_allclose(after, np.maximum(before - 0.5, 0), atol=1e-12)
 
@@ -112,7 +115,7 @@ def test_the_strength_is_chosen_by_held_out_pixels(dtype):
     problem, truth = box((6, 6), (8, 8), noise=0.02, hold_out=0.1, dtype=dtype, pixels=25)
     volume = total_variation(problem)
     tried = [trial.misfit for trial in volume.trace[:-1]]
-    assert np.all(np.diff(tried[:-1]) < 0) and tried[-1] > 0.9 * tried[-2]
+    assert np.all(np.diff(tried[:-1]) < 0) and tried[-1] > 0.99 * tried[-2]
     assert volume.trace[-1].what.startswith(volume.trace[-3].what)
     assert volume.value.dtype == dtype
     error = volume.value - truth[:, :12, :12]

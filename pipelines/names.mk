@@ -9,11 +9,14 @@ NAMES := $(ONE_NAME) CAPTURES DARK SWEEPS TRADES WHITE
 
 HASH := \#
 BEYOND_NAMES := $$ & ; | < > ( ) { } [ ] " ' ` \ ! % $(HASH)
+# what controls a terminal, which Make's own messages would pass on
+CONTROLS := $(shell printf '\001 \002 \003 \004 \005 \006 \007 \010 \016 \017 \020 \021 \022 \023 \024 \025 \026 \027 \030 \031 \032 \033 \034 \035 \036 \037 \177')
 define NEWLINE
 
 
 endef
 found = $(strip $(foreach c,$(BEYOND_NAMES),$(findstring $c,$(value $1))) $(if $(findstring $(NEWLINE),$(value $1)),line break) \
+	$(if $(strip $(foreach c,$(CONTROLS),$(findstring $c,$(value $1)))),a control character) \
 	$(if $(filter $1,$(NAMES)),$(foreach c,: =,$(findstring $c,$(subst skimage:,,$(value $1))))) \
 	$(if $(filter BANDS,$1),$(foreach b,$(value $1),$(if $(word 3,$(subst =, ,$b)),= twice))))
 

@@ -98,10 +98,7 @@ def plan_batch(
 
 
 def outcomes(
-    batch: Batch,
-    pool: Pool,
-    work: Callable[[Path], Any],
-    write: Callable[[Any, Path, Path], Any],
+    batch: Batch, pool: Pool, work: Callable[[Path], Any], write: Callable[[Any, Path, Path], Any]
 ) -> Iterator[tuple[Path, Any]]:
     """Do what a batch has to do; not many more results than workers are held.
 
@@ -184,9 +181,7 @@ def summarise(batch: Batch, ended: Iterable[tuple[Path, Any]]) -> BatchSummary:
     reports.sort(key=lambda pair: order[pair[0]])
     errors.sort(key=lambda pair: order[pair[0]])
     done = BatchSummary(
-        str(batch.output),
-        len(batch.jobs) - len(batch.todo),
-        tuple(report for _, report in reports),
+        str(batch.output), len(batch.jobs) - len(batch.todo), tuple(report for _, report in reports)
     )
     if batch.several:
         _write_summary(batch, dict(reports), dict(errors))
@@ -255,10 +250,8 @@ def failed_together(
     """
     worst = max((error for _, error in errors), key=lambda error: error.exit_code)
     return type(worst)(
-        (
-            f"{len(errors)} of {total} {things} failed: "
-            f"{', '.join(Path(path).name for path, _ in errors)}"
-        ),
+        f"{len(errors)} of {total} {things} failed: "
+        f"{', '.join(Path(path).name for path, _ in errors)}",
         where,
         fix,
     )

@@ -34,9 +34,7 @@ class Journal:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
             raise OutputError(
-                f"cannot be written ({error.strerror})",
-                path,
-                remedy(error),
+                f"cannot be written ({error.strerror})", path, remedy(error)
             ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -92,6 +90,6 @@ def _read(line: bytes) -> tuple[str, Any] | None:
         return None
     try:
         key, record = json.loads(text)
-    except ValueError:
+        return str(key), record
+    except (ValueError, TypeError, RecursionError):  # sealed, but none of ours
         return None
-    return key, record

@@ -56,10 +56,8 @@ def check_output(
         raise OutputError("is a folder", path, "name a file for the result")
     if suffixes and path.suffix not in suffixes:
         raise UsageError(
-            (
-                f"the result is written as {' or '.join(suffixes)}, not "
-                f"{path.suffix or 'without a suffix'}"
-            ),
+            f"the result is written as {' or '.join(suffixes)}, not "
+            f"{path.suffix or 'without a suffix'}",
             path,
             "change the suffix of OUT",
         )
@@ -278,27 +276,26 @@ def _announcement(target: Path) -> Path:
 
 @contextlib.contextmanager
 def _announced(staged: Sequence[_Staged]) -> Iterator[list[Path]]:
-    """Beside each of several files of one folder it says, for good, what all of them are, until
-    the block ends well.
+    """Beside each of several files it says, for good, what all of them are, until the block ends
+    well: their names as seen from there, sizes and times.
     """
-    folders: dict[Path, list[_Staged]] = {}
-    for file in staged:
-        folders.setdefault(file.target.parent, []).append(file)
-    folders = {folder: files for folder, files in folders.items() if len(files) > 1}
-    announcements = [_announcement(file.target) for files in folders.values() for file in files]
+    several = staged if len(staged) > 1 else []
+    places = [Path(os.path.realpath(f.target.parent), f.target.name) for f in several]
+    announcements = [_announcement(place) for place in places]
     how = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     with contextlib.ExitStack() as held:
         try:
-            for folder, files in folders.items():
-                told = [[file.target.name, *_about(file.descriptor)] for file in files]
-                for file in files:
-                    with _told(file.path):
-                        made = os.open(_announcement(file.target), how, 0o600)
-                        held.callback(os.close, made)
-                        fcntl.flock(made, fcntl.LOCK_EX)
-                        os.ftruncate(made, 0)
-                        write_at(made, 0, json.dumps(told).encode())
-                        os.fsync(made)
+            for file, announcement in zip(several, announcements):
+                names = [os.path.relpath(place, announcement.parent) for place in places]
+                told = [[name, *_about(f.descriptor)] for name, f in zip(names, several)]
+                with _told(file.path):
+                    made = os.open(announcement, how, 0o600)
+                    held.callback(os.close, made)
+                    fcntl.flock(made, fcntl.LOCK_EX)
+                    os.ftruncate(made, 0)
+                    write_at(made, 0, json.dumps(told).encode())
+                    os.fsync(made)
+            for folder in dict.fromkeys(place.parent for place in places):
                 sync_folder(folder)
             yield announcements
         finally:
@@ -310,27 +307,53 @@ def _announced(staged: Sequence[_Staged]) -> Iterator[list[Path]]:
 def settle(path: str | os.PathLike) -> None:
     """Where the several results of one command, of which the file at `path` is one, were cut off
     while they took their places, let the rest follow; else nothing, at the cost of one look.
+
+    They follow only where it says the same beside all of them: who can write in one folder decides
+    nothing in another. Where it does not, none has moved yet, or all have.
     """
-    how = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    with contextlib.suppress(OSError, ValueError, TypeError):
+    with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
         announcement = _announcement(_target(path))
         if not os.path.lexists(announcement):
             return
-        descriptor = os.open(announcement, how)
+        descriptor = os.open(announcement, _LOOK)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)  # until a command that is about it has ended
+            if not _is_same_file(descriptor, announcement):
+                return
             told = json.loads(os.pread(descriptor, 1 << 20, 0))
-            # names of this folder only: who could write the announcement could write them, too
-            targets = [announcement.with_name(name) for name, *_ in told]
+            folder = os.path.realpath(announcement.parent)
+            targets = [Path(os.path.normpath(os.path.join(folder, name))) for name, *_ in told]
+            if not all(target.parent.is_dir() for target in targets):
+                return  # a disk that is not there now
+            if not all(_says(target, told) for target in targets):
+                announcement.unlink()
+                return
             for target, (_, *about) in zip(targets, told):
-                partial = partial_path(target)
-                if os.path.lexists(partial) and _about(partial) == about:
-                    os.replace(partial, target)
-            sync_folder(announcement.parent)
+                with contextlib.suppress(FileNotFoundError):
+                    if _about(partial_path(target)) == about:
+                        os.replace(partial_path(target), target)
+            for parent in dict.fromkeys(target.parent for target in targets):
+                sync_folder(parent)
             for target in targets:
                 _announcement(target).unlink(missing_ok=True)
         finally:
             os.close(descriptor)
+
+
+_LOOK = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+def _says(target: Path, told: list[list[Any]]) -> bool:
+    """Whether it says of the same files beside one of them."""
+    try:
+        descriptor = os.open(_announcement(target), _LOOK)
+    except FileNotFoundError:
+        return False
+    with open(descriptor, "rb") as file:
+        found = json.loads(file.read(1 << 20) or b"[]")
+    return [[Path(name).name, *rest] for name, *rest in found] == [
+        [Path(name).name, *rest] for name, *rest in told
+    ]
 
 
 def _about(file: Path | int) -> list[int]:

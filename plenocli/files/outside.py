@@ -217,16 +217,6 @@ def close() -> None:
             _idle.pop().end(1)
 
 
-def used_seconds() -> float:
-    """Processor time, s, of the children that wait, which the system does not count before they
-    end; 0 where it does not say.
-    """
-    with _lock, contextlib.suppress(OSError):
-        # the clock of another process, as clock_getcpuclockid(3) names it on Linux
-        return sum(time.clock_gettime((~child.pid << 3) | 2) for child in _idle)
-    return 0.0
-
-
 def _forget() -> None:
     """In a forked process: the children are the parent's."""
     global _lock

@@ -2,13 +2,13 @@
 
 See harness.py.
 
-A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name, or
-"False" for what it returns, "lasting": whether all later calls fail too, "of": another module that
-holds the function}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize", "nth": bytes a
-file may have}; {"call": "memory", "nth": bytes of memory beyond what is in use}; {"call": "array"},
-the nth numpy array gets no memory; {"call": "short"}, writes that take only a part; {"call":
-"without", "module": name}, a module that is not installed. With {"places": True} the notes also say
-where messages are made, as file:line words.
+A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name,
+"False" for what it returns or "KILL", "lasting": whether all later calls fail too, "of": another
+module that holds the function}; {"call": "bytes", "nth": room on the disk}; {"call": "filesize",
+"nth": bytes a file may have}; {"call": "memory", "nth": bytes of memory beyond what is in use};
+{"call": "array"}, the nth numpy array gets no memory; {"call": "short"}, writes that take only a
+part; {"call": "without", "module": name}, a module that is not installed. With {"places": True} the
+notes also say where messages are made, as file:line words.
 """
 
 import errno
@@ -180,6 +180,8 @@ def _arm(fault, fired):
         seen += 1
         if seen == fault["nth"] or (fault.get("lasting") and seen > fault["nth"]):
             fired.add("x ")
+            if fault["error"] == "KILL":
+                os.kill(os.getpid(), signal.SIGKILL)
             if number is None:
                 return False
             raise OSError(number, os.strerror(number))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.faults.harness import is_clean_refusal
+from tests.faults.test_resealed import resealed
 from tests.files import test_container as hdf5
 
 
@@ -69,6 +70,25 @@ def test_hdf5_with_a_valid_digest(runner, tmp_path, count, make):
     outcome = runner.run(["inspect", "bomb.h5"], tmp_path, limit=10)
     assert is_cheap_refusal(outcome), outcome
     count("bombs", refused=1)
+
+
+def test_text_and_numbers_that_their_table_allows_are_held_by_the_limit_of_memory(
+    runner, stages, tmp_path
+):
+    """What is legal of any length, and packs well, is read within --mem-limit or not at all."""
+
+    def longer(file):
+        for name, entry in file["sweep"].items():
+            if entry.shape and name in ("key", "status"):
+                kind = "S64" if name == "key" else entry.dtype
+                del file["sweep"][name]
+                file["sweep"].create_dataset(
+                    name, (4_000_000,), kind, chunks=(65536,), compression="gzip"
+                )
+
+    (tmp_path / "bomb.h5").write_bytes(resealed((stages[0] / "sweep.h5").read_bytes(), longer))
+    outcome = runner.run(["inspect", "bomb.h5", "--mem-limit", "64MiB"], tmp_path, limit=10)
+    assert is_clean_refusal(outcome, (3, 5), "bomb") and outcome.grown < 200e6, outcome
 
 
 def test_superblocks_that_declare_a_huge_file(runner, stages, tmp_path):

@@ -45,6 +45,7 @@ HOSTILE = (
     "a%b.dng",
     "a(1).dng",
     "a\ntouch PWNED",
+    "a\x1b[31m.dng",
 )
 
 

@@ -16,6 +16,7 @@ import pytest
 from plenocli.cli.main import run
 from plenocli.execution.journal import Journal
 from plenocli.files.atomic import publish, settle, together
+from tests.faults.harness import tree
 
 CALLS = (
     "open",
@@ -37,7 +38,7 @@ class Moment:
     """After a call: names -> file number; file number -> bytes, when they were written, and what
     of them is safe.
 
-    history: names as they were after each call since the folder was last fsynced.
+    histories: of each folder, names as they were after each call since it was last fsynced.
     """
 
     call: str
@@ -45,29 +46,31 @@ class Moment:
     bytes: dict
     times: dict
     safe: dict
-    history: list
+    histories: dict
 
 
 class Record:
-    """All moments of a folder while calls of `os` pass through."""
+    """All moments of a folder, and those in it, while calls of `os` pass through."""
 
     def __init__(self, folder, monkeypatch):
         self.folder, self.moments, self._safe = folder, [], {}
         names, content, _ = self._look()
         self._safe = dict(content)
-        self._history = [names]
+        self._histories = {place: [inside] for place, inside in names.items()}
         self._inside = False
         for name in CALLS:
             monkeypatch.setattr(os, name, self._passing(name, getattr(os, name)))
 
     def _look(self):
         names, content, times = {}, {}, {}
-        for entry in filter(os.DirEntry.is_file, os.scandir(self.folder)):
-            names[entry.name] = entry.inode()
-            times[entry.inode()] = entry.stat().st_mtime_ns
-            if entry.inode() not in content:
-                with open(entry.path, "rb") as file:
-                    content[entry.inode()] = file.read()
+        for place in (self.folder, *sorted(p for p in self.folder.iterdir() if p.is_dir())):
+            names[os.stat(place).st_ino] = inside = {}
+            for entry in filter(os.DirEntry.is_file, os.scandir(place)):
+                inside[os.path.relpath(entry.path, self.folder)] = entry.inode()
+                times[entry.inode()] = entry.stat().st_mtime_ns
+                if entry.inode() not in content:
+                    with open(entry.path, "rb") as file:
+                        content[entry.inode()] = file.read()
         return names, content, times
 
     def _passing(self, name, real):
@@ -87,14 +90,15 @@ class Record:
 
     def _note(self, call, about):
         names, content, times = self._look()
-        if not self._history or names != self._history[-1]:
-            self._history.append(names)
+        for place, inside in names.items():
+            if inside != self._histories.setdefault(place, [{}])[-1]:
+                self._histories[place] = [*self._histories[place], inside]
         if about is not None and about.st_ino in content:
             self._safe[about.st_ino] = content[about.st_ino]
-        elif about is not None and about.st_ino == os.stat(self.folder).st_ino:
-            self._history = [names]
+        elif about is not None and about.st_ino in names:
+            self._histories[about.st_ino] = [names[about.st_ino]]
         self.moments.append(
-            Moment(call, names, content, times, dict(self._safe), list(self._history))
+            Moment(call, names, content, times, dict(self._safe), dict(self._histories))
         )
 
     def cuts(self):
@@ -103,7 +107,8 @@ class Record:
         for number, moment in enumerate(self.moments):
             known |= moment.bytes
             times |= moment.times
-            for names in moment.history:
+            for chosen in itertools.product(*moment.histories.values()):
+                names = {name: file for inside in chosen for name, file in inside.items()}
                 variants = []
                 for file in dict.fromkeys(names.values()):
                     now, safe = known[file], moment.safe.get(file, b"")
@@ -111,8 +116,8 @@ class Record:
                     torn = now[:kept] + bytes(len(now) - kept)
                     same = file in moment.safe and now == safe
                     variants.append([(file, v) for v in ([now] if same else {now, safe, torn})])
-                for chosen in itertools.product(*variants):
-                    content = dict(chosen)
+                for chosen_bytes in itertools.product(*variants):
+                    content = dict(chosen_bytes)
                     yield (
                         number,
                         {name: (content[file], times[file]) for name, file in names.items()},
@@ -124,6 +129,7 @@ OLD = {"a": b"old a", "b": b"old b"}
 
 def make(folder, files):
     for name, content in files.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         content, when = content if isinstance(content, tuple) else (content, None)
         (folder / name).write_bytes(content)
         if when is not None:
@@ -136,9 +142,9 @@ def after_the_cut(folder, view):
     folder.mkdir()
     make(folder, view)
     for name in list(view):
-        if not name.startswith("."):
+        if not os.path.basename(name).startswith("."):
             settle(folder / name)
-    return {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")}
+    return {n: b for n, b in tree(folder).items() if not os.path.basename(n).startswith(".")}
 
 
 @pytest.fixture
@@ -147,14 +153,15 @@ def places(tmp_path):
     return tmp_path / "out", tmp_path / "later"
 
 
-@pytest.mark.parametrize("old", [{}, OLD], ids=["new", "replaced"])
-@pytest.mark.parametrize("count", [1, 2], ids=["rename", "transaction"])
-def test_every_cut_leaves_old_or_new(places, monkeypatch, old, count):
+@pytest.mark.parametrize("replaced", [False, True], ids=["new", "replaced"])
+@pytest.mark.parametrize("names", ["a", "a b", "x/a y/a"], ids=["rename", "transaction", "folders"])
+def test_every_cut_leaves_old_or_new(places, monkeypatch, replaced, names):
     folder, later = places
-    make(folder, dict(list(old.items())[:count]))
-    before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    new = {"a": b"new a" * 100, "b": b"new b" * 200}
-    new = {name: new[name] for name in list(new)[:count]}
+    new = {name: b"new " + name.encode() * 99 for name in names.split()}
+    for name in new:
+        (folder / name).parent.mkdir(exist_ok=True)
+    before = {name: b"old " + name.encode() for name in new} if replaced else {}
+    make(folder, before)
     with monkeypatch.context() as patch:
         record = Record(folder, patch)
         with together():
@@ -163,7 +170,7 @@ def test_every_cut_leaves_old_or_new(places, monkeypatch, old, count):
     found = [after_the_cut(later, view) for _, view in record.cuts()]
     assert len(found) > 20 and found[-1] == new and before in found
     assert [files for files in found if files not in (before, new)] == []
-    assert {p.name for p in folder.iterdir()} == set(new)
+    assert tree(folder) == new
 
 
 @pytest.mark.parametrize("forgotten", ["file", "folder"])
@@ -267,4 +274,4 @@ def test_every_cut_of_a_command_leaves_old_or_new(
 
 
 def _results(folder):
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    return {n: b for n, b in tree(folder).items() if ".parts/" not in n}

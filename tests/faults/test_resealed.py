@@ -18,6 +18,7 @@ RECONSTRUCT = "reconstruct X --pif pif.h5 --method tikhonov -o o.h5"
 BY_DICTIONARY = "reconstruct capture.h5 --pif pif.h5 --method dictionary --dictionary X -o o.h5"
 SIMULATE = "capture-sim camera.toml --pif X --scene photo.png -o o.h5"
 RESUME = "learn-dict photo.png --pif pif.h5 --resume X --iterations 3 -o o.h5"
+VOLUME = "volume volume-capture.h5 --pif X -o o.h5"
 AXES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"}
 SCORE = "score X --truth capture.h5 -o o.json"
 
@@ -122,6 +123,20 @@ IMPOSSIBLE = [
     ("pif.h5", SIMULATE, values("pif/pixel_shape", lambda v: v * 0 + 1)),
     ("pif.h5", "show X -o o.png", values("pif/pixel_shape", lambda v: v * 0 + 1)),
     ("dictionary.h5", RESUME, other("dictionary/state/atoms", lambda v: v[:, :1])),
+    (
+        "dictionary.h5",
+        RESUME,
+        other("dictionary/state/history_step_residual", lambda v: v[:, None]),
+    ),
+    ("calibration.h5", DEMUX, values("response/wavelength", lambda v: v * 1e-10)),
+    ("stack.h5", SIMULATE, values("planes/distance", lambda v: v - v[0])),
+    ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: v * 0 + 1)),
+    ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31)))),
+    (
+        "kernels.h5",
+        "show X -o o.png",
+        values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31))),
+    ),
     ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
 ]
 

@@ -1,5 +1,6 @@
 """Nothing of a file that we wrote, values or notes, can be altered unseen, whatever its format."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -9,8 +10,11 @@ from plenocli.base.errors import InputError
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.images.exr import read_exr
 from plenocli.files.images.mosaic import read_capture
+from plenocli.files.images.pictures import read_picture
+from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.scores import read_scores
 from plenocli.files.seal import SEAL, publish_sealed, require_seal
+from plenocli.stages.evaluation.inspect import run_inspect
 from tests.faults.harness import is_clean_refusal
 
 READERS = {
@@ -40,6 +44,20 @@ def test_any_byte_that_is_altered_is_seen(stages, tmp_path, campaign, count, nam
     count("one byte altered in a file of ours", mutants=slow, silent=0)
     path.write_bytes(good)
     assert READERS[name](path) is not None
+
+
+def test_any_byte_of_a_tiff_that_is_altered_is_seen_by_whoever_reads_it(tmp_path, campaign):
+    path, rng = tmp_path / "a.ome.tif", np.random.default_rng(8)
+    write_volume_tiff(path, rng.random((2, 8, 9), np.float32), None, np.arange(2.0), (1e-6, 1e-6))
+    assert run_inspect(path).content.verified
+    good = path.read_bytes()
+    for place in rng.integers(4, len(good), size=campaign(40, 2000)):
+        bad = bytearray(good)
+        bad[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(bad)
+        for read in (run_inspect, read_picture, read_tiff_volume):
+            with pytest.raises(InputError):
+                read(path)
 
 
 EDITS = {
@@ -99,8 +117,6 @@ def test_files_of_other_programs_need_no_seal(tmp_path):
 @pytest.mark.parametrize("size", [80, 1 << 22, (1 << 22) + 31, 9_000_001])
 def test_the_seal_is_the_digest_of_all_other_bytes(tmp_path, size):
     """By hashlib over the whole content at once, whatever pieces the file was written in."""
-    import hashlib
-
     content = np.random.default_rng(size).bytes(size).replace(b"plenocli", b"")
     publish_sealed(tmp_path / "a", [b"x" * 7 + SEAL.encode(), content])
     stored = (tmp_path / "a").read_bytes()
@@ -114,3 +130,31 @@ def test_the_seal_is_the_digest_of_all_other_bytes(tmp_path, size):
     with pytest.raises(ValueError, match="no place"):
         publish_sealed(tmp_path / "b", [b"plenocli"])
     assert not (tmp_path / "b").exists()
+
+
+JOURNALS = [
+    b"5",
+    b"[[1], 2]",
+    b"[" * 100_000,
+    b'["KEY", {"status": 0, "metrics": {"psnr_db": {"a": 1}}}]',
+    b'["KEY", {"status": 0, "metrics": {"psnr_db": 1e300}}]',
+    b'["KEY", {"status": 0, "metrics": {"\\u001b[31m": 1}}]',
+    b'["KEY", {"status": 0, "metrics": {}, "stages": {"score": NaN}}]',
+]
+
+
+@pytest.mark.parametrize("text", JOURNALS, ids=range(len(JOURNALS)))
+def test_a_journal_of_nonsense_with_true_checksums_is_worked_out_anew(
+    runner, stages, tmp_path, text
+):
+    for path in filter(lambda p: p.is_file(), stages[0].iterdir()):
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "s.parts").mkdir()
+    lines = (stages[0] / "sweep.parts" / "points.jsonl").read_bytes().split(b"\n")
+    keys = [json.loads(line.partition(b" ")[2])[0].encode() for line in lines if line]
+    texts = [text.replace(b"KEY", key) for key in keys]
+    sealed = [hashlib.sha256(t).hexdigest()[:16].encode() + b" " + t + b"\n" for t in texts]
+    (tmp_path / "s.parts" / "points.jsonl").write_bytes(b"".join(sealed))
+    outcome = runner.run(["sweep", "designs.toml", "-o", "s.h5"], tmp_path)
+    assert outcome.code == 0 and "2 computed now" in outcome.text, outcome
+    assert (tmp_path / "s.h5").read_bytes() == (stages[0] / "sweep.h5").read_bytes()

@@ -1,14 +1,16 @@
 """Results of one command appear together or not at all; links, owners and permissions are kept."""
 
+import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from plenocli.base.errors import OutputError, UsageError
 from plenocli.files.artefacts.container import read_artefact, write_artefact
-from plenocli.files.atomic import check_output, publish, staged_path, together
+from plenocli.files.atomic import check_output, publish, settle, staged_path, together
 from tests.faults.harness import is_clean_refusal, tree
 
 OLD = b"what was there before"
@@ -20,8 +22,14 @@ def folder(stages, tmp_path):
     for path in stages[0].iterdir():
         if path.is_file():
             shutil.copy(path, tmp_path)
-    (tmp_path / "out").mkdir()
+    empty(tmp_path / "out")
     return tmp_path
+
+
+def empty(out):
+    shutil.rmtree(out, ignore_errors=True)
+    for name in ("x", "y"):
+        (out / name).mkdir(parents=True)
 
 
 SEVERAL = {
@@ -29,6 +37,7 @@ SEVERAL = {
         "capture-sim camera.toml --pif pif.h5 --scene photo.png -o out/q.h5 --scene-out out/s.h5"
     ),
     "score": "score image.h5 --truth capture.h5 -o out/s.json --report out/s.html",
+    "folders": "score image.h5 --truth capture.h5 -o out/x/s.json --report out/y/s.html",
     "sweep": "sweep designs.toml -o out/w.h5",
     "planes": (
         "simulate-pif camera.toml --scene near.toml --accuracy 0.05 --superpixels 1x1 "
@@ -47,8 +56,7 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
     assert len(whole) >= 2
     for old in (dict.fromkeys(whole, OLD), {}):
         for nth in range(1, campaign(9, 200)):
-            shutil.rmtree(folder / "out")
-            (folder / "out").mkdir()
+            empty(folder / "out")
             for name, content in old.items():
                 (folder / "out" / name).write_bytes(content)
             outcome = runner.run(
@@ -61,6 +69,50 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
                 assert is_clean_refusal(outcome, 4, "space") and there == old, (nth, outcome)
             else:
                 assert there == whole, nth
+
+
+@pytest.mark.parametrize("command", SEVERAL.values(), ids=SEVERAL)
+@pytest.mark.parametrize(
+    "call", ["replace", *(pytest.param(c, marks=pytest.mark.slow) for c in ("fsync", "unlink"))]
+)
+def test_a_kill_at_any_call_leaves_all_old_or_all_new(
+    runner, folder, campaign, count, command, call
+):
+    """Once plenocli has looked at one of them, whichever that is."""
+    words, kills = [*command.split(), "--overwrite"], 0
+    assert runner.run(words, folder).code == 0
+    whole = _results(folder)
+    for old in (dict.fromkeys(whole, OLD), {}):
+        for nth in range(1, campaign(4, 200)):
+            empty(folder / "out")
+            for name, content in old.items():
+                (folder / "out" / name).write_bytes(content)
+            outcome = runner.run(
+                words, folder, fault={"call": call, "nth": nth, "error": "KILL", "lasting": False}
+            )
+            if not outcome.fired:
+                break
+            kills += 1
+            settle(folder / "out" / sorted(whole)[nth % len(whole)])
+            there = {n: b for n, b in _results(folder).items() if not Path(n).name.startswith(".")}
+            assert there in (old, whole), (nth, sorted(there))
+        assert runner.run(words, folder).code == 0 and _results(folder) == whole
+    count("kill -9 at each call", killed=kills, mixed=0)
+
+
+def test_what_is_said_in_one_folder_moves_no_file_of_another(tmp_path):
+    """Nor does nonsense stop anybody from reading."""
+    files = {n: tmp_path / n for n in ("a/f", "b/f", "b/.f.partial")}
+    for name, path in files.items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(name)
+    about = os.stat(files["b/.f.partial"])
+    names = ["f", "../b/f", str(files["b/f"])]
+    texts = [json.dumps([[n, about.st_size, about.st_mtime_ns] for n in names[i:]]) for i in (0, 1)]
+    for text in (*texts, "[" * 100_000, "5", '[["/"]]', "[[1, 2, 3]]", "\udcff"):
+        (tmp_path / "a" / ".f.together").write_bytes(os.fsencode(text))
+        settle(files["a/f"])
+        assert {n: p.read_text() for n, p in files.items()} == {n: n for n in files}, text
 
 
 def _results(folder):

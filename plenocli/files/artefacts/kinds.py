@@ -39,7 +39,28 @@ def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
     return None
 
 
-_RULES = {"calibration": (_lit_lenslets, _whole_response)}
+def _one_entry_each(data: Mapping[str, np.ndarray]) -> str | None:
+    offset = data["stack/lenslet_offset"]
+    if np.abs(offset.astype(float)).max() > 1e4:
+        return "'stack/lenslet_offset' lies beyond any array"
+    entries = np.column_stack([data["stack/plane"], offset])
+    return (
+        "an entry of 'stack' is twice" if len(np.unique(entries, axis=0)) < len(entries) else None
+    )
+
+
+def _even_history(data: Mapping[str, np.ndarray]) -> str | None:
+    kept = {v.shape for path, v in data.items() if path.startswith("dictionary/state/history_")}
+    even = len(kept) <= 1 and all(len(shape) == 1 for shape in kept)
+    return None if even else "'dictionary/state' has histories of several lengths"
+
+
+_RULES = {
+    "calibration": (_lit_lenslets, _whole_response),
+    "pif-stack": (_one_entry_each,),
+    "dictionary": (_even_history,),
+    "checkpoint": (_even_history,),
+}
 
 
 def _field(path: str, axes: str, dtype: str, unit: str, doc: str, rare: Any = ()) -> Field:

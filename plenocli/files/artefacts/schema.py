@@ -309,11 +309,7 @@ def plot_attributes(schema: Schema, declared: Declared) -> dict[str, dict[str, A
 
 
 def _plot_group(
-    schema: Schema,
-    group: str,
-    signal: str,
-    companions: tuple[str, ...],
-    declared: Declared,
+    schema: Schema, group: str, signal: str, companions: tuple[str, ...], declared: Declared
 ) -> dict[str, Any]:
     """NXdata attributes of one group: axes are the datasets of the group whose single dimension
     names an axis of the signal.

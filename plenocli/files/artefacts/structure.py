@@ -134,10 +134,8 @@ def _declaration(path: Name, dataset: Any, name: str) -> tuple[tuple[int, ...], 
     for position in range(properties.get_nfilters()):
         if properties.get_filter(position)[0] not in _FILTERS:
             raise InputError(
-                (
-                    f"'/{name}' uses the filter {properties.get_filter(position)[0]}, not gzip, "
-                    "shuffle or fletcher32"
-                ),
+                f"'/{name}' uses the filter {properties.get_filter(position)[0]}, not gzip, "
+                "shuffle or fletcher32",
                 path,
                 _FIX,
             )

@@ -20,10 +20,7 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
     """
     path = Path(path)
     return parse_toml(
-        read_text(path, "camera"),
-        path,
-        Camera,
-        prepare=lambda data: with_curves(data, path.parent),
+        read_text(path, "camera"), path, Camera, prepare=lambda data: with_curves(data, path.parent)
     )
 
 

@@ -44,9 +44,7 @@ def read_curve(path: Path) -> dict[str, Any]:
             # a header has no figures at its start: what has is a row that was mistyped
             if rows or number != lines[0][0] or line[0] in "+-.0123456789":
                 raise InputError(
-                    f"line {number} is no wavelength and transmittance: {line[:60]!r}",
-                    path,
-                    WANTED,
+                    f"line {number} is no wavelength and transmittance: {line[:60]!r}", path, WANTED
                 ) from None
             words = re.split(r"[\s()\[\],;]+", line.lower())
             unit = next((word for word in words if word in LENGTHS), unit)

@@ -93,10 +93,8 @@ def _read(path: Path) -> tuple[Any, list[str]]:
 
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
-            (
-                f"is {path.suffix or 'a file without a suffix'}; prescriptions are read as "
-                f"{', '.join(SUFFIXES)}"
-            ),
+            f"is {path.suffix or 'a file without a suffix'}; prescriptions are read as "
+            f"{', '.join(SUFFIXES)}",
             path,
             "convert it to .zmx",
         )
@@ -110,9 +108,7 @@ def _read(path: Path) -> tuple[Any, list[str]]:
             from optiland import fileio
     except ImportError as error:
         raise UsageError(
-            f"importing a prescription needs optiland ({error})",
-            path,
-            how_to_install("lens"),
+            f"importing a prescription needs optiland ({error})", path, how_to_install("lens")
         ) from None
     load = {
         ".zmx": fileio.load_zemax_file,

@@ -20,16 +20,10 @@ def read_text(path: Path, what: str, wanted: str | None = None) -> str:
     fix = wanted or f"give the TOML file of a {what}"
     try:
         if path.exists() and not path.is_file():
-            raise InputError(
-                f"is {'a folder' if path.is_dir() else 'no ordinary file'}",
-                path,
-                fix,
-            )
+            raise InputError(f"is {'a folder' if path.is_dir() else 'no ordinary file'}", path, fix)
         if path.stat().st_size > MAX_BYTES:
             raise InputError(
-                f"is larger than {MAX_BYTES} bytes and so no {what} description",
-                path,
-                fix,
+                f"is larger than {MAX_BYTES} bytes and so no {what} description", path, fix
             )
         return path.read_text(encoding="utf-8")
     except OSError as error:

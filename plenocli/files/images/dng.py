@@ -94,10 +94,8 @@ def _check(path: str | os.PathLike[str], values: np.ndarray, cfa: str, white: fl
         )
     if min(values.shape) < SMALLEST:
         raise OutputError(
-            (
-                f"{values.shape[0]} x {values.shape[1]} pixels are too few for a DNG: RAW readers "
-                f"refuse less than {SMALLEST} x {SMALLEST}"
-            ),
+            f"{values.shape[0]} x {values.shape[1]} pixels are too few for a DNG: RAW readers "
+            f"refuse less than {SMALLEST} x {SMALLEST}",
             path,
             "write .h5 instead",
         )

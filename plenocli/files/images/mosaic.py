@@ -17,14 +17,7 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.tiling import InParts
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
-from plenocli.files.images.containers import (
-    BIO,
-    LYTRO,
-    Contained,
-    read_bio,
-    read_lytro,
-    read_pages,
-)
+from plenocli.files.images.containers import BIO, LYTRO, Contained, read_bio, read_lytro, read_pages
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import read_exr, write_exr
 from plenocli.files.images.pictures import file_type, read_stored
@@ -173,9 +166,7 @@ def _capture_of(path: Path, artefact: Artefact, mosaic: np.ndarray) -> Capture:
     found = _described(path, mosaic, said, "capture")
     origin = artefact.provenance
     metadata = replace(
-        found.metadata,
-        accuracy=origin.accuracy,
-        matrix=origin.inputs.get("pif", {}).get("sha256"),
+        found.metadata, accuracy=origin.accuracy, matrix=origin.inputs.get("pif", {}).get("sha256")
     )
     grid = replace(
         found.grid or SuperpixelGrid(), centre=artefact.data.get("capture/lenslet_centre")
@@ -327,10 +318,8 @@ def _from_image(path: Path, kind: str, cfa: str) -> Capture:
             details["note"] = f"{values.shape[-1]} identical channels, one taken"
         else:
             raise InputError(
-                (
-                    f"is a picture with {values.shape[-1]} different channels, not a mosaic "
-                    "with one value a pixel"
-                ),
+                f"is a picture with {values.shape[-1]} different channels, not a mosaic "
+                "with one value a pixel",
                 path,
                 "give the sensor's mosaic before demosaicing",
             )

@@ -14,6 +14,7 @@ from plenocli.base.errors import InputError
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.images.exr import oiio_error, oiio_name, require_at_most
 from plenocli.files.outside import outside
+from plenocli.files.seal import require_seal
 
 _MAGIC = (
     (b"\x89PNG\r\n\x1a\n", "png"),
@@ -120,8 +121,10 @@ def read_stored(
 
     Returns (values (row, column, channel), channel names, bits); values of odd bit depths (10, 12,
     14) come back unscaled in uint16.
-    Raises InputError.
+    Raises InputError, also for a TIFF of ours that was altered.
     """
+    if kind == "tiff":
+        require_seal(path)
     values, names, bits = outside(_stored, path, kind, most)
     return values, names, bits
 

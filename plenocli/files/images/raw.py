@@ -281,10 +281,8 @@ def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: f
     zeros = float(np.mean(values == 0))
     if zeros >= 0.99:
         raise InputError(
-            (
-                f"is {zeros:.1%} zeros although LibRaw reports no error: the image data "
-                "are missing or cut off"
-            ),
+            f"is {zeros:.1%} zeros although LibRaw reports no error: the image data "
+            "are missing or cut off",
             path,
             _FIX,
         )
@@ -297,10 +295,8 @@ def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: f
     over = float(np.mean(values > white))
     if over > 0.01:
         raise InputError(
-            (
-                f"contradicts its metadata: {over:.1%} of the pixels are above its white "
-                f"level of {white:g} DN"
-            ),
+            f"contradicts its metadata: {over:.1%} of the pixels are above its white "
+            f"level of {white:g} DN",
             path,
             _FIX,
         )
@@ -311,10 +307,8 @@ def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: f
     ]
     if max(below) > 0.5:
         raise InputError(
-            (
-                f"contradicts its metadata: {max(below):.0%} of the pixels at one position lie far "
-                f"below its black level of {black.max():g} DN"
-            ),
+            f"contradicts its metadata: {max(below):.0%} of the pixels at one position lie far "
+            f"below its black level of {black.max():g} DN",
             path,
             _FIX,
         )

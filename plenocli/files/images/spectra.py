@@ -10,11 +10,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
-from plenocli.files.artefacts.provenance import (
-    Provenance,
-    provenance_texts,
-    read_provenance_texts,
-)
+from plenocli.files.artefacts.provenance import Provenance, provenance_texts, read_provenance_texts
 from plenocli.files.images.spectral_exr import read_spectral_exr, write_spectral_exr
 from plenocli.inverse.spectra.spectra import Spectra
 

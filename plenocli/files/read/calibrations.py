@@ -81,6 +81,9 @@ def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefa
         raise InputError(
             "has another number of pixels in response/F than in its windows", path, "make it again"
         )
+    light = artefact.data.get("response/wavelength", np.array([5e-7]))
+    if not 1e-8 < light.min() <= light.max() < 1e-3:
+        raise InputError("has a response to no light: wavelengths are in metres", path, "mend it")
     return artefact
 
 
@@ -110,11 +113,7 @@ def calibration_of(artefact: Artefact, *, response: bool = True) -> Calibration:
 
 
 def write_calibration(
-    path: str | Path,
-    calibration: Calibration,
-    provenance: Provenance,
-    *,
-    overwrite: bool = False,
+    path: str | Path, calibration: Calibration, provenance: Provenance, *, overwrite: bool = False
 ) -> None:
     """Write a calibration, whole or not at all.
 
@@ -142,11 +141,7 @@ def write_calibration(
             "response/energy": c.response.energy,
         }
         attrs["response"] = _response_attrs(c.response, c.sensor)
-    write_artefact(
-        path,
-        Artefact("calibration", datasets, attrs, provenance),
-        overwrite=overwrite,
-    )
+    write_artefact(path, Artefact("calibration", datasets, attrs, provenance), overwrite=overwrite)
 
 
 # --- reading --------------------------------------------------------------------------------------

@@ -154,10 +154,8 @@ def _read(path: Path, cfa: str, shape: tuple[int, ...] | None) -> tuple["Capture
     capture = read_capture(path, cfa=cfa)
     if shape is not None and capture.shape != shape:
         raise InputError(
-            (
-                f"is {capture.shape[0]} x {capture.shape[1]} px, other captures "
-                f"{shape[0]} x {shape[1]}"
-            ),
+            f"is {capture.shape[0]} x {capture.shape[1]} px, other captures "
+            f"{shape[0]} x {shape[1]}",
             path,
             "give captures of one camera",
         )

@@ -75,11 +75,7 @@ def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | Non
     if camera is None:
         raise InputError("does not say for which camera it is", path, "run simulate-pif again")
     return FieldMatrix(
-        path=Path(path),
-        nodes=nodes,
-        parts=parts,
-        pitch=camera.lenslet_array.pitch,
-        by_band=by_band,
+        path=Path(path), nodes=nodes, parts=parts, pitch=camera.lenslet_array.pitch, by_band=by_band
     )
 
 
@@ -89,10 +85,8 @@ def _lenslet_matrix(artefact: "Artefact", path: Path, *, by_band: bool) -> Lensl
 
     if artefact.attrs.get("pif", {}).get("lattice", "square") != "square":
         raise InputError(
-            (
-                "belongs to a hexagonal lattice, whose object blocks do not tile a "
-                "picture in rows and columns"
-            ),
+            "belongs to a hexagonal lattice, whose object blocks do not tile a "
+            "picture in rows and columns",
             path,
             "use the pif of a camera with a square lattice",
         )

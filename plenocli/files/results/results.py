@@ -221,10 +221,8 @@ def read_whites(paths: Iterable[Path | str]) -> dict[str, WhiteTarget]:
         group = groups.setdefault(frame.method, [])
         if group and frame.values.shape != group[0].values.shape:
             raise UsageError(
-                (
-                    f"has {by(frame.values.shape)} values (band x row x column), {group[0].name} "
-                    f"{by(group[0].values.shape)}"
-                ),
+                f"has {by(frame.values.shape)} values (band x row x column), {group[0].name} "
+                f"{by(group[0].values.shape)}",
                 path,
                 "give white targets demultiplexed with one calibration",
             )

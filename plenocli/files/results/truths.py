@@ -209,10 +209,8 @@ def _at_wavelengths(
     if len(own) == 1 or asked.min() < own[0] - 1e-8 or asked.max() > own[-1] + 1e-8:
         if len(own) != len(asked) or np.abs(np.asarray(own) - asked).max() > 1e-9:
             raise InputError(
-                (
-                    f"covers {own[0] * 1e9:.4g} to {own[-1] * 1e9:.4g} nm, the result "
-                    f"{asked.min() * 1e9:.4g} to {asked.max() * 1e9:.4g} nm"
-                ),
+                f"covers {own[0] * 1e9:.4g} to {own[-1] * 1e9:.4g} nm, the result "
+                f"{asked.min() * 1e9:.4g} to {asked.max() * 1e9:.4g} nm",
                 where,
                 "give a truth that covers the bands of the result",
             )

@@ -24,7 +24,7 @@ def superpixel_orbits(
     for (r, c), index in place.items():
         flips = bool(r < 0 and symmetry[0]), bool(c < 0 and symmetry[1])
         a, b = (-n if flip else n for n, flip in zip((r, c), flips))
-        turned = bool(turns and a > b)
+        turned = bool(turns and a > b and (b, a) in place)  # of 9x1 superpixels none has a twin
         found.setdefault(place[(b, a) if turned else (a, b)], []).append((index, (turned, *flips)))
     return list(found.items())
 

@@ -215,7 +215,8 @@ class _LensletSample:
             and np.linalg.matrix_rank(self.centres - self.middle, tol=1e-3 * np.ptp(self.centres))
             == 2
         )
-        arms = (self.centres - self.middle) / np.abs(self.extremes - self.middle).max(axis=0)
+        reach = np.abs(self.extremes - self.middle).max(axis=0)
+        arms = (self.centres - self.middle) / np.where(reach > 0, reach, 1)  # a single row has none
         arms = (
             np.concatenate([np.ones((self.count, 1)), arms], axis=1)
             if affine

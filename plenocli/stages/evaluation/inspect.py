@@ -118,13 +118,14 @@ def _exr(path: Path) -> ChannelsReport:
 
 def _picture(path: Path, kind: str) -> ChannelsReport:
     from plenocli.files.images.pictures import read_stored
+    from plenocli.files.seal import require_seal
 
     values, names, bits = read_stored(path, kind)
     return ChannelsReport(
         type=kind,
         rows=values.shape[0],
         columns=values.shape[1],
-        verified=False,
+        verified=kind == "tiff" and require_seal(path),
         channels={name: statistics(values[..., i]) for i, name in enumerate(names)},
         bits=bits,
         dtype=str(values.dtype),

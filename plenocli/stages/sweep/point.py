@@ -52,10 +52,8 @@ def _require_files(job: Job) -> None:
             raise OutputError(
                 f"{socket.gethostname()} does not see this file",
                 path,
-                (
-                    "workers need the same files under the same names: put them on a file "
-                    "system that all share"
-                ),
+                "workers need the same files under the same names: put them on a file "
+                "system that all share",
             )
 
 
@@ -241,9 +239,7 @@ def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
 
     start = time.process_time()
     report = run_simulate_pif(
-        folder / "camera.toml",
-        folder / "pif.h5",
-        _settings(Settings, task.options("simulate-pif")),
+        folder / "camera.toml", folder / "pif.h5", _settings(Settings, task.options("simulate-pif"))
     )
     assert isinstance(report, PifSummary | StackSummary)  # nothing was to be explained
     return MatrixCost(
@@ -515,10 +511,7 @@ def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:
     matrix = (
         {}
         if cost is None
-        else {
-            "matrix_seconds": cost.matrix_seconds,
-            "matrix_bytes": float(cost.matrix_bytes),
-        }
+        else {"matrix_seconds": cost.matrix_seconds, "matrix_bytes": float(cost.matrix_bytes)}
     )
     return matrix | {
         "lenslets": float(lenslets),

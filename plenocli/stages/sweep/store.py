@@ -8,7 +8,7 @@ import contextlib
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from plenocli.execution.pool import Lost, Pool
 from plenocli.stages.sweep.point import run_capture, run_matrix, run_point
 from plenocli.stages.sweep.task import (
     Job,
+    KeptCapture,
     MadeCapture,
     MadeMatrix,
     MatrixCost,
@@ -28,6 +29,7 @@ from plenocli.stages.sweep.task import (
     SharedCapture,
     SharedMatrix,
     refused,
+    remembered,
 )
 
 if TYPE_CHECKING:
@@ -137,7 +139,7 @@ class Store:
         """
         missing: dict[str, DesignPoint] = {}
         for point in points:
-            if point.task is not None and not self._is_known(point.key):
+            if point.task is not None and self._known(point.key) is None:
                 missing.setdefault(point.key, point)
         groups: dict[str, list[DesignPoint]] = {}
         for point in missing.values():
@@ -153,16 +155,16 @@ class Store:
             )
         for point in points:
             if point.task is not None:
-                point.result = PointResult.from_json(self.journal.records[point.key])
+                point.result = self._known(point.key)
         return len(missing)
 
-    def _is_known(self, key: str) -> bool:
-        """Whether the journal has a result that stands."""
+    def _known(self, key: str) -> PointResult | None:
+        """What the journal has of a point, where that stands."""
         record = self.journal.records.get(key)
-        if record is None:
-            return False
-        lacked = PointResult.from_json(record).status == LACKED_MEMORY
-        return not (lacked and record.get("mem_limit") != budget().memory)
+        found = remembered(PointResult, record)
+        if found is not None and found.status == LACKED_MEMORY:
+            return found if dict(record or {}).get("mem_limit") == budget().memory else None
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,11 +248,9 @@ class _Work:
         serves one alone.
         """
         points, path = self.groups[group], self._path(group)
-        record = self.store.journal.records.get(f"matrix {group}")
-        if record is not None and path.is_file():
-            self._open_points(
-                group, SharedMatrix(str(path.resolve()), MatrixCost.from_json(record))
-            )
+        cost = remembered(MatrixCost, self.store.journal.records.get(f"matrix {group}"))
+        if cost is not None and path.is_file():
+            self._open_points(group, SharedMatrix(str(path.resolve()), cost))
         elif group and len(points) > 1:
             self.ready.append((_Token(group), run_matrix, self._job(points[0])))
         else:
@@ -270,10 +270,10 @@ class _Work:
 
     def _open_capture(self, point: DesignPoint, shared: _Shared) -> None:
         """Find a capture that lies there already, or make its job ready."""
-        record = self.store.journal.records.get(f"capture {point.capture}")
-        paths = self._capture_paths(point.capture, 0 if record is None else record["files"])
-        if record is not None and all(path.is_file() for path in paths):
-            shared.made = _located(paths, tuple(record["notes"]), record["cpu_seconds"])
+        kept = remembered(KeptCapture, self.store.journal.records.get(f"capture {point.capture}"))
+        paths = self._capture_paths(point.capture, 0 if kept is None else kept.files)
+        if kept is not None and all(path.is_file() for path in paths):
+            shared.made = _located(paths, kept.notes, kept.cpu_seconds)
             return
         shared.under_way = True
         self.ready.append((_Token(capture=point.capture), run_capture, self._job(point)))
@@ -309,12 +309,8 @@ class _Work:
             paths = self._capture_paths(key, len(result.contents))
             for path, content in zip(paths, result.contents):
                 publish(path, content, overwrite=True)
-            record = {
-                "files": len(paths),
-                "notes": result.notes,
-                "cpu_seconds": result.cpu_seconds,
-            }
-            self.store.journal.add(f"capture {key}", record)
+            kept = KeptCapture(files=len(paths), notes=result.notes, cpu_seconds=result.cpu_seconds)
+            self.store.journal.add(f"capture {key}", asdict(kept))
             shared.made = _located(paths, result.notes, result.cpu_seconds)
         else:
             shared.made = result
@@ -331,14 +327,14 @@ class _Work:
                 self._keep(group, point, result)
             return len(self.groups[group])
         publish(self._path(group), result.content, overwrite=True)
-        self.store.journal.add(f"matrix {group}", result.cost.as_json())
+        self.store.journal.add(f"matrix {group}", asdict(result.cost))
         self._open_points(group, SharedMatrix(str(self._path(group).resolve()), result.cost))
         return 0
 
     def _keep(self, group: str, point: DesignPoint, result: PointResult | PlenoError) -> None:
         """Keep the result of a point; its matrix goes after the last one of the group."""
         found = refused(result) if isinstance(result, PlenoError) else result
-        self.store.journal.add(point.key, found.as_json() | {"mem_limit": budget().memory})
+        self.store.journal.add(point.key, asdict(found) | {"mem_limit": budget().memory})
         self.left[group] -= 1
         if not self.left[group]:
             self._path(group).unlink(missing_ok=True)

@@ -224,9 +224,7 @@ def finish(
     )
     with together():
         publish(
-            store.output.with_suffix(".csv"),
-            _csv(points, table).encode(),
-            overwrite=store.again,
+            store.output.with_suffix(".csv"), _csv(points, table).encode(), overwrite=store.again
         )
         publish(measured_path(store.output), _measured(points).encode(), overwrite=True)
         if store.plot is not None and not table.ahead.any():

@@ -8,7 +8,9 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 if TYPE_CHECKING:
     from plenocli.base.errors import PlenoError
@@ -16,6 +18,10 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
     Description = Camera | Microscope
+
+Figure = Annotated[float, Field(ge=-1e100, le=1e100)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
+Kept = TypeVar("Kept")
 
 Options = Mapping[str, Any]
 """Option -> value of one stage, JSON-able."""
@@ -143,29 +149,10 @@ class MatrixCost:
     cpu_seconds: of the processor that it took, measured.
     """
 
-    matrix_seconds: float
-    matrix_bytes: int
+    matrix_seconds: Figure = 0.0
+    matrix_bytes: int = 0
     notes: tuple[str, ...] = ()
-    cpu_seconds: float = 0.0
-
-    def as_json(self) -> dict[str, Any]:
-        """As the journal keeps it."""
-        return {
-            "matrix_seconds": self.matrix_seconds,
-            "matrix_bytes": self.matrix_bytes,
-            "notes": list(self.notes),
-            "cpu_seconds": self.cpu_seconds,
-        }
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> MatrixCost:
-        """What as_json wrote."""
-        return cls(
-            matrix_seconds=record.get("matrix_seconds", 0.0),
-            matrix_bytes=record.get("matrix_bytes", 0),
-            notes=tuple(record.get("notes", ())),
-            cpu_seconds=record.get("cpu_seconds", 0.0),
-        )
+    cpu_seconds: Figure = 0.0
 
 
 @dataclass(frozen=True)
@@ -235,33 +222,29 @@ class PointResult:
 
     status: int = 0
     reason: str = ""
-    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    metrics: Mapping[Name, Figure | None] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    seconds: float = 0.0
-    stages: Mapping[str, float] = field(default_factory=dict)
+    seconds: Figure = 0.0
+    stages: Mapping[str, Figure] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, Any]:
-        """As the journal keeps it."""
-        return {
-            "status": self.status,
-            "reason": self.reason,
-            "metrics": dict(self.metrics),
-            "notes": list(self.notes),
-            "seconds": self.seconds,
-            "stages": dict(self.stages),
-        }
 
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> PointResult:
-        """What as_json wrote."""
-        return cls(
-            status=record.get("status", 0),
-            reason=record.get("reason", ""),
-            metrics=record.get("metrics", {}),
-            notes=tuple(record.get("notes", ())),
-            seconds=record.get("seconds", 0.0),
-            stages=record.get("stages", {}),
-        )
+@dataclass(frozen=True, kw_only=True)
+class KeptCapture:
+    """What the journal keeps of a capture: how many files it is, what was said, seconds."""
+
+    files: Annotated[int, Field(ge=1, le=100)]
+    notes: tuple[str, ...] = ()
+    cpu_seconds: float = 0.0
+
+
+def remembered(kind: type[Kept], record: Any) -> Kept | None:
+    """The `kind` that a journal keeps as `record`; None where it is none, for then it was written
+    by hand or by another version, and is worked out anew.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(record)
+    except ValidationError:
+        return None
 
 
 def refused(error: PlenoError) -> PointResult:

@@ -131,6 +131,7 @@ IMPOSSIBLE = [
     ("calibration.h5", DEMUX, values("response/wavelength", lambda v: v * 1e-10)),
     ("stack.h5", SIMULATE, values("planes/distance", lambda v: v - v[0])),
     ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: v * 0 + 1)),
+    ("kernels.h5", VOLUME, values("stack/spacing", lambda v: v * 0 + 1e-300)),
     ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31)))),
     (
         "kernels.h5",

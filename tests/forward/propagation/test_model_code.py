@@ -57,7 +57,7 @@ def changed(code, copy, file, old, new):
             NAMES[1:2],
         ),
         (f"{PROPAGATION}/fresnel/shaped.py", "PIECES = 6", "PIECES = 7", NAMES[2:3]),
-        (f"{PROPAGATION}/exact/lenslets.py", "GAPS = 3.0", "GAPS = 4.0", NAMES[3:4]),
+        (f"{PROPAGATION}/exact/lenslets.py", "LEAST = 1e-10", "LEAST = 2e-10", NAMES[3:4]),
         (
             f"{PROPAGATION}/exact/prolate.py",
             "return ",

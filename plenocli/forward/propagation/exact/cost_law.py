@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation.costs import Cost, Features, law, summed
-from plenocli.forward.propagation.exact.oblique import ORDERS
+from plenocli.forward.propagation.exact.oblique import orders_for
 from plenocli.forward.propagation.exact.term_counts import (
     MANY_CELLS,
     ExactBand,
@@ -124,7 +124,10 @@ def features(
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
     mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
     # terms that go with the point, too
-    terms = band.terms * (OBLIQUE_TERMS if oblique else 1)
+    terms, orders = (
+        band.terms * (OBLIQUE_TERMS if oblique else 1),
+        orders_for(geometry, band.cut / 2),
+    )
     rows = sizes.lit * terms * sizes.rows
     operations = {
         "interval_values": 4 * rows * sizes.across,
@@ -137,7 +140,7 @@ def features(
         "field_cubed": wide * field_cubed(camera, geometry, band),
         "spread_values": wide
         * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * terms)
-        * (ORDERS if oblique else 1),
+        * orders,
         "columns": count,
         "sensor_values_double" if double else "sensor_values_single": count * fine,
         "written_double" if double else "written_single": written,
@@ -147,7 +150,7 @@ def features(
     own = _pupil_share(camera, n) * own_products(geometry, band, _parabolic(camera), n)
     held = {
         "own_coupling_isolated" if sizes.lit == 1 else "own_coupling_joined": item * own**2,
-        "field_squared": (band.psf_nodes / (2 if even else 1)) ** 2 * (ORDERS**2 if oblique else 1),
+        "field_squared": (band.psf_nodes / (2 if even else 1)) ** 2 * orders**2,
         "intervals": item
         * (sizes.beside + 1)
         * (sizes.lit * sizes.across * sizes.points)

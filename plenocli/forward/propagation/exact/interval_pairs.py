@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -34,33 +35,23 @@ ROWS_AT_ONCE = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
 
 
+@dataclass(frozen=True)
 class SensorSide:
-    """How light goes to the superpixel s along one axis, to all lenslets alike: sensor nodes u (m,
-    from its centre) and the roots of their weights;
+    """How light goes to the superpixel s along one axis, to all lenslets alike.
 
-    points (m, on the array) that are computed, and their weights in what is left out;
-    modes: (lines, nodes), what the field on the nodes, weighted, is carried by, or None:
-        the nodes themselves;
-    faint: root of the faintest point's light over the brightest's.
+    u: sensor nodes, m from its centre;
+    root: the roots of their weights;
+    points: m on the array, that are computed;
+    emphasis: their weights in what is left out;
+    modes: (lines, nodes), what the field on the nodes, weighted, is carried by, or None: the nodes
+        themselves.
     """
 
-    def __init__(
-        self,
-        u: np.ndarray,
-        root: np.ndarray,
-        points: np.ndarray,
-        emphasis: np.ndarray,
-        modes: np.ndarray | None = None,
-        faint: float = 1.0,
-    ) -> None:
-        self.u, self.root, self.points, self.emphasis, self.modes, self.faint = (
-            u,
-            root,
-            points,
-            emphasis,
-            modes,
-            faint,
-        )
+    u: np.ndarray
+    root: np.ndarray
+    points: np.ndarray
+    emphasis: np.ndarray
+    modes: np.ndarray | None = None
 
     @property
     def lines(self) -> int:
@@ -287,7 +278,7 @@ class Pair:
         reach the superpixel.
         """
         if self.symmetric:
-            return split(self._field, tolerance * self.row.side.faint, symmetric=True)
+            return split(self._field, tolerance, symmetric=True)
         rows, columns = self.row.weigh, self.column.weigh
         u, s, v = split(rows @ self._field @ columns.T, tolerance)
         s = np.maximum(np.diag(s), np.finfo(float).tiny)  # no light passes a shut filter

@@ -64,16 +64,8 @@ over itself (measured: 0.5 to 2.3).
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
 
-FAINT, LEAST = 0.1, 1e-10
-"""Share of the brightest point's light below which a point's own light is what its column's error
-is measured by; least share, and cut of the main lens's field, that this is done for.
-"""
-
-GAPS = 3.0
-"""By how much finer fields are cut where lenslets leave gaps, and once more where these are narrow.
-"""
-NARROW = 2.0
-"""Diffraction cells of an opening."""
+LEAST = 1e-10
+"""Finest cut: below it is the rounding of double precision."""
 
 
 def exact_band(
@@ -96,12 +88,9 @@ def exact_band(
     # cuts hurt corners more
     share = min(1.0, 4 / math.pi * (geometry.D2 / max(geometry.blur, geometry.D2)) ** 2)
     cut = CUT * accuracy * math.sqrt(share) / (1 + 4 * accuracy) / finer
-    # points beside a lenslet: edges are all that their columns have
-    if geometry.lenslet_width < 0.999 * geometry.D2:
-        cut /= GAPS
-        opening = geometry.diffraction_cells * geometry.lenslet_width / geometry.D2
-        # narrow ones throw light of points beside them beside their superpixel
-        cut /= GAPS if opening < NARROW else 1.0
+    # edges are all that columns of points beside a lenslet have
+    cut = max(LEAST, cut * base.faintest)
+    missed = CUT_EFFECT * max(CUT * accuracy, cut / base.faintest)
     count = prolate_count(_bandwidth(geometry, superpixels), cut / 100)
     count = (
         count
@@ -110,7 +99,7 @@ def exact_band(
     )
     require_sketch(field_terms(geometry, base.terms, cut, True))
     return ExactBand(
-        **vars(base) | {"sampling": math.hypot(base.sampling, CUT_EFFECT * CUT * accuracy)},
+        **vars(base) | {"sampling": math.hypot(base.sampling, missed)},
         cut=cut,
         sensor_count=count,
     )
@@ -156,7 +145,19 @@ class ExactSquareLenslets(LensletFields):
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
-        self._illuminate(camera, band.cut / 2)
+        g = geometry
+        self._field = (
+            separable_field(camera, g, band.half, band.cut / 2, spherical_field)
+            if g.chief == (0.0, 0.0)
+            else oblique_field(camera, g, band.half, band.cut / 2)
+        )
+        flip_rows, flip_columns, turn = (
+            a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels))
+        )
+        self.symmetry = flip_rows, flip_columns, turn
+        alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
+        self._turn = alike and turn
+        self._entering = self._light()
         self._extent, self._bandwidth = (
             [_extent(geometry, n) for n in geometry.pixel_shape],
             _bandwidth(geometry, plan.superpixels),
@@ -175,36 +176,6 @@ class ExactSquareLenslets(LensletFields):
             psf_terms=self._field.terms,
             products=max(counts),
         )
-
-    def _illuminate(self, camera: Camera, tolerance: float) -> None:
-        """The main lens's field, its symmetries, and the light of points that enters, down to
-        that of the faintest point.
-        """
-        g = self.geometry
-        alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
-        while True:
-            self._field = (
-                separable_field(camera, g, self.band.half, tolerance, spherical_field)
-                if g.chief == (0.0, 0.0)
-                else oblique_field(camera, g, self.band.half, tolerance)
-            )
-            flip_rows, flip_columns, turn = (
-                a and b for a, b in zip(self._field.symmetry, g.mirrors(self.superpixels))
-            )
-            self.symmetry = flip_rows, flip_columns, turn
-            self._turn = alike and self.symmetry[2]
-            self._entering = self._light()
-            brightest = self._entering.max()
-            least = max(LEAST, self._entering.min() / brightest) if brightest > 0 else 1.0
-            faint = math.sqrt(least) if least < FAINT else 1.0
-            if tolerance <= 1.01 * faint * self.band.cut / 2 or tolerance <= LEAST:
-                break
-            # what is cut may itself be as bright as the faintest
-            tolerance = max(
-                LEAST,
-                tolerance / 30 if least < 100 * self._field.tail**2 else faint * self.band.cut / 2,
-            )
-        self._faint = faint
 
     # which lenslets light which superpixels
 
@@ -253,12 +224,8 @@ class ExactSquareLenslets(LensletFields):
                     for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
                 )
             points = self._points(s, axis)
-            emphasis = edge_emphasis(g, points)
-            if self._faint < 1:
-                light = self._entering.max(axis=1 - axis)[: len(points)] / self._entering.max()
-                emphasis = np.maximum(emphasis, 1 / np.sqrt(np.maximum(light, LEAST)))
             self._sensor_sides[s, axis] = SensorSide(
-                u, np.sqrt(w), points, emphasis, modes, self._faint
+                u, np.sqrt(w), points, edge_emphasis(g, points), modes
             )
         return self._sensor_sides[s, axis]
 
@@ -273,7 +240,7 @@ class ExactSquareLenslets(LensletFields):
                 m,
                 self._sensor_side(s, axis),
                 self._parabolic,
-                self.band.cut / 3 * self._faint,
+                self.band.cut / 3,
                 self.dtype,
             )
         return self._intervals[s, m, axis]

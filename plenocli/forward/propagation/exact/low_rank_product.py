@@ -107,10 +107,12 @@ class Product:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
         is seen of M through it.
         """
-        columns = self._times(0, self._mixed(1, count if q is None else count - q.shape[1]))
-        if q is None or seen is None:
-            q = orthonormal(columns)
+        # with no room left the range is found anew: what would be added is rounding, and would not
+        # be perpendicular to what is there
+        if q is None or seen is None or count >= self.limit:
+            q = orthonormal(self._times(0, self._mixed(1, count)))
             return q, self._through_basis(q)
+        columns = self._times(0, self._mixed(1, count - q.shape[1]))
         for _ in range(2):
             columns -= q @ (q.conj().T @ columns)
         new = orthonormal(columns)

@@ -1,21 +1,21 @@
 """The main lens's field on a lenslet off the axis, in direction cosines about its chief ray.
 
-From the pupil point xi to the place C + x on the array (C the lenslet's centre, rho0 = |C| with z2)
-the path is that of the chief ray to C + x, which is kept exactly (lenslets.py), and what goes with
-the pupil point: with s = (C - xi)/rho, ds = s - s0 and f(s; x) = (|x|^2 - (s.x)^2) s_z/(2 z2),
+From the pupil point xi to the place C + x on the array (C the lenslet's centre) the path is that of
+the chief ray to C + x, which is kept exactly (lenslets.py, openings.py), and what goes with the
+pupil point: with the direction cosines s of the way to C, ds = s - s0 from the chief ray's,
 
-    psi(xi; x) = ds.x + f(s; x) - f(s0; x)  ~  ds.x + ds.A(x) + ds.B(x).ds/2,
+    psi(xi; x) = ds.x + G(xi; x).
 
-A and B quadratic forms of x, the derivatives of f by s. The field of the point imaged at C + p is
-the integral of P exp(j k [psi(xi; p + d) - psi(xi; p)]), d = x - p: no function of d alone, but one
-that changes slowly with p. With h(d) of the linear part alone and its derivatives h_i, h_ij, which
-stand for j k ds_i,
+The field of the point imaged at C + p is the integral of P exp(j k [psi(xi; p + d) - psi(xi; p)]),
+d = x - p: of one wave for each ds, and E = j k [G(xi; p + d) - G(xi; p)], with the logarithm of how
+much stronger the wave is, a slow function of ds. E is fitted by a polynomial of ds, exp E follows
+as a power series, and each power's integral is one product of waves,
 
-    F(d; p) = h + sum_i L_i h_i + sum_ij (L^B_ij/(2 j k) + L_i L_j/2) h_ij,
-    L_i = A_i(d + p) - A_i(p) = A_i[d, d] + 2 A_i[d, p],
+    F(d; p) = sum_ab e_ab(d; p) h_ab(d),   h_ab = integral of P ds_y^a ds_x^b exp(j k ds.d).
 
-which ends with second powers of p. Blocks of such fields, one for each pair of powers of p's two
-coordinates, are one matrix, whose singular vectors are functions of d and p along either axis.
+F is computed for Gauss-Legendre nodes of p over the lenslet, out of focus each with the two spheres
+of its point, and is a polynomial of p between them. All nodes together are one matrix, whose
+singular vectors are functions of d and p along either axis.
 docs/model.md, "Exact propagation".
 """
 
@@ -23,6 +23,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +33,6 @@ from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.exact.debye import APODISATION, aperture_norm
 from plenocli.forward.propagation.exact.low_rank_product import Product
-from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.fresnel.spread_function import (
     SeparableField,
     legendre,
@@ -42,20 +43,20 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
-ORDERS = 3
-"""Powers of a point's coordinates, 0 to 2, that its field goes with."""
-SINGLE = 3e-5
-"""Root energy that may be lost from which on single precision serves."""
+Place = tuple[float, float]
+"""(row, column), m."""
+MOST_ORDERS, MOST_POWERS = 10, 24
+"""Nodes along an axis of a point's place, and powers of ds, that are affordable."""
+FITTED = [(a, n - a) for n in (1, 2, 3, 4) for a in range(n + 1)]
+"""Powers of ds along rows and columns that E is fitted by."""
 ALIKE = 1e-5
-"""Relative difference of fields that are mirror images but for the rounding of single precision."""
-BAND = 1e-9
-"""Root mean square that functions of the band of h may miss of it."""
+"""Relative difference of fields that are mirror images."""
 SHARP = 1e-6
 """Blur of a point, in lenslets, below which it is in focus."""
 SKETCH = 64
 """Columns of the first sketch of a field's singular vectors."""
 SLAB = 1 << 20
-"""Numbers in a slab of pupil nodes x field points."""
+"""Numbers in a slab of pupil nodes x polynomials, or of pupil nodes x field points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,20 +64,22 @@ class ObliqueField(SeparableField):
     """F(d; p) = sum_j a_j(dy, py) b_j(dx, px), as SeparableField, each term a polynomial of the
     point: `rows`, `columns` are Legendre coefficients (degrees, order x term).
 
-    scale: m, that powers of the point are counted in.
+    orders: of normalised Legendre polynomials of the point's place;
+    scale: half width (m) of the places that they are normalised on.
     """
 
+    orders: int
     scale: float
 
     @property
     def terms(self) -> int:
         """Number of separable terms."""
-        return self.rows.shape[1] // ORDERS
+        return self.rows.shape[1] // self.orders
 
 
 def orders_of(field: SeparableField) -> int:
-    """Powers of the point that the terms of a field are made of, 1 on the axis."""
-    return ORDERS if isinstance(field, ObliqueField) else 1
+    """Polynomials of the point that the terms of a field are made of, 1 on the axis."""
+    return field.orders if isinstance(field, ObliqueField) else 1
 
 
 def at_points(field: SeparableField, values: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -89,9 +92,15 @@ def at_points(field: SeparableField, values: np.ndarray, points: np.ndarray) -> 
     """
     if not isinstance(field, ObliqueField):
         return values
-    parts = values.reshape(*values.shape[:-1], ORDERS, -1)
-    share = (points / field.scale)[..., None]
-    return parts[..., 0, :] + share * (parts[..., 1, :] + share * parts[..., 2, :])
+    parts = values.reshape(*values.shape[:-1], field.orders, -1)
+    at = _of_points(np.asarray(points).ravel() / field.scale, field.orders)
+    at = at.reshape(*np.shape(points), 1, field.orders)
+    return sum(at[..., n] * parts[..., n, :] for n in range(field.orders))
+
+
+def _of_points(places: np.ndarray, orders: int) -> np.ndarray:
+    """Legendre polynomials of mean square 1: (place in [-1, 1], order)."""
+    return legendre(places, orders, 1) * np.sqrt(2 * np.arange(orders) + 1)
 
 
 def oblique_field(
@@ -105,29 +114,23 @@ def oblique_field(
     Raises NumericsError as psf_nodes.
     """
     g, count = geometry, psf_nodes(geometry, half)
-    t, w = gauss(count)
-    scale = g.D2 / math.sqrt(12)
-    (h, *moved), steepest = _linear_part(camera, g, half * t, tolerance)
-    blocks = _by_powers(h, half, g.k * half * steepest, g)
-    blocks[1, 0], blocks[0, 1] = (blocks[a] + b for a, b in zip(((1, 0), (0, 1)), moved))
-    flips = tuple(g.chief[axis] == 0.0 and _same(h, np.flip(h, axis)) for axis in (0, 1))
-    turn = g.chief[0] == g.chief[1] and _same(h, h.T)
+    (t, w), orders, scale = gauss(count), orders_for(geometry, tolerance), geometry.D2 / 2
+    places, share = gauss(orders)
+    fields = _Fields(camera, g, half, t, tolerance)
     root = np.sqrt(w * half)
-    zero = np.zeros_like(blocks[0, 0])
-    matrix = np.block(
-        [
-            [
-                blocks.get((a, b), zero) * (root[:, None] * root * scale ** (a + b))
-                for b in range(ORDERS)
-            ]
-            for a in range(ORDERS)
-        ]
-    )
-    unit = np.eye(len(matrix), dtype=matrix.dtype)
+    matrix = np.empty((orders, count, orders, count), complex)
+    for (i, y), (j, x) in product(enumerate(places * scale), repeat=2):
+        weight = math.sqrt(share[i] * share[j]) / 2
+        matrix[i, :, j] = fields.of((y, x)) * (weight * root[:, None] * root)
+    matrix = matrix.reshape(orders * count, -1)
+    unit = np.eye(len(matrix), dtype=complex)
     factors = Product([matrix], [unit], {(0, 0): unit}, False).factors(tolerance, SKETCH)
     project = legendre(t, count, 1).T * w * ((2 * np.arange(count) + 1) / 2)[:, None]
+    onto = _of_points(places, orders).T * np.sqrt(share / 2)
     rows, columns = (
-        np.hstack([project @ (part / root[:, None]) for part in np.split(factor, ORDERS)])
+        np.einsum(
+            "dy,on,nyj->doj", project / root, onto, factor.reshape(orders, count, -1), optimize=True
+        ).reshape(count, -1)
         for factor in factors
     )
     return ObliqueField(
@@ -135,84 +138,219 @@ def oblique_field(
         rows=rows,
         columns=columns,
         even=False,
-        symmetry=(*flips, turn),
+        symmetry=fields.symmetry,
         tail=tolerance,
+        orders=orders,
         scale=scale,
     )
 
 
 def neglected(geometry: Geometry) -> float:
-    """Estimated relative L2 error of the worst column by what F leaves out, 0 on the axis.
-
-    Third powers of places on the lenslet in the path, k T x^3/z2^2 with T the tangent at the
-    pupil's rim, and of the phase that goes with the point, k T x^2 s/z2.
-
-    Returns a number, 1 to 7 times what was found in 40 cases (f/2.2 to f/11, 1 to 22 degrees, z2
-    of 1.5 to 40 mm, blur over up to one lenslet, gaps) where that was above 1e-5.
+    """Estimated relative L2 error of the worst column by what F leaves out, 0 on the axis: what E's
+    fit misses, and where a point's place or ds takes more orders than are affordable.
     """
     g = geometry
     if g.chief == (0.0, 0.0):
         return 0.0
-    half = g.D2 / 2
-    slope = g.k * g.D1 / (2 * g.z2)
-    turned = slope * half**2 * math.sin(g.obliquity) / g.z2
+    missed, steep, turns = _sizes(g)
     dim = 1 + 3 * (1 - g.lenslet_width / g.D2)
-    return dim * (1.2 * slope * half**3 / g.z2**2 + 3 * turned**3)
+    rest = _interpolated(turns, MOST_ORDERS), _truncated(steep, MOST_POWERS)
+    return dim * math.hypot(missed, *rest)
 
 
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    return bool(np.linalg.norm(one - other) < ALIKE * np.linalg.norm(one))
+def orders_for(geometry: Geometry, tolerance: float) -> int:
+    """Nodes along an axis of a point's place that its field takes; 1 on the axis."""
+    if geometry.chief == (0.0, 0.0):
+        return 1
+    turns = _sizes(geometry)[2]
+    return next(
+        (n for n in range(1, MOST_ORDERS) if _interpolated(turns, n) < tolerance), MOST_ORDERS
+    )
 
 
-def _linear_part(
-    camera: Camera, geometry: Geometry, d: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, float]:
-    """(h, h_0, h_1) (3, len(d), len(d)), 1/m, at displacements d (m) along either axis: the
-    integral of P exp(j k ds.d) over the pupil, and of that times what a point's wave out of focus
-    changes by with its place along either axis, 1/m; and the largest direction cosine ds along an
-    axis.
+def _interpolated(turns: float, nodes: int) -> float:
+    """Error of exp(j turns t) by interpolation from Gauss-Legendre nodes on [-1, 1]."""
+    return turns**nodes * 2**nodes * math.factorial(nodes) / math.factorial(2 * nodes)
+
+
+def _truncated(size: float, powers: int) -> float:
+    """Error of exp of a number of this size by its series."""
+    return size ** (powers + 1) / math.factorial(powers + 1)
+
+
+@lru_cache(maxsize=256)
+def _sizes(geometry: Geometry) -> tuple[float, float, float]:
+    """(what the fit of E misses, |E|, by how much E changes with the point), of a point's light on
+    its own lenslet.
     """
-    g, lens = geometry, camera.main_lens
-    single, blurred = tolerance > SINGLE, g.blur > SHARP * g.D2
-    real = np.dtype(np.float32 if single else np.float64)
-    total = np.zeros((3, len(d), len(d)), np.complex64 if single else complex)
-    steepest = 0.0
-    for rows in pupil_rows(camera, g, g.k * math.sqrt(2) * np.abs(d).max() / g.z2):
-        y, x = np.broadcast_to(rows.y[:, None], rows.x.shape).ravel(), rows.x.ravel()
-        r2 = y * y + x * x
-        cos2 = g.z2**2 / (g.z2**2 + r2)
-        here, image = (_Sphere(g, q, y, x) for q in (1 / g.z2, 1 / g.z2 - g.eps))
-        # pupil_rows has the paraxial defocus; the difference of the two spheres takes its place
-        weight = rows.weight.ravel() * np.exp(1j * g.k * (here.path - image.path - g.eps * r2 / 2))
-        weight *= APODISATION[lens.apodisation](cos2) * cos2 / (g.z2 * here.far) ** 2
-        steepest = max(steepest, *(float(np.abs(s).max()) for s in here.sines))
-        parts = [weight]
-        if blurred:
-            parts += [1j * g.k * weight * (s - t) for s, t in zip(here.sines, image.sines)]
-        step = max(1, SLAB // len(d))
-        for start in range(0, len(weight), step):
+    g = geometry
+    waves, t = _Waves(g), np.linspace(-1, 1, 3)
+    reach = g.D2 / 2 * (1 + g.row_spacing) / 2
+    found = []
+    for p in product((-reach, 0.0, reach), repeat=2):
+        # places on the lenslet, from the point
+        exact = waves.exponent(p, reach * t - p[0], reach * t - p[1])
+        fit = np.tensordot(waves.powers, np.tensordot(waves.fit, exact, 1), 1)
+        found.append((np.abs(exact - fit), np.abs(exact), exact))
+    missed, size, exact = (np.array(a) for a in zip(*found))
+    middle = exact[len(exact) // 2]
+    return (
+        float(missed.max()),
+        float(size.max()),
+        float(np.abs(exact - middle).max()),
+    )
+
+
+class _Waves:
+    """Directions all over the pupil, and what of the path the fit by their powers has.
+
+    steepest: T (m/m), the largest |ds| along an axis;
+    powers: (pupil point, power) ds^a ds^b/T^(a+b), as FITTED;
+    fit: (power, pupil point), its pseudo-inverse.
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        g = self.geometry = geometry
+        turn = np.arange(10) * (math.pi / 5)
+        # a square pupil reaches farther than a round one
+        r = np.array([[0.4], [0.8], [1.1], [1.41]]) * g.D1 / 2
+        self.y, self.x = ((r * f(turn)).ravel() for f in (np.sin, np.cos))
+        s = np.array(_Sphere(g, g.chief, 1 / g.z2, self.y, self.x).sines)
+        self.steepest = float(np.abs(s).max())
+        y, x = s / self.steepest
+        self.powers = np.stack([y**a * x**b for a, b in FITTED], axis=1)
+        self.fit = np.linalg.pinv(self.powers)
+        self.sines = s
+
+    def exponent(self, p: Place, dy: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """E of the point imaged at p (m from the lenslet's centre) at displacements dy, dx (m) from
+        it: (pupil point, row, column).
+        """
+        k, (far, near), (far_p, near_p) = (
+            self.geometry.k,
+            self._ways(p[0] + dy, p[1] + dx),
+            self._ways(np.array(p[:1]), np.array(p[1:])),
+        )
+        linear = self.sines[0][:, None, None] * dy[:, None] + self.sines[1][:, None, None] * dx
+        return 1j * k * ((far - near) - (far_p - near_p) - linear) - 2 * (
+            np.log(far / near) - self._stronger
+        )
+
+    def _ways(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lengths (m) of the ways from the pupil points, and from its centre, to places (m) on the
+        array: (pupil point, row, column) and (row, column).
+        """
+        g = self.geometry
+        y, x = g.chief[0] + y, g.chief[1] + x
+        away = (y[:, None] - self.y[:, None, None]) ** 2 + (x - self.x[:, None, None]) ** 2
+        return np.sqrt(g.z2**2 + away), np.sqrt(g.z2**2 + y[:, None] ** 2 + x**2)
+
+    @property
+    def _stronger(self) -> np.ndarray:
+        far, near = self._ways(np.zeros(1), np.zeros(1))
+        return np.log(far / near)
+
+
+class _Fields:
+    """F(d; p) on nodes half t along either axis.
+
+    symmetry: (flip rows, flip columns, exchange both) that leave all of them alike.
+    """
+
+    def __init__(
+        self, camera: Camera, geometry: Geometry, half: float, t: np.ndarray, tolerance: float
+    ) -> None:
+        g = self.geometry = geometry
+        self._camera, self._d = camera, half * t
+        self._waves = _Waves(g)
+        phase = g.k * self._waves.steepest * half
+        self._nodes, self._node_weights = gauss(math.ceil(phase + 5 * math.cbrt(phase) + 12))
+        # in E's size everywhere, of which the far ends hold little light
+        ends = np.array([-half, 0.0, half])
+        size = max(
+            float(np.abs(self._waves.exponent(p, ends, ends)).max())
+            for p in product((-g.D2 / 2, g.D2 / 2), repeat=2)
+        )
+        self._powers = next(
+            (n for n in range(MOST_POWERS) if _truncated(size, n) < tolerance), MOST_POWERS
+        )
+        wave = np.exp(1j * phase * np.outer(t, self._nodes))
+        self._along = [wave * self._nodes**n for n in range(self._powers + 1)]
+        self._blurred = g.blur > SHARP * g.D2
+        middle = self._density((0.0, 0.0))
+        h = wave @ middle @ wave.T
+        flips = tuple(g.chief[axis] == 0.0 and _same(h, np.flip(h, axis)) for axis in (0, 1))
+        self.symmetry = (*flips, g.chief[0] == g.chief[1] and _same(h, h.T))
+        self._shared = None if self._blurred else self._by_power(middle)
+
+    def of(self, p: Place) -> np.ndarray:
+        """F of the point imaged at p (m from the lenslet's centre): (row, column), 1/m."""
+        parts = self._shared or self._by_power(self._density(p))
+        out = np.empty(parts[0, 0].shape, complex)
+        step = max(1, SLAB // (len(self._waves.y) * len(self._d)))
+        for start in range(0, len(out), step):
             some = slice(start, start + step)
-            left, right = (
-                _waves(g.k / (2 * np.pi) * np.outer(s[some], d), real) for s in here.sines
-            )
-            for out, part in zip(total, parts):
-                out += (left * part[some, None].astype(left.dtype)).T @ right
-    norm = g.wavelength * math.sqrt(aperture_norm(lens, g))
-    return total.astype(complex) / norm, steepest
+            exponent = self._waves.exponent(p, self._d[some], self._d)
+            fitted = dict(zip(FITTED, np.tensordot(self._waves.fit, exponent, 1)))
+            series = _exponential(fitted, self._powers)
+            out[some] = sum(e * parts[power][some] for power, e in series.items())
+        return out
+
+    def _by_power(self, density: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+        """h_ab/T^(a+b) for all powers."""
+        right = [density @ wave.T for wave in self._along]
+        return {
+            (a, n - a): self._along[a] @ right[n - a]
+            for n in range(self._powers + 1)
+            for a in range(n + 1)
+        }
+
+    def _density(self, p: Place) -> np.ndarray:
+        """The pupil, with the two spheres of the point imaged at p, on nodes of ds/T along either
+        axis, which carry waves to all d as the pupil itself does: 1/m.
+        """
+        g, lens = self.geometry, self._camera.main_lens
+        count, steepest = len(self._nodes), self._waves.steepest
+        total = np.zeros((count, 2 * count))
+        place = g.chief[0] + p[0], g.chief[1] + p[1]
+        reach = g.k * math.sqrt(2) * np.abs(self._d).max() / g.z2
+        for rows in pupil_rows(self._camera, g, reach):
+            y, x = np.broadcast_to(rows.y[:, None], rows.x.shape).ravel(), rows.x.ravel()
+            r2 = y * y + x * x
+            cos2 = g.z2**2 / (g.z2**2 + r2)
+            chief = _Sphere(g, g.chief, 1 / g.z2, y, x)
+            here, image = (_Sphere(g, place, q, y, x) for q in (1 / g.z2, 1 / g.z2 - g.eps))
+            # pupil_rows has the paraxial defocus; the difference of the two spheres takes its place
+            late = here.path - image.path - g.eps * r2 / 2
+            weight = rows.weight.ravel() * np.exp(1j * g.k * late)
+            weight *= APODISATION[lens.apodisation](cos2) * cos2 / (g.z2 * chief.far) ** 2
+            step = max(1, SLAB // count)
+            for start in range(0, len(weight), step):
+                some = slice(start, start + step)
+                left, right = (legendre(s[some] / steepest, count, 1) for s in chief.sines)
+                right = np.ascontiguousarray(right * weight[some, None]).view(float)
+                total += left.T @ right
+        moments = total.view(complex) / (g.wavelength * math.sqrt(aperture_norm(lens, g)))
+        degrees = np.arange(count) + 0.5
+        onto = legendre(self._nodes, count, 1) * degrees * self._node_weights[:, None]
+        return onto @ moments @ onto.T
 
 
 class _Sphere:
-    """A sphere about a point of the chief ray, its distance 1/q from the pupil.
+    """A sphere about a point of a ray through the pupil's centre, its distance 1/q from the pupil.
 
+    place: where the ray meets the array, m from the axis;
     y, x: (node,) pupil points, m;
     far: of them from it, over its own distance along the axis;
     path: (node,) m, by which they are farther from it than the pupil's centre is;
     sines: [(node,), (node,)] by how much the direction cosines from them to it differ from the
-        chief ray's, for places on the array (over q z2).
+        ray's, for places on the array (over q z2).
     """
 
-    def __init__(self, geometry: Geometry, q: float, y: np.ndarray, x: np.ndarray) -> None:
-        ty, tx = (c / geometry.z2 for c in geometry.chief)
+    def __init__(
+        self, geometry: Geometry, place: Place, q: float, y: np.ndarray, x: np.ndarray
+    ) -> None:
+        ty, tx = (c / geometry.z2 for c in place)
         middle = math.sqrt(1 + ty * ty + tx * tx)
         self.far = np.sqrt(1 + (ty - q * y) ** 2 + (tx - q * x) ** 2)
         # differences of squares, over q, so that nothing cancels and q may be 0
@@ -224,103 +362,22 @@ class _Sphere:
         ]
 
 
-def _waves(turns: np.ndarray, real: np.dtype) -> np.ndarray:
-    """exp(2 pi j turns), complex numbers of parts `real`; `turns` is overwritten."""
-    turns -= np.rint(turns)
-    phase = (2 * np.pi * turns).astype(real)
-    out = np.empty(phase.shape, np.result_type(real, np.complex64))
-    out.real, out.imag = np.cos(phase), np.sin(phase)
-    return out
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.linalg.norm(one - other) < ALIKE * np.linalg.norm(one))
 
 
-def _by_powers(
-    h: np.ndarray, half: float, phase: float, geometry: Geometry
+def _exponential(
+    exponent: dict[tuple[int, int], np.ndarray], powers: int
 ) -> dict[tuple[int, int], np.ndarray]:
-    """F(d; p) on Gauss nodes of [-half, half] by powers (of p's row, of its column): {(a, b):
-    as h}.
-
-    phase: rad over half, that the steepest wave of h runs through.
-    """
-    g = geometry
-    slope, bend = _forms(g)
-    t, w = gauss(len(h))
-    d = half * t
-    # in functions of its own band derivatives do not raise what single precision rounds
-    value = prolate(t, phase, min(prolate_count(phase, BAND), len(t)))
-    steps = _differentiation(d)
-    slopes = steps @ value
-    curves = steps @ slopes
-    project = value.T * w
-    h = project @ h @ project.T
-    first = [slopes @ h @ value.T, value @ h @ slopes.T]
-    both = slopes @ h @ slopes.T
-    second = [[curves @ h @ value.T, both], [both, value @ h @ curves.T]]
-    h = value @ h @ value.T
-    place = np.broadcast_to(d[:, None], h.shape), np.broadcast_to(d, h.shape)
-
-    def form(m: np.ndarray) -> np.ndarray:
-        return m[0, 0] * place[0] ** 2 + 2 * m[0, 1] * place[0] * place[1] + m[1, 1] * place[1] ** 2
-
-    def beside(m: np.ndarray, a: int) -> np.ndarray:
-        return 2 * (m[a, 0] * place[0] + m[a, 1] * place[1])
-
-    whole = [form(m) for m in slope]
-    mixed = [[beside(m, a) for a in (0, 1)] for m in slope]
-    found: dict[tuple[int, int], np.ndarray] = {(0, 0): h.copy()}
-    # the amplitude 1/R^2 of a pupil point, against that of the chief ray
-    nearer = -2 / (1j * g.k * math.hypot(g.z2, *g.chief))
-    for i in (0, 1):
-        found[0, 0] += (whole[i] + nearer * place[i]) * first[i]
-    for a in (0, 1):
-        found[1 - a, a] = mixed[0][a] * first[0] + mixed[1][a] * first[1] + nearer * first[a]
-    for i in (0, 1):
-        for j in (0, 1):
-            curved = bend[i][j] / (2j * g.k)
-            found[0, 0] += (form(curved) + whole[i] * whole[j] / 2) * second[i][j]
-            for a in (0, 1):
-                found[1 - a, a] += (beside(curved, a) + whole[i] * mixed[j][a]) * second[i][j]
-                for b in (0, 1):
-                    power = (2 - a - b, a + b)
-                    found[power] = found.get(power, 0) + (
-                        mixed[i][a] * mixed[j][b] / 2 * second[i][j]
-                    )
-    return found
-
-
-def _forms(geometry: Geometry) -> tuple[list[np.ndarray], list[list[np.ndarray]]]:
-    """(A, B): first and second derivatives by s of (|x|^2 - (s.x)^2) s_z/(2 z2) at the chief ray,
-    as 2x2 matrices of quadratic forms of x, 1/m.
-    """
-    g = geometry
-    s = np.array(g.chief) / math.sqrt(g.z2**2 + g.chief[0] ** 2 + g.chief[1] ** 2)
-    upright = math.sqrt(1 - s @ s)
-    unit = np.eye(2)
-    across = unit - np.outer(s, s)
-    along = [np.outer(s, e) + np.outer(e, s) for e in unit]
-    slope = [(-upright * along[i] - across * s[i] / upright) / (2 * g.z2) for i in (0, 1)]
-    bend = [
-        [
-            (
-                -upright * (np.outer(unit[i], unit[j]) + np.outer(unit[j], unit[i]))
-                + (along[i] * s[j] + along[j] * s[i]) / upright
-                - across * (unit[i, j] / upright + s[i] * s[j] / upright**3)
+    """exp of a polynomial without a constant, by powers of its two variables up to so many."""
+    one = np.ones_like(next(iter(exponent.values())))
+    out: dict[tuple[int, int], np.ndarray] = {(0, 0): one}
+    for n in range(1, powers + 1):
+        for a in range(n + 1):
+            # n e_n = sum of m E_m e_(n-m)
+            out[a, n - a] = sum(
+                (i + j) / n * e * out[a - i, n - a - j]
+                for (i, j), e in exponent.items()
+                if i <= a and j <= n - a
             )
-            / (2 * g.z2)
-            for j in (0, 1)
-        ]
-        for i in (0, 1)
-    ]
-    return slope, bend
-
-
-def _differentiation(d: np.ndarray) -> np.ndarray:
-    """The matrix that differentiates polynomials given on the nodes d, by barycentric weights."""
-    gap = d[:, None] - d
-    np.fill_diagonal(gap, 1.0)
-    size = np.log(np.abs(gap)).sum(axis=1)
-    sign = np.where(np.arange(len(d)) % 2, -1.0, 1.0)
-    ratio = np.exp(size[:, None] - size) * np.outer(sign, sign)
-    out = ratio / gap
-    np.fill_diagonal(out, 0.0)
-    np.fill_diagonal(out, -out.sum(axis=1))
     return out

@@ -30,7 +30,7 @@ from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
 from plenocli.forward.propagation.costs import Cost, Features, law
 from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_cubed
 from plenocli.forward.propagation.exact.debye import spherical_field
-from plenocli.forward.propagation.exact.oblique import ORDERS, at_points, oblique_field
+from plenocli.forward.propagation.exact.oblique import at_points, oblique_field, orders_for
 from plenocli.forward.propagation.exact.residual import Residual, path
 from plenocli.forward.propagation.fresnel.array_to_sensor import pixel_energy, sensor_nodes
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
@@ -380,7 +380,7 @@ def features(
     pairs = len(nodes) * made
     most, lines, terms = int(nodes.max()), max(g.object_shape), float(band.terms)
     # a wave off the axis has terms that go with the point, too
-    orders, terms = (ORDERS, OBLIQUE_TERMS * terms) if oblique else (1, terms)
+    orders, terms = orders_for(g, band.spread_cut), (OBLIQUE_TERMS if oblique else 1) * terms
     values = float((nodes**2).sum()) * lit
     # every part of the points makes its kernels anew
     parts = max(math.ceil(g.object_shape[1] / 16), math.ceil(lit * tall * wide / TOGETHER))

@@ -16,7 +16,7 @@ from plenocli.forward.propagation.fresnel.trial_columns import trial_columns
 from plenocli.forward.propagation.harmonics.bessel import bessel_tail
 from plenocli.forward.propagation.harmonics.interpolation import tap_error
 from plenocli.forward.propagation.plan import BandPlan
-from plenocli.forward.propagation.sampling import OTHERS, dimness, is_symmetric, pixel_error
+from plenocli.forward.propagation.sampling import beyond_tried, dimness, is_symmetric, pixel_error
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -99,7 +99,7 @@ def harmonic_band(
 
     def missed(count: int) -> float:
         if tried is not None:
-            return OTHERS * tried.error(count, 0)
+            return beyond_tried(tried) * tried.error(count, 0)
         return PIXEL_EFFECT * pixel_error(count, 0, own, own, g.diffraction_cells, g.blur / g.D2)
 
     nodes = next((n for n in range(2, MOST_NODES) if missed(n) <= SHARE * accuracy), None)

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING
 
+from plenocli.forward.propagation.costs import law
 from plenocli.forward.propagation.exact import cost_law, openings
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact.oblique import neglected
@@ -31,7 +32,7 @@ from plenocli.forward.propagation.sampling import (
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.propagation.costs import Cost
+    from plenocli.forward.propagation.costs import Cost, Features
 
 
 class Model(ABC):
@@ -77,6 +78,23 @@ class Model(ABC):
         """
 
     @abstractmethod
+    def features(
+        self,
+        camera: Camera,
+        geometry: Geometry,
+        band: BandPlan,
+        shape: tuple[int, int, int, int],
+        double: bool,
+    ) -> Features:
+        """What the matrix at one wavelength consists of.
+
+        band: as `size` gives it;
+        shape: (band, superpixel, pixel, point);
+        double: whether its fields have double precision.
+
+        Raises NumericsError where the model would need too much.
+        """
+
     def cost(
         self,
         camera: Camera,
@@ -85,13 +103,8 @@ class Model(ABC):
         shape: tuple[int, int, int, int],
         double: bool,
     ) -> Cost:
-        """Cost of the matrix at one wavelength.
-
-        shape: (band, superpixel, pixel, point);
-        double: precision of the fields.
-
-        Raises NumericsError where the model would need too much.
-        """
+        """Cost of the matrix at one wavelength, as `features`."""
+        return law(self.name).cost(self.features(camera, geometry, band, shape, double))
 
     def fields(
         self, camera: Camera, geometry: Geometry, plan: PifPlan, band: BandPlan
@@ -125,7 +138,7 @@ class Rays(Model):
     name, kind, lenslets = "rays", "ray", rays.RayLenslets
     valid_for = staticmethod(rays.valid_for)
     size = staticmethod(rays.size_band)
-    cost = staticmethod(rays.cost)
+    features = staticmethod(rays.features)
 
     def error_bound(self, camera: Camera, geometry: Geometry) -> float:
         """As Model.error_bound; a law that is within 2.5 of what was measured promises only what
@@ -142,7 +155,7 @@ class FresnelLowRank(Model):
     valid_for = staticmethod(_square_only)
     error_bound = staticmethod(_paraxial_error)
     size = staticmethod(partial(size_band, dim=True))
-    cost = staticmethod(square_cost.cost)
+    features = staticmethod(square_cost.features)
 
 
 class FresnelTripleProduct(Model):
@@ -152,7 +165,7 @@ class FresnelTripleProduct(Model):
     valid_for = staticmethod(shaped.valid_for)
     error_bound = staticmethod(_paraxial_error)
     size = staticmethod(size_band)
-    cost = staticmethod(shaped.cost)
+    features = staticmethod(shaped.features)
 
 
 class ExactLowRank(Model):
@@ -162,7 +175,7 @@ class ExactLowRank(Model):
     libraries = ("scipy.linalg",)
     valid_for = staticmethod(exact.valid_for)
     size = staticmethod(exact.exact_band)
-    cost = staticmethod(cost_law.cost)
+    features = staticmethod(cost_law.features)
 
     def error_bound(self, camera: Camera, geometry: Geometry) -> float:
         """None on the axis: it is what the others are measured by. Off it spherical waves are."""
@@ -176,7 +189,7 @@ class ExactHarmonics(Model):
     libraries = ("scipy.fft", "scipy.sparse")
     valid_for = staticmethod(harmonics.valid_for)
     size = staticmethod(harmonic_sizing.harmonic_band)
-    cost = staticmethod(harmonic_cost.cost)
+    features = staticmethod(harmonic_cost.features)
 
     def error_bound(self, camera: Camera, geometry: Geometry) -> float:
         """None: it is what the others are measured by."""
@@ -189,7 +202,7 @@ class ExactOpenings(Model):
     name, kind, lenslets = "exact, openings", "exact", openings.OpenLenslets
     valid_for = staticmethod(openings.valid_for)
     size = staticmethod(openings.opening_band)
-    cost = staticmethod(openings.cost)
+    features = staticmethod(openings.features)
 
     def error_bound(self, camera: Camera, geometry: Geometry) -> float:
         """As of ExactLowRank."""

@@ -62,7 +62,7 @@ def changed(code, copy, file, old, new):
             f"{PROPAGATION}/exact/prolate.py",
             "return ",
             "return 2 * ",
-            [NAMES[3], NAMES[5]],
+            NAMES[3:4],
         ),
         (f"{PROPAGATION}/exact/debye.py", "return ", "return 2 * ", NAMES[3:]),
         (f"{PROPAGATION}/harmonics/pixels.py", "return ", "return 2 * ", NAMES[4:5]),
@@ -83,7 +83,7 @@ def test_a_change_of_what_computes_is_seen(code, copy, file, old, new, models):
         (f"{PROPAGATION}/response.py", "TAIL = 6", "TAIL = 7"),
         (f"{PROPAGATION}/costs.toml", "[", "# measured again\n["),
         (f"{PROPAGATION}/ray/rays.py", '"""', '"""Words. '),
-        (f"{PROPAGATION}/ray/rays.py", "def cost(", "def cost(_=0, *, "),
+        (f"{PROPAGATION}/ray/rays.py", "def features(", "def features(_=0, *, "),
     ],
 )
 def test_what_does_not_compute_changes_nothing(code, copy, file, old, new):

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from plenocli.forward.propagation.costs import Cost, Features, law, summed
+from plenocli.forward.propagation.costs import Features, summed
 from plenocli.forward.propagation.exact.oblique import orders_for
 from plenocli.forward.propagation.exact.term_counts import (
     MANY_CELLS,
@@ -89,33 +89,21 @@ class _Sizes:
         return sum(kind.count for kind in self.kinds)
 
 
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix.
-
-    band: an ExactBand;
-    shape: (band, superpixel, pixel, point) of it;
-    double: whether its fields have double precision.
+def features(
+    camera: Camera,
+    geometry: Geometry,
+    band: BandPlan,
+    shape: tuple[int, ...],
+    double: bool,
+    numbers: TermLaw | None = None,
+) -> Features:
+    """What a matrix consists of, as Model.features; `numbers` of the laws of terms instead of the
+    usual ones.
 
     Raises NumericsError where the superpixels beside the lenslet's own are expected to have more
     terms than a sketch may hold.
     """
     assert isinstance(band, ExactBand)
-    return law("exact, low rank").cost(features(camera, geometry, band, shape, double))
-
-
-def features(
-    camera: Camera,
-    geometry: Geometry,
-    band: ExactBand,
-    shape: tuple[int, ...],
-    double: bool,
-    numbers: TermLaw | None = None,
-) -> Features:
-    """What a matrix consists of, as `cost`; `numbers` of the laws of terms instead of the usual
-    ones.
-    """
     n = numbers or term_law()
     oblique = geometry.chief != (0.0, 0.0)
     even, item = is_symmetric(camera) and not oblique, 16 if double else 8

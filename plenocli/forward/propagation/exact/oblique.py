@@ -53,6 +53,8 @@ ALIKE = 1e-5
 """Relative difference of fields that are mirror images."""
 SHARP = 1e-6
 """Blur of a point, in lenslets, below which it is in focus."""
+FINER = 10.0
+"""By how much finer a series ends than singular vectors are cut: all of it falls on one column."""
 SKETCH = 64
 """Columns of the first sketch of a field's singular vectors."""
 SLAB = 1 << 20
@@ -118,13 +120,15 @@ def oblique_field(
     places, share = gauss(orders)
     fields = _Fields(camera, g, half, t, tolerance)
     root = np.sqrt(w * half)
-    matrix = np.empty((orders, count, orders, count), complex)
+    blocks = np.empty((orders, count, orders, count), complex)
     for (i, y), (j, x) in product(enumerate(places * scale), repeat=2):
         weight = math.sqrt(share[i] * share[j]) / 2
-        matrix[i, :, j] = fields.of((y, x)) * (weight * root[:, None] * root)
-    matrix = matrix.reshape(orders * count, -1)
+        blocks[i, :, j] = fields.of((y, x)) * (weight * root[:, None] * root)
+    matrix = blocks.reshape(orders * count, -1)
     unit = np.eye(len(matrix), dtype=complex)
-    factors = Product([matrix], [unit], {(0, 0): unit}, False).factors(tolerance, SKETCH)
+    # at an end of its interval a polynomial may be `orders` times its root mean square
+    cut = tolerance / orders
+    factors = Product([matrix], [unit], {(0, 0): unit}, False).factors(cut, SKETCH)
     project = legendre(t, count, 1).T * w * ((2 * np.arange(count) + 1) / 2)[:, None]
     onto = _of_points(places, orders).T * np.sqrt(share / 2)
     rows, columns = (
@@ -139,7 +143,7 @@ def oblique_field(
         columns=columns,
         even=False,
         symmetry=fields.symmetry,
-        tail=tolerance,
+        tail=cut,
         orders=orders,
         scale=scale,
     )
@@ -164,7 +168,8 @@ def orders_for(geometry: Geometry, tolerance: float) -> int:
         return 1
     turns = _sizes(geometry)[2]
     return next(
-        (n for n in range(1, MOST_ORDERS) if _interpolated(turns, n) < tolerance), MOST_ORDERS
+        (n for n in range(1, MOST_ORDERS) if FINER * _interpolated(turns, n) < tolerance),
+        MOST_ORDERS,
     )
 
 
@@ -187,9 +192,9 @@ def _sizes(geometry: Geometry) -> tuple[float, float, float]:
     waves, t = _Waves(g), np.linspace(-1, 1, 3)
     reach = g.D2 / 2 * (1 + g.row_spacing) / 2
     found = []
-    for p in product((-reach, 0.0, reach), repeat=2):
+    for p, q in product((-reach, 0.0, reach), repeat=2):
         # places on the lenslet, from the point
-        exact = waves.exponent(p, reach * t - p[0], reach * t - p[1])
+        exact = waves.exponent((p, q), reach * t - p, reach * t - q)
         fit = np.tensordot(waves.powers, np.tensordot(waves.fit, exact, 1), 1)
         found.append((np.abs(exact - fit), np.abs(exact), exact))
     missed, size, exact = (np.array(a) for a in zip(*found))
@@ -265,14 +270,14 @@ class _Fields:
         self._waves = _Waves(g)
         phase = g.k * self._waves.steepest * half
         self._nodes, self._node_weights = gauss(math.ceil(phase + 5 * math.cbrt(phase) + 12))
-        # in E's size everywhere, of which the far ends hold little light
-        ends = np.array([-half, 0.0, half])
+        # as E is on the lenslets; no field is asked for beyond them
+        places = (half - g.D2 / 2) * np.linspace(-1, 1, 3)
         size = max(
-            float(np.abs(self._waves.exponent(p, ends, ends)).max())
-            for p in product((-g.D2 / 2, g.D2 / 2), repeat=2)
+            float(np.abs(self._waves.exponent((p, q), places - p, places - q)).max())
+            for p, q in product((-g.D2 / 2, g.D2 / 2), repeat=2)
         )
         self._powers = next(
-            (n for n in range(MOST_POWERS) if _truncated(size, n) < tolerance), MOST_POWERS
+            (n for n in range(MOST_POWERS) if FINER * _truncated(size, n) < tolerance), MOST_POWERS
         )
         wave = np.exp(1j * phase * np.outer(t, self._nodes))
         self._along = [wave * self._nodes**n for n in range(self._powers + 1)]

@@ -27,7 +27,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
-from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.costs import Features
 from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_cubed
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.oblique import at_points, oblique_field, orders_for
@@ -348,23 +348,11 @@ def _count(geometry: Geometry, parabolic: bool, offset: Place, lenslet: Place) -
     return nodes_for((1 if g.lenslet_shape == "square" else 2) * g.k * most)
 
 
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix.
-
-    band: an OpeningBand;
-    shape: (band, superpixel, pixel, point) of it;
-    double: whether its fields have double precision.
-    """
-    assert isinstance(band, OpeningBand)
-    return law("exact, openings").cost(features(camera, geometry, band, shape, double))
-
-
 def features(
-    camera: Camera, geometry: Geometry, band: OpeningBand, shape: tuple[int, ...], double: bool
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
 ) -> Features:
-    """What a matrix consists of, as `cost`."""
+    """What a matrix consists of, as Model.features."""
+    assert isinstance(band, OpeningBand)
     g, superpixels, oblique = geometry, superpixels_of(shape[1]), geometry.chief != (0.0, 0.0)
     parabolic, r = camera.lenslet_array.profile == "parabolic", band.kernel_terms
     lit = columns(camera, g, shape) / shape[1]

@@ -233,46 +233,22 @@ def _lens_terms(
     come: ObliqueWave | None,
     symmetric: bool,
 ) -> tuple[AxisFunctions, np.ndarray, AxisFunctions, float]:
-    """The lens's functions of y and of x, their core, and the phase (rad) that they run
-    through per half width.
+    """What the lens, and the oblique wave of a chief ray, do along both axes together: functions of
+    y and of x, their core, and the phase (rad) that they run through per half width.
     """
-    if come is not None:
-        return _oblique_lens_terms(reach_x, f, k, tolerance, come, symmetric)
-    if f is None:
-        one = np.ones((1, 1))
-        return (lambda x: np.ones((len(x), 1))), one, (lambda x: np.ones((len(x), 1))), 0.0
-    slope = k * f * (reach_x / f) ** 4 / 2
-    t, _ = gauss(_nodes(slope))
-    basis, core, _ = split(
-        ell(reach_x * t[:, None], reach_x * t, f, k) / len(t), tolerance, symmetric=True
-    )
-    series = _series(t) @ (basis * np.sqrt(len(t)))
-
-    def functions(grid: np.ndarray) -> np.ndarray:
-        return legendre(grid, len(t), 1) @ series
-
-    return functions, core, functions, slope
-
-
-def _oblique_lens_terms(
-    reach_x: float,
-    f: float | None,
-    k: float,
-    tolerance: float,
-    come: ObliqueWave,
-    symmetric: bool,
-) -> tuple[AxisFunctions, np.ndarray, AxisFunctions, float]:
-    """As _lens_terms, with what the oblique wave of the chief ray does along both axes together."""
     slope = 0.0 if f is None else k * f * (reach_x / f) ** 4 / 2
-    rim = reach_x * np.linspace(-1, 1, 5)
-    # a path that is all but a product is steepest at its corners
-    slope += k * 2 * np.ptp(come.together(rim[:, None], rim))
+    if come is not None:
+        rim = reach_x * np.linspace(-1, 1, 5)
+        # a path that is all but a product is steepest at its corners
+        slope += k * 2 * np.ptp(come.together(rim[:, None], rim))
     t, _ = gauss(_nodes(slope))
     y, x = reach_x * t[:, None], reach_x * t
-    matrix = np.exp(1j * k * come.together(y, x)) / len(t)
+    matrix = np.ones((len(t), len(t))) / len(t)
+    if come is not None:
+        matrix = matrix * np.exp(1j * k * come.together(y, x))
     if f is not None:
         matrix = matrix * ell(y, x, f, k)
-    left, core, right = split(matrix, tolerance, symmetric)
+    left, core, right = split(matrix, tolerance, symmetric or come is None)
     series = [_series(t) @ (basis * np.sqrt(len(t))) for basis in (left, right)]
 
     def functions(coefficients: np.ndarray) -> AxisFunctions:

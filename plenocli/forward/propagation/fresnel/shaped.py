@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss, nodes_for, smooth_nodes
-from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.costs import Features
 from plenocli.forward.propagation.fresnel.array_to_sensor import (
     lenslet_kernel,
     pixel_energy,
@@ -496,21 +496,10 @@ def _chord_counts(
     return 1, count, 2 * count, pieces((2 * half - half / 2 * (1 - t)) / math.sqrt(3))
 
 
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix.
-
-    shape: (band, superpixel, pixel, point) of it;
-    double: whether its fields have double precision.
-    """
-    return law("fresnel, triple product").cost(features(camera, geometry, band, shape, double))
-
-
 def features(
     camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
 ) -> Features:
-    """What a matrix consists of, as `cost`: counted from the node rules, without the points that
+    """What a matrix consists of, counted from the node rules, without the points that
     symmetry gives.
     """
     grid, superpixels, item = superpixels_of(shape[1]), shape[1], 16 if double else 8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.costs import Features
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.square import narrows
 from plenocli.forward.propagation.plan import BandPlan
@@ -21,21 +21,10 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix.
-
-    shape: (band, superpixel, pixel, point) of it;
-    double: whether its fields have double precision.
-    """
-    return law("fresnel, low rank").cost(features(camera, geometry, band, shape, double))
-
-
 def features(
     camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
 ) -> Features:
-    """What a matrix consists of, as `cost`: the tables that SquareLenslets fills and the products
+    """What a matrix consists of: the tables that SquareLenslets fills and the products
     of its columns.
     """
     grid = superpixels_of(shape[1])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.costs import Features
 from plenocli.forward.propagation.harmonics.corners import SIDES
 from plenocli.forward.propagation.harmonics.sizing import HarmonicBand
 from plenocli.forward.propagation.sampling import distinct
@@ -18,23 +18,11 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.plan import BandPlan
 
 
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix.
-
-    band: a HarmonicBand;
-    shape: (band, superpixel, pixel, point) of it;
-    double: whether its fields have double precision.
-    """
-    assert isinstance(band, HarmonicBand)
-    return law("exact, harmonics").cost(features(camera, geometry, band, shape, double))
-
-
 def features(
-    camera: Camera, geometry: Geometry, band: HarmonicBand, shape: tuple[int, ...], double: bool
+    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
 ) -> Features:
-    """What a matrix consists of, as `cost`."""
+    """What a matrix consists of, as Model.features."""
+    assert isinstance(band, HarmonicBand)
     points = distinct(camera, geometry, shape)[0]
     # corners take every point by itself
     lit = points if band.corner_orders else min(points, distances(geometry))

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
-from plenocli.forward.propagation.costs import Cost, Features, law
+from plenocli.forward.propagation.costs import Features, law
 from plenocli.forward.propagation.lenslet_fields import (
     FieldNotes,
     LensletFields,
@@ -115,13 +115,6 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
     focused = math.hypot(0.9 / (cells * (1 + fit)) ** 0.7, 2 / (1 + 5 * border) / (1 + fit / 4))
     blurred = (1 + 2 / cells) / (1 + fit) if geometry.blur * cells > geometry.D2 else 0.0
     return min(2.0, max(focused, blurred))
-
-
-def cost(
-    camera: Camera, geometry: Geometry, band: BandPlan, shape: tuple[int, ...], double: bool
-) -> Cost:
-    """The Cost of a matrix of `shape` (band, superpixel, pixel, point)."""
-    return law("rays").cost(features(camera, geometry, band, shape, double))
 
 
 def features(

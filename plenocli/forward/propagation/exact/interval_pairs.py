@@ -35,7 +35,7 @@ ROWS_AT_ONCE = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SensorSide:
     """How light goes to the superpixel s along one axis, to all lenslets alike.
 

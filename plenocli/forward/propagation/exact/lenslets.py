@@ -225,7 +225,11 @@ class ExactSquareLenslets(LensletFields):
                 )
             points = self._points(s, axis)
             self._sensor_sides[s, axis] = SensorSide(
-                u, np.sqrt(w), points, edge_emphasis(g, points), modes
+                u=u,
+                root=np.sqrt(w),
+                points=points,
+                emphasis=edge_emphasis(g, points),
+                modes=modes,
             )
         return self._sensor_sides[s, axis]
 

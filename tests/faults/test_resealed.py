@@ -120,6 +120,7 @@ IMPOSSIBLE = [
     ("dictionary.h5", BY_DICTIONARY, values("dictionary/atoms", lambda v: v * 0 + 1e300)),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "lambda", -1.0)),
     ("image.h5", SCORE, values("image/value", lambda v: v * 0 + 1e300)),
+    ("capture.h5", "view X -o o.html", other("capture/mosaic", lambda v: v[:, :5])),
     ("pif.h5", SIMULATE, values("pif/pixel_shape", lambda v: v * 0 + 1)),
     ("pif.h5", "show X -o o.png", values("pif/pixel_shape", lambda v: v * 0 + 1)),
     ("dictionary.h5", RESUME, other("dictionary/state/atoms", lambda v: v[:, :1])),

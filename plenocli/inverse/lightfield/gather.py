@@ -189,9 +189,9 @@ def _along_tiles(shot: Capture, some: np.ndarray | None) -> tuple[Samples, float
     them have in common, which stands for a white image.
     """
     size = shot.grid.shape if shot.grid else None
-    if size is None:
+    if size is None or shot.shape[0] % size[0] or shot.shape[1] % size[1]:
         raise InputError(
-            "does not say where its lenslets are",
+            "does not say where its lenslets are, or holds no whole number of them",
             shot.metadata.path,
             "give --calibration (from calibrate) with the white image of this camera",
         )

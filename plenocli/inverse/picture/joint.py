@@ -10,6 +10,10 @@ from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import error_bars
 from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
 from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
+
+BORDER_STEPS = 4
+"""Solutions over all lenslets, of which the first is exact but at the array's border."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +32,51 @@ class JointEstimate:
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
     """LMMSE over 3x3 lenslets, the contrast of each its own. sigma is what each lenslet's own light
     leaves open (docs/model.md, "Spatial reconstruction").
+
+    Of several bands every lenslet's brightness in each is free, as in demultiplexing: scenes are
+    not as alike in them as surfaces under one photograph.
     """
     own = estimators.prior.lmmse(data.known_sigma, data.scene)
-    x, _, scale = estimators.prior.joint(data.known_sigma, data.scene).apply(data.y, data.common)
-    y = own_light(estimators, data.y, x) if estimators.coupled else data.y
+    joint, y = estimators.prior.joint(data.known_sigma, data.scene), data.y
+    if estimators.coupled and len(estimators.system.bands) > 1:
+        brightness, seen = _even_light(estimators, data, joint.mean)
+        x, _, scale = joint.apply(y - seen, data.common)
+        x += np.repeat(brightness, x.shape[-1] // brightness.shape[-1], axis=-1)
+    else:
+        x, _, scale = joint.apply(y, data.common)
+    y = own_light(estimators, y, x) if estimators.coupled else y
     apart, left = error_bars.posterior(own, y, estimators.system.object_shape, data.common)
     return JointEstimate(
         value=x,
         sigma=error_bars.JOINTLY * error_bars.about(x - apart, left),
         scale=float(np.exp(np.mean(np.log(scale)))),
     )
+
+
+def _even_light(
+    estimators: Estimators, data: Superpixels, mean: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the brightnesses (lenslet_row, lenslet_column, band) of lenslets differ from `mean`, by
+    least squares over all lenslets, drawn to it where bands are hardly told apart, and the
+    superpixels that they make.
+    """
+    system, count = estimators.system, len(estimators.system.bands)
+    blocks = system.even_blocks
+    prior = PointPrior(
+        mean=np.zeros(count),
+        inverse=np.linalg.inv(estimators.prior.bands() + 1e-4 * np.eye(count)),
+        rho=0.0,
+        points=1,
+    )
+    variance = np.full(blocks.shape[1], data.known_sigma**2)
+    lattice = LatticeSystem(blocks, system.offsets, variance, data.y.shape[:2], prior)
+    left = data.y - mean * blocks.sum(axis=(0, 2))
+    found, seen = np.zeros((*data.y.shape[:2], count)), np.zeros_like(left)
+    for _ in range(BORDER_STEPS):
+        step = lattice.step(lattice.directions(left - seen), lattice.mirrored(found))
+        found = found + step
+        seen = lattice.forward(lattice.mirrored(found))
+    return found, seen
 
 
 def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -202,7 +202,7 @@ class Demultiplexer:
     def _crosstalk(
         self, c: LensletResponses, light: NeighbourLight, values: np.ndarray, noise: Noise
     ) -> Crosstalk:
-        return Crosstalk(c, light, values, noise, prior=self.prior, ratio=self.ratio)
+        return Crosstalk(c, light, values, noise, ratio=self.ratio)
 
     def _believed(
         self,

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 
 BLOCK_NUMBERS = 90_000, 45_000
 """Pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache."""
-COMPILED_NUMBERS = 360_000
-"""Of a block that is compiled, where only a superpixel must stay there and calls cost more."""
-COMPILED_FROM = 4_000_000
-"""Pixels from which importing numba pays."""
 FACTOR_NUMBERS = 250_000
 """Numbers of responses that are factored together."""
 STREAMED_NUMBERS = 2_000_000
@@ -233,7 +229,6 @@ def normal_equations(
     radiance: np.ndarray | None = None,
     doubt: np.ndarray | None = None,
     sandwich: bool = False,
-    among: int | None = None,
 ) -> NormalEquations:
     """Normal equations of superpixels.
 
@@ -246,7 +241,6 @@ def normal_equations(
     radiance: (lenslet, band), or None.
     doubt: (pixel, band), variance of the response that counts in chi alone.
     sandwich: whether `spread` is wanted.
-    among: superpixels of which these are a part; None: all.
     """
     bands = factored.r.shape[-1]
     basis = (_SharedBasis if factored.shared else _OwnBases)(factored.basis)
@@ -254,34 +248,11 @@ def normal_equations(
     out = NormalEquations.unfilled(total, bands, factored.basis.shape[-1], sandwich)
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
-    kernel = (
-        None
-        if factored.shared or variance is None or radiance is not None or doubt is not None
-        else _kernel((among or total) * factored.basis.shape[-1])
-    )
-    step = max(
-        1,
-        (BLOCK_NUMBERS[not factored.shared] if kernel is None else COMPILED_NUMBERS)
-        // factored.basis.shape[-1],
-    )
+    step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.basis.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
-        x = cut(part)
-        if (
-            kernel is None
-            or variance is None
-            or not _compiled(kernel, factored, part, x, variance, out)
-        ):
-            x = x if kernel is None else cut(part)
-            _block(
-                factored,
-                basis,
-                part,
-                x,
-                variance,
-                None if radiance is None else radiance[part],
-                out,
-            )
+        given = None if radiance is None else radiance[part]
+        _block(factored, basis, part, cut(part), variance, given, out)
     return out
 
 
@@ -309,7 +280,6 @@ def streamed_equations(
                 factored,
                 lambda inner: cut(slice(first + inner.start, first + inner.stop)),
                 part.stop - first,
-                among=total,
                 **own,
             )
         )
@@ -322,51 +292,6 @@ def streamed_equations(
         for one in fields(NormalEquations)
     }
     return FactoredResponses(q=None, r=r, used=None, sound=sound), NormalEquations(**joined)
-
-
-def _kernel(pixels: int) -> Callable[..., None] | None:
-    """The compiled sums where there is enough to do for them, and numba; or None.
-
-    One basis for all is as quick without.
-    """
-    if pixels < COMPILED_FROM:
-        return None
-    from plenocli.inverse.spectra.factored_kernel import superpixels
-
-    return superpixels
-
-
-def _compiled(
-    kernel: Callable[..., None],
-    factored: FactoredResponses,
-    part: slice,
-    x: np.ndarray,
-    variance: _PixelVariance,
-    out: NormalEquations,
-) -> bool:
-    """Fill `out` for one block by the compiled kernel; False where some lenslet lacks pixels,
-    which is left to _block.
-    """
-    blank = factored.blanks(part)
-    if blank is not None:
-        x[blank] = 0
-    known = variance.known if variance.known is not None else np.empty((0, x.shape[1]), np.float32)
-    sandwich = out.spread is not None
-    kernel(
-        factored.basis[part],
-        factored.inverse[part],
-        x,
-        np.float32(variance.gain),
-        variance.read,
-        known,
-        sandwich,
-        out.unweighted[part],
-        out.normal[part],
-        out.right[part],
-        out.normal[part] if out.spread is None else out.spread[part],
-        out.chi[part],
-    )
-    return not np.isnan(out.unweighted[part]).any()
 
 
 def _block(

@@ -15,14 +15,6 @@ NOISE = Noise(gain=GAIN, read_variance=READ)
 PRIOR = np.full(BANDS, 0.4), 0.04 * (0.6 * np.ones((BANDS, BANDS)) + 0.4 * np.eye(BANDS))
 
 
-@pytest.fixture(params=["arrays", "compiled"], autouse=True)
-def engine(request, monkeypatch):
-    """Both ways to the same sums."""
-    if request.param == "compiled":
-        pytest.importorskip("numba")
-        monkeypatch.setattr(factored_module, "COMPILED_FROM", 0)
-
-
 @pytest.fixture(params=["shared", "each"])
 def case(request):
     """(response, values, rng) of lenslets with one F or one each, some of whose pixels the

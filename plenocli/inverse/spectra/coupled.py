@@ -28,9 +28,9 @@ MOST = 2.0
 TURNS = 3
 KNOWN_TO = 0.035
 """Share of what neighbours' light changes, over the array, by which the change may be wrong."""
-FINER = 4.0
-"""By which more points than three a side would change an answer less than three instead of one
-did: edges between points.
+FINER = 2.2
+"""By which more points than three a side would change the answers of a lenslet and those about it
+(rms) less than three instead of one did: edges between points.
 """
 
 
@@ -127,6 +127,8 @@ def fine(capture: LatticeCapture, first: LatticeAnswer) -> LatticeAnswer:
 
     first: by `coupled`.
     """
+    from scipy.ndimage import uniform_filter
+
     light = first.light
     blocks = light.fine(capture.response)
     blocks = blocks.reshape(*blocks.shape[:2], -1)
@@ -134,8 +136,8 @@ def fine(capture: LatticeCapture, first: LatticeAnswer) -> LatticeAnswer:
     system = LatticeSystem(blocks, light.offsets, variance, first.value.shape[:2], _prior(first))
     points, left = _solved(system, capture, np.tile(first.value, (1, 1, POINTS**2)))
     found = _answer(system, capture, points, left, light)
-    between = (found.value - first.value) / FINER
-    return replace(found, sigma=np.hypot(found.sigma, between))
+    between = uniform_filter((found.value - first.value) ** 2, (3, 3, 0), mode="nearest")
+    return replace(found, sigma=np.sqrt(found.sigma**2 + between / FINER**2))
 
 
 def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAnswer) -> bool:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.errors import InputError
 from plenocli.evaluation.designs import DesignTable, Metric, Parameter
 
 if TYPE_CHECKING:
@@ -38,10 +39,17 @@ def designs_of(artefact: "Artefact") -> DesignTable:
     """The table that an artefact of a sweep holds."""
     data, attrs = artefact.data, artefact.attrs["sweep"]
     status = data["sweep/status"]
+    try:
+        parameters = tuple(Parameter(**told) for told in attrs["parameters"])
+        metrics = tuple(Metric(**told) for told in attrs["metrics"])
+        objectives = dict(attrs["objectives"])
+    except (KeyError, TypeError, ValueError) as error:
+        what = f"a table of designs does not say what it holds ({type(error).__name__}: {error})"
+        raise InputError(what, fix="make it again: plenocli sweep") from None
     return DesignTable(
-        parameters=tuple(Parameter(**told) for told in attrs["parameters"]),
-        metrics=tuple(Metric(**told) for told in attrs["metrics"]),
-        objectives=dict(attrs["objectives"]),
+        parameters=parameters,
+        metrics=metrics,
+        objectives=objectives,
         values=data["sweep/parameter"],
         figures=data.get("sweep/metric", np.zeros((len(status), 0))),
         status=status,

@@ -23,7 +23,7 @@ from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.solvers.least_squares import decompose
 from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
 from plenocli.inverse.picture.trust.excess import even_light, with_excess
-from plenocli.inverse.picture.trust.moved_light import motions, moved_rest
+from plenocli.inverse.picture.trust.moved_light import motions, moved_even_light, moved_rest
 from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
 from plenocli.inverse.sparse.dictionary import Dictionary, Learner, Settings
 from tests.reference.scenes import scenes
@@ -240,6 +240,38 @@ def test_moved_light_is_found_far_below_the_noise(name, snr_db):
     lmmse = shared.prior.lmmse(data.sigma, None)
     assert moved_rest(shared.system, shared.svd, lmmse, y, data.sigma) > 3
     assert psnr(made("lmmse", data, shared)) > psnr(made("block-mean", data)) - 0.2
+
+
+@pytest.mark.parametrize("snr_db", [20, 30])
+def test_a_small_shift_hidden_in_noise_costs_half_a_decibel_at_most(snr_db):
+    """Nothing outside the range tells a shift of 0.05 px at 20 dB: even light that moved does."""
+    spectrum = np.fft.fft2(matrix().reshape(26, 26, -1), axes=(0, 1))
+    f = np.fft.fftfreq(26)
+    turn = np.exp(-2j * np.pi * 0.05 * (f[:, None] - f))[:, :, None]
+    off = np.fft.ifft2(spectrum * turn, axes=(0, 1)).real.reshape(matrix().shape)
+    shared, smooth = estimators(), np.linspace(0.2, 0.8, 20 * COUNT)
+    picture = np.sqrt(np.outer(smooth, 1 + 0.3 * np.sin(7 * smooth)))
+    for blocks in (scene(), to_blocks(picture, SHAPE)):
+        error, found = [], []
+        for y in (blocks @ off.T, blocks @ matrix().T):
+            sigma = np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20)
+            y = y + sigma * np.random.default_rng(3).standard_normal(y.shape)
+            data = Superpixels(y=y, noise=Noise.of_sigma(sigma))
+            lmmse, flat = shared.prior.lmmse(sigma, None), y.reshape(COUNT**2, -1).T
+            found.append(moved_even_light(shared.system, lmmse, flat)[1])
+            error.append(np.mean((made("lmmse", data, shared).value - blocks) ** 2))
+        assert found[0] > 6 and found[1] < 3
+        assert error[0] < 10**0.05 * error[1]
+
+
+def test_a_scene_in_step_with_the_lenslets_is_no_light_that_moved():
+    shared = estimators()
+    for name in ("stripes of 0.5 lenslets", "stripes of 1 lenslets", "sine of a lenslet"):
+        y = to_blocks(scenes(20, COUNT)[name], SHAPE).reshape(COUNT**2, -1) @ matrix().T
+        sigma = np.sqrt(np.mean(y**2)) / 10
+        y = y + sigma * np.random.default_rng(2).standard_normal(y.shape)
+        pattern, found = moved_even_light(shared.system, shared.prior.lmmse(sigma, None), y.T)
+        assert found == 0 and not pattern.any(), name
 
 
 def test_what_a_matrix_spoils_is_told_from_what_a_scene_shows():

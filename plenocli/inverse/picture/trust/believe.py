@@ -25,11 +25,12 @@ from plenocli.inverse.picture.trust.continuity import (
     detail_jumps,
     group_factors,
     groups,
+    jumps,
     pieces,
     relative_factor,
 )
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
-from plenocli.inverse.picture.trust.moved_light import moved_rest
+from plenocli.inverse.picture.trust.moved_light import moved_even_light, moved_rest
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
 
@@ -85,7 +86,9 @@ class Belief:
     raised: root mean square over the coordinates in use of the noise over that of a pixel.
     moved: standard deviations of light that moved, see `moved_rest`.
     pattern: (pixel,) what even light of brightness 1 makes beside what the matrix says, None where
-        it is believed.
+        that is nothing.
+    displaced: standard deviations of even light that moved, see `moved_even_light`; 0 where it is
+        not taken out.
     """
 
     level: NoiseLevel
@@ -96,6 +99,7 @@ class Belief:
     raised: float = 1.0
     moved: float = 0.0
     pattern: np.ndarray | None = None
+    displaced: float = 0.0
 
     def cleared(self, y: np.ndarray) -> np.ndarray:
         """Superpixels y (.., pixel) without the pattern."""
@@ -123,6 +127,14 @@ def believe(
     lmmse = estimators.prior.lmmse(level.sigma, scene)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = _Judge.of(estimators, lmmse, y, scene)
+    shown, displaced = None, 0.0
+    if judge is not None and not coupled:
+        found_even, displaced = moved_even_light(estimators.system, lmmse, stacked)
+        if displaced > SURE and judge.goes_on(lmmse, found_even) < CONTINUOUS:
+            shown, y = found_even, without_pattern(lmmse, y, found_even)
+            stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
+        else:
+            displaced = 0.0
     first = None if judge is None else judge.of_lmmse(lmmse)
     loud = float(np.sqrt(np.mean(y**2)))
     beyond = (
@@ -152,6 +164,8 @@ def believe(
             right=True,
             continuity=None if first is None else first.relative,
             reference=None if first is None or rough else first.reference,
+            pattern=shown,
+            displaced=displaced,
         )
     pattern = even_light(lmmse, stacked)
     y = without_pattern(lmmse, y, pattern)
@@ -176,7 +190,8 @@ def believe(
         reference=None if now is None else now.reference,
         raised=float(np.sqrt(power)) / level.sigma,
         moved=moved,
-        pattern=pattern,
+        pattern=pattern if shown is None else pattern + shown,
+        displaced=displaced,
     )
 
 
@@ -247,6 +262,20 @@ class _Judge:
             noise=rng.standard_normal(clear.shape),
             shape=system.object_shape,
         )
+
+    def goes_on(self, lmmse: Lmmse, pattern: np.ndarray) -> float:
+        """The factor on what `pattern` (pixel,) times each lenslet's brightness shows that makes
+        the picture's jumps least: 0 where that is no part of a continuous scene.
+        """
+        y = self.y.reshape(-1, self.y.shape[-1]).T
+        scales = lmmse.scales(y)
+        shown = np.outer(lmmse.analysis @ pattern, lmmse.brightness(y))
+        shown = lmmse.gain @ lmmse.shrunk(shown, scales)
+        level, detail = (
+            jumps(x.T.reshape(*self.y.shape[:2], -1), self.shape)
+            for x in (lmmse.apply(y, scales) - shown, shown)
+        )
+        return Jumps(level=level, detail=detail[:, None]).factor
 
     def of_lmmse(self, lmmse: Lmmse) -> _Verdict:
         """Noise of the photographs is that of a pixel, and in the coordinates what is believed."""

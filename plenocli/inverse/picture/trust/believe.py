@@ -32,7 +32,7 @@ from plenocli.inverse.picture.trust.continuity import (
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
 from plenocli.inverse.picture.trust.moved_light import moved_even_light, moved_rest
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
-from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix, steady_rest
+from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix
 
 CONTINUOUS = 0.5
 """Factor relative to photographs under the right matrix from which on a picture is believed: of
@@ -53,10 +53,6 @@ SURE, HINT = 4.0, 2.5
 """Standard deviations of chance from which on noise found over the capture's own, or light that
 moved, speaks against the matrix by itself, and from which on beside a picture that may not go on
 across borders.
-"""
-STEADY = 5.0
-"""Standard deviations from which on light that goes with brightness speaks against the matrix by
-itself: what a noisy white image leaves has 4.7.
 """
 CHANCE = 1.0
 """Standard deviations of chance that a factor is allowed where nothing else is found, and that are
@@ -142,14 +138,12 @@ def believe(
     )
     chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
     found = beyond > MISTOLD + SURE * chance or model_error * loud > level.sigma
-    steady = 0.0 if coupled else steady_rest(estimators.svd, stacked, level.sigma)
     moved = 0.0
     if not coupled:
         moved = moved_rest(estimators.system, estimators.svd, lmmse, stacked, level.sigma)
     found = found or moved > SURE
     quiet = beyond <= HINT * chance and moved <= HINT
-    doubtful = not quiet or steady > HINT
-    least = None if first is None else first.relative if doubtful else first.most
+    least = None if first is None else first.most if quiet else first.relative
     continuous = least is None or least >= CONTINUOUS
     rough = (
         first is not None
@@ -157,7 +151,7 @@ def believe(
         and quiet
         and _scene_jumps(estimators.svd, lmmse, stacked, level, first)
     )
-    if not found and steady <= STEADY and (continuous or rough):
+    if not found and (continuous or rough):
         return Belief(
             level=level,
             lmmse=lmmse,
@@ -172,9 +166,7 @@ def believe(
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
-    raised = lmmse
-    if found or not continuous:
-        raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
+    raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
     now = None if judge is None else judge.of_lmmse(raised)
     for _ in range(ROUNDS):
         if judge is None or now is None or now.relative >= CONTINUOUS or not len(raised.power):

@@ -42,32 +42,6 @@ def reached(svd: Svd, energy: float, sigma: float) -> np.ndarray:
     return svd.u[:, : min(svd.rank(1e-6), loud)]
 
 
-def steady_rest(svd: Svd, y: np.ndarray, sigma: float) -> float:
-    """How far what no object gives goes with the brightness of lenslets, in standard deviations.
-
-    An error of the matrix leaves a like pattern in every lenslet, noise does not: only products of
-    two different lenslets are summed, whose mean is 0 whatever the noise of each.
-
-    svd: of the own block.
-    y: (pixel, signal) superpixels.
-    sigma: noise of a pixel.
-    """
-    even = svd.s * svd.vt.sum(axis=1)
-    energy = float(np.sum(y**2)) / y.shape[1] / float(even @ even) * svd.vt.shape[1]
-    basis = reached(svd, energy, sigma)
-    rest = y - basis @ (basis.T @ y)
-    bright = y.sum(axis=0)
-    weighted = rest * bright
-    each = np.sum(weighted**2, axis=0)
-    total = weighted.sum(axis=1)
-    common = float(total @ total) - float(each.sum())
-    left = max(len(svd.u) - basis.shape[1], 1)
-    # light far below the noise that is stated says nothing, however clean it is
-    each = np.maximum(each, left * sigma**2 * bright**2)
-    chance = 2 * (float(each.sum()) ** 2 - float(each @ each)) / left
-    return common / np.sqrt(chance) if chance > 0 else 0.0
-
-
 def spoilt_by_matrix(lmmse: Lmmse, y: np.ndarray) -> bool:
     """Whether the estimate from superpixels y (pixel, signal) is what a wrong matrix makes and no
     scene: a pattern in proportion to brightness, or much negative light.

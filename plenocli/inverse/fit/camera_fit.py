@@ -78,11 +78,6 @@ class CameraFit:
         pairs = np.argwhere(np.triu(np.abs(self.correlation) > TOGETHER, 1))
         return tuple((names[i], names[j]) for i, j in pairs)
 
-    @property
-    def unmeasured(self) -> tuple[str, ...]:
-        """Names of the parameters of which the captures say nothing new."""
-        return tuple(p.name for p in self.parameters if not p.measured)
-
     def as_json(self) -> dict[str, Any]:
         """The fields by name, without camera and matrix."""
         return {

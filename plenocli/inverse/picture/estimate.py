@@ -34,11 +34,6 @@ BRIGHTNESS = 0.2
 DEFECTIVE = 0.1
 """What defective pixels may add to the brightness before it is settled anew."""
 
-_DISPLACED = (
-    "the system matrix is not quite this camera's: in every lenslet even light is displaced a "
-    "little ({:.2g} standard deviations), which is taken out; --fit finds the camera that fits"
-)
-
 Explain = Callable[[np.ndarray, float, str | None], str | None]
 """(superpixels (lenslet_row, lenslet_column, pixel), their noise, scene) -> what may be wrong."""
 
@@ -135,19 +130,16 @@ def estimate(
         estimators, data = _at_unit(estimators, data, bright)
         unit *= bright
     settled = _settle(estimators, method, data, model_error)
-    belief, joint = settled.belief, settled.joint
+    belief, joint, own = settled.belief, settled.joint, settled.own
     data = replace(data, noise=Noise.of_sigma(belief.level.sigma))
     looked_through = estimators
     if belief.pattern is not None:
-        data, joint = replace(data, y=belief.cleared(data.y)), None
-        settled = replace(settled, own=belief.cleared(settled.own))
-    if belief.right and belief.displaced:
-        common("said of the matrix", lambda: note(_DISPLACED.format(belief.displaced)))
-    if not belief.right:
-        noise = belief.level.sigma
-        cause = None if explain is None else explain(settled.own, noise, data.scene)
+        cause = None if explain is None else explain(own, belief.level.sigma, data.scene)
         taken_away = estimators.coupled and estimators.overlap == 3
         _tell(belief, model_error, cause, coupled=taken_away)
+        data, joint = replace(data, y=belief.cleared(data.y)), None
+        own = belief.cleared(own)
+    if not belief.right:
         rows = belief.lmmse.whitening()
         looked_through = estimators.seen_through(rows)
         data = replace(data, y=data.y @ rows.T)
@@ -156,22 +148,22 @@ def estimate(
     if found.sigma is not None and not belief.right:
         # noise that was raised swallows contrast: the bars are no shorter than with the noise told
         told = estimators.prior.lmmse(belief.level.sigma, data.scene)
-        _, left = posterior(told, settled.own, estimators.system.object_shape, data.common)
+        _, left = posterior(told, own, estimators.system.object_shape, data.common)
         found = replace(found, sigma=np.maximum(found.sigma, left))
     kept = 1.0
     if guard:
         shape = estimators.system.object_shape
-        found, kept = guarded(found, settled.own, belief, shape, data.common)
+        found, kept = guarded(found, own, belief, shape, data.common)
     if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
         # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found
-        sigma = of_picture(estimators, data, settled.own, found.value)
+        sigma = of_picture(estimators, data, own, found.value)
         found = replace(found, sigma=sigma)
     if kept < 1:
         note(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
             "lenslet: more of it would not go on across the lenslets' borders"
         )
-    seen = data.common("seen", lambda: what_is_seen(looked_through, settled.own, belief.lmmse))
+    seen = data.common("seen", lambda: what_is_seen(looked_through, own, belief.lmmse))
     found = replace(found, trace=(*bare.findings, *found.trace))
     return _in_unit(found, Trusted.of(belief, kept, unit), unit), seen
 
@@ -292,7 +284,9 @@ def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: boo
             "what is left over is the picture's own light, displaced "
             f"({belief.moved:.2g} standard deviations)"
         )
-    if belief.continuity is not None:
+    if belief.displaced:
+        against.append(f"even light is displaced ({belief.displaced:.2g} standard deviations)")
+    if belief.continuity is not None and not belief.right:
         against.append(
             "across the lenslets' borders the picture goes on "
             f"{max(belief.continuity, 0):.2g} times as well as with a right matrix"

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
+from plenocli.inverse.picture.estimators import root_mean_square
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 
 PATCHES = (1, 2, 4)
@@ -114,13 +115,13 @@ def judge(
         for which in (inner, structured):
             at = out & which[..., None]
             if at.any():
-                errors = [_rms((one - y)[at]) / even.max() for one in made]
+                errors = [root_mean_square((one - y)[at]) / even.max() for one in made]
                 found.append(
                     HeldOut(
                         patch=patch,
                         pixels=int(np.count_nonzero(at)),
                         structured=which is structured,
-                        noise=_rms(1 / np.sqrt(weight[at])) / float(even.max()),
+                        noise=root_mean_square(1 / np.sqrt(weight[at])) / float(even.max()),
                         model=errors[0],
                         both=errors[1],
                         neighbours=errors[2],
@@ -174,7 +175,3 @@ def _block_mean(y: np.ndarray, weight: np.ndarray, even: np.ndarray) -> np.ndarr
     total = np.where(known, y, 0).sum(axis=2)
     white = np.where(known, even, 0).sum(axis=2)
     return np.divide(total, white, out=np.zeros_like(total), where=white > 0)[..., None] * even
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

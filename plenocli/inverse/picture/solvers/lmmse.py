@@ -85,17 +85,6 @@ class Lmmse:
         level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]
         return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
 
-    def expected(self, scale: float = 1.0) -> float:
-        """Root mean square error that it expects of fields whose covariance is `scale`
-        times the given one.
-        """
-        left = scale * np.maximum(
-            self.variance - self.gain**2 @ (1 / (self.power + self.noise / scale)), 0
-        )
-        return float(
-            np.sqrt(np.mean(left + self.sigma**2 * (self.even**2 @ np.sum(self.levels**2, axis=1))))
-        )
-
     def whitening(self) -> np.ndarray:
         """What of superpixels the estimate looks at, brightness first, weighted so that all of its
         noise is that of a pixel, (row, pixel).

@@ -24,9 +24,8 @@ LOOKED_AT = 256
 """Lenslets that are looked at, spread over all, at most."""
 ALIKE, IN_STEP = 0.99, 0.04
 """Squared mean of the lenslets' brightness over its mean square from which on what goes with it is
-what all have in common, and the share that no motion makes from which on that is a scene in step
-with the lenslets (0.04 and more; of a shift of 0.05 px at most 0.02, and with photographs' own
-detail 0.04 at 30 dB).
+what all have in common, and the share that no motion makes, give or take two standard deviations,
+from which on that may be a scene in step with the lenslets (0.04 and more).
 """
 
 
@@ -86,7 +85,8 @@ def moved_even_light(
     moved = np.linalg.lstsq(made.T, found, rcond=1e-6)[0] @ made
     squares, others = float(moved @ moved), len(found) - len(made)
     alike = float(bright.sum()) ** 2 > ALIKE * power * len(bright)
-    if alike and float(np.sum((found - moved) ** 2)) - others > IN_STEP * squares:
+    most = float(np.sum((found - moved) ** 2)) - others + 2 * np.sqrt(2 * max(others, 0))
+    if alike and most > IN_STEP * squares:
         return nothing
     return lmmse.analysis.T @ (moved * deviation), _deviations(squares, len(made))
 

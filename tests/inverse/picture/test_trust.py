@@ -280,7 +280,7 @@ def test_the_noise_of_a_wrong_matrix_says_how_wrong_it_is():
     """Between the error in all pixels, spread evenly, and what falls upon single coordinates."""
     told = made("lmmse", captured(matrix(*DISTURBED["pitch"]))).as_json()
     assert not told["matrix_believed"] and told["noise_raised"] > 2
-    assert told["continuity"] < 0.6 and told["excess"] > told["noise_sigma"]
+    assert told["excess"] > told["noise_sigma"]
 
 
 @cache

@@ -75,8 +75,8 @@ class Belief:
     level: noise of a pixel.
     lmmse: of a lenslet by itself, with the noise that is believed in each coordinate.
     right: whether nothing speaks against the matrix; the noise is white then.
-    continuity: factor of the picture relative to photographs under the right matrix, before
-        anything was raised; None where there are too few lenslets.
+    continuity: factor of the picture relative to photographs under the right matrix, without
+        displaced even light, before anything was raised; None where there are too few lenslets.
     reference: factor of these photographs, for what is made with the noise that is believed; None
         where it is no measure: too few lenslets, or a scene that jumps everywhere.
     raised: root mean square over the coordinates in use of the noise over that of a pixel.

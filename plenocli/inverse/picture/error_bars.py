@@ -1,13 +1,9 @@
 """Standard deviations of pictures, whatever method made them: half the width of the interval that
 holds the truth with 95 %, over 1.96.
 
-All rest on what LMMSE knows of a lenslet when it has seen its superpixel: the field is normal about
-LMMSE's estimate, with the covariance that is left, averaged over the contrasts that the lenslet may
-have. What that says of directions that hide in the noise is the photographs' opinion, and two
-things in the capture itself tell whether this picture shares it: the power of the directions that
-stand just above the noise, and how far adjacent lenslets disagree at their common border, where
-they see nearly the same point. Another method's picture is off by LMMSE's error and by its distance
-from LMMSE, which is known point by point.
+All rest on what LMMSE knows of a lenslet when it has seen its superpixel, widened or narrowed by
+what the capture itself says of weak directions and of the lenslets' borders, and on each picture's
+distance from LMMSE's (docs/model.md, "Spatial reconstruction").
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """Continuity of a picture across the borders of lenslets: a measure of its error without the truth.
 
-Points on either side of a border are neighbours in the scene and are estimated from different
-superpixels. A picture is m + t, the brightness of each lenslet and the detail in it; d and D are
-the jumps of m and t across all borders. Where t = g x (true detail) + error that the neighbour does
-not share, the factor on t that makes d + factor D least, -<d, D> / <D, D>, is the factor with the
-least error. Scenes have jumps of their own between adjacent points, and a lenslet's edge is seen
-worse than its middle: so the factor is compared with that of photographs under the right matrix,
-captured with the same noise.
+A picture is m + t, the brightness of each lenslet and the detail in it; d and D are the jumps of m
+and t across all borders. The factor on t that makes d + factor D least, -<d, D> / <D, D>, is
+compared with that of photographs under the right matrix, captured with the same noise.
 
 docs/model.md, "Spatial reconstruction".
 """

@@ -1,10 +1,8 @@
 """Noise by coordinate: what a capture holds in each coordinate of LMMSE beyond what photographs and
 noise explain.
 
-Light that the matrix does not know is structured: of a wrong focus, a shift or a veil most lies in
-a few directions, and what falls there upon strong coordinates does no harm that falling upon weak
-ones would. So noise is not raised in all of them, as a white one would be, but where the capture's
-lenslets together show more than is expected.
+An error of the matrix falls upon a few directions, and upon strong ones does no harm: so noise is
+raised only where the capture's lenslets together show more than is expected.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """Light that a matrix leaves over because the camera displaces light otherwise than it says.
 
-What a camera does wrong moves its light: a sensor that is off shifts the superpixels, a wrong
-distance magnifies them, a grid that is turned turns them; out of focus every pixel sees the object
-displaced, in proportion to the pixel's place; a wrong pitch displaces superpixels in proportion to
-the object's place. So what is left of a capture outside the reach of the matrix is compared with
-what the estimate would show if it moved. That part of the estimate does not depend on the noise
-there: whatever the scene, noise alone has a common share with it by chance only, and how much is
-known. A sum of squares needs a hundred times the energy to see as much.
+What is left of a capture outside the reach of the matrix is compared with what the estimate would
+show if it moved, whatever the scene; what even light would show if it moved is looked for within.
 
 docs/model.md, "Spatial reconstruction".
 """

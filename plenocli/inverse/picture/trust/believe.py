@@ -1,10 +1,7 @@
 """What a capture says of its matrix, and the noise that follows.
 
 Three witnesses that need no truth: how much lies where the matrix reaches nothing, whether it is
-what the picture would show if light moved, and how well the picture goes on across the lenslets'
-borders. Where all agree with the matrix, noise is what the
-capture says. Else it is raised coordinate by coordinate: by what the lenslets together hold beyond
-photographs and noise, and, where that does not do, until the picture is continuous.
+what the picture would show if light moved, and how well that goes on across the lenslets' borders.
 
 docs/model.md, "Spatial reconstruction".
 """
@@ -123,14 +120,10 @@ def believe(
     lmmse = estimators.prior.lmmse(level.sigma, scene)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = _Judge.of(estimators, lmmse, y, scene)
-    shown, displaced = None, 0.0
-    if judge is not None and not coupled:
-        found_even, displaced = moved_even_light(estimators.system, lmmse, stacked)
-        if displaced > SURE and judge.goes_on(lmmse, found_even) < CONTINUOUS:
-            shown, y = found_even, without_pattern(lmmse, y, found_even)
-            stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
-        else:
-            displaced = 0.0
+    shown, displaced = (None, 0.0) if coupled else _displaced(judge, estimators, lmmse, stacked)
+    if judge is not None and shown is not None:
+        y = without_pattern(lmmse, y, shown)
+        stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
     first = None if judge is None else judge.of_lmmse(lmmse)
     loud = float(np.sqrt(np.mean(y**2)))
     beyond = (
@@ -138,9 +131,8 @@ def believe(
     )
     chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
     found = beyond > MISTOLD + SURE * chance or model_error * loud > level.sigma
-    moved = 0.0
-    if not coupled:
-        moved = moved_rest(estimators.system, estimators.svd, lmmse, stacked, level.sigma)
+    system, svd = estimators.system, estimators.svd
+    moved = 0.0 if coupled else moved_rest(system, svd, lmmse, stacked, level.sigma)
     found = found or moved > SURE
     quiet = beyond <= HINT * chance and moved <= HINT
     least = None if first is None else first.most if quiet else first.relative
@@ -149,7 +141,7 @@ def believe(
         first is not None
         and not continuous
         and quiet
-        and _scene_jumps(estimators.svd, lmmse, stacked, level, first)
+        and _scene_jumps(svd, lmmse, stacked, level, first)
     )
     if not found and (continuous or rough):
         return Belief(
@@ -161,8 +153,7 @@ def believe(
             pattern=shown,
             displaced=displaced,
         )
-    pattern = even_light(lmmse, stacked)
-    y = without_pattern(lmmse, y, pattern)
+    y = without_pattern(lmmse, y, pattern := even_light(lmmse, stacked))
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
@@ -277,6 +268,16 @@ class _Judge:
             found=detail_jumps(lmmse, self.y, self.shape),
             right=detail_jumps(lmmse, self.clear + noise, self.shape),
         )
+
+
+def _displaced(
+    judge: _Judge | None, estimators: Estimators, lmmse: Lmmse, y: np.ndarray
+) -> tuple[np.ndarray | None, float]:
+    """Even light that moved and is no part of a continuous scene, as `moved_even_light`."""
+    shown, deviations = moved_even_light(estimators.system, lmmse, y)
+    if judge is None or deviations <= SURE or judge.goes_on(lmmse, shown) >= CONTINUOUS:
+        return None, 0.0
+    return shown, deviations
 
 
 def _scene_jumps(

@@ -1,9 +1,8 @@
 """Whether a picture that jumps at the borders of lenslets is one of a scene that jumps everywhere.
 
-A chessboard, letters, noise or stars are as discontinuous at borders as what a wrong matrix makes
-of a photograph. They are told apart by what a wrong matrix does and a scene does not: it leaves
-light where the matrix reaches nothing; it spoils weak coordinates before strong ones; it makes the
-same pattern in every lenslet, as bright as the lenslet; it makes light negative.
+They are told apart by what a wrong matrix does and a scene does not: it leaves light where the
+matrix reaches nothing; it spoils weak coordinates before strong ones; it makes the same pattern in
+every lenslet, as bright as the lenslet; it makes light negative.
 
 docs/model.md, "Spatial reconstruction".
 """

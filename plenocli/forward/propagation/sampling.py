@@ -33,7 +33,7 @@ FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
 """Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N the lenslet's
 diffraction cells (measured, worst column, N from 1.3 to 140; beyond the table as its end).
 """
-LAW = 0.38
+LAW = 0.5
 """Share of an accuracy that pixel_error may reach: it says as little as that of the true error.
 """
 WHOLE, BESIDE = (1.0, 1.0, 1.0), (0.65, 0.65, 0.3)
@@ -76,9 +76,9 @@ OTHERS = 6.0
 foreign cameras: 95 % of others within 3.9 times the worst of 3 columns tried, 2.1 of 6, 1.3 of
 12).
 """
-BENT = 4.0
-"""By how much finer pixels are sampled where what lies off the axis changes a column by its own
-size.
+ASIDE, BENT = 1.5, 4.0
+"""By how much finer pixels are sampled off the axis, and how much more where that changes a column
+by its own size.
 """
 TRIED_CUT_EFFECT = 0.06
 """The same where columns were tried, whose cut is for the dimmest point: with it what is said is
@@ -205,7 +205,8 @@ def size_band(
     """
     window = coherent_window(geometry, superpixels, ring)
     # columns tried and laws of pixels are those of the axis
-    accuracy /= 1 + BENT * min(1.0, oblique_error(geometry, False))
+    if geometry.chief != (0.0, 0.0):
+        accuracy /= ASIDE + BENT * min(1.0, oblique_error(geometry, False))
     lit = max(geometry.reach(superpixels, window))
     far = 0 if window is None else max(geometry.reach(superpixels)) + lit
     active = geometry.pixel_active / (geometry.wavelength * geometry.z3)

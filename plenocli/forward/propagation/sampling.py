@@ -204,9 +204,7 @@ def size_band(
     Raises NumericsError as psf_nodes.
     """
     window = coherent_window(geometry, superpixels, ring)
-    # columns tried and laws of pixels are those of the axis
-    if geometry.chief != (0.0, 0.0):
-        accuracy /= ASIDE + BENT * min(1.0, oblique_error(geometry, False))
+    accuracy /= _finer_aside(geometry)
     lit = max(geometry.reach(superpixels, window))
     far = 0 if window is None else max(geometry.reach(superpixels)) + lit
     active = geometry.pixel_active / (geometry.wavelength * geometry.z3)
@@ -264,6 +262,13 @@ def size_band(
         pixel_rule=rule,
         beside=beside,
     )
+
+
+def _finer_aside(geometry: Geometry) -> float:
+    """By how much finer pixels are sampled off the axis, whose columns were tried on it."""
+    if geometry.chief == (0.0, 0.0):
+        return 1.0
+    return ASIDE + BENT * min(1.0, oblique_error(geometry, False))
 
 
 def beyond_tried(tried: TrialColumns) -> float:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.files.outside import outside
@@ -98,8 +99,9 @@ def write_ome_tiff(
             file.write(
                 values,
                 photometric="minisblack",
-                metadata=one.metadata() | {"UUID": name},
-                software=SEAL,
+                metadata=one.metadata() | {"UUID": name, "Creator": f"plenocli {__version__}"},
+                # named apart from the seal too: damage to one name leaves the other
+                software=f"written by plenocli {__version__}, {SEAL}",
             )
     publish_sealed(path, [memory.getbuffer()], overwrite=overwrite)
 

@@ -18,7 +18,7 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
     path: of the dictionary artefact.
     system: the matrix that captures are explained by.
 
-    Raises InputError where the atoms have another number of points than the matrix.
+    Raises InputError where the atoms have another number of points than the matrix, or are one.
     """
     from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
@@ -34,6 +34,8 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
             if several
             else "learn it with this pif",
         )
+    if atoms.shape[1] < 2:  # the first is even, for brightness
+        raise InputError("has no atom but one", path, "learn more --atoms")
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
         note(f"the dictionary was learnt for another system matrix than {system.path.name}")
     try:

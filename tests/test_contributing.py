@@ -12,7 +12,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(
-    r"^```python\n# (in )?(plenocli/[\w/]+\.py)(?:, (before )?(\w+))?\n(.*?)^```", re.S | re.M
+    r"^```(?:python|toml)\n# (in )?(plenocli/[\w/]+\.(?:py|toml))"
+    r"(?:, (before )?(\w+))?\n(.*?)^```",
+    re.S | re.M,
 )
 
 
@@ -25,7 +27,9 @@ def recipe(title):
 
 
 def put(text, before, name, code):
-    """A module's text with a block added: to its imports, before a name, or to a table."""
+    """A file's text with a block added: at its end, to imports, before a name, or to a table."""
+    if name == "end":
+        return text + code
     if name == "imports":
         return re.sub(r"^from plenocli", code + "from plenocli", text, count=1, flags=re.M)
     start = re.search(rf"^{name}\b[^=\n]*= [({{]", text, re.M)

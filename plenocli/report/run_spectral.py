@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import PlenoError
+from plenocli.evaluation.metrics.response import response_error
+from plenocli.evaluation.response_score import paired_responses
 from plenocli.evaluation.results import Result
 from plenocli.evaluation.scores import ScoreDocument
-from plenocli.files.results.results import read_result
+from plenocli.files.results.results import read_response, read_result
 from plenocli.files.results.run_folder import RunFile, RunFolder
 from plenocli.report.drawing import Figures
 from plenocli.report.page import Page
@@ -76,7 +78,7 @@ def add_spectral(page: Page, run: RunFolder, scores: Sequence[RunFile]) -> str |
             page.heading(f"Results in {folder.relative_to(run.root).as_posix()}")
         _add_merged_scores(page, run, files)
     for file in responses:
-        _add_agreement(page, file)
+        _add_agreement(page, run, file)
     scored = {digest for file in scores for digest in file.sources.values()}
     _add_bands_alone(
         page, [file for file in spectra if file.digest not in scored and not _is_white(run, file)]
@@ -125,11 +127,24 @@ def _add_merged_scores(page: Page, run: RunFolder, files: Sequence[RunFile]) -> 
     add_spectra(page, merged, drawn)
 
 
-def _add_agreement(page: Page, file: RunFile) -> None:
-    """Responses beside the one that was measured, band by band."""
+def _add_agreement(page: Page, run: RunFolder, file: RunFile) -> None:
+    """Responses beside the one that was measured, band by band, and where in the superpixel the
+    first one differs.
+    """
+    from plenocli.report.spectral_pictures import response_errors
+
     page.heading("Responses compared", file.made_by)
     if file.scores is not None:
         add_table(page, file.scores)
+    first, truth = (run.by_digest(file.sources.get(role)) for role in ("result 1", "truth"))
+    if first is None or truth is None:
+        return
+    pair = paired_responses(read_response(first.path), read_response(truth.path))
+    error, _, mean = response_error(pair.first, pair.second)
+    page.figure(
+        response_errors(error, np.nanmax(mean, axis=0), pair.window, pair.wavelengths),
+        f"{first.name} less {truth.name}, after a gain for each band.",
+    )
 
 
 def _is_white(run: RunFolder, file: RunFile) -> bool:

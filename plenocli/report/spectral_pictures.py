@@ -12,6 +12,7 @@ from plenocli.report.drawing import (
     COLOURS,
     LEVEL_MAP,
     LIGHT_MAP,
+    SIGN_MAP,
     TRUTH,
     bare,
     colour_bar,
@@ -124,6 +125,36 @@ def response_picture(
             image = axes.imshow(values, cmap=LIGHT_MAP, vmin=0, interpolation="nearest")
             bare(axes, nanometres(wavelengths[band]))
             colour_bar(axes, image, "")
+    return made.png
+
+
+def response_errors(
+    error: np.ndarray, peak: np.ndarray, window: tuple[int, ...], wavelengths: np.ndarray
+) -> bytes:
+    """Which pixels of the superpixel differ between two responses, on one scale.
+
+    error: (pixel, band) difference.
+    peak: (band,) brightest pixel.
+    window: (rows, columns) of pixels.
+    wavelengths: (band,) m.
+
+    Returns PNG.
+    """
+    count = len(wavelengths)
+    shares = 100 * np.asarray(error) / np.asarray(peak)
+    limit = float(np.nanmax(np.abs(shares))) or 1.0
+    with drawing(min(2.5 * count, 10.2), 2.7) as made:
+        panels = made.figure.subplots(1, count, squeeze=False)[0]
+        for band, axes in enumerate(panels):
+            image = axes.imshow(
+                np.nan_to_num(shares[:, band]).reshape(window),
+                cmap=SIGN_MAP,
+                vmin=-limit,
+                vmax=limit,
+                interpolation="nearest",
+            )
+            bare(axes, nanometres(wavelengths[band]))
+        made.figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, label="% of the peak")
     return made.png
 
 

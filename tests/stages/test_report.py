@@ -404,7 +404,7 @@ def test_a_browser_shows_the_page_without_a_network(page, tmp_path, width, heigh
     assert [address for address in seen["requests"] if not address.startswith("data:")] == [
         page.resolve().as_uri()
     ]
-    assert len(seen["value"]["pictures"]) == 17 and all(
+    assert len(seen["value"]["pictures"]) == 15 and all(
         natural > 300 and shown > 250 for natural, shown in seen["value"]["pictures"]
     )
     assert seen["value"]["needs"] <= seen["value"]["has"] == width, "the page scrolls sideways"

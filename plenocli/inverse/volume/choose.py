@@ -29,7 +29,7 @@ COMPARED = ("rl", "lmmse", "tv")
 """What `auto` tries; the likelihood already lets lmmse take voxels for independent."""
 TRIED = 25
 """Iterations of Richardson-Lucy by which planes are judged."""
-WORTH = 0.02
+WORTH = 0.05
 """Share of the misfit that a further plane must take away."""
 
 

@@ -132,6 +132,13 @@ def _paraxial_error(camera: Camera, geometry: Geometry) -> float:
     return paraxial_error.paraxial_error(geometry, _parabolic(camera))
 
 
+def _error_off_the_axis(camera: Camera, geometry: Geometry) -> float:
+    """Of the exact models: none on the axis, where they are what others are measured by; off it
+    spherical waves are.
+    """
+    return min(1.0, neglected(geometry))
+
+
 class Rays(Model):
     """Geometric optics."""
 
@@ -176,10 +183,7 @@ class ExactLowRank(Model):
     valid_for = staticmethod(exact.valid_for)
     size = staticmethod(exact.exact_band)
     features = staticmethod(cost_law.features)
-
-    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
-        """None on the axis: it is what the others are measured by. Off it spherical waves are."""
-        return min(1.0, neglected(geometry))
+    error_bound = staticmethod(_error_off_the_axis)
 
 
 class ExactHarmonics(Model):
@@ -203,10 +207,7 @@ class ExactOpenings(Model):
     valid_for = staticmethod(openings.valid_for)
     size = staticmethod(openings.opening_band)
     features = staticmethod(openings.features)
-
-    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
-        """As of ExactLowRank."""
-        return min(1.0, neglected(geometry))
+    error_bound = staticmethod(_error_off_the_axis)
 
 
 MODELS: tuple[Model, ...] = (

@@ -161,7 +161,7 @@ def estimate(
     if kept < 1:
         note(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
-            "lenslet: more of it would be noise, or not go on across the lenslets' borders"
+            "lenslet: more of it would not go on across the lenslets' borders"
         )
     seen = data.common("seen", lambda: what_is_seen(looked_through, own, belief.lmmse))
     found = replace(found, trace=(*bare.findings, *found.trace))

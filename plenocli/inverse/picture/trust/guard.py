@@ -1,5 +1,5 @@
-"""The last resort: a picture that does not go on across the lenslets' borders, or is further from
-what LMMSE expects than no detail is, is drawn back towards the mean of each lenslet.
+"""The last resort: a picture that does not go on across the lenslets' borders is drawn back towards
+the mean of each lenslet.
 """
 
 from __future__ import annotations
@@ -37,15 +37,6 @@ def detail_kept(
     return float(np.clip(factor / least, 0, 1))
 
 
-def likely_share(detail: np.ndarray, likely: np.ndarray) -> float:
-    """Share of a picture's detail that is kept beside what LMMSE expects of it (the same shape):
-    all, unless none at all would be nearer to that.
-    """
-    if np.sum((detail - likely) ** 2) <= np.sum(likely**2):
-        return 1.0
-    return float(np.clip(np.sum(detail * likely) / np.sum(detail**2), 0, 1))
-
-
 def guarded(
     found: Reconstruction,
     y: np.ndarray,
@@ -53,7 +44,7 @@ def guarded(
     shape: tuple[int, int],
     common: Common = alone,
 ) -> tuple[Reconstruction, float]:
-    """(the picture with as much of its detail as `detail_kept` and `likely_share` say, that share).
+    """(the picture with as much of its detail as `detail_kept` says, that share).
 
     Its standard deviation grows by the detail that is given up, see error_bars.about.
 
@@ -62,13 +53,7 @@ def guarded(
     """
     lmmse, stacked = belief.lmmse, y.reshape(-1, y.shape[-1]).T
     mean = (lmmse.even @ (lmmse.levels @ stacked)).T.reshape(found.value.shape)
-
-    def share() -> float:
-        detail = found.value - mean
-        likely = lmmse.apply(stacked, lmmse.scales(stacked)).T.reshape(detail.shape) - mean
-        return min(detail_kept(found.value, mean, belief, shape), likely_share(detail, likely))
-
-    kept = common("kept", share)
+    kept = common("kept", lambda: detail_kept(found.value, mean, belief, shape))
     if kept == 1:
         return found, kept
     drawn = mean + kept * (found.value - mean)

@@ -20,6 +20,8 @@ LIKELY = 0.5
 """Confidence below which a slope is unknown."""
 LEAST_SIGMA = 0.1
 """Of a slope: what tents, lenslets of one value and rims of the pupil leave at best."""
+STEADY, STEP_OF_ROUNDING = 10, 0.05
+"""Rounds of the map's total variation, and the step in slope up to which it is quadratic."""
 EDGE = 2
 """Lenslets to each side within which a step of the geometric limit makes an occlusion edge."""
 FEW = 0.05
@@ -44,7 +46,9 @@ def depth(
     a lenslet's width; its least value is found on a parabola, and corrected by least squares. A
     lenslet whose views agree best on the first or the last plane lies beyond the slopes, one whose
     disagreement hardly changes has no texture, and one may have several slopes alike: they are
-    unknown, NaN with confidence 0.
+    unknown, NaN with confidence 0. The known ones, each as sure as its own standard deviation says,
+    make the map of the least total variation beside their squares; the standard deviations stay
+    those of lenslets by themselves.
 
     docs/model.md, "Refocusing and depth".
     """
@@ -118,7 +122,7 @@ def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: f
     inside = (found > tried[0]) & (found < tried[-1])
     confidence, sigma = _certainty(disagreement, tried, found)
     known = textured & ~beyond & inside & (confidence >= LIKELY)
-    slope = np.where(known, found, np.nan)
+    slope = np.where(known, _steady(found, np.where(known, 1 / sigma**2, 0.0)), np.nan)
     return DepthMap(
         slope=slope,
         confidence=np.where(known, confidence, 0.0),
@@ -126,6 +130,28 @@ def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: f
         edge=_edges(slope, sigma),
         beyond=float(np.mean(textured & (beyond | ~inside))),
     )
+
+
+def _steady(slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The map s of least sum of weight (s - slope)^2 / 2 + |steps between neighbours|, by
+    reweighted least squares; weight 0 takes what lies around. (row, column) each.
+    """
+    from scipy import sparse
+    from scipy.sparse.linalg import cg
+
+    if not weight.any():
+        return slope
+    rows, columns = (sparse.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in slope.shape)
+    down, right = sparse.eye(slope.shape[0]), sparse.eye(slope.shape[1])
+    steps = sparse.vstack([sparse.kron(rows, right), sparse.kron(down, columns)]).tocsr()
+    data = sparse.diags(weight.ravel())
+    middle = float((weight * slope).sum() / weight.sum())
+    found = np.where(weight > 0, slope, middle).ravel()
+    for _ in range(STEADY):
+        size = np.hypot(steps @ found, STEP_OF_ROUNDING)
+        matrix = data + steps.T @ sparse.diags(1 / size) @ steps
+        found, _ = cg(matrix, data @ slope.ravel(), x0=found, rtol=1e-6, maxiter=500)
+    return found.reshape(slope.shape)
 
 
 def _certainty(

@@ -152,8 +152,11 @@ def estimate(
         found = replace(found, sigma=np.maximum(found.sigma, left))
     kept = 1.0
     if guard:
-        shape = estimators.system.object_shape
-        found, kept = guarded(found, own, belief, shape, data.common)
+        shape, svd = (
+            estimators.system.object_shape,
+            looked_through.svd if method.unrestrained else None,
+        )
+        found, kept = guarded(found, own, belief, shape, data.common, svd)
     if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
         # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found
         sigma = of_picture(estimators, data, own, found.value)
@@ -161,7 +164,7 @@ def estimate(
     if kept < 1:
         note(
             f"{kept:.0%} of the detail that {found.method} gives is kept, towards the mean of each "
-            "lenslet: more of it would not go on across the lenslets' borders"
+            "lenslet: more of it would be noise, or not go on across the lenslets' borders"
         )
     seen = data.common("seen", lambda: what_is_seen(looked_through, own, belief.lmmse))
     found = replace(found, trace=(*bare.findings, *found.trace))

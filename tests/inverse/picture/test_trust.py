@@ -120,6 +120,24 @@ def test_a_shift_is_never_worse_than_the_mean_of_each_lenslet():
         assert psnr(made(method, data, shared)) > floor - 0.2, method
 
 
+@pytest.mark.parametrize("snr_db", [40, 20])
+def test_amplified_noise_is_not_given_by_the_right_matrix_either(snr_db):
+    """Non-negative least squares of a photograph is further from it than no detail is."""
+    data = captured(matrix(), snr_db)
+    assert psnr(made("nnls", data)) > psnr(made("block-mean", data))
+
+
+def test_stars_that_least_squares_finds_are_kept():
+    """Few points on black are told by their sign, though no photograph is like that."""
+    rng = np.random.default_rng(5)
+    x = np.where(rng.random((3, 3, 400)) < 0.01, rng.random((3, 3, 400)), 0)
+    y = x @ matrix().T
+    sigma = np.sqrt(np.mean(y**2)) / 1000
+    noise = sigma * rng.standard_normal(y.shape)
+    found = made("nnls", Superpixels(y=y + noise, noise=Noise.of_sigma(sigma)))
+    assert np.mean((found.value - x) ** 2) < 0.01 * np.mean(x**2)
+
+
 @pytest.mark.parametrize("snr_db", [60, 40, 20])
 def test_the_right_matrix_is_believed(snr_db):
     found = made("lmmse", captured(matrix(), snr_db))

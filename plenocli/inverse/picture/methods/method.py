@@ -87,6 +87,7 @@ class Method(ABC):
     in_tiles: whether large captures may be estimated tile by tile.
     weighs_all: whether one weight goes by the power of all lenslets, which some do not tell.
     points_around: of a method that sees the whole picture, how far a point looks.
+    unrestrained: whether a picture that explains its capture may be noise for the most part.
     """
 
     name: str
@@ -101,6 +102,7 @@ class Method(ABC):
     in_tiles: bool = True
     weighs_all: bool = False
     points_around: int = 0
+    unrestrained: bool = False
 
     def makes_joint_estimate(self, estimators: Estimators) -> bool:
         """Whether LMMSE over 3x3 lenslets is made, before the method or instead of it."""

@@ -325,6 +325,7 @@ NNLS = Estimator(
     phases=footprint.nnls_phases,
     options=("nnls_iterations",),
     in_batches=True,
+    unrestrained=True,
     estimate=partial(_by_lenslet, nnls, True),
 )
 LMMSE = Estimator(name="lmmse", sees=Sees.RING, phases=footprint.lmmse_phases, estimate=_own_lmmse)

@@ -43,8 +43,8 @@ DEFINITIONS = {
         "nothing in the capture speaks against the system matrix"
     ),
     "detail_kept": (
-        "share of the method's detail that was kept, as far as it goes on across the lenslets' "
-        "borders; the rest is the mean of each lenslet"
+        "share of the method's detail that was kept, as far as it is no noise and goes on across "
+        "the lenslets' borders; the rest is the mean of each lenslet"
     ),
     "interval_coverage": (
         "share of the points that lie within 1.96 predicted standard deviations of the truth; 0.95 "

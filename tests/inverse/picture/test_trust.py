@@ -21,6 +21,7 @@ from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.solvers.least_squares import decompose
+from plenocli.inverse.picture.trust import believe
 from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
 from plenocli.inverse.picture.trust.excess import even_light, with_excess
 from plenocli.inverse.picture.trust.moved_light import motions, moved_even_light, moved_rest
@@ -299,6 +300,17 @@ def test_the_noise_of_a_wrong_matrix_says_how_wrong_it_is():
     told = made("lmmse", captured(matrix(*DISTURBED["pitch"]))).as_json()
     assert not told["matrix_believed"] and told["noise_raised"] > 2
     assert told["excess"] > told["noise_sigma"]
+
+
+def test_a_pitch_that_is_off_breaks_the_picture_by_even_light_that_it_displaces(monkeypatch):
+    """Without that the picture goes on across borders, and the rest of the error is told by what
+    the matrix cannot produce alone; a wrong focus breaks it all the same.
+    """
+    pitch = captured(matrix(*DISTURBED["pitch"]))
+    assert made("lmmse", pitch).as_json()["continuity"] > 0.9
+    assert made("lmmse", captured(matrix(*DISTURBED["focus"]))).as_json()["continuity"] < 0.1
+    monkeypatch.setattr(believe, "_displaced", lambda *_: (None, 0.0))
+    assert made("lmmse", pitch).as_json()["continuity"] < 0.6
 
 
 @cache

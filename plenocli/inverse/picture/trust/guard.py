@@ -1,5 +1,5 @@
-"""The last resort: a picture that does not go on across the lenslets' borders, or is amplified noise,
-is drawn back towards the mean of each lenslet.
+"""The last resort: a picture that does not go on across the lenslets' borders, or is amplified
+noise, is drawn back towards the mean of each lenslet.
 """
 
 from __future__ import annotations

@@ -203,16 +203,20 @@ def staged_path(path: str | os.PathLike) -> Path:
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _told(
+    path: Path,
+    what: str = "cannot be written",
+    fix: str = "free some space or choose another folder; what was there before is untouched",
+) -> Iterator[None]:
     """OSError within the block becomes the OutputError for a file."""
     try:
         yield
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})",
-            path,
-            "free some space or choose another folder; what was there before is untouched",
-        ) from error
+        raise OutputError(f"{what} ({error.strerror})", path, fix) from error
+
+
+_CUT_OFF = "is one of several results that were cut off halfway, and cannot follow the others"
+_FOLLOWS = "make its folder writable: all results follow when plenocli next looks at one of them"
 
 
 def _stage(path: Path, overwrite: bool) -> _Staged:
@@ -239,7 +243,7 @@ def _keep_rights(file: _Staged) -> None:
     os.fchmod(file.descriptor, stat.S_IMODE(before.st_mode))
 
 
-def _commit(staged: Sequence[_Staged]) -> None:
+def _commit(staged: list[_Staged]) -> None:
     """Let all files take their places, or none."""
     for file in staged:
         if not file.overwrite and file.target.exists():
@@ -248,25 +252,41 @@ def _commit(staged: Sequence[_Staged]) -> None:
                 file.path,
                 "pass --overwrite or choose another name",
             )
-    placed: list[tuple[_Staged, Path | None]] = []
-    with _announced(staged) as announcements:
+    several = staged if len(staged) > 1 else []  # a single file needs no way back
+    with _announced(several) as announcements:
         try:
+            for file in several:
+                with _told(file.path):
+                    _before(file.target).unlink(missing_ok=True)
             for file in staged:
                 with _told(file.path):
-                    # a single file needs no way back
-                    placed.append((file, _kept(file.target) if len(staged) > 1 else None))
+                    if several and file.target.exists():
+                        _named_too(file.target, _before(file.target))
                     os.replace(file.partial, file.target)
         except BaseException:
-            for announcement in announcements:
-                announcement.unlink(missing_ok=True)
-            for file, before in placed:
-                _put_back(file, before)
+            _take_back(several, announcements)
             raise
-        for _, before in placed:
-            if before is not None:
-                before.unlink(missing_ok=True)
-        for folder in dict.fromkeys(file.target.parent for file in staged):
-            sync_folder(folder)
+        for file in several:
+            with contextlib.suppress(OSError):
+                _before(file.target).unlink(missing_ok=True)
+        _sync_folders(file.target for file in staged)
+
+
+def _take_back(staged: list[_Staged], announcements: list[Path]) -> None:
+    """Undo what `_commit` did, as far as it came. What is new stands by under its temporary names
+    until all is undone: where this is cut off, or fails too, `settle` lets all follow.
+    """
+    try:
+        for file in staged:
+            with _told(file.path, "can neither take nor leave its place", _FOLLOWS):
+                _put_back(file)
+        _sync_folders(file.target for file in staged)
+    except BaseException:
+        announcements.clear()
+        for file in staged:
+            os.close(file.descriptor)
+        staged.clear()
+        raise
 
 
 def _announcement(target: Path) -> Path:
@@ -275,11 +295,10 @@ def _announcement(target: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _announced(staged: Sequence[_Staged]) -> Iterator[list[Path]]:
+def _announced(several: Sequence[_Staged]) -> Iterator[list[Path]]:
     """Beside each of several files it says, for good, what all of them are, until the block ends
     well: their names as seen from there, sizes and times.
     """
-    several = staged if len(staged) > 1 else []
     places = [Path(os.path.realpath(f.target.parent), f.target.name) for f in several]
     announcements = [_announcement(place) for place in places]
     how = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -295,8 +314,7 @@ def _announced(staged: Sequence[_Staged]) -> Iterator[list[Path]]:
                     os.ftruncate(made, 0)
                     write_at(made, 0, json.dumps(told).encode())
                     os.fsync(made)
-            for folder in dict.fromkeys(place.parent for place in places):
-                sync_folder(folder)
+            _sync_folders(places)
             yield announcements
         finally:
             for announcement in announcements:
@@ -329,13 +347,13 @@ def settle(path: str | os.PathLike) -> None:
                 announcement.unlink()
                 return
             for target, (_, *about) in zip(targets, told):
-                with contextlib.suppress(FileNotFoundError):
+                with _told(target, _CUT_OFF, _FOLLOWS), contextlib.suppress(FileNotFoundError):
                     if _about(partial_path(target)) == about:
                         os.replace(partial_path(target), target)
-            for parent in dict.fromkeys(target.parent for target in targets):
-                sync_folder(parent)
-            for target in targets:
-                _announcement(target).unlink(missing_ok=True)
+            _sync_folders(targets)
+            for name in (_before, _announcement):
+                for target in targets:
+                    name(target).unlink(missing_ok=True)
         finally:
             os.close(descriptor)
 
@@ -362,26 +380,27 @@ def _about(file: Path | int) -> list[int]:
     return [found.st_size, found.st_mtime_ns]
 
 
-def _kept(target: Path) -> Path | None:
-    """A second name for a file that is there, by which it can be put back."""
-    if not target.exists():
-        return None
-    before = target.with_name(f".{target.name}.before")
-    before.unlink(missing_ok=True)
+def _before(target: Path) -> Path:
+    """A second name of the old file, by which it can be put back."""
+    return target.with_name(f".{target.name}.before")
+
+
+def _named_too(path: Path, name: Path) -> None:
     try:
-        os.link(target, before)
+        os.link(path, name)
     except OSError:  # a file system without hard links
-        os.rename(target, before)
-    return before
+        os.rename(path, name)
 
 
-def _put_back(file: _Staged, before: Path | None) -> None:
-    """Undo what `_commit` did to one file, as far as it came."""
-    if before is not None:
+def _put_back(file: _Staged) -> None:
+    before, moved = _before(file.target), _is_same_file(file.descriptor, file.target)
+    if before.exists():
+        if moved:
+            _named_too(file.target, file.partial)
         os.rename(before, file.target)
         before.unlink(missing_ok=True)  # two names of one file are not renamed
-    elif _is_same_file(file.descriptor, file.target):
-        file.target.unlink()
+    elif moved:
+        os.rename(file.target, file.partial)
 
 
 def _open_partial(partial: Path, mode: int = 0o666) -> int:
@@ -457,6 +476,11 @@ def reserve(descriptor: int, size: int) -> None:
             errno.ENODEV,
         ):
             raise
+
+
+def _sync_folders(files: Iterable[Path]) -> None:
+    for folder in dict.fromkeys(file.parent for file in files):
+        sync_folder(folder)
 
 
 def sync_folder(folder: Path) -> None:

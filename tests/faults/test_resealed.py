@@ -141,6 +141,8 @@ IMPOSSIBLE = [
         values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31))),
     ),
     ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
+    ("dictionary.h5", RESUME, values("dictionary/state/iteration", lambda v: v * 0 - 1)),
+    ("fit.h5", "show X -o o.png", values("fit/tolerance", lambda v: v * 0)),
 ]
 
 

@@ -97,6 +97,8 @@ def read_unfinished(path: Path, system: LensletMatrix, *, kept: bool) -> Unfinis
             or state.atoms.shape != artefact.data["dictionary/atoms"].shape
         ):
             raise ValueError("the atoms of its state are not those that it shows")
+        if state.iteration != len(state.history):
+            raise ValueError("its iterations and their history differ in number")
         return Unfinished(
             state=state,
             settings=Settings(**parameters["settings"]),

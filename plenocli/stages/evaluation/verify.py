@@ -19,22 +19,15 @@ class Verified:
 
     files: that were compared.
     signer: who signed the manifest, None where nobody was asked for.
-    unlisted: files of the folder that its manifest does not list.
     """
 
     path: Path
     files: int = 1
     signer: str | None = None
-    unlisted: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """JSON-able."""
-        return {
-            "path": str(self.path),
-            "files": self.files,
-            "signer": self.signer,
-            "unlisted": list(self.unlisted),
-        }
+        return {"path": str(self.path), "files": self.files, "signer": self.signer}
 
     def line(self) -> str:
         """In words."""
@@ -43,8 +36,6 @@ class Verified:
             told = f"{self.path}: {self.files} files as they were sealed"
         if self.signer is not None:
             told += f", signed by {self.signer}"
-        if self.unlisted:
-            told += f"; {few(self.unlisted)} came since and are not vouched for"
         return told
 
 
@@ -89,18 +80,12 @@ def _folder(root: Path, signers: Path | None) -> Verified:
     signer = None if signers is None else manifest.signer(root, signers)
     listed = manifest.read_manifest(root)
     found = manifest.differences(manifest.digests(root), listed)
-    if found.altered or found.missing:
-        told = [
-            f"{few(names)} {verb}"
-            for names, verb in (
-                (found.altered, "altered"),
-                (found.missing, "missing"),
-            )
-            if names
-        ]
+    lists = ((found.altered, "altered"), (found.missing, "missing"), (found.unlisted, "not listed"))
+    told = [f"{few(names)} {verb}" for names, verb in lists if names]
+    if told:
         raise InputError(
             f"is not as it was sealed: {'; '.join(told)}",
             root,
             "make them again, or accept them: plenocli seal FOLDER",
         )
-    return Verified(path=root, files=found.same, signer=signer, unlisted=found.unlisted)
+    return Verified(path=root, files=found.same, signer=signer)

@@ -10,7 +10,9 @@ NAMES := $(ONE_NAME) CAPTURES DARK SWEEPS TRADES WHITE
 HASH := \#
 BEYOND_NAMES := $$ & ; | < > ( ) { } [ ] " ' ` \ ! % $(HASH)
 # what controls a terminal, which Make's own messages would pass on
-CONTROLS := $(shell printf '\001 \002 \003 \004 \005 \006 \007 \010 \016 \017 \020 \021 \022 \023 \024 \025 \026 \027 \030 \031 \032 \033 \034 \035 \036 \037 \177')
+CONTROLS := $(shell printf '\001 \002 \003 \004 \005 \006 \007 \010 \016 \017 \020 \021 \022 \023 \024 \025 \026 \027 \030 \031 \032 \033 \034 \035 \036 \037 \177'; \
+	for a in 20 21 22 23; do for b in 0 1 2 3 4 5 6 7; do printf " \302\\$$a$$b"; done; done; \
+	printf ' \342\200\252 \342\200\253 \342\200\254 \342\200\255 \342\200\256 \342\201\246 \342\201\247 \342\201\250 \342\201\251')
 define NEWLINE
 
 

@@ -46,6 +46,8 @@ HOSTILE = (
     "a(1).dng",
     "a\ntouch PWNED",
     "a\x1b[31m.dng",
+    "a\x9b31m.dng",
+    "a\u202egnd.b",
 )
 
 
@@ -127,12 +129,13 @@ def test_ordinary_names_pass(tmp_path):
 
 
 HOSTILE_SAMPLES = ("$(shell touch PWNED)", "a b.png", "a&touch PWNED&", "it's.png", "p(1).png")
+HOSTILE_SAMPLES += ("a\x1b[31m.png", "a\ntouch PWNED", "a\x9b31m.png", "a\u202egnp.b", "a\x7f")
 
 
 @pytest.mark.parametrize("setting", ["CAMERA", "SCENE", "RUN", "METHODS"])
 @pytest.mark.parametrize("name", HOSTILE_SAMPLES)
 def test_the_makefile_that_init_writes_refuses_them_too(tmp_path, setting, name):
-    if setting == "METHODS" and name == "a b.png":
+    if setting == "METHODS" and name == "a b.png":  # a list
         return
     code, out, error = make("plenocli/samples/Makefile", f"{setting}={name}", cwd=tmp_path)
     assert code == 2 and f"*** {setting} holds" in error and out == "", error

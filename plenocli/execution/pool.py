@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import threading
@@ -392,6 +393,8 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
         ) from error
+    # its tracebacks of a broken connection, of which we say what to do
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     address, security = _address(scheduler)
     try:
         client = Client(address, timeout="10s", security=security, set_as_default=False)

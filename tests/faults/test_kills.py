@@ -1,12 +1,15 @@
 """kill -9 at any time: a target is absent or whole, the same command run again gives the same
 bytes, and nothing is left beside it.
+
+With test_transactions.py and test_cluster_kills.py, `make faults` kills 400 of each kind: commands
+with one result (14), with several, a sweep, learning with a checkpoint, make with all that it runs,
+and client, workers and scheduler of Dask; forked from a warm process, else a start of Python would
+be most of each.
 """
 
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,6 +17,7 @@ import numpy as np
 import pytest
 
 from plenocli.files.artefacts.container import read_artefact
+from tests.faults.forked import Forks
 from tests.faults.harness import results, tree
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +50,7 @@ def test_a_killed_stage_leaves_nothing_half_done(runner, stages, tmp_path, campa
     assert tree(target.parent) == whole
     empty(target.parent)
     rng, killed, finished = np.random.default_rng(list(name.encode())), 0, 0
-    while killed < int(os.environ.get("KILLS", campaign(4, 200))):
+    while killed < campaign(4, 400 if name == "sweep" else 29):
         outcome = runner.run(command, tmp_path, kill_after=rng.uniform(0, usual))
         if outcome.code == 0:
             finished += 1
@@ -71,50 +75,68 @@ def empty(folder):
 
 @pytest.mark.slow
 def test_make_after_a_kill_gives_the_tree_of_an_uninterrupted_run(tmp_path, campaign, count):
-    """The tiny pipeline, all of its processes killed at once at random times,
-    until it gets through.
+    """A short pipeline, make and all that it runs killed at once at random times, until it gets
+    through; then from the start again.
     """
-    environment = os.environ | {
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(ROOT),
-    }
+    pytest.importorskip("distributed")
+    words = ["-f", "pipelines/spatial.mk", "CONFIG=sample_configs/tiny.toml", "EXPERIMENTS=paper"]
+    words += ["METHODS=block-mean tikhonov", "-j2"]
+    rng, killed, through, wanted = np.random.default_rng(8), 0, 0, campaign(6, 400)
+    folders = [tmp_path / name for name in ("bin", "whole", "killed")]
+    for folder in folders:
+        folder.mkdir()
+    with Forks(tmp_path) as forks:
+        forks.shim(folders[0])
 
-    def make(run):
-        command = [
-            "make",
-            "-f",
-            "pipelines/spatial.mk",
-            f"RUN={run}",
-            "CONFIG=sample_configs/tiny.toml",
-            "ITERATIONS=2",
-            "BATCH=64",
-            "-j2",
-        ]
-        return subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        def make(folder):
+            return forks.make([*words, f"RUN={folder / 'run'}"], ROOT, folders[0])
 
-    start = time.monotonic()
-    assert make(tmp_path / "whole" / "run").wait() == 0
-    usual, rng, killed = time.monotonic() - start, np.random.default_rng(8), 0
-    for _ in range(int(os.environ.get("KILLS", campaign(3, 20)))):
-        child = make(tmp_path / "killed" / "run")
-        try:
-            assert child.wait(timeout=rng.uniform(0.02, 0.3) * usual) == 0
-            break
-        except subprocess.TimeoutExpired:
-            os.killpg(child.pid, signal.SIGKILL)
-            child.wait()
+        assert make(folders[1]).code(300) == 0
+        start, whole = time.monotonic(), tree(folders[1])
+        empty(folders[1])
+        assert make(folders[1]).code(300) == 0 and tree(folders[1]) == whole
+        usual = time.monotonic() - start
+        while killed < wanted:
+            process = make(folders[2])
+            if process.ended(rng.uniform() ** 3 * usual):
+                assert process.code(0) == 0 and tree(folders[2]) == whole
+                empty(folders[2])
+                through += 1
+                continue
+            process.kill()
             killed += 1
-    assert make(tmp_path / "killed" / "run").wait() == 0
-    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+            left = tree(folders[2])
+            assert all(left.get(name, data) == data for name, data in whole.items())
+            assert through < wanted
+        assert make(folders[2]).code(300) == 0 and tree(folders[2]) == whole
     count("kill -9 of make with all that runs", killed=killed, other_files_than_uninterrupted=0)
+
+
+@pytest.mark.slow
+def test_killed_learning_goes_on_from_its_checkpoint(runner, stages, tmp_path, campaign, count):
+    for name in ("photo.png", "pif.h5"):
+        (tmp_path / name).symlink_to(stages[0] / name)
+    command = "learn-dict photo.png --pif pif.h5 --atoms 80 --batch 64 --iterations 6".split()
+    command += ["--checkpoint", "kept.h5", "-o", "new.h5"]
+    usual = runner.run(command, tmp_path).seconds
+    whole, rng, killed = read_artefact(tmp_path / "new.h5").data, np.random.default_rng(6), 0
+    (tmp_path / "new.h5").unlink()
+    while killed < (wanted := campaign(4, 400)) or not (tmp_path / "new.h5").exists():
+        after = rng.uniform() ** 2 * usual if killed < wanted else None
+        outcome = runner.run(command, tmp_path, kill_after=after)
+        killed += outcome.code == -signal.SIGKILL
+        assert outcome.code in (0, -signal.SIGKILL), outcome
+        if (tmp_path / "kept.h5").exists():
+            assert read_artefact(tmp_path / "kept.h5").kind == "checkpoint"
+        if (tmp_path / "new.h5").exists():
+            found = read_artefact(tmp_path / "new.h5").data
+            assert {k: v.tobytes() for k, v in found.items()} == {
+                k: v.tobytes() for k, v in whole.items()
+            }
+            if killed < wanted:
+                (tmp_path / "new.h5").unlink()
+    assert sorted(tree(tmp_path)) == ["new.h5", "photo.png", "pif.h5"]
+    count("kill -9 of learning with a checkpoint", killed=killed, other_dictionaries=0)
 
 
 @pytest.mark.slow

@@ -73,7 +73,14 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
 
 @pytest.mark.parametrize("command", SEVERAL.values(), ids=SEVERAL)
 @pytest.mark.parametrize(
-    "call", ["replace", *(pytest.param(c, marks=pytest.mark.slow) for c in ("fsync", "unlink"))]
+    "call",
+    [
+        "replace",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("fsync", "unlink", "link", "open", "write", "pwrite", "close")
+        ),
+    ],
 )
 def test_a_kill_at_any_call_leaves_all_old_or_all_new(
     runner, folder, campaign, count, command, call

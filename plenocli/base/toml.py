@@ -67,7 +67,11 @@ def violations(
     text: the TOML, empty where the tables came from elsewhere.
     """
     line_of = _lines(text)
-    lines = [_short(_sentence(e, model)) + _on_line(e["loc"], line_of) for e in error.errors()]
+    found = error.errors()
+    within = Counter(e["loc"][:-1] for e in found)
+    # a list whose items are all wrong is not too short beside that
+    found = [e for e in found if not (e["type"] == "too_short" and within[e["loc"]])]
+    lines = [_short(_sentence(e, model)) + _on_line(e["loc"], line_of) for e in found]
     count = f"{len(lines)} {'violation' if len(lines) == 1 else 'violations'}"
     if len(lines) > _MOST_LINES:
         lines[_MOST_LINES:] = ["..."]

@@ -21,6 +21,7 @@ from plenocli.base.quantities import (
 )
 from plenocli.base.units import format_length
 from plenocli.forward.camera.model import Aberration, Light, Sensor
+from plenocli.forward.camera.plausible import unusual
 
 Planes = Annotated[
     tuple[SignedLength, ...],
@@ -113,6 +114,14 @@ class Microscope(Section):
             raise ValueError(
                 f'sensor.cfa = "{self.sensor.cfa}": volumes are of monochrome sensors; leave it out'
             )
+        lengths = {
+            "lenslet_array.pitch": self.lenslet_array.pitch,
+            "lenslet_array.focal_length": self.lenslet_array.focal_length,
+            "sensor.distance": self.sensor.distance,
+            "sensor.pixel_pitch": self.sensor.pixel_pitch,
+        }
+        if asked := unusual(lengths):
+            raise ValueError(asked)
         for axis, pixels in enumerate(self.sensor.pixels_per_lenslet):
             spacing = self.lenslet_array.pitch / self.sensor.pixel_pitch
             if abs(pixels / spacing - 1) > 0.1:

@@ -767,7 +767,7 @@ class Camera(Section):
 
     def unusual_lengths(self) -> str | None:
         """What its lengths may have been meant to be (plausible.unusual)."""
-        return unusual(self._lengths())
+        return unusual(self._lengths().by_key)
 
     def _fitting(self, cells: FilterArray) -> FilterArray:
         """The filter array with its size; ValueError where it does not fit into the pupil."""

@@ -90,17 +90,16 @@ def implausible(lengths: Lengths) -> str | None:
     return worst.sentence + _meant(lengths)
 
 
-def unusual(lengths: Lengths) -> str | None:
-    """The lengths that are far from those of cameras, each with what may have been meant, in one
-    sentence; None where there are none. Ratios do not show where all are in a wrong unit.
+def unusual(by_key: Mapping[str, float]) -> str | None:
+    """The lengths (m, by dotted keys) that are far from those of cameras, each with what may have
+    been meant, in one sentence; None where there are none. Ratios do not show where all are in a
+    wrong unit.
     """
     asked = []
-    for key, value in lengths.by_key.items():
+    for key, value in by_key.items():
         low, high = USUAL.get(key, (0.0, math.inf))
         meant = next((value * f for f in UNITS if low <= value * f <= high), None)
-        derived = (
-            key == "lenslet_array.pitch" and "lenslet_array.superpixel_pitch" in lengths.by_key
-        )
+        derived = key == "lenslet_array.pitch" and "lenslet_array.superpixel_pitch" in by_key
         if not low <= value <= high and meant is not None and not derived:
             asked.append(f"{key} is {_text(value)}: did you mean {_text(meant)}?")
     return "; ".join(asked) or None

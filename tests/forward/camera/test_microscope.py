@@ -40,6 +40,9 @@ def test_the_sample_reads_and_survives_its_own_text():
         ("medium_index = 1.35", "medium_index = 1.35\nspecimen_index = 1.33", "go together"),
         ("medium_index = 1.35", "medium_index = 1.35\nrings = [0.0, 0.0]", "rings"),
         ('pitch = "100 um"', 'pitch = "100"', "100"),
+        ('focal_length = "2500 um"', 'focal_length = "2500 mm"', "did you mean 2.5 mm"),
+        ('\ndistance = "2500 um"', '\ndistance = "2.5 um"', "did you mean 2.5 mm"),
+        ('["593 nm"]', '["593 um"]', "1 violation\n.*outside 100 nm"),
     ],
 )
 def test_what_cannot_be_is_refused_with_its_path(old, new, said):

@@ -150,6 +150,7 @@ def oblique_case(seed, number):
     away = array.distance * math.tan(math.radians(rng.uniform(0.5, 20))) / array.pitch
     away = min(away, 2000.0)
     row, column = round(away * math.sin(turn)), round(away * math.cos(turn))
+    column = column or int(row == 0)  # on the axis the main lens has no spheres
     camera = camera.replace(
         **{
             "lenslet_array.lattice": "square",

@@ -22,6 +22,7 @@ docs/model.md, "Exact propagation".
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -156,10 +157,9 @@ def neglected(geometry: Geometry) -> float:
     g = geometry
     if g.chief == (0.0, 0.0):
         return 0.0
-    missed, steep, turns = _sizes(g)
+    missed, sizes, turns = _sizes(g)
     dim = 1 + 3 * (1 - g.lenslet_width / g.D2)
-    rest = _interpolated(turns, MOST_ORDERS), _truncated(steep, MOST_POWERS)
-    return dim * math.hypot(missed, *rest)
+    return dim * math.hypot(missed, _interpolated(turns, MOST_ORDERS), _beyond(sizes, MOST_POWERS))
 
 
 def orders_for(geometry: Geometry, tolerance: float) -> int:
@@ -178,15 +178,20 @@ def _interpolated(turns: float, nodes: int) -> float:
     return turns**nodes * 2**nodes * math.factorial(nodes) / math.factorial(2 * nodes)
 
 
-def _truncated(size: float, powers: int) -> float:
-    """Error of exp of a number of this size by its series."""
-    return size ** (powers + 1) / math.factorial(powers + 1)
+def _beyond(sizes: Sequence[float], powers: int) -> float:
+    """At most what exp E has beyond so many powers of ds, from E's parts of 1, 2, ... powers, of
+    these sizes.
+    """
+    series = [1.0]
+    for n in range(1, powers + 1):
+        series.append(sum(d / n * e * series[n - d] for d, e in enumerate(sizes, 1) if d <= n))
+    return math.exp(min(sum(sizes), 100.0)) - math.fsum(series)
 
 
 @lru_cache(maxsize=256)
-def _sizes(geometry: Geometry) -> tuple[float, float, float]:
-    """(what the fit of E misses, |E|, by how much E changes with the point), of a point's light on
-    its own lenslet.
+def _sizes(geometry: Geometry) -> tuple[float, list[float], float]:
+    """(what the fit of E misses, E's parts by their powers of ds, by how much E changes with the
+    point), of a point's light on its own lenslet.
     """
     g = geometry
     waves, t = _Waves(g), np.linspace(-1, 1, 3)
@@ -195,14 +200,15 @@ def _sizes(geometry: Geometry) -> tuple[float, float, float]:
     for p, q in product((-reach, 0.0, reach), repeat=2):
         # places on the lenslet, from the point
         exact = waves.exponent((p, q), reach * t - p, reach * t - q)
-        fit = np.tensordot(waves.powers, np.tensordot(waves.fit, exact, 1), 1)
-        found.append((np.abs(exact - fit), np.abs(exact), exact))
-    missed, size, exact = (np.array(a) for a in zip(*found))
-    middle = exact[len(exact) // 2]
+        parts = waves.parts(exact)
+        # out of focus the point's own spheres go with it, too
+        late = 1j * g.k * _late(g, (p, q), waves.y, waves.x)[:, None, None]
+        found.append((exact - parts.sum(axis=0), np.abs(parts).max(axis=(1, 2, 3)), exact + late))
+    missed, sizes, exact = (np.array(a) for a in zip(*found))
     return (
-        float(missed.max()),
-        float(size.max()),
-        float(np.abs(exact - middle).max()),
+        float(np.abs(missed).max()),
+        sizes.max(axis=0).tolist(),
+        float(np.abs(exact - exact[len(exact) // 2]).max()),
     )
 
 
@@ -241,6 +247,13 @@ class _Waves:
             np.log(far / near) - self._stronger
         )
 
+    def parts(self, exponent: np.ndarray) -> np.ndarray:
+        """The fit of E in parts of 1, 2, ... powers of ds: (part, pupil point, row, column)."""
+        fitted = np.tensordot(self.fit, exponent, 1)
+        degrees = np.array([a + b for a, b in FITTED])
+        some = (degrees == d for d in range(1, degrees.max() + 1))
+        return np.stack([np.tensordot(self.powers[:, d], fitted[d], 1) for d in some])
+
     def _ways(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lengths (m) of the ways from the pupil points, and from its centre, to places (m) on the
         array: (pupil point, row, column) and (row, column).
@@ -272,12 +285,13 @@ class _Fields:
         self._nodes, self._node_weights = gauss(math.ceil(phase + 5 * math.cbrt(phase) + 12))
         # as E is on the lenslets; no field is asked for beyond them
         places = (half - g.D2 / 2) * np.linspace(-1, 1, 3)
-        size = max(
-            float(np.abs(self._waves.exponent((p, q), places - p, places - q)).max())
+        parts = [
+            np.abs(self._waves.parts(self._waves.exponent((p, q), places - p, places - q)))
             for p, q in product((-g.D2 / 2, g.D2 / 2), repeat=2)
-        )
+        ]
+        sizes = np.max(parts, axis=(0, 2, 3, 4)).tolist()
         self._powers = next(
-            (n for n in range(MOST_POWERS) if FINER * _truncated(size, n) < tolerance), MOST_POWERS
+            (n for n in range(MOST_POWERS) if FINER * _beyond(sizes, n) < tolerance), MOST_POWERS
         )
         wave = np.exp(1j * phase * np.outer(t, self._nodes))
         self._along = [wave * self._nodes**n for n in range(self._powers + 1)]
@@ -317,17 +331,14 @@ class _Fields:
         g, lens = self.geometry, self._camera.main_lens
         count, steepest = len(self._nodes), self._waves.steepest
         total = np.zeros((count, 2 * count))
-        place = g.chief[0] + p[0], g.chief[1] + p[1]
         reach = g.k * math.sqrt(2) * np.abs(self._d).max() / g.z2
         for rows in pupil_rows(self._camera, g, reach):
             y, x = np.broadcast_to(rows.y[:, None], rows.x.shape).ravel(), rows.x.ravel()
             r2 = y * y + x * x
             cos2 = g.z2**2 / (g.z2**2 + r2)
             chief = _Sphere(g, g.chief, 1 / g.z2, y, x)
-            here, image = (_Sphere(g, place, q, y, x) for q in (1 / g.z2, 1 / g.z2 - g.eps))
             # pupil_rows has the paraxial defocus; the difference of the two spheres takes its place
-            late = here.path - image.path - g.eps * r2 / 2
-            weight = rows.weight.ravel() * np.exp(1j * g.k * late)
+            weight = rows.weight.ravel() * np.exp(1j * g.k * (_late(g, p, y, x) - g.eps * r2 / 2))
             weight *= APODISATION[lens.apodisation](cos2) * cos2 / (g.z2 * chief.far) ** 2
             step = max(1, SLAB // count)
             for start in range(0, len(weight), step):
@@ -365,6 +376,16 @@ class _Sphere:
             -(a * middle + t * apart) / (self.far * middle * geometry.z2)
             for a, t in ((y, ty), (x, tx))
         ]
+
+
+def _late(geometry: Geometry, p: Place, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """By how much the sphere about the image of the point whose chief ray meets the array at p (m
+    from the lenslet's centre) is ahead of the one about p, in m: (pupil point,).
+    """
+    g = geometry
+    place = g.chief[0] + p[0], g.chief[1] + p[1]
+    here, image = (_Sphere(g, place, q, y, x).path for q in (1 / g.z2, 1 / g.z2 - g.eps))
+    return here - image
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:
